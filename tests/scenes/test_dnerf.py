@@ -1,0 +1,566 @@
+import json
+import math
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from xplanes.scenes.cameras import focal_length, look_at
+from xplanes.scenes.dnerf import SceneError, read_scene
+from xplanes.scenes.images import load_images, load_premultiplied, shrink
+
+LEGO = Path(__file__).parents[3] / "shared" / "scenes" / "lego"
+ANGLE = 0.7
+
+
+def picture(seed, size=12):
+    """Straight RGBA with soft and fully transparent parts. uint8 [size, size, 4]"""
+    values = np.random.default_rng(seed).integers(0, 256, (size, size, 4), dtype=np.uint8)
+    values[: size // 3, :, 3] = 0
+    values[-size // 3 :, :, 3] = 255
+    return values
+
+
+def pose(index):
+    angle = 0.3 + index
+    place = torch.tensor([[4 * math.cos(angle), 4 * math.sin(angle), 1.0]], dtype=torch.float64)
+    return look_at(place)[0].tolist()
+
+
+class SceneFolder:
+    """A small scene on disk whose transforms can be changed before it is read."""
+
+    def __init__(self, path):
+        self.path = path
+        self.contents = {}
+
+    def add(self, split, count, *, size=12, fixed=False):
+        (self.path / split).mkdir(parents=True)
+        frames = []
+        for i in range(count):
+            Image.fromarray(picture(i, size)).save(self.path / split / f"r_{i}.png")
+            time = i / max(count - 1, 1)
+            matrix = pose(0 if fixed else i)
+            frames.append(
+                {"file_path": f"./{split}/r_{i}", "time": time, "transform_matrix": matrix}
+            )
+        self.contents[split] = {"camera_angle_x": ANGLE, "frames": frames}
+        self.write(split)
+        return self
+
+    def frame(self, index, split="train"):
+        return self.contents[split]["frames"][index]
+
+    def write(self, split="train"):
+        text = json.dumps(self.contents[split])
+        (self.path / f"transforms_{split}.json").write_text(text)
+
+    def read(self, resolution=None, splits=("train",), views=None):
+        return read_scene(self.path, resolution=resolution, splits=splits, views=views)
+
+    def error(self, **arguments):
+        with pytest.raises(SceneError) as caught:
+            self.read(**arguments)
+        return str(caught.value)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return SceneFolder(tmp_path / "ball").add("train", 5)
+
+
+def box_average(straight, factor):
+    """Independent reference: premultiplied float64 block means, from 0 to 255. [H, W, 4]"""
+    pixels = straight.astype(np.float64)
+    pixels[..., :3] *= pixels[..., 3:] / 255
+    rows, columns = pixels.shape[0] // factor, pixels.shape[1] // factor
+    result = np.zeros((rows, columns, 4))
+    for row in range(rows):
+        for column in range(columns):
+            block = pixels[row * factor : (row + 1) * factor]
+            result[row, column] = block[:, column * factor : (column + 1) * factor].mean((0, 1))
+    return result
+
+
+# What a sound scene becomes
+
+
+def test_reads_images_cameras_and_times(scene):
+    scene.add("val", 2)
+    result = scene.read(splits=["train", "val", "train"])
+    views = result.splits["train"]
+    assert result.name == "ball"
+    assert list(result.splits) == ["train", "val"]
+    assert result.video is None
+    assert views.files == tuple(f"train/r_{i}.png" for i in range(5))
+    assert views.times.tolist() == [0, 0.25, 0.5, 0.75, 1]
+    assert views.focal == pytest.approx(focal_length(ANGLE, 12))
+    assert views.images.dtype == torch.uint8
+    for i in range(5):
+        torch.testing.assert_close(views.camera_to_world[i], torch.tensor(pose(i)))
+        error = np.abs(views.images[i].numpy() - box_average(picture(i), 1)).max()
+        assert error <= 0.5 + 1e-4
+
+
+@pytest.mark.parametrize("factor", [2, 3, 4, 12])
+def test_integer_factors_average_premultiplied_blocks(scene, factor):
+    views = scene.read(resolution=12 // factor).splits["train"]
+    assert views.images.shape == (5, 12 // factor, 12 // factor, 4)
+    assert views.focal == pytest.approx(focal_length(ANGLE, 12 // factor))
+    for i in range(5):
+        expected = box_average(picture(i), factor)
+        assert np.abs(views.images[i].numpy() - expected).max() <= 1
+
+
+@pytest.mark.parametrize("resolution", [5, 7, 8, 11])
+def test_other_factors_average_the_area_that_a_pixel_covers(scene, resolution):
+    views = scene.read(resolution=resolution).splits["train"]
+    for i in range(5):
+        # Enlarged by whole pixels, the picture divides into blocks again.
+        enlarged = picture(i).repeat(resolution, axis=0).repeat(resolution, axis=1)
+        found = views.images[i].numpy()
+        assert np.abs(found - box_average(enlarged, 12)).max() <= 1
+        assert (found[..., :3] <= found[..., 3:]).all()
+
+
+@pytest.mark.parametrize("resolution", [7, 12, 24, 36, 47])
+def test_edges_neither_ring_nor_spill(resolution):
+    straight = np.zeros((4, 48, 48), np.float32)
+    straight[:, 16:32, 16:32] = 255
+    pixels = shrink(straight, resolution, resolution)
+    scale = resolution / 48
+    middle = slice(math.ceil(16 * scale), math.floor(32 * scale))
+    assert (pixels[middle, middle] == 255).all()
+    assert (pixels[: math.floor(16 * scale)] == 0).all()
+    assert (pixels[:, math.ceil(32 * scale) :] == 0).all()
+
+
+def test_hidden_colour_does_not_bleed(tmp_path):
+    straight = np.zeros((4, 4, 4), np.uint8)
+    straight[..., 0] = 255  # red everywhere, though only the left column is visible
+    straight[:, 0, 3] = 255
+    Image.fromarray(straight).save(tmp_path / "red.png")
+    pixels = load_images([tmp_path / "red.png"], 2)[0]
+    assert pixels[0, 0].tolist() == [128, 0, 0, 128]
+    assert pixels[0, 1].tolist() == [0, 0, 0, 0]
+
+
+def test_images_without_alpha_are_opaque(scene):
+    straight = picture(0)[..., :3]
+    Image.fromarray(straight).save(scene.path / "train" / "r_0.png")
+    image = scene.read().splits["train"].images[0]
+    assert (image[..., 3] == 255).all()
+    assert (image[..., :3].numpy() == straight).all()
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "P", "1", "RGB", "RGBA"])
+def test_other_kinds_of_pixels_are_converted(tmp_path, mode):
+    original = Image.fromarray(picture(0)).convert(mode)
+    original.save(tmp_path / "image.png")
+    straight = np.asarray(original.convert("RGBA"))
+    found = load_images([tmp_path / "image.png"], None)[0].numpy()
+    assert np.abs(found - box_average(straight, 1)).max() <= 0.5 + 1e-4
+
+
+def test_transparent_palette_entries_stay_transparent(tmp_path):
+    palette = Image.new("P", (2, 1))
+    palette.putpalette([255, 0, 0, 0, 0, 255])
+    palette.putdata([0, 1])
+    palette.save(tmp_path / "image.png", transparency=0)
+    assert load_images([tmp_path / "image.png"], None)[0, 0].tolist() == [[0] * 4, [0, 0, 255, 255]]
+
+
+def test_sixteen_bit_grey_keeps_its_range(tmp_path):
+    values = np.array([[0, 257, 32768, 65535]], np.uint16)
+    Image.fromarray(values).save(tmp_path / "image.png")
+    channels = load_premultiplied(tmp_path / "image.png")
+    assert channels[0, 0].tolist() == pytest.approx([0, 1, 127.502, 255], abs=1e-3)
+    assert (channels[3] == 255).all()
+
+
+def test_cmyk_is_refused_in_words(scene):
+    Image.new("CMYK", (12, 12)).save(scene.path / "train" / "r_1.jpg")
+    scene.frame(1)["file_path"] = "train/r_1.jpg"
+    scene.write()
+    message = scene.error()
+    assert "r_1.jpg" in message
+    assert "CMYK" in message
+    assert "RGBA" in message
+
+
+@pytest.mark.parametrize(
+    "name", ["train/r_1.png", "train/r_1", ".\\train\\r_1", "./train/../train/r_1"]
+)
+def test_spellings_of_file_path(scene, name):
+    scene.frame(1)["file_path"] = name
+    scene.write()
+    assert scene.read().splits["train"].files[1] == "train/r_1.png"
+
+
+def test_focal_length_in_pixels_instead_of_an_angle(scene):
+    del scene.contents["train"]["camera_angle_x"]
+    scene.contents["train"] |= {"fl_x": 30.0, "fl_y": 30.0, "w": 24, "h": 24, "cx": 12, "cy": 12}
+    scene.write()
+    assert scene.read().splits["train"].focal == pytest.approx(15)
+    assert scene.read(resolution=6).splits["train"].focal == pytest.approx(7.5)
+
+
+def test_no_times_at_all_is_a_static_scene(scene):
+    for frame in scene.contents["train"]["frames"]:
+        del frame["time"]
+    scene.frame(1)["transform_matrix"] = scene.frame(0)["transform_matrix"]
+    scene.write()
+    assert scene.read().splits["train"].times.tolist() == [0] * 5
+
+
+def test_video_is_read_when_there_is_one(scene):
+    scene.add("video", 3, fixed=True)
+    video = scene.read(resolution=6).video
+    assert video is not None
+    assert video.images.shape == (3, 6, 6, 4)
+    assert video.times.tolist() == [0, 0.5, 1]
+
+
+def test_images_need_not_be_square_at_their_own_size(scene):
+    for i in range(5):
+        Image.fromarray(picture(i)[:6]).save(scene.path / "train" / f"r_{i}.png")
+    views = scene.read().splits["train"]
+    assert (views.height, views.width) == (6, 12)
+    message = scene.error(resolution=6)
+    assert "12x6" in message
+    assert "data.resolution=6" in message
+    assert "data.resolution=null" in message
+
+
+def test_an_empty_image_is_only_a_warning(scene):
+    Image.new("RGBA", (12, 12)).save(scene.path / "train" / "r_3.png")
+    with pytest.warns(UserWarning, match=r"1 of 5 images show nothing.*r_3\.png"):
+        scene.read()
+
+
+def test_a_sound_scene_gives_no_warning(scene):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene.read(resolution=6)
+
+
+@pytest.mark.parametrize(
+    ("count", "expected"), [(1, [0]), (2, [0, 4]), (3, [0, 2, 4]), (4, [0, 1, 3, 4]), (5, range(5))]
+)
+def test_few_views_spread_over_time(scene, count, expected):
+    scene.add("val", 3)
+    result = scene.read(splits=["train", "val"], views=count)
+    assert result.splits["train"].files == tuple(f"train/r_{i}.png" for i in expected)
+    assert len(result.splits["val"]) == 3
+
+
+def test_few_views_follow_time_rather_than_file_order(scene):
+    for index, time in enumerate([0.5, 1, 0, 0.75, 0.25]):
+        scene.frame(index)["time"] = time
+    scene.write()
+    assert sorted(scene.read(views=3).splits["train"].times.tolist()) == [0, 0.5, 1]
+
+
+@pytest.mark.parametrize("count", [0, -1, 6])
+def test_more_views_than_there_are(scene, count):
+    message = scene.error(views=count)
+    assert f"data.views={count}" in message
+    assert "1 to 5" in message
+
+
+# What is refused
+
+
+def test_missing_folder_names_its_neighbours_and_the_ways_out(scene):
+    scene.path = scene.path.parent / "bal"
+    message = scene.error()
+    assert str(scene.path) in message
+    assert "does not exist" in message
+    assert "ball" in message
+    assert "python -m xplanes download dnerf" in message
+    assert "data=demo" in message
+
+
+def test_missing_root_names_the_nearest_folder(tmp_path):
+    message = SceneFolder(tmp_path / "no" / "such" / "scene").error()
+    assert f"There is no scene in {tmp_path}." in message
+
+
+def test_a_file_is_not_a_scene_folder(scene):
+    scene.path = scene.path / "transforms_train.json"
+    assert "is not a folder" in scene.error()
+
+
+def test_a_folder_of_scenes_is_not_a_scene(scene):
+    scene.path = scene.path.parent
+    message = scene.error()
+    assert "no transforms_train.json" in message
+    assert "Scenes inside it: ball" in message
+
+
+def test_missing_test_split_points_to_val(scene):
+    scene.add("val", 2)
+    message = scene.error(splits=["train", "test"])
+    assert "transforms_test.json" in message
+    assert "train, val" in message
+    assert "data.eval_split=val" in message
+
+
+def test_missing_split_without_val(scene):
+    message = scene.error(splits=["test"])
+    assert "transforms_test.json" in message
+    assert "Splits of this scene: train." in message
+    assert "data.eval_split" not in message
+
+
+@pytest.mark.parametrize("text", ["{", "", "\x80", "[" * 100000])
+def test_broken_json(scene, text):
+    (scene.path / "transforms_train.json").write_bytes(text.encode("latin-1"))
+    message = scene.error()
+    assert "transforms_train.json" in message
+    assert "JSON" in message
+
+
+@pytest.mark.parametrize(
+    "text", ["[]", "3", '{"camera_angle_x": 1}', '{"frames": []}', '{"frames": 3}']
+)
+def test_no_frames(scene, text):
+    (scene.path / "transforms_train.json").write_text(text)
+    message = scene.error()
+    assert "transforms_train.json" in message
+    assert "frames" in message
+
+
+@pytest.mark.parametrize("key", ["file_path", "transform_matrix"])
+def test_missing_key(scene, key):
+    del scene.frame(2)[key]
+    scene.write()
+    message = scene.error()
+    assert "frame 2" in message
+    assert f'"{key}"' in message
+
+
+def test_a_frame_that_is_no_object(scene):
+    scene.contents["train"]["frames"][2] = "r_2"
+    scene.write()
+    assert "frame 2 is 'r_2'" in scene.error()
+
+
+def test_missing_image(scene):
+    (scene.path / "train" / "r_2.png").unlink()
+    message = scene.error()
+    assert "frame 2 (./train/r_2)" in message
+    assert ".png" in message
+
+
+@pytest.mark.parametrize("name", [3, "", None, "train/r_1\0"])
+def test_file_path_that_is_no_name(scene, name):
+    scene.frame(1)["file_path"] = name
+    scene.write()
+    assert "file_path must be text" in scene.error()
+
+
+@pytest.mark.parametrize("damage", ["truncate", "flip", "text", "empty"])
+def test_damaged_image(scene, damage):
+    path = scene.path / "train" / "r_2.png"
+    content = bytearray(path.read_bytes())
+    if damage == "truncate":
+        content = content[: len(content) // 2]
+    elif damage == "flip":
+        content[len(content) // 2] ^= 0xFF
+    else:
+        content = b"no image" if damage == "text" else b""
+    path.write_bytes(content)
+    message = scene.error()
+    assert "r_2.png" in message
+    assert "cannot be decoded" in message
+
+
+def test_images_of_different_sizes(scene):
+    Image.fromarray(picture(0, 8)).save(scene.path / "train" / "r_3.png")
+    message = scene.error(resolution=4)
+    assert "r_3.png has 8x8" in message
+    assert "r_0.png has 12x12" in message
+
+
+@pytest.mark.parametrize(("resolution", "words"), [(13, "at most 12"), (0, "1 to 12")])
+def test_impossible_resolution(scene, resolution, words):
+    message = scene.error(resolution=resolution)
+    assert f"data.resolution={resolution}" in message
+    assert words in message
+
+
+@pytest.mark.parametrize("matrix", [[[1, 0], [0, 1]], "identity", None, [[1, 2, 3, 4]] * 3, [[[]]]])
+def test_pose_of_another_shape(scene, matrix):
+    scene.frame(1)["transform_matrix"] = matrix
+    scene.write()
+    message = scene.error()
+    assert "frame 1" in message
+    assert "4 rows of 4 numbers" in message
+
+
+def _not_a_number(matrix):
+    matrix[0, 3] = math.nan
+
+
+def _transposed(matrix):
+    matrix[:] = matrix.T.copy()
+
+
+def _scaled(matrix):
+    matrix[:3, :3] *= 1.01
+
+
+def _mirrored(matrix):
+    matrix[:3, 0] *= -1
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (_not_a_number, "NaN"),
+        (_transposed, "last row"),
+        (_scaled, "not orthonormal"),
+        (_mirrored, "determinant -1"),
+    ],
+)
+def test_pose_that_is_not_rigid(scene, damage, words):
+    matrix = np.array(pose(1))
+    damage(matrix)
+    scene.frame(1)["transform_matrix"] = matrix.tolist()
+    scene.write()
+    message = scene.error()
+    assert "frame 1 (./train/r_1)" in message
+    assert words in message
+
+
+@pytest.mark.parametrize("time", [-0.1, 1.1, math.nan, math.inf, "0", None, True])
+def test_time_out_of_range(scene, time):
+    scene.frame(1)["time"] = time
+    scene.write()
+    message = scene.error()
+    assert "frame 1" in message
+    assert f"time is {time!r}" in message
+    assert "[0, 1]" in message
+
+
+def test_time_missing_on_some_frames(scene):
+    del scene.frame(3)["time"]
+    scene.write()
+    message = scene.error()
+    assert "frame 3" in message
+    assert "4 of 5 frames" in message
+
+
+def test_the_same_file_twice(scene):
+    scene.frame(3)["file_path"] = "train/r_1.png"
+    scene.write()
+    message = scene.error()
+    assert "frame 3" in message
+    assert "same file" in message
+    assert "frame 1" in message
+
+
+def test_the_same_camera_and_time_twice(scene):
+    scene.frame(3).update(time=0.25, transform_matrix=scene.frame(1)["transform_matrix"])
+    scene.write()
+    message = scene.error()
+    assert "frame 3" in message
+    assert "same camera and time" in message
+    assert "frame 1" in message
+
+
+@pytest.mark.parametrize("name", ["../outside", "train/../../outside", "/etc/hostname", "C:\\r_1"])
+def test_file_path_outside_the_folder(scene, name):
+    Image.fromarray(picture(0)).save(scene.path.parent / "outside.png")
+    scene.frame(1)["file_path"] = name
+    scene.write()
+    message = scene.error()
+    assert "frame 1" in message
+    assert "leaves the scene's folder" in message or "absolute" in message
+
+
+def test_a_link_that_leaves_the_folder(scene):
+    Image.fromarray(picture(0)).save(scene.path.parent / "outside.png")
+    path = scene.path / "train" / "r_1.png"
+    path.unlink()
+    try:
+        path.symlink_to(scene.path.parent / "outside.png")
+    except OSError:
+        pytest.skip("this system does not let the test make links")
+    message = scene.error()
+    assert "leaves the scene's folder" in message
+    assert "outside.png" in message
+
+
+@pytest.mark.parametrize("angle", [0, -1, math.pi, math.nan, "wide", None, True])
+def test_field_of_view_out_of_range(scene, angle):
+    scene.contents["train"]["camera_angle_x"] = angle
+    scene.write()
+    message = scene.error()
+    assert f"camera_angle_x is {angle!r}" in message
+    assert "between 0 and pi" in message
+
+
+@pytest.mark.parametrize("other", [{}, {"fl_x": 30}, {"fl_x": 0, "w": 12}])
+def test_field_of_view_missing(scene, other):
+    del scene.contents["train"]["camera_angle_x"]
+    scene.contents["train"] |= other
+    scene.write()
+    message = scene.error()
+    assert 'no "camera_angle_x"' in message
+    assert "fl_x and w" in message
+
+
+@pytest.mark.parametrize(
+    ("other", "word"),
+    [({"k1": 0.1}, "k1"), ({"fl_x": 10, "fl_y": 12}, "fl_y"), ({"cx": 3, "w": 12}, "cx")],
+)
+def test_lenses_that_are_not_read(scene, other, word):
+    scene.contents["train"] |= other
+    scene.write()
+    message = scene.error()
+    assert word in message
+    assert "undistort" in message
+
+
+def test_focal_length_of_single_frames(scene):
+    scene.frame(1)["camera_angle_x"] = 0.5
+    scene.write()
+    assert "camera_angle_x of single frames" in scene.error()
+
+
+def test_video_of_a_moving_camera(scene):
+    scene.add("video", 3)
+    message = scene.error()
+    assert "transforms_video.json" in message
+    assert "moves" in message
+
+
+# A real scene
+
+
+@pytest.mark.skipif(not LEGO.is_dir(), reason=f"the D-NeRF lego scene is not at {LEGO}")
+def test_lego():
+    scene = read_scene(LEGO, resolution=100, splits=["train", "val"], views=8)
+    train, val = scene.splits["train"], scene.splits["val"]
+    assert (len(train), len(val)) == (8, 11)
+    assert (train.times[0], train.times[-1]) == (0, 1)
+    assert train.focal == pytest.approx(138.8889, abs=1e-3)
+    distances = train.camera_to_world[:, :3, 3].norm(dim=1)
+    torch.testing.assert_close(distances, torch.full((8,), 4.0311), atol=1e-3, rtol=0)
+    assert (train.images[..., :3] <= train.images[..., 3:]).all()
+    with Image.open(LEGO / train.files[3]) as original:
+        expected = box_average(np.asarray(original), 8)
+    assert np.abs(train.images[3].numpy() - expected).max() <= 1
+
+
+@pytest.mark.skipif(not LEGO.is_dir(), reason=f"the D-NeRF lego scene is not at {LEGO}")
+def test_lego_without_its_test_split():
+    if (LEGO / "transforms_test.json").exists():
+        pytest.skip("this copy of lego has a test split")
+    with pytest.raises(SceneError, match=r"data\.eval_split=val"):
+        read_scene(LEGO, resolution=100, splits=["train", "test"])

@@ -1,0 +1,354 @@
+import hashlib
+import io
+import json
+import shutil
+import threading
+import zipfile
+from collections import namedtuple
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+from xplanes.scenes import fetch as fetch_module
+from xplanes.scenes.download import DNERF_URL, TRAIN_VIEWS, download_dnerf
+from xplanes.scenes.errors import SceneError
+
+
+def make_archive(*, top="data/", skip=(), extra=(), train_views=None):
+    """A zip in the shape of the D-NeRF archive, with a few bytes for every image."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for scene, train in ({**TRAIN_VIEWS, **(train_views or {})}).items():
+            for split, count in (("train", train), ("val", 20), ("test", 20)):
+                frames = [{"file_path": f"./{split}/r_{i:03}"} for i in range(count)]
+                files = [f"{scene}/{split}/r_{i:03}.png" for i in range(count)]
+                listing = f"{scene}/transforms_{split}.json"
+                for name, text in [
+                    (listing, json.dumps({"frames": frames})),
+                    *((file, file) for file in files),
+                ]:
+                    if name not in skip:
+                        archive.writestr(top + name, text)
+        archive.writestr("__MACOSX/data/lego/._r_000.png", "junk")
+        for name in extra:
+            archive.writestr(name, "junk")
+    return content.getvalue()
+
+
+@pytest.fixture(scope="module")
+def archive():
+    return make_archive()
+
+
+class Handler(BaseHTTPRequestHandler):
+    def do_GET(self):
+        server = self.server
+        server.requests.append(dict(self.headers))
+        if server.status != 200:
+            self.send_error(server.status)
+            return
+        body, start = server.content, 0
+        asked = self.headers.get("Range")
+        unchanged = self.headers.get("If-Range") == server.etag or server.ignores_if_range
+        if asked and server.ranges and unchanged:
+            start = int(asked.removeprefix("bytes=").removesuffix("-"))
+            if start >= len(body):
+                self.send_response(416)
+                self.send_header("Content-Range", f"bytes */{len(body)}")
+                self.end_headers()
+                return
+            self.send_response(206)
+            self.send_header("Content-Range", f"bytes {start}-{len(body) - 1}/{len(body)}")
+        else:
+            self.send_response(200)
+        if server.etag:
+            self.send_header("ETag", server.etag)
+        if server.sends_length:
+            self.send_header("Content-Length", str(len(body) - start))
+        self.send_header("Content-Type", server.content_type)
+        self.end_headers()
+        limit = server.limits.pop(0) if server.limits else None
+        self.wfile.write(body[start:][:limit])
+        self.close_connection = True
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def server(archive, monkeypatch):
+    monkeypatch.setenv("no_proxy", "*")
+    monkeypatch.setattr(fetch_module, "PAUSE_SECONDS", 0.01)
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        server.content = archive
+        server.requests = []
+        server.limits = []  # bytes after which each answer is cut off
+        server.status = 200
+        server.etag = '"one"'
+        server.ranges = True
+        server.ignores_if_range = False
+        server.sends_length = True
+        server.content_type = "application/zip"
+        server.url = f"http://127.0.0.1:{server.server_port}/data.zip"
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+def download(root, server, **arguments):
+    lines = []
+    result = download_dnerf(root, url=server.url, announce=lines.append, **arguments)
+    return result, lines
+
+
+def error(root, server, **arguments):
+    with pytest.raises(SceneError) as caught:
+        download(root, server, **arguments)
+    return str(caught.value)
+
+
+def assert_complete(root):
+    assert sorted(path.name for path in root.iterdir()) == sorted(TRAIN_VIEWS)
+    for scene, count in TRAIN_VIEWS.items():
+        assert len(list((root / scene / "train").iterdir())) == count
+        assert (root / scene / "val" / "r_019.png").read_text() == f"{scene}/val/r_019.png"
+
+
+def scenes_in(root):
+    return [path.name for path in root.iterdir() if path.is_dir()]
+
+
+def test_downloads_and_unpacks_all_scenes(tmp_path, server):
+    root = tmp_path / "data" / "dnerf"
+    checksum = hashlib.sha256(server.content).hexdigest().upper()
+    result, lines = download(root, server, sha256=checksum)
+    assert result == root
+    assert_complete(root)
+    assert server.url in lines[0]
+    assert "lego" in lines[-1]
+
+
+def test_scenes_may_lie_at_the_top_of_the_archive(tmp_path, server):
+    server.content = make_archive(top="")
+    download(tmp_path, server)
+    assert_complete(tmp_path)
+
+
+def test_nothing_is_fetched_when_all_is_there(tmp_path, server):
+    download(tmp_path, server)
+    _, lines = download(tmp_path, server)
+    assert len(server.requests) == 1
+    assert "already" in lines[0]
+
+
+def test_scenes_already_there_are_kept(tmp_path, server):
+    (tmp_path / "lego").mkdir()
+    (tmp_path / "lego" / "transforms_train.json").write_text("mine")
+    download(tmp_path, server)
+    assert (tmp_path / "lego" / "transforms_train.json").read_text() == "mine"
+    assert sorted(scenes_in(tmp_path)) == sorted(TRAIN_VIEWS)
+
+
+def test_a_folder_in_the_way_is_not_touched(tmp_path, server):
+    (tmp_path / "lego").mkdir()
+    (tmp_path / "lego" / "notes.txt").write_text("mine")
+    message = error(tmp_path, server)
+    assert str(tmp_path / "lego") in message
+    assert "Move it" in message
+    assert not server.requests
+
+
+def test_goes_on_within_one_call_after_a_cut(tmp_path, server):
+    server.limits = [50_000, 60_000]
+    _, lines = download(tmp_path, server)
+    assert_complete(tmp_path)
+    assert [request.get("Range") for request in server.requests] == [
+        None,
+        "bytes=50000-",
+        "bytes=110000-",
+    ]
+    assert any("trying again" in line for line in lines)
+
+
+def test_goes_on_at_the_next_call_after_a_cut(tmp_path, server, monkeypatch):
+    monkeypatch.setattr(fetch_module, "ATTEMPTS", 1)
+    server.limits = [50_000]
+    message = error(tmp_path, server)
+    assert "ended after 0.1 of" in message
+    assert "dnerf.zip.part" in message
+    assert scenes_in(tmp_path) == []
+    download(tmp_path, server)
+    assert server.requests[1]["Range"] == "bytes=50000-"
+    assert server.requests[1]["If-Range"] == '"one"'
+    assert_complete(tmp_path)
+
+
+def test_a_complete_part_is_not_fetched_again(tmp_path, server):
+    part = tmp_path / "dnerf.zip.part"
+    part.write_bytes(server.content)
+    note = {"url": server.url, "validator": '"one"'}
+    part.with_name("dnerf.zip.part.json").write_text(json.dumps(note))
+    download(tmp_path, server)
+    assert len(server.requests) == 1
+    assert_complete(tmp_path)
+
+
+@pytest.mark.parametrize("ignores_if_range", [False, True])
+@pytest.mark.parametrize("size", [1000, 10_000_000])
+def test_a_changed_file_is_fetched_from_its_start(tmp_path, server, ignores_if_range, size):
+    part = tmp_path / "dnerf.zip.part"
+    part.write_bytes(b"old" * (size // 3))
+    note = {"url": server.url, "validator": '"zero"'}
+    part.with_name("dnerf.zip.part.json").write_text(json.dumps(note))
+    server.ignores_if_range = ignores_if_range
+    download(tmp_path, server)
+    assert "Range" in server.requests[0]
+    assert_complete(tmp_path)
+
+
+@pytest.mark.parametrize("note", [None, "{", '{"url": "elsewhere", "validator": "one"}', "[]"])
+def test_a_part_of_unknown_origin_is_not_continued(tmp_path, server, note):
+    part = tmp_path / "dnerf.zip.part"
+    part.write_bytes(b"old")
+    if note is not None:
+        part.with_name("dnerf.zip.part.json").write_text(note)
+    download(tmp_path, server)
+    assert "Range" not in server.requests[0]
+    assert_complete(tmp_path)
+
+
+def test_server_without_ranges_starts_again(tmp_path, server):
+    server.ranges = False
+    server.limits = [50_000]
+    download(tmp_path, server)
+    assert server.requests[1]["Range"] == "bytes=50000-"
+    assert_complete(tmp_path)
+
+
+@pytest.mark.parametrize("etag", [None, 'W/"weak"'])
+def test_server_that_names_no_version_starts_again(tmp_path, server, etag):
+    server.etag = etag
+    server.limits = [50_000]
+    download(tmp_path, server)
+    assert "Range" not in server.requests[1]
+    assert_complete(tmp_path)
+
+
+def test_server_that_tells_no_length(tmp_path, server):
+    server.sends_length = False
+    download(tmp_path, server)
+    assert_complete(tmp_path)
+
+
+def test_wrong_checksum(tmp_path, server):
+    message = error(tmp_path, server, sha256="ab" * 32)
+    assert hashlib.sha256(server.content).hexdigest() in message
+    assert "ab" * 32 in message
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_truncated_archive(tmp_path, server):
+    server.content = server.content[:-100]
+    message = error(tmp_path, server)
+    assert "dnerf.zip" in message
+    assert "damaged" in message
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_damaged_member_leaves_no_scene(tmp_path, server):
+    content = bytearray(server.content)
+    place = content.index(b"trex/test/r_019.png", content.index(b"data/trex/test/r_019.png") + 10)
+    content[place] ^= 0xFF
+    server.content = bytes(content)
+    message = error(tmp_path, server)
+    assert "CRC" in message
+    assert "r_019.png" in message
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "name", ["../evil", "data/../../evil", "/evil", "data\\..\\evil", "C:/evil"]
+)
+def test_members_that_leave_the_folder(tmp_path, server, name):
+    server.content = make_archive(extra=[name])
+    root = tmp_path / "root"
+    message = error(root, server)
+    assert "evil" in message
+    assert "leads out" in message
+    assert list(root.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["root"]
+
+
+@pytest.mark.parametrize(
+    ("missing", "words"),
+    [
+        ("trex/transforms_val.json", "trex/transforms_val.json is missing"),
+        ("hook/test/r_007.png", "hook lacks ./test/r_007.png"),
+    ],
+)
+def test_incomplete_archive_leaves_no_scene(tmp_path, server, missing, words):
+    server.content = make_archive(skip=[missing])
+    assert words in error(tmp_path, server)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_number_of_training_views(tmp_path, server):
+    server.content = make_archive(train_views={"lego": 49})
+    assert "lego has 49 training views instead of 50" in error(tmp_path, server)
+
+
+def test_not_found_names_the_address_and_the_way_by_hand(tmp_path, server):
+    server.status = 404
+    message = error(tmp_path, server)
+    assert f"{server.url} answered 404" in message
+    assert DNERF_URL in message
+    assert str(tmp_path / "dnerf.zip") in message
+    assert "data=demo" in message
+    assert len(server.requests) == 1
+
+
+def test_web_page_instead_of_the_archive(tmp_path, server):
+    server.content = b"<html>This link was disabled</html>"
+    server.content_type = "text/html; charset=utf-8"
+    assert "web page" in error(tmp_path, server)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_offline(tmp_path, server):
+    server.url = "http://127.0.0.1:9/data.zip"
+    message = error(tmp_path, server)
+    assert "cannot be reached" in message
+    assert "by hand" in message
+    assert str(tmp_path / "dnerf.zip") in message
+
+
+def test_other_kinds_of_address(tmp_path, server):
+    server.url = "file:///etc/hostname"
+    assert "not an http or https address" in error(tmp_path, server)
+
+
+def test_archive_fetched_by_hand_is_used_and_kept(tmp_path, server):
+    (tmp_path / "dnerf.zip").write_bytes(server.content)
+    _, lines = download(tmp_path, server)
+    assert "already" in lines[0]
+    assert not server.requests
+    assert sorted(scenes_in(tmp_path)) == sorted(TRAIN_VIEWS)
+    assert (tmp_path / "dnerf.zip").exists()
+
+
+def test_damaged_archive_fetched_by_hand_is_kept(tmp_path, server):
+    (tmp_path / "dnerf.zip").write_bytes(b"no zip")
+    message = error(tmp_path, server)
+    assert "Replace it or delete it" in message
+    assert (tmp_path / "dnerf.zip").exists()
+
+
+def test_full_disk(tmp_path, server, monkeypatch):
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 0, len(server.content)))
+    message = error(tmp_path, server)
+    assert "free space" in message
+    assert str(tmp_path) in message
+    assert scenes_in(tmp_path) == []

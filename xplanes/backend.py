@@ -1,0 +1,38 @@
+"""Which implementation of the inner loops a tensor gets."""
+
+import functools
+import importlib.util
+import logging
+import os
+
+import torch
+from torch import Tensor
+
+logger = logging.getLogger(__name__)
+
+
+@functools.cache
+def numba_found() -> bool:
+    """Whether the compiled CPU loops can be used; says so once where they cannot."""
+    if importlib.util.find_spec("numba") is None:
+        logger.warning(
+            "numba is not installed: the CPU takes the plain torch path, several times slower. "
+            "Install it with `pip install numba`."
+        )
+        return False
+    return True
+
+
+def cpu_loops(tensor: Tensor) -> bool:
+    """Whether compiled CPU loops apply to ``tensor``: on the CPU, in float32 or float64."""
+    return (
+        tensor.device.type == "cpu"
+        and tensor.dtype in (torch.float32, torch.float64)
+        and os.environ.get("XPLANES_CPU_LOOPS", "1") != "0"
+        and numba_found()
+    )
+
+
+def name(device: torch.device) -> str:
+    """Name of the inner loops on a device, for the header of a run."""
+    return "compiled loops" if cpu_loops(torch.empty(0, device=device)) else "torch"

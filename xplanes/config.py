@@ -1,0 +1,264 @@
+"""Every setting, typed. The values live in conf/, one YAML group per thing a user varies."""
+
+import math
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any
+
+from omegaconf import MISSING, DictConfig, OmegaConf
+
+
+class ConfigError(ValueError):
+    """A setting that cannot work; the message names the key, the value and the way out."""
+
+
+@dataclass
+class DataConfig:
+    """A scene on disk in the format of D-NeRF or Blender."""
+
+    name: str = MISSING  # Kind of data: demo or dnerf.
+    root: str = MISSING  # Folder that holds the scenes.
+    scene: str = MISSING  # Folder of the scene, or name of the demo scene.
+    resolution: int | None = MISSING  # Pixels per side; null keeps the native size.
+    views: int | None = MISSING  # Training views kept, spread over time; null keeps all.
+    eval_split: str = MISSING  # Split that is scored: test or val.
+    half_side: float | None = MISSING  # Half the side of the scene's cube; null finds it.
+    background_share: float = MISSING  # Share of rays drawn far from the silhouettes; null-rays.
+    skip_background: bool = MISSING  # Draw rays near the silhouettes more often than elsewhere.
+
+
+@dataclass
+class DemoConfig(DataConfig):
+    """A procedural scene, rendered on first use."""
+
+    seed: int = MISSING  # Varies colours, motion and cameras.
+    train_views: int = MISSING  # Training views, each at its own time.
+    test_views: int = MISSING  # Test views, at times of their own.
+    val_views: int = MISSING  # Validation views.
+
+
+@dataclass
+class DecoderConfig:
+    """The MLP from features to colour and density."""
+
+    width: int = MISSING  # Neurons of each hidden layer.
+    hidden: int = MISSING  # Hidden layers.
+    activation: str = MISSING  # Between layers: relu or silu.
+    density: str = MISSING  # Activation of the density: softplus or exp.
+    density_scale: float = MISSING  # Factor on the density.
+    density_start: float = MISSING  # Start of the density logit; lower is emptier.
+    freeze: bool = MISSING  # Keep the decoder as it starts.
+
+
+@dataclass
+class ModelConfig:
+    """The field: planes and decoder."""
+
+    name: str = MISSING  # Name in run directories and tables.
+    plane_set: str = MISSING  # six, nine, or three (no time).
+    resolution: int = MISSING  # Texels along each space axis.
+    time_resolution: int | None = MISSING  # Rows of the time planes; null: half the frames.
+    channels: int = MISSING  # Channels of each plane.
+    space_scale: float = MISSING  # Standard deviation of the space planes at the start.
+    time_scale: float = MISSING  # Standard deviation of the time planes at the start.
+    decoder: DecoderConfig = field(default_factory=DecoderConfig)
+
+
+@dataclass
+class LRMConfig:
+    """The Large Reconstruction Model that starts the planes."""
+
+    name: str = MISSING  # none starts them at random.
+
+
+@dataclass
+class SamplerConfig:
+    """Where rays are sampled, and which samples are never computed."""
+
+    name: str = MISSING  # Name of the sampler.
+    samples: int = MISSING  # Steps along the diagonal of the cube.
+    grid_resolution: int = MISSING  # Cells of the occupancy grid along each side.
+    time_bins: int = MISSING  # Bins of the occupancy grid along time.
+    threshold: float = MISSING  # Opacity of one step below which a cell is empty.
+    decay: float = MISSING  # Factor on a cell's density at each look.
+    skip_empty: bool = MISSING  # Skip samples in empty cells.
+    skip_occluded: bool = MISSING  # Skip samples behind opaque surfaces.
+    occlusion: float = MISSING  # Light left behind a surface below which it is opaque.
+    silhouettes: bool = MISSING  # Rule out cells that the images' alpha shows to be empty.
+    update_every: int = MISSING  # Steps between looks at cells that no ray samples.
+    update_cells: int = MISSING  # Cells per look.
+
+
+@dataclass
+class LossConfig:
+    """Terms of the loss beyond the colour's mean squared error."""
+
+    background: str = MISSING  # Behind training rays: white or random.
+    total_variation: float = MISSING  # Weight of squared differences between texels.
+    time_smoothness: float = MISSING  # Weight of squared second differences along time.
+    time_magnitude: float = MISSING  # Weight of squared values of the time planes.
+    every: int = MISSING  # Steps between applications of these, at as many times the weight.
+
+
+@dataclass
+class TrainerConfig:
+    """Budget, optimiser, evaluation and hardware."""
+
+    name: str = MISSING  # Name of the hardware setting.
+    accelerator: str = MISSING  # auto, cpu or gpu.
+    devices: int = MISSING  # Processes; rays are split between them.
+    strategy: str = MISSING  # auto, or ddp for several devices.
+    precision: str = MISSING  # 32, or bf16 for the decoder.
+    max_steps: int = MISSING  # Steps at most.
+    max_seconds: float | None = MISSING  # Training clock at most; null for no limit.
+    rays_per_batch: int = MISSING  # Rays of a step at most.
+    samples_per_batch: int = MISSING  # Samples of a step at most, on average.
+    accumulate: int = MISSING  # Batches per optimiser step.
+    plane_lr: float = MISSING  # Learning rate of the space planes.
+    time_lr: float = MISSING  # Learning rate of the time planes.
+    decoder_lr: float = MISSING  # Learning rate of the decoder.
+    warmup_steps: int = MISSING  # Steps until the full learning rate.
+    final_lr: float = MISSING  # Share of the learning rate left at the end.
+    checkpoint_every: int = MISSING  # Steps between checkpoints.
+    evaluate_at: list[float] = MISSING  # Shares of the budget at which the views are scored.
+    evaluate_views: int | None = MISSING  # Views scored on the way; null scores all.
+    log_every: int = MISSING  # Steps between TensorBoard scalars.
+    deterministic: bool = MISSING  # Refuse operations whose result may vary.
+    media: bool = MISSING  # Write the turning render at the end.
+
+
+@dataclass
+class TrainConfig:
+    """The whole configuration of a run."""
+
+    seed: int = MISSING  # Source of all randomness.
+    resume: str | None = MISSING  # A run directory to go on with, or auto.
+    data: Any = MISSING
+    model: Any = MISSING
+    lrm: Any = MISSING
+    sampler: Any = MISSING
+    loss: LossConfig = field(default_factory=LossConfig)
+    trainer: TrainerConfig = field(default_factory=TrainerConfig)
+
+
+SCHEMAS: dict[tuple[str | None, str], type] = {
+    (None, "train_schema"): TrainConfig,
+    ("data", "dnerf_schema"): DataConfig,
+    ("data", "demo_schema"): DemoConfig,
+    ("model", "xplanes_schema"): ModelConfig,
+    ("lrm", "lrm_schema"): LRMConfig,
+    ("sampler", "occupancy_schema"): SamplerConfig,
+    ("loss", "loss_schema"): LossConfig,
+    ("trainer", "trainer_schema"): TrainerConfig,
+}
+"""Schema by configuration group and the name under which its YAML files inherit it."""
+
+
+def register_schemas() -> None:
+    """Make the schemas known to Hydra; calling it again changes nothing."""
+    from hydra.core.config_store import ConfigStore
+
+    store = ConfigStore.instance()
+    for (group, name), schema in SCHEMAS.items():
+        store.store(group=group, name=name, node=schema)
+
+
+def to_plain(config: DictConfig) -> dict[str, Any]:
+    """The resolved configuration as dicts, lists, numbers and strings, without Hydra's part."""
+    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    assert isinstance(plain, dict)
+    plain.pop("hydra", None)
+    return {str(key): value for key, value in plain.items()}
+
+
+def build(schema: type, values: dict[str, Any]) -> Any:
+    """A plain dict as an instance of its schema, nested schemas included."""
+    arguments = {}
+    for entry in fields(schema):
+        value = values[entry.name]
+        inner = entry.type
+        arguments[entry.name] = (
+            build(inner, value) if is_dataclass(inner) and isinstance(inner, type) else value
+        )
+    return schema(**arguments)
+
+
+def parse(config: dict[str, Any]) -> TrainConfig:
+    """A plain configuration, as saved in a run directory, as typed settings.
+
+    Raises:
+        ConfigError: If settings are out of range or contradict one another.
+    """
+    data = DemoConfig if config["data"]["name"] == "demo" else DataConfig
+    typed = TrainConfig(
+        seed=config["seed"],
+        resume=config.get("resume"),
+        data=build(data, config["data"]),
+        model=build(ModelConfig, config["model"]),
+        lrm=build(LRMConfig, config["lrm"]),
+        sampler=build(SamplerConfig, config["sampler"]),
+        loss=build(LossConfig, config["loss"]),
+        trainer=build(TrainerConfig, config["trainer"]),
+    )
+    check(typed)
+    return typed
+
+
+_POSITIVE = """data.resolution data.views data.half_side data.train_views data.test_views
+data.val_views model.resolution model.time_resolution model.channels model.decoder.width
+model.decoder.density_scale sampler.samples sampler.grid_resolution sampler.time_bins
+sampler.threshold sampler.update_every sampler.update_cells loss.every trainer.devices
+trainer.max_steps trainer.max_seconds trainer.rays_per_batch trainer.samples_per_batch
+trainer.accumulate trainer.plane_lr trainer.time_lr trainer.decoder_lr trainer.checkpoint_every
+trainer.evaluate_views trainer.log_every""".split()
+_NOT_NEGATIVE = """seed model.decoder.hidden model.space_scale model.time_scale loss.total_variation
+loss.time_smoothness loss.time_magnitude trainer.warmup_steps""".split()
+_SHARE = """data.background_share sampler.decay sampler.occlusion trainer.final_lr""".split()
+_CHOICES: dict[str, tuple[str, ...]] = {
+    "data.eval_split": ("test", "val"),
+    "model.plane_set": ("six", "nine", "three"),
+    "model.decoder.activation": ("relu", "silu"),
+    "model.decoder.density": ("softplus", "exp"),
+    "loss.background": ("white", "random"),
+    "trainer.accelerator": ("auto", "cpu", "gpu"),
+    "trainer.strategy": ("auto", "ddp"),
+    "trainer.precision": ("32", "bf16"),
+}
+
+
+def check(config: TrainConfig) -> None:
+    """Refuse settings that cannot work, each with the key, the value and what is allowed."""
+    for key, value in _leaves(config):
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"{key}={value}: must be a finite number")
+        if value is None:
+            continue
+        if key in _POSITIVE and value <= 0:
+            raise ConfigError(f"{key}={value}: must be above 0")
+        if key in _NOT_NEGATIVE and value < 0:
+            raise ConfigError(f"{key}={value}: must not be negative")
+        if key in _SHARE and not 0 <= value <= 1:
+            raise ConfigError(f"{key}={value}: must lie between 0 and 1")
+        if key in _CHOICES and value not in _CHOICES[key]:
+            raise ConfigError(f"{key}={value}: must be one of {', '.join(_CHOICES[key])}")
+    at = config.trainer.evaluate_at
+    if any(not 0 <= share <= 1 for share in at):
+        raise ConfigError(f"trainer.evaluate_at={at}: shares of the budget, from 0 to 1")
+    if config.trainer.devices > 1 and config.trainer.strategy != "ddp":
+        raise ConfigError(
+            f"trainer.devices={config.trainer.devices} with trainer.strategy=auto: several devices "
+            "need trainer=ddp"
+        )
+    if config.sampler.grid_resolution**3 * config.sampler.time_bins > 2**28:
+        raise ConfigError(
+            f"sampler.grid_resolution={config.sampler.grid_resolution} with sampler.time_bins="
+            f"{config.sampler.time_bins}: more than 268 million cells; lower one of them"
+        )
+
+
+def _leaves(node: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    found = []
+    for entry in fields(node):
+        value = getattr(node, entry.name)
+        key = f"{prefix}{entry.name}"
+        found += _leaves(value, f"{key}.") if is_dataclass(value) else [(key, value)]
+    return found

@@ -1,0 +1,175 @@
+"""From low-rank and sparse triplanes to the planes of a field (g2).
+
+Planes come out channels last: space planes [3, R, R, C] in the order xy, xz, yz, where plane "ab"
+has its FIRST axis a along the width (last spatial dimension) and b along the rows; time planes
+[P, Rt, R, C], where plane "at" has a along the width and time along the rows. Space axes are
+sampled with ``align_corners=False`` and zero outside, as LRM planes are; time t in [0, 1] lies at
+row ``t * (Rt - 1)``, so with Rt = T each frame owns a row.
+"""
+
+import torch
+from torch import Tensor
+
+from xplanes.decomposition.decompose import check_triplanes
+from xplanes.decomposition.interpolation import frame_times, space_weights, time_weights
+from xplanes.decomposition.rank1 import rank1_factors, shared_factors
+
+STATIC = ("middle", "median", "mean")
+DYNAMIC = ("random", "rank1")
+
+TIME_PLANES = {
+    "six": ("xt", "yt", "zt"),
+    "nine": ("xt", "yt", "xt", "zt", "yt", "zt"),
+}
+"""Time planes of each plane set, in storage order."""
+
+TIME_ROWS = {
+    "six": ((0, 1), (0, 2), (1, 2)),
+    "nine": ((0, 1), (2, 3), (4, 5)),
+}
+"""For xy, xz and yz the time planes of its first and second axis, by position in storage."""
+
+
+def space_planes(
+    low_rank: Tensor, *, static: str = "median", resolution: int | None = None
+) -> Tensor:
+    """Space planes from the low-rank part (X-Planes, Eq. 13; "middle" is the paper's choice).
+
+    Args:
+        low_rank: What stands still. [T, 3, C, H, W]
+        static: "middle" (the frame T/2), "median" or "mean" over time, entry by entry.
+        resolution: R, in cells; None keeps the triplanes' own, which must then be square.
+
+    Returns:
+        Planes xy, xz, yz. [3, R, R, C]
+
+    Raises:
+        ValueError: For a wrong shape or option.
+    """
+    check_triplanes(low_rank, "low_rank")
+    if static not in STATIC:
+        raise ValueError(f"static is {static!r}: allowed are {', '.join(STATIC)}")
+    if static == "middle":
+        plane = low_rank[len(low_rank) // 2]
+    elif static == "mean":
+        plane = low_rank.mean(dim=0)
+    else:
+        plane = torch.stack([_median(low_rank[:, index]) for index in range(3)])
+    size = _resolution(low_rank, resolution)
+    if plane.shape[-2:] != (size, size):
+        rows = space_weights(size, plane.shape[-2], plane)
+        columns = space_weights(size, plane.shape[-1], plane)
+        plane = rows @ plane @ columns.mT
+    return plane.permute(0, 2, 3, 1).contiguous()
+
+
+def time_planes(
+    sparse: Tensor,
+    *,
+    plane_set: str,
+    dynamic: str = "rank1",
+    resolution: int | None = None,
+    time_resolution: int | None = None,
+    noise: float = 0.01,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Space-time planes whose products start near the sparse part (X-Planes, Eq. 14-16).
+
+    "rank1" minimises the product loss frame by frame on the triplanes' own grid: in closed form for
+    nine planes, by alternating least squares for six. "random" is the paper's start near zero. Both
+    get noise, because a product of two zeros has a zero gradient.
+
+    Args:
+        sparse: What moves. [T, 3, C, H, W]
+        plane_set: "six" (xt, yt, zt shared) or "nine" (xt, yt, xt, zt, yt, zt, a pair per row).
+        dynamic: "rank1" or "random".
+        resolution: R, in cells; None keeps the triplanes' own, which must then be square.
+        time_resolution: Rt; None takes T, one row per frame.
+        noise: Standard deviation of the noise.
+        generator: Source of the noise.
+
+    Returns:
+        Time planes in the order of ``TIME_PLANES``. [P, Rt, R, C]
+
+    Raises:
+        ValueError: For a wrong shape or option.
+    """
+    check_triplanes(sparse, "sparse")
+    for name, value, allowed in (
+        ("plane_set", plane_set, TIME_ROWS),
+        ("dynamic", dynamic, DYNAMIC),
+    ):
+        if value not in allowed:
+            raise ValueError(f"{name} is {value!r}: allowed are {', '.join(allowed)}")
+    if noise < 0:
+        raise ValueError(f"noise is {noise}: it must not be negative")
+    frames, _, channels, height, width = sparse.shape
+    size = _resolution(sparse, resolution)
+    count = frames if time_resolution is None else time_resolution
+    if count < 1:
+        raise ValueError(f"time_resolution is {time_resolution}: it must be at least 1")
+    shape = (len(TIME_PLANES[plane_set]), count, size, channels)
+    kind = sparse.dtype if sparse.dtype == torch.float64 else torch.float32
+    planes = noise * torch.randn(
+        shape,
+        dtype=kind,
+        device=generator.device if generator else sparse.device,
+        generator=generator,
+    ).to(sparse.device)
+    if dynamic == "random":
+        return planes
+
+    if plane_set == "nine":
+        factors = [factor for index in range(3) for factor in rank1_factors(sparse[:, index])]
+    elif height == width:
+        factors = list(shared_factors(sparse))
+    else:
+        raise ValueError(f"six planes share axes and need square triplanes, not {height} x {width}")
+    ticks = torch.linspace(0, 1, count, dtype=torch.float64, device=sparse.device)
+    for plane, factor in zip(planes, factors, strict=True):
+        if len(factor) != count:
+            # A single row has to stand for all times: take the middle.
+            weights = time_weights(ticks if count > 1 else ticks + 0.5, frames, factor)
+            factor = torch.einsum("st,tac->sac", weights, factor)
+        if factor.shape[1] != size:
+            factor = space_weights(size, factor.shape[1], factor) @ factor
+        plane += factor
+    return planes
+
+
+def frame_profiles(planes: Tensor, frames: Tensor, count: int, size: int) -> Tensor:
+    """Sample time planes at frames and at the cell centres of a grid, one axis after the other.
+
+    Args:
+        planes: Time planes. [P, Rt, R, C]
+        frames: Numbers of the frames. [B]
+        count: Number of frames T that fill [0, 1].
+        size: Cells of the grid along the spatial axis.
+
+    Returns:
+        Values along the spatial axis. [P, B, size, C]
+    """
+    rows = time_weights(frame_times(frames, count), planes.shape[1], planes)
+    values = torch.einsum("bt,ptac->pbac", rows, planes)
+    if planes.shape[2] == size:
+        return values
+    return space_weights(size, planes.shape[2], planes) @ values
+
+
+def _median(values: Tensor) -> Tensor:
+    """Median over the first axis, the mean of the middle two where their number is even."""
+    lower = values.median(dim=0).values
+    if len(values) % 2:
+        return lower
+    return 0.5 * (lower - (-values).median(dim=0).values)
+
+
+def _resolution(triplanes: Tensor, resolution: int | None) -> int:
+    height, width = triplanes.shape[-2:]
+    if resolution is None:
+        if height != width:
+            raise ValueError(f"triplanes are {height} x {width}: name a resolution")
+        return height
+    if resolution < 1:
+        raise ValueError(f"resolution is {resolution}: it must be at least 1")
+    return resolution

@@ -1,0 +1,69 @@
+"""A triplane sequence as the sum of a standing and a moving one."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from xplanes.decomposition.rpca import robust_pca
+
+ORIENTATIONS = ("xy", "xz", "yz")
+
+
+@dataclass(frozen=True)
+class Decomposition:
+    """Two triplane sequences that add up to the one given, and how each orientation came out.
+
+    Attributes:
+        low_rank: What stands still. [T, 3, C, H, W]
+        sparse: What moves. [T, 3, C, H, W]
+        reports: For "xy", "xz" and "yz" the builtins of ``RobustPCA.report``.
+    """
+
+    low_rank: Tensor
+    sparse: Tensor
+    reports: dict[str, dict[str, Any]]
+
+
+def decompose(triplanes: Tensor, **options: Any) -> Decomposition:
+    """Robust PCA of each orientation, one column per frame (X-Planes, Eq. 8-12).
+
+    Frames are rows of the tensor and are read in place: nothing is transposed or copied, unless the
+    tensor is half precision or its planes are not contiguous.
+
+    Args:
+        triplanes: One triplane per frame, planes xy, xz, yz, first axis along the width; any
+            floating type, never changed. [T, 3, C, H, W]
+        **options: Options of ``robust_pca``.
+
+    Raises:
+        ValueError: For a wrong shape, NaN or infinity, or an option out of range.
+        TypeError: For a tensor that is not of a floating type.
+    """
+    check_triplanes(triplanes, "triplanes")
+    kind = triplanes.dtype if triplanes.dtype == torch.float64 else torch.float32
+    low_rank = torch.empty(triplanes.shape, dtype=kind, device=triplanes.device)
+    sparse = torch.empty_like(low_rank)
+    reports = {}
+    for index, name in enumerate(ORIENTATIONS):
+        parts = low_rank[:, index].flatten(1).mT, sparse[:, index].flatten(1).mT
+        matrix = triplanes[:, index].flatten(1).mT
+        reports[name] = robust_pca(matrix, out=parts, **options).report()
+    return Decomposition(low_rank, sparse, reports)
+
+
+def check_triplanes(triplanes: Tensor, name: str) -> None:
+    """Refuse what is not a non-empty triplane sequence.
+
+    Args:
+        triplanes: The tensor. [T, 3, C, H, W]
+        name: What the message calls it.
+
+    Raises:
+        ValueError: For a wrong shape.
+    """
+    if triplanes.dim() != 5 or triplanes.shape[1] != 3 or not triplanes.numel():
+        raise ValueError(
+            f"{name} must be [T, 3, C, H, W] and not empty, not {tuple(triplanes.shape)}"
+        )

@@ -1,0 +1,291 @@
+"""Robust PCA: a matrix as the sum of a low-rank and a sparse one."""
+
+import math
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from xplanes.decomposition.reference import plain_admm
+from xplanes.decomposition.solver import SCHEDULES, Progress, minimise
+from xplanes.decomposition.svt import block_rows
+
+METHODS = (*SCHEDULES, "exact")
+SCALES = ("rms", "none")
+
+
+@dataclass(frozen=True)
+class RobustPCA:
+    """The two parts of a matrix, and how they came out.
+
+    Attributes:
+        low_rank: L. [M, T]
+        sparse: S. [M, T]
+        rank: Rank of L.
+        iterations: Iterations made.
+        residual: ``|L + S - Y| / |Y|``, Frobenius norms, measured on the result.
+        converged: Whether the tolerance was met within the limit.
+        change: Size of the last measured step (see ``solver.Progress``); a small residual
+            beside a large change means feasible but not yet the optimal split.
+        sparsity: Share of non-zero entries in S.
+        low_rank_energy: ``|L|^2 / |Y|^2``.
+        sparse_energy: ``|S|^2 / |Y|^2``.
+        drift: ``|L - L(T/2)| / |L|``: 0 if L stands still.
+        sparsity_weight: The weight used.
+        penalty: The penalty at the end, in units of ``1 / unit``.
+        unit: What Y is measured in: its root mean square, or 1 with ``scale="none"``.
+        method: The method used.
+    """
+
+    low_rank: Tensor
+    sparse: Tensor
+    rank: int
+    iterations: int
+    residual: float
+    converged: bool
+    change: float
+    sparsity: float
+    low_rank_energy: float
+    sparse_energy: float
+    drift: float
+    sparsity_weight: float
+    penalty: float
+    unit: float
+    method: str
+
+    def report(self) -> dict[str, int | float | bool | str]:
+        """Everything but the two matrices, as builtins."""
+        names = [field.name for field in fields(self)]
+        return {name: getattr(self, name) for name in names if name not in ("low_rank", "sparse")}
+
+
+@torch.no_grad()
+def robust_pca(
+    matrix: Tensor,
+    *,
+    sparsity_weight: float | str = 0.009,
+    penalty: float = 0.05,
+    tolerance: float = 1e-4,
+    max_iterations: int = 500,
+    method: str = "adaptive",
+    scale: str = "rms",
+    progress: bool = True,
+    out: tuple[Tensor, Tensor] | None = None,
+) -> RobustPCA:
+    """Split Y into L + S with the least ``|L|_* + sparsity_weight |S|_1`` (X-Planes, Eq. 10-12).
+
+    The paper prints a Frobenius norm for L, but its update (Eq. 24-25) is singular value
+    thresholding, the proximal step of the NUCLEAR norm, which is what is minimised here.
+
+    Both norms scale with Y, so the optimum does too: the weight suits every scale. The penalty does
+    not; ``scale="rms"`` measures it against the root mean square of Y. Only the path of a fixed
+    penalty depends on it: "adaptive" starts from it and always measures it so.
+
+    Beside the results, which have the size of Y each, memory holds four cache-sized blocks; an
+    input that is neither float32 nor float64, or has no contiguous rows or columns, is copied once.
+
+    Args:
+        matrix: Y, any floating type; never changed. Half precision is computed and returned in
+            float32. [M, T]
+        sparsity_weight: Weight of S; "auto" is ``1 / sqrt(max(M, T))`` (Candes et al. 2011).
+        penalty: Penalty of ADMM; the start of it for "adaptive", unused by "growing".
+        tolerance: Bound on ``|L + S - Y| / |Y|``; "adaptive" also wants the relative step below
+            ten times this. float32 cannot reach much below 1e-6.
+        max_iterations: Limit; reaching it unconverged gives a warning.
+        method: "adaptive" (over-relaxed ADMM, penalty balanced, then grown no faster than the
+            split converges), "growing" (inexact ALM, Lin et al. 2010, growth 1.2: the smallest
+            residual soonest, a slightly wrong split), "admm" (the paper's Algorithm 1), "exact"
+            (the same with a full singular value decomposition, slow: the reference).
+        scale: "rms" or "none": the unit of the penalty.
+        progress: Show a progress bar after two seconds.
+        out: Where L and S go, in the computing type and layout of the matrix. [M, T], [M, T]
+
+    Raises:
+        ValueError: For a wrong number of dimensions, an empty matrix, NaN or infinity, or an option
+            out of range.
+        TypeError: For a matrix that is not of a floating type.
+    """
+    _check_options(sparsity_weight, penalty, tolerance, max_iterations, method, scale)
+    peak = _check_matrix(matrix)
+    work = _computable(matrix.detach())
+    rows, columns = work.shape
+    weight = (
+        1 / math.sqrt(max(rows, columns)) if isinstance(sparsity_weight, str) else sparsity_weight
+    )
+    low_rank, sparse = out or (_like(work), _like(work))
+    if peak == 0:
+        low_rank.zero_()
+        sparse.zero_()
+        end = Progress(0, 0, penalty, 0.0, 0.0)
+        return _result(work, low_rank, sparse, end, weight, 1.0, method, tolerance, 1.0)
+
+    # Squares of extreme numbers leave the range of the type: compute on a copy near 1, exactly.
+    factor = 1.0 if 1e-12 < peak < 1e12 else 2.0 ** -math.frexp(peak)[1]
+    if factor != 1:
+        work = work * factor
+    unit = (_norm(work) / math.sqrt(work.numel())) if scale == "rms" else factor
+    with _full_precision(work.device), _bar(max_iterations, progress) as show:
+        if method == "exact":
+            end = plain_admm(
+                work, low_rank, sparse, sparsity_weight=weight, penalty=penalty / unit,
+                tolerance=tolerance, max_iterations=max_iterations, on_iteration=show,
+            )  # fmt: skip
+        else:
+            begin = penalty / unit
+            if method == "adaptive":
+                begin = penalty * math.sqrt(work.numel()) / _norm(work)
+            elif method == "growing":
+                begin = 1.25 / _norm(work)
+            end = minimise(
+                work, low_rank, sparse, sparsity_weight=weight, penalty=begin,
+                schedule=SCHEDULES[method], tolerance=tolerance, max_iterations=max_iterations,
+                on_iteration=show,
+            )  # fmt: skip
+    result = _result(work, low_rank, sparse, end, weight, unit, method, tolerance, factor)
+    if not result.converged:
+        warnings.warn(
+            f"robust PCA stopped at {end.iterations} iterations with residual "
+            f"{result.residual:.1e} and step {result.change:.1e} (tolerance {tolerance:.1e}, ten "
+            "times that for the step): raise max_iterations or tolerance",
+            stacklevel=2,
+        )
+    return result
+
+
+def _check_options(
+    sparsity_weight: float | str,
+    penalty: float,
+    tolerance: float,
+    limit: int,
+    method: str,
+    scale: str,
+) -> None:
+    if isinstance(sparsity_weight, str):
+        if sparsity_weight != "auto":
+            raise ValueError(
+                f"sparsity_weight is {sparsity_weight!r}: allowed are 'auto' or a number"
+            )
+    elif not 0 < sparsity_weight < math.inf:
+        raise ValueError(f"sparsity_weight is {sparsity_weight}: it must be positive and finite")
+    for name, value in (("penalty", penalty), ("tolerance", tolerance)):
+        if not 0 < value < math.inf:
+            raise ValueError(f"{name} is {value}: it must be positive and finite")
+    if limit < 1:
+        raise ValueError(f"max_iterations is {limit}: it must be at least 1")
+    for name, value, allowed in (("method", method, METHODS), ("scale", scale, SCALES)):
+        if value not in allowed:
+            raise ValueError(f"{name} is {value!r}: allowed are {', '.join(allowed)}")
+
+
+def _check_matrix(matrix: Tensor) -> float:
+    if not matrix.is_floating_point():
+        raise TypeError(f"robust_pca needs a floating-point matrix, not {matrix.dtype}")
+    if matrix.dim() != 2 or not matrix.numel():
+        raise ValueError(f"robust_pca needs a non-empty matrix [M, T], not {tuple(matrix.shape)}")
+    low, high = torch.aminmax(matrix)
+    peak = max(abs(low.item()), abs(high.item()))
+    # NaN compares as false, whichever of the two it is in.
+    if not (math.isfinite(low.item()) and math.isfinite(high.item())):
+        raise ValueError(
+            "robust_pca got NaN or infinity: the triplanes or features it was given are broken "
+            f"(smallest value {low.item()}, largest {high.item()})"
+        )
+    return peak
+
+
+def _computable(matrix: Tensor) -> Tensor:
+    """The matrix itself if a pass can read it in place, else a copy that can be."""
+    rows, columns = matrix.shape
+    if matrix.dtype not in (torch.float32, torch.float64):
+        matrix = matrix.float()
+    by_row = matrix.stride(1) == 1 and matrix.stride(0) >= columns
+    by_column = matrix.stride(0) == 1 and matrix.stride(1) >= rows
+    return matrix if by_row or by_column else matrix.contiguous()
+
+
+def _like(matrix: Tensor) -> Tensor:
+    rows, columns = matrix.shape
+    if matrix.stride(0) == 1 and columns > 1:
+        return matrix.new_empty(columns, rows).mT
+    return matrix.new_empty(rows, columns)
+
+
+def _norm(matrix: Tensor) -> float:
+    return math.hypot(
+        *(torch.linalg.vector_norm(b).item() for b in matrix.split(block_rows(matrix)))
+    )
+
+
+def _result(
+    matrix: Tensor,
+    low_rank: Tensor,
+    sparse: Tensor,
+    end: Progress,
+    weight: float,
+    unit: float,
+    method: str,
+    tolerance: float,
+    factor: float,
+) -> RobustPCA:
+    """Measure the parts in one pass, undo the scale ``factor`` and judge convergence."""
+    middle = matrix.shape[1] // 2
+    sums = torch.zeros(6, dtype=torch.float64, device=matrix.device)
+    rows = block_rows(matrix)
+    for y, low, part in zip(
+        matrix.split(rows), low_rank.split(rows), sparse.split(rows), strict=True
+    ):
+        measured = (y, low, part, low + part - y, low - low[:, middle : middle + 1])
+        for index, block in enumerate(measured):
+            sums[index] += torch.linalg.vector_norm(block).double().square()
+        sums[5] += part.count_nonzero()
+    whole, low_energy, part_energy, gap, drift, count = sums.tolist()
+    if factor != 1:
+        low_rank /= factor
+        sparse /= factor
+    residual = math.sqrt(gap / whole) if whole else 0.0
+    adaptive = method == "adaptive"
+    return RobustPCA(
+        low_rank=low_rank,
+        sparse=sparse,
+        rank=end.rank,
+        iterations=end.iterations,
+        residual=residual,
+        converged=residual <= tolerance and (not adaptive or end.change <= 10 * tolerance),
+        change=end.change,
+        sparsity=count / matrix.numel(),
+        low_rank_energy=low_energy / whole if whole else 0.0,
+        sparse_energy=part_energy / whole if whole else 0.0,
+        drift=math.sqrt(drift / low_energy) if low_energy else 0.0,
+        sparsity_weight=weight,
+        penalty=end.penalty * unit,
+        unit=unit / factor,
+        method=method,
+    )
+
+
+@contextmanager
+def _full_precision(device: torch.device) -> Iterator[None]:
+    """Keep reduced-precision matrix products (TF32, bfloat16, autocast) out of the loop."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")
+    try:
+        with torch.autocast(device.type, enabled=False):
+            yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+@contextmanager
+def _bar(limit: int, wanted: bool):
+    from tqdm import tqdm
+
+    with tqdm(total=limit, desc="robust PCA", delay=2, leave=False, disable=not wanted) as bar:
+
+        def show(state: Progress) -> None:
+            bar.set_postfix(residual=f"{state.residual:.0e}", rank=state.rank, refresh=False)
+            bar.update()
+
+        yield show

@@ -1,0 +1,118 @@
+"""Compiled loops for reading planes on the CPU; `lookup` holds the readable twin.
+
+Nothing but the planes, the points and the result touches memory: indices and weights live in
+registers. Imported only when needed, since numba takes a second to load.
+"""
+
+# ruff: noqa: D103 (the callers in lookup.py document these loops)
+
+import numpy as np
+from numba import njit, prange
+
+COMPILE = {"cache": True, "nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
+
+
+@njit(inline="always", **COMPILE)
+def space_taps(value, size):
+    half = type(value)(0.5)
+    position = value * type(value)(size) * half + (type(value)(size) * half - half)
+    # A NaN or a huge value must not become an index; its weight still carries it on.
+    safe = position if position > -1 else type(value)(-1)
+    safe = safe if safe < size else type(value)(size)
+    floor = np.floor(safe)
+    lower = np.int64(floor)
+    fraction = position - floor
+    first, second = type(value)(1) - fraction, fraction
+    if lower < 0 or position >= size:
+        first = type(value)(0)
+    if lower + 1 > size - 1 or position < -1:
+        second = type(value)(0)
+    return max(min(lower, size - 1), 0), min(lower + 1, size - 1), first, second
+
+
+@njit(inline="always", **COMPILE)
+def time_taps(value, size):
+    position = value * type(value)(size - 1)
+    safe = position if position > 0 else type(value)(0)
+    safe = safe if safe < size - 1 else type(value)(size - 1)
+    lower = max(min(np.int64(safe), size - 2), 0)
+    fraction = safe - type(value)(lower)
+    return lower, min(lower + 1, size - 1), type(value)(1) - fraction, fraction
+
+
+@njit(inline="always", **COMPILE)
+def add(target, source, weight):
+    for c in range(len(target)):
+        target[c] += weight * source[c]
+
+
+@njit(parallel=True, **COMPILE)
+def gather(space, time, points, times, rows, axes, features, factors):
+    channels = space.shape[3]
+    for n in prange(points.shape[0]):
+        for plane in range(3):
+            c0, c1, u0, u1 = space_taps(points[n, 0 if plane < 2 else 1], space.shape[2])
+            r0, r1, v0, v1 = space_taps(points[n, 1 if plane < 1 else 2], space.shape[1])
+            w00, w01, w10, w11 = v0 * u0, v0 * u1, v1 * u0, v1 * u1
+            for c in range(channels):
+                features[n, plane, c] = (
+                    w00 * space[plane, r0, c0, c]
+                    + w01 * space[plane, r0, c1, c]
+                    + w10 * space[plane, r1, c0, c]
+                    + w11 * space[plane, r1, c1, c]
+                )
+        if time.shape[0] == 0:
+            continue
+        r0, r1, v0, v1 = time_taps(times[n], time.shape[1])
+        for plane in range(time.shape[0]):
+            c0, c1, u0, u1 = space_taps(points[n, axes[plane]], time.shape[2])
+            w00, w01, w10, w11 = v0 * u0, v0 * u1, v1 * u0, v1 * u1
+            for c in range(channels):
+                factors[n, plane, c] = (
+                    w00 * time[plane, r0, c0, c]
+                    + w01 * time[plane, r0, c1, c]
+                    + w10 * time[plane, r1, c0, c]
+                    + w11 * time[plane, r1, c1, c]
+                )
+        for row in range(3):
+            a, b = rows[row, 0], rows[row, 1]
+            for c in range(channels):
+                features[n, row, c] += factors[n, a, c] * factors[n, b, c]
+
+
+@njit(parallel=True, **COMPILE)
+def scatter_space(points, gradient, space):
+    """One task owns one plane, so that no two write to one place."""
+    for plane in prange(3):
+        for n in range(points.shape[0]):
+            c0, c1, u0, u1 = space_taps(points[n, 0 if plane < 2 else 1], space.shape[2])
+            r0, r1, v0, v1 = space_taps(points[n, 1 if plane < 1 else 2], space.shape[1])
+            source = gradient[n, plane]
+            add(space[plane, r0, c0], source, v0 * u0)
+            add(space[plane, r0, c1], source, v0 * u1)
+            add(space[plane, r1, c0], source, v1 * u0)
+            add(space[plane, r1, c1], source, v1 * u1)
+
+
+@njit(parallel=True, **COMPILE)
+def product_gradients(rows, gradient, factors, spread):
+    for n in prange(gradient.shape[0]):
+        spread[n] = 0
+        for row in range(3):
+            a, b = rows[row, 0], rows[row, 1]
+            for c in range(gradient.shape[2]):
+                spread[n, a, c] += gradient[n, row, c] * factors[n, b, c]
+                spread[n, b, c] += gradient[n, row, c] * factors[n, a, c]
+
+
+@njit(parallel=True, **COMPILE)
+def scatter_time(points, times, axes, gradient, time):
+    for plane in prange(time.shape[0]):
+        for n in range(points.shape[0]):
+            r0, r1, v0, v1 = time_taps(times[n], time.shape[1])
+            c0, c1, u0, u1 = space_taps(points[n, axes[plane]], time.shape[2])
+            source = gradient[n, plane]
+            add(time[plane, r0, c0], source, v0 * u0)
+            add(time[plane, r0, c1], source, v0 * u1)
+            add(time[plane, r1, c0], source, v1 * u0)
+            add(time[plane, r1, c1], source, v1 * u1)

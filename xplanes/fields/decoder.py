@@ -1,0 +1,74 @@
+"""The MLP that turns plane features into colour and density."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+Activation = Literal["relu", "silu"]
+DensityActivation = Literal["softplus", "exp"]
+
+_ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"relu": F.relu, "silu": F.silu}
+
+
+class Decoder(nn.Module):
+    """Features of three planes to colour and density, in the shape that public LRMs share.
+
+    Channel 0 of the last layer is the density's logit, channels 1 to 3 are the colour's. Density is
+    ``scale * softplus(logit - 1)`` (OpenLRM) or ``scale * exp(logit - 1)`` (TripoSR), per unit length
+    of the field's frame; it does not depend on the viewing direction.
+
+    Args:
+        channels: Channels of one plane; the input has three times as many.
+        width: Neurons of each hidden layer.
+        hidden: Number of hidden layers.
+        activation: Between layers.
+        density: Activation of the density.
+        density_scale: Factor on the density.
+        colour_margin: Widens the sigmoid of the colour by this much on either side of [0, 1].
+
+    Source: X-Planes, Eq. 14; OpenLRM 1.1; TripoSR.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        *,
+        width: int = 64,
+        hidden: int = 3,
+        activation: Activation = "relu",
+        density: DensityActivation = "softplus",
+        density_scale: float = 1.0,
+        colour_margin: float = 0.001,
+    ) -> None:
+        super().__init__()
+        sizes = [3 * channels, *[width] * hidden, 4]
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
+        self.activation = _ACTIVATIONS[activation]
+        self.density_activation: DensityActivation = density
+        self.density_scale = density_scale
+        self.colour_margin = colour_margin
+
+    def logits(self, features: Tensor) -> Tensor:
+        """The last layer's output before the activations. [N, 3 C] -> [N, 4]"""
+        hidden = features
+        for layer in self.layers[:-1]:
+            hidden = self.activation(layer(hidden))
+        return self.layers[-1](hidden)
+
+    def activate(self, logits: Tensor) -> tuple[Tensor, Tensor]:
+        """Colour and density from logits, in float32 whatever the logits' type. [N, 4] -> [N, 3], [N]"""
+        if logits.dtype in (torch.float16, torch.bfloat16):
+            logits = logits.float()
+        raw = logits[:, 0] - 1
+        density = F.softplus(raw) if self.density_activation == "softplus" else raw.exp()
+        colour = logits[:, 1:].sigmoid()
+        if self.colour_margin:
+            colour = colour * (1 + 2 * self.colour_margin) - self.colour_margin
+        return colour, density * self.density_scale
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Colour and density of each feature vector. [N, 3 C] -> [N, 3], [N]"""
+        return self.activate(self.logits(features))

@@ -1,0 +1,123 @@
+"""Reading feature planes at points, and writing gradients back.
+
+A plane is stored channels-last, [H, W, C]: the C numbers of a texel lie side by side, so one read of
+memory brings them all. Plane "ab" has axis a along its columns and axis b along its rows.
+
+Space axes follow the LRMs' convention: coordinates from -1 to 1 run over the whole texels
+(``align_corners=False``) and beyond the border there is zero. The time axis runs from the first row
+(t = 0) to the last (t = 1), so that with as many rows as frames each frame owns one.
+"""
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from xplanes.backend import cpu_loops
+
+Rows = tuple[tuple[int, int], ...]
+"""For each space plane, the two time planes whose product is added to it."""
+
+SPACE_COLUMNS = (0, 0, 1)
+SPACE_ROWS = (1, 2, 2)
+"""Axes (x = 0, y = 1, z = 2) along columns and rows of the planes xy, xz, yz."""
+
+def time_plane_axes(rows: Rows) -> list[int]:
+    """Space axis along the columns of each time plane of a plane set, in order of the planes."""
+    axes: dict[int, int] = {}
+    for (first, second), column, row in zip(rows, SPACE_COLUMNS, SPACE_ROWS, strict=bool(rows)):
+        axes[first], axes[second] = column, row
+    return [axes[plane] for plane in sorted(axes)]
+
+
+def plane_features(
+    space: Tensor, time: Tensor | None, points: Tensor, times: Tensor, rows: Rows
+) -> Tensor:
+    """Features of Eq. 15: each space plane plus the product of its two time planes.
+
+    Gradients reach the planes only. On the CPU compiled loops do the work, elsewhere
+    `plane_features_reference`.
+
+    Args:
+        space: Planes xy, xz, yz. [3, H, H, C]
+        time: Space-time planes, rows are time; None for a scene that stands still. [P, T, H', C]
+        points: Positions in the field's frame. [N, 3]
+        times: Times from 0 to 1. [N]
+        rows: For each space plane, the two time planes multiplied.
+
+    Returns:
+        One feature vector per space plane. [N, 3, C]
+
+    Source: X-Planes, Eq. 15.
+    """
+    if cpu_loops(space):
+        return _Features.apply(space, time, points, times, rows)  # type: ignore[return-value]
+    return plane_features_reference(space, time, points, times, rows)
+
+
+def plane_features_reference(
+    space: Tensor, time: Tensor | None, points: Tensor, times: Tensor, rows: Rows
+) -> Tensor:
+    """The same as `plane_features`, written for reading: one ``grid_sample`` per plane."""
+
+    def sample(plane: Tensor, columns: Tensor, line: Tensor) -> Tensor:
+        grid = torch.stack([columns, line], dim=-1)[None, None]
+        return F.grid_sample(plane.permute(2, 0, 1)[None], grid, align_corners=False)[0, :, 0].T
+
+    features = [
+        sample(plane, points[:, column], points[:, row])
+        for plane, column, row in zip(space, SPACE_COLUMNS, SPACE_ROWS, strict=True)
+    ]
+    if time is not None:
+        # Time runs from the centre of the first row to the centre of the last.
+        line = (2 * times.clamp(0, 1) - 1) * (1 - 1 / time.shape[1])
+        axes = time_plane_axes(rows)
+        factors = [sample(p, points[:, axis], line) for p, axis in zip(time, axes, strict=True)]
+        features = [f + factors[a] * factors[b] for f, (a, b) in zip(features, rows, strict=True)]
+    return torch.stack(features, dim=1)
+
+
+class _Features(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, space: Tensor, time: Tensor | None, points: Tensor, times: Tensor, rows: Rows
+    ) -> Tensor:
+        from xplanes.fields import cpu
+
+        moving = space.new_zeros(0, 1, 1, space.shape[3]) if time is None else time
+        count, channels = len(points), space.shape[3]
+        points, times = points.to(space.dtype).contiguous(), times.to(space.dtype).contiguous()
+        pairs = torch.tensor(rows or [(0, 0)] * 3)
+        axes = torch.tensor(time_plane_axes(rows), dtype=torch.int64)
+        features = space.new_empty(count, 3, channels)
+        factors = space.new_empty(count, len(moving), channels)
+        cpu.gather(
+            *_arrays(space, moving, points, times, pairs, axes), *_arrays(features, factors)
+        )
+        ctx.save_for_backward(points, times, pairs, axes, factors)
+        ctx.shapes = (space.shape, moving.shape)
+        return features
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        from xplanes.fields import cpu
+
+        points, times, pairs, axes, factors = ctx.saved_tensors
+        gradient = gradient.to(factors.dtype).contiguous()
+        space = time = None
+        if ctx.needs_input_grad[0]:
+            space = gradient.new_zeros(ctx.shapes[0])
+            cpu.scatter_space(*_arrays(points, gradient, space))
+        if ctx.needs_input_grad[1]:
+            time = gradient.new_zeros(ctx.shapes[1])
+            spread = torch.empty_like(factors)
+            cpu.product_gradients(*_arrays(pairs, gradient, factors, spread))
+            cpu.scatter_time(*_arrays(points, times, axes, spread, time))
+        return space, time, None, None, None
+
+
+def _arrays(*tensors: Tensor) -> tuple[Any, ...]:
+    return tuple(tensor.detach().numpy() for tensor in tensors)

@@ -1,0 +1,146 @@
+"""The X-Planes field: three space planes, six or nine space-time factors, one decoder."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from xplanes.fields.decoder import Decoder
+from xplanes.fields.lookup import Rows, plane_features
+
+PLANE_SETS: dict[str, Rows] = {
+    "three": (),
+    "six": ((0, 1), (0, 2), (1, 2)),
+    "nine": ((0, 1), (2, 3), (4, 5)),
+}
+"""Which two time planes each of xy, xz, yz multiplies.
+
+six: xt, yt, zt, each shared by two rows. nine: xt, yt | xt', zt | yt', zt'. three: none, a scene that
+stands still.
+"""
+
+SPACE_PLANES = ("xy", "xz", "yz")
+
+TIME_PLANES: dict[str, tuple[str, ...]] = {
+    "three": (),
+    "six": ("xt", "yt", "zt"),
+    "nine": ("xt", "yt", "xt'", "zt", "yt'", "zt'"),
+}
+
+
+class XPlanes(nn.Module):
+    """A dynamic radiance field of additively combined planes.
+
+    The field lives in the cube [-1, 1]^3. Outside it the planes are zero; renderers skip what lies
+    there.
+
+    Args:
+        planes: Start values by name, axis "a" of plane "ab" along the columns: xy, xz, yz
+            [C, H, H] and the plane set's time planes [C, T, H'], T rows of time.
+        decoder: From features [N, 3 C] to colour [N, 3] and density [N].
+        plane_set: "six" (K-Planes' set), "nine" (Tensor4D's) or "three" (no time).
+
+    Raises:
+        ValueError: If a plane is missing or superfluous, or the shapes do not fit one another.
+
+    Source: X-Planes, Eq. 14 and 15.
+    """
+
+    def __init__(
+        self, *, planes: Mapping[str, Tensor], decoder: Decoder, plane_set: str = "six"
+    ) -> None:
+        super().__init__()
+        if plane_set not in PLANE_SETS:
+            raise ValueError(f"plane_set={plane_set!r}: must be one of {', '.join(PLANE_SETS)}")
+        self.plane_set = plane_set
+        self.rows = PLANE_SETS[plane_set]
+        names = TIME_PLANES[plane_set]
+        if set(planes) != {*SPACE_PLANES, *names}:
+            raise ValueError(
+                f"planes are {', '.join(sorted(planes))}: plane_set={plane_set!r} needs "
+                f"{', '.join((*SPACE_PLANES, *names))}"
+            )
+        self.space = nn.Parameter(_stack(planes, SPACE_PLANES))
+        self.time = nn.Parameter(_stack(planes, names)) if names else None
+        if self.space.shape[1] != self.space.shape[2]:
+            raise ValueError(f"space planes are {list(planes['xy'].shape)}: must be [C, H, H]")
+        if self.time is not None and self.time.shape[3] != self.space.shape[3]:
+            raise ValueError(
+                f"time planes have {self.time.shape[3]} channels, space planes "
+                f"{self.space.shape[3]}: must be equal"
+            )
+        self.decoder = decoder
+
+    @property
+    def planes(self) -> dict[str, Tensor]:
+        """The planes by name, as views of the parameters. [C, rows, columns] each"""
+        stacks = [(SPACE_PLANES, self.space)]
+        if self.time is not None:
+            stacks.append((TIME_PLANES[self.plane_set], self.time))
+        return {
+            name: plane.permute(2, 0, 1)
+            for names, stack in stacks
+            for name, plane in zip(names, stack, strict=True)
+        }
+
+    def features(self, points: Tensor, times: Tensor) -> Tensor:
+        """Features that the decoder sees. [N, 3], [N] -> [N, 3 C]"""
+        return plane_features(self.space, self.time, points, times, self.rows).flatten(1)
+
+    def forward(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+        """Colour and density of points at times.
+
+        Args:
+            points: Positions in the field's frame, the cube [-1, 1]^3. [N, 3]
+            times: Times from 0 to 1. [N]
+
+        Returns:
+            Colour in [0, 1] (up to the decoder's margin) and density per unit length of the field's
+            frame. [N, 3], [N]
+        """
+        return self.decoder(self.features(points, times))
+
+
+def _stack(planes: Mapping[str, Tensor], names: Sequence[str]) -> Tensor:
+    """Named planes [C, rows, columns] as one tensor, channels last. [P, rows, columns, C]"""
+    shapes = {name: list(planes[name].shape) for name in names}
+    first = shapes[names[0]]
+    if len(first) != 3 or any(shape != first for shape in shapes.values()):
+        raise ValueError(f"planes {shapes}: must all have one shape [C, rows, columns]")
+    return torch.stack([planes[name].permute(1, 2, 0) for name in names]).contiguous()
+
+
+def random_planes(
+    plane_set: str,
+    *,
+    channels: int,
+    resolution: int,
+    time_resolution: int,
+    space_scale: float,
+    time_scale: float,
+    generator: torch.Generator,
+) -> dict[str, Tensor]:
+    """Start values for a field without an LRM: small noise around zero.
+
+    Time planes must not start at zero: a product of two zeros has no gradient.
+
+    Args:
+        plane_set: A key of `PLANE_SETS`.
+        channels: Channels C of each plane.
+        resolution: Texels along each space axis.
+        time_resolution: Rows of the time planes.
+        space_scale: Standard deviation of the space planes.
+        time_scale: Standard deviation of the time planes.
+        generator: Source of randomness.
+
+    Returns:
+        Planes by name. [C, rows, columns] each
+    """
+    square = (channels, resolution, resolution)
+    planes = {
+        name: space_scale * torch.randn(square, generator=generator) for name in SPACE_PLANES
+    }
+    strip = (channels, time_resolution, resolution)
+    for name in TIME_PLANES[plane_set]:
+        planes[name] = time_scale * torch.randn(strip, generator=generator)
+    return planes

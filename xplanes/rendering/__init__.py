@@ -1,0 +1,1 @@
+"""Field and rays to pixels: ray-box, occupancy, sampling, compositing."""

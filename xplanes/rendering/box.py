@@ -1,0 +1,32 @@
+"""Where rays meet the cube in which a field lives."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+Field = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""From points [N, 3] and times [N] to colour [N, 3] and density [N]."""
+
+
+def ray_box(origins: Tensor, directions: Tensor, half: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Distances at which rays enter and leave the cube [-half, half]^3.
+
+    Args:
+        origins: Ray origins. [R, 3]
+        directions: Ray directions; distances are in units of their length. [R, 3]
+        half: Half the side of the cube.
+
+    Returns:
+        Near and far, near >= 0 (0 from inside). A ray that misses the cube, or has no direction, has
+        near = far = 0. [R], [R]
+    """
+    # A ray parallel to a face divides by zero: infinities of the right sign are what the slab test
+    # wants, and 0 * inf (a ray that runs along a face) counts as inside that slab.
+    inverse = directions.reciprocal()
+    first, second = (-half - origins) * inverse, (half - origins) * inverse
+    near = torch.minimum(first, second).nan_to_num(-torch.inf, torch.inf, -torch.inf)
+    far = torch.maximum(first, second).nan_to_num(torch.inf, torch.inf, -torch.inf)
+    near, far = near.amax(dim=-1).clamp_min(0), far.amin(dim=-1)
+    hit = (far > near) & far.isfinite()
+    return torch.where(hit, near, 0), torch.where(hit, far, 0)

@@ -1,0 +1,50 @@
+"""Silhouettes into the occupancy grid."""
+
+import torch
+from torch import Tensor
+
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.silhouettes import silhouette_hull
+from xplanes.scenes.views import Views
+
+CHUNK = 2**17
+
+
+def carve(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
+    """Rule out the grid's cells that the silhouettes of the training views show to be empty.
+
+    Args:
+        grid: Changed in place.
+        views: Training views; without alpha nothing is ruled out.
+        frame: The field's frame.
+    """
+    if bool((views.images[..., 3] > 0).all()):
+        return
+    size, bins = grid.resolution, grid.time_bins
+    covers = _views_of_bins(views.times, bins)
+    axis = (torch.arange(size) + 0.5) * (2 / size) - 1
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).flip(-1)
+    world = frame.to_world(points.reshape(-1, 3))
+    radius = 3**0.5 / size / frame.scale
+    allowed = torch.empty(bins, size**3, dtype=torch.bool)
+    for start in range(0, size**3, CHUNK):
+        part = slice(start, start + CHUNK)
+        held = silhouette_hull(views, world[part], radius=radius)
+        for index, cover in enumerate(covers):
+            allowed[index, part] = held[cover].any(dim=0)
+    grid.allow(allowed)
+
+
+def _views_of_bins(times: Tensor, bins: int) -> list[Tensor]:
+    """Views that speak for each time bin: those inside it and the next one on either side."""
+    order = times.argsort(stable=True)
+    ordered = times[order].contiguous()
+    covers = []
+    for index in range(bins):
+        edges = torch.tensor([index / bins, (index + 1) / bins])
+        first, last = torch.searchsorted(ordered, edges).tolist()
+        before = ordered[max(first - 1, 0)]
+        after = ordered[min(last, len(ordered) - 1)]
+        covers.append(order[(ordered >= before) & (ordered <= after)])
+    return covers

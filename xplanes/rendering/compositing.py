@@ -1,0 +1,98 @@
+"""From densities and colours along rays to pixels."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from xplanes.backend import cpu_loops
+
+OPAQUE = 80.0
+"""Optical depth beyond which nothing is seen: exp(-80) is 2e-35."""
+
+
+def composite(
+    optical_depth: Tensor, colour: Tensor, distances: Tensor, ray: Tensor, starts: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Merge the samples of each ray, by Beer and Lambert.
+
+    ``w_i = exp(-sum_{j<i} tau_j) (1 - exp(-tau_i))`` within each ray, from sums of optical depths,
+    so that no depth from 0 to the largest number makes a NaN or an infinity. A depth that is NaN
+    makes its ray NaN. Gradients reach depths and colours.
+
+    Args:
+        optical_depth: Density times length of each sample, samples of a ray side by side from front
+            to back. [N]
+        colour: Colour of each sample. [N, 3]
+        distances: Distance of each sample from the ray's origin. [N]
+        ray: Ray of each sample, ascending. [N]
+        starts: Index of each ray's first sample; of the next ray's where it has none. [R]
+
+    Returns:
+        For each ray the sums of weight times (colour, 1, distance) in float32 or better, and the
+        weights, which carry no gradient. [R, 5], [N]
+    """
+    if optical_depth.dtype in (torch.float16, torch.bfloat16):
+        optical_depth = optical_depth.float()
+    colour, distances = colour.to(optical_depth.dtype), distances.to(optical_depth.dtype)
+    if cpu_loops(optical_depth):
+        return _Composite.apply(optical_depth, colour, distances, starts)  # type: ignore[return-value]
+    return composite_reference(optical_depth, colour, distances, ray, starts)
+
+
+def composite_reference(
+    optical_depth: Tensor, colour: Tensor, distances: Tensor, ray: Tensor, starts: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The same as `composite`, written for reading."""
+    depth = optical_depth.clamp(0, OPAQUE)
+    weights = depth_before(depth, ray, starts).neg().exp().to(depth.dtype) * -torch.expm1(-depth)
+    values = torch.cat([colour, torch.ones_like(distances)[:, None], distances[:, None]], dim=1)
+    total = torch.zeros(len(starts), 5, dtype=depth.dtype, device=depth.device)
+    return total.index_add(0, ray, weights[:, None] * values), weights.detach()
+
+
+def depth_before(optical_depth: Tensor, ray: Tensor, starts: Tensor) -> Tensor:
+    """Optical depth in front of each sample on its own ray. float64 [N]
+
+    One running sum over all rays, less the sum at the ray's first sample. In float64, with depths
+    limited to `OPAQUE`, a million samples keep seven digits behind the point.
+    """
+    depth = optical_depth.double()
+    total = depth.cumsum(0) - depth
+    return total - total[starts[ray]]
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, optical_depth: Tensor, colour: Tensor, distances: Tensor, starts: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        from xplanes.rendering import cpu
+
+        inputs = [t.contiguous() for t in (optical_depth, colour, distances, starts)]
+        weights = torch.empty_like(optical_depth)
+        total = optical_depth.new_empty(len(starts), 5)
+        arrays = [t.detach().numpy() for t in inputs]
+        cpu.composite(*arrays, OPAQUE, weights.numpy(), total.numpy())
+        ctx.save_for_backward(*inputs, weights)
+        ctx.mark_non_differentiable(weights)
+        return total, weights
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        from xplanes.rendering import cpu
+
+        *inputs, weights = ctx.saved_tensors
+        d_depth, d_colour = torch.empty_like(inputs[0]), torch.empty_like(inputs[1])
+        arrays = [t.detach().numpy() for t in inputs]
+        cpu.composite_backward(
+            *arrays,
+            OPAQUE,
+            weights.numpy(),
+            gradient.to(weights.dtype).contiguous().numpy(),
+            d_depth.numpy(),
+            d_colour.numpy(),
+        )
+        return d_depth, d_colour, None, None

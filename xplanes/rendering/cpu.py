@@ -1,0 +1,130 @@
+"""Compiled loops over rays on the CPU; `marching` and `compositing` hold the readable twins.
+
+Imported only when needed, since numba takes a second to load.
+"""
+
+# ruff: noqa: D103 (the callers document these loops)
+
+import numpy as np
+from numba import njit, prange
+
+COMPILE = {"cache": True, "nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
+
+
+@njit(inline="always", **COMPILE)
+def cell(place, size):
+    return min(max(np.int64(place), 0), size - 1)
+
+
+@njit(parallel=True, **COMPILE)
+def count_samples(
+    start, slope, near, far, jitter, bins, occupied, density, size, step, limit, skip, counts
+):
+    """Candidates, samples in occupied cells, and those not behind a surface, for each ray."""
+    for r in prange(len(near)):
+        candidates, found, visible = 0, 0, 0
+        depth = 0.0
+        distance = near[r] + jitter[r] * step
+        while distance < far[r]:
+            candidates += 1
+            x = cell(start[r, 0] + distance * slope[r, 0], size)
+            y = cell(start[r, 1] + distance * slope[r, 1], size)
+            z = cell(start[r, 2] + distance * slope[r, 2], size)
+            index = ((bins[r] * size + z) * size + y) * size + x
+            if not skip or occupied[index]:
+                found += 1
+                if depth < limit:
+                    visible += 1
+                    depth += density[index] * step
+            distance = near[r] + (candidates + jitter[r]) * step
+        counts[0, r], counts[1, r], counts[2, r] = candidates, found, visible
+
+
+@njit(parallel=True, **COMPILE)
+def fill_samples(
+    origins,
+    directions,
+    start,
+    slope,
+    near,
+    jitter,
+    bins,
+    occupied,
+    size,
+    step,
+    skip,
+    starts,
+    counts,
+    ray,
+    distances,
+    cells,
+    points,
+):
+    for r in prange(len(near)):
+        place = starts[r]
+        end = place + counts[r]
+        candidate = 0
+        while place < end:
+            distance = near[r] + (candidate + jitter[r]) * step
+            candidate += 1
+            x = cell(start[r, 0] + distance * slope[r, 0], size)
+            y = cell(start[r, 1] + distance * slope[r, 1], size)
+            z = cell(start[r, 2] + distance * slope[r, 2], size)
+            index = ((bins[r] * size + z) * size + y) * size + x
+            if not skip or occupied[index]:
+                ray[place], distances[place], cells[place] = r, distance, index
+                for axis in range(3):
+                    points[place, axis] = origins[r, axis] + distance * directions[r, axis]
+                place += 1
+
+
+@njit(parallel=True, **COMPILE)
+def composite(optical_depth, colour, distances, starts, opaque, weights, total):
+    """Weights of the samples, and colour, opacity and depth of the rays."""
+    rays = len(starts)
+    for r in prange(rays):
+        end = starts[r + 1] if r + 1 < rays else len(optical_depth)
+        before = 0.0
+        red, green, blue, opacity, far = 0.0, 0.0, 0.0, 0.0, 0.0
+        for n in range(starts[r], end):
+            depth = max(min(np.float64(optical_depth[n]), opaque), 0.0)
+            if np.isnan(optical_depth[n]):
+                depth = np.nan
+            weight = np.exp(-before) * -np.expm1(-depth)
+            before += depth
+            weights[n] = weight
+            red += weight * colour[n, 0]
+            green += weight * colour[n, 1]
+            blue += weight * colour[n, 2]
+            far += weight * distances[n]
+            opacity += weight
+        total[r, 0], total[r, 1], total[r, 2] = red, green, blue
+        total[r, 3], total[r, 4] = opacity, far
+
+
+@njit(parallel=True, **COMPILE)
+def composite_backward(
+    optical_depth, colour, distances, starts, opaque, weights, gradient, d_depth, d_colour
+):
+    """Gradients of `composite` by one walk from back to front along each ray."""
+    rays = len(starts)
+    for r in prange(rays):
+        end = starts[r + 1] if r + 1 < rays else len(optical_depth)
+        before = 0.0
+        for n in range(starts[r], end):
+            before += max(min(np.float64(optical_depth[n]), opaque), 0.0)
+        behind = 0.0
+        for n in range(end - 1, starts[r] - 1, -1):
+            value = (
+                gradient[r, 0] * colour[n, 0]
+                + gradient[r, 1] * colour[n, 1]
+                + gradient[r, 2] * colour[n, 2]
+                + gradient[r, 3]
+                + gradient[r, 4] * distances[n]
+            )
+            # Light that leaves sample n, against what all later samples lose as it thickens.
+            d_depth[n] = np.exp(-before) * value - behind
+            before -= max(min(np.float64(optical_depth[n]), opaque), 0.0)
+            behind += weights[n] * value
+            for c in range(3):
+                d_colour[n, c] = weights[n] * gradient[r, c]

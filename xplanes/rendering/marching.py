@@ -1,0 +1,176 @@
+"""Placing samples along rays where the scene holds something."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from xplanes.backend import cpu_loops
+from xplanes.rendering.box import ray_box
+from xplanes.rendering.compositing import depth_before
+from xplanes.rendering.occupancy import OccupancyGrid
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples that reach the field, those of a ray side by side from front to back.
+
+    Attributes:
+        ray: Ray of each sample, ascending. [N]
+        starts: Index of each ray's first sample. [R]
+        points: Positions in the field's frame. [N, 3]
+        distances: Distance from the ray's origin. [N]
+        cells: Cell of the occupancy grid. [N]
+        candidates: Samples in the box before any was dropped.
+        empty: Samples dropped because their cell is empty.
+        occluded: Samples dropped because an opaque surface lies in front.
+    """
+
+    ray: Tensor
+    starts: Tensor
+    points: Tensor
+    distances: Tensor
+    cells: Tensor
+    candidates: int
+    empty: int
+    occluded: int
+
+    def __len__(self) -> int:
+        return len(self.ray)
+
+
+def march(
+    origins: Tensor,
+    directions: Tensor,
+    times: Tensor,
+    jitter: Tensor,
+    grid: OccupancyGrid,
+    *,
+    step: float,
+    skip_empty: bool = True,
+    occlusion: float = 0.0,
+) -> Samples:
+    """Place samples at equal steps through the cube [-1, 1]^3 and keep the useful ones.
+
+    Args:
+        origins: Ray origins in the field's frame. [R, 3]
+        directions: Unit directions. [R, 3]
+        times: Time of each ray. [R]
+        jitter: Place of each ray's samples within their steps, from 0 to 1. [R]
+        grid: Tells which cells are empty.
+        step: Distance between samples.
+        skip_empty: Whether samples in empty cells are dropped.
+        occlusion: Samples behind which the grid's densities leave less light than this are dropped;
+            0 keeps all.
+
+    Returns:
+        The samples that remain.
+    """
+    limit = -math.log(occlusion) if occlusion > 0 else math.inf
+    if cpu_loops(origins):
+        return _march_cpu(
+            origins, directions, times, jitter, grid, step=step, skip=skip_empty, limit=limit
+        )
+    return march_reference(
+        origins, directions, times, jitter, grid, step=step, skip=skip_empty, limit=limit
+    )
+
+
+def march_reference(
+    origins: Tensor,
+    directions: Tensor,
+    times: Tensor,
+    jitter: Tensor,
+    grid: OccupancyGrid,
+    *,
+    step: float,
+    skip: bool,
+    limit: float,
+) -> Samples:
+    """The same as `march`, in whole-tensor operations."""
+    near, far = ray_box(origins, directions)
+    steps = int(((far - near).max() / step).ceil()) + 1 if len(near) else 0
+    offset = torch.arange(steps, device=near.device, dtype=near.dtype) + jitter[:, None]
+    distances = near[:, None] + offset * step
+    inside = distances < far[:, None]
+    half = 0.5 * grid.resolution
+    cells = grid.bins(times)[:, None]
+    for axis in (2, 1, 0):
+        place = (origins[:, axis, None] + distances * directions[:, axis, None] + 1) * half
+        cells = cells * grid.resolution + place.long().clamp_(0, grid.resolution - 1)
+    live = inside & grid.occupied[cells] if skip else inside
+    ray, place = live.nonzero(as_tuple=True)
+    distances, cells = distances[ray, place], cells[ray, place]
+    candidates, found = int(inside.sum()), len(ray)
+    if math.isfinite(limit) and found:
+        depth = depth_before(grid.density[cells] * step, ray, _starts(ray, len(near)))
+        visible = (depth < limit).nonzero()[:, 0]
+        ray, distances, cells = ray[visible], distances[visible], cells[visible]
+    return Samples(
+        ray=ray,
+        starts=_starts(ray, len(near)),
+        points=torch.addcmul(origins[ray], directions[ray], distances[:, None]),
+        distances=distances,
+        cells=cells,
+        candidates=candidates,
+        empty=candidates - found,
+        occluded=found - len(ray),
+    )
+
+
+def _starts(ray: Tensor, rays: int) -> Tensor:
+    """Index of each ray's first sample. [N] -> [rays]"""
+    counts = torch.bincount(ray, minlength=rays)
+    return counts.cumsum(0) - counts
+
+
+def _march_cpu(
+    origins: Tensor,
+    directions: Tensor,
+    times: Tensor,
+    jitter: Tensor,
+    grid: OccupancyGrid,
+    *,
+    step: float,
+    skip: bool,
+    limit: float,
+) -> Samples:
+    from xplanes.rendering import cpu
+
+    near, far = ray_box(origins, directions)
+    half = 0.5 * grid.resolution
+    origins, directions = origins.contiguous(), directions.contiguous()
+    rays = [
+        t.numpy() for t in ((origins + 1) * half, directions * half, near, far, jitter.contiguous())
+    ]
+    bins, occupied = grid.bins(times).numpy(), grid.occupied.numpy()
+    counts = torch.empty(3, len(near), dtype=torch.int64)
+    size = grid.resolution
+    cpu.count_samples(
+        *rays, bins, occupied, grid.density.numpy(), size, step, limit, skip, counts.numpy()
+    )
+    candidates, found, kept = counts.sum(dim=1).tolist()
+    starts = counts[2].cumsum(0) - counts[2]
+    ray, cells = torch.empty(2, kept, dtype=torch.int64)
+    distances, points = origins.new_empty(kept), origins.new_empty(kept, 3)
+    start, slope, near, _, jitter_array = rays
+    cpu.fill_samples(
+        origins.numpy(),
+        directions.numpy(),
+        start,
+        slope,
+        near,
+        jitter_array,
+        bins,
+        occupied,
+        size,
+        step,
+        skip,
+        starts.numpy(),
+        counts[2].numpy(),
+        *(t.numpy() for t in (ray, distances, cells, points)),
+    )
+    return Samples(
+        ray, starts, points, distances, cells, candidates, candidates - found, found - kept
+    )

@@ -1,0 +1,101 @@
+"""Where a scene holds anything, and when: a grid of cells over space and time."""
+
+import torch
+from torch import Tensor, nn
+
+from xplanes.rendering.box import Field
+
+
+class OccupancyGrid(nn.Module):
+    """The density that the field last showed in each cell of the cube [-1, 1]^3 and each time bin.
+
+    A cell is occupied while its density could stop more than ``threshold`` of the light over one
+    sample step. Cells start as occupied and lose their density by ``decay`` at each look that does
+    not confirm it. Cells that are not ``allowed`` (silhouettes show them empty) never fill.
+
+    Args:
+        resolution: Cells along each side.
+        time_bins: Bins along time.
+        step: Length of one sample, in the field's frame.
+        threshold: Opacity of one sample step below which a cell counts as empty.
+        decay: Factor on a cell's density at each look.
+    """
+
+    density: Tensor
+    occupied: Tensor
+    allowed: Tensor
+
+    def __init__(
+        self,
+        resolution: int,
+        time_bins: int,
+        *,
+        step: float,
+        threshold: float = 0.01,
+        decay: float = 0.95,
+    ) -> None:
+        super().__init__()
+        self.resolution, self.time_bins = resolution, time_bins
+        self.decay = decay
+        self.empty_density = threshold / step
+        cells = time_bins * resolution**3
+        self.register_buffer("allowed", torch.ones(cells, dtype=torch.bool))
+        self.register_buffer("density", torch.full((cells,), 4 * self.empty_density))
+        self.register_buffer("occupied", torch.ones(cells, dtype=torch.bool))
+
+    def bins(self, times: Tensor) -> Tensor:
+        """Time bin of each time from 0 to 1. int64 [N]"""
+        return (times * self.time_bins).long().clamp_(0, self.time_bins - 1)
+
+    def allow(self, allowed: Tensor) -> None:
+        """Rule out cells for good. bool [time_bins, G, G, G], axes z, y, x"""
+        self.allowed.copy_(allowed.reshape(-1))
+        self.density.mul_(self.allowed)
+        torch.gt(self.density, self.empty_density, out=self.occupied)
+
+    @property
+    def occupied_fraction(self) -> float:
+        """Share of all cells that are occupied."""
+        return float(self.occupied.float().mean())
+
+    @torch.no_grad()
+    def observe(self, cells: Tensor, density: Tensor) -> None:
+        """Take in the field's density at samples. [N], [N]"""
+        seen = torch.maximum(self.density[cells] * self.decay, density.float())
+        self.density.scatter_reduce_(0, cells, seen, "amax", include_self=False)
+        self.occupied[cells] = self.density[cells] > self.empty_density
+
+    @torch.no_grad()
+    def update(self, field: Field, count: int, generator: torch.Generator) -> None:
+        """Look at ``count`` random cells that samples do not reach, at random points and times.
+
+        Cells that are allowed but empty are looked at, so that a wrong guess is corrected.
+
+        Args:
+            field: From points [N, 3] and times [N] to colour [N, 3] and density [N].
+            count: Number of cells.
+            generator: Source of randomness; equal generators keep the grids of all ranks equal.
+        """
+        device = self.density.device
+        candidates = self.allowed.nonzero()[:, 0]
+        if not len(candidates):
+            return
+        pick = torch.randint(len(candidates), (count,), generator=generator).to(device)
+        cells = candidates[pick]
+        points, times = self.draw(cells, torch.rand(count, 4, generator=generator).to(device))
+        self.observe(cells, field(points, times)[1])
+
+    def draw(self, cells: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
+        """Points and times inside cells, placed by numbers from 0 to 1. [N], [N, 4] -> [N, 3], [N]"""
+        size = self.resolution
+        index = torch.stack(
+            [
+                cells % size,
+                torch.div(cells, size, rounding_mode="floor") % size,
+                torch.div(cells, size**2, rounding_mode="floor") % size,
+                torch.div(cells, size**3, rounding_mode="floor"),
+            ],
+            dim=-1,
+        )
+        place = index + uniform
+        return place[:, :3] * (2 / size) - 1, place[:, 3] / self.time_bins

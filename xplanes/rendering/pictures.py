@@ -1,0 +1,76 @@
+"""Tensors as pictures: strips of a view, depth in colours, sheets of planes."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from torch import Tensor
+
+from xplanes.files import replacing
+
+_RAMP = torch.tensor(
+    [[13, 8, 135], [126, 3, 168], [204, 71, 120], [248, 149, 64], [240, 249, 33]]
+).div(255)
+"""Five stops from dark blue over magenta to yellow, even in lightness."""
+
+
+def colour_map(values: Tensor) -> Tensor:
+    """Numbers from 0 to 1 as colours, dark to light. [...] -> [..., 3]"""
+    place = values.nan_to_num(0).clamp(0, 1) * (len(_RAMP) - 1)
+    lower = place.long().clamp(max=len(_RAMP) - 2)
+    ramp = _RAMP.to(values.device)
+    return torch.lerp(ramp[lower], ramp[lower + 1], (place - lower)[..., None])
+
+
+def depth_picture(depth: Tensor) -> Tensor:
+    """Depth as colours, near is light; 0 (nothing there) is white. [H, W] -> [H, W, 3]"""
+    seen = depth > 0
+    if not seen.any():
+        return torch.ones(*depth.shape, 3)
+    near, far = depth[seen].aminmax()
+    colours = colour_map(1 - 0.9 * (depth - near) / (far - near).clamp_min(1e-6))
+    return torch.where(seen[..., None], colours, 1.0)
+
+
+def strip(truth: Tensor, colour: Tensor, depth: Tensor) -> Tensor:
+    """Truth, prediction, error (x 4) and depth side by side. [H, W, 3] twice, [H, W] -> [H, 4 W, 3]"""
+    error = colour_map(4 * (colour - truth).abs().mean(dim=-1))
+    return torch.cat([truth, colour, error, depth_picture(depth)], dim=1)
+
+
+def plane_sheet(planes: Mapping[str, Tensor], columns: int = 3, side: int = 128) -> Tensor:
+    """Feature planes as pictures, three channels of each as colours, in rows of ``columns``.
+
+    Args:
+        planes: Planes by name. [C, rows, columns] each
+        columns: Pictures per row.
+        side: Pixels per picture.
+
+    Returns:
+        One picture. [H, W, 3]
+    """
+    tiles = []
+    for plane in planes.values():
+        shown = plane.detach().float().cpu()[:3]
+        shown = torch.cat([shown, shown[:1].expand(3 - len(shown), -1, -1)])
+        spread = 2.5 * shown.std().clamp_min(1e-8)
+        shown = ((shown - shown.mean()) / (2 * spread) + 0.5).clamp(0, 1)
+        tile = F.interpolate(shown[None], size=(side, side), mode="nearest")[0].permute(1, 2, 0)
+        tiles.append(F.pad(tile, (0, 0, 2, 2, 2, 2), value=1.0))
+    while len(tiles) % columns:
+        tiles.append(torch.ones_like(tiles[0]))
+    rows = [torch.cat(tiles[i : i + columns], dim=1) for i in range(0, len(tiles), columns)]
+    return torch.cat(rows)
+
+
+def to_bytes(picture: Tensor) -> Tensor:
+    """Colours from 0 to 1 as bytes. [H, W, 3] -> uint8 [H, W, 3]"""
+    return (picture.detach().cpu().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+
+
+def write_png(path: Path, picture: Tensor) -> None:
+    """Write a picture with colours from 0 to 1, whole or not at all. [H, W, 3]"""
+    with replacing(path) as temporary:
+        Image.fromarray(to_bytes(picture).numpy()).save(temporary, format="PNG")

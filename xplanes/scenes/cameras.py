@@ -1,0 +1,90 @@
+"""Pinhole cameras in the convention of D-NeRF files.
+
+Camera axes are OpenGL's: x right, y up, looking along -z. Pixel centres lie at +0.5.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def focal_length(angle_x: float, width: int) -> float:
+    """Focal length in pixels of a camera that sees ``angle_x`` radians across ``width`` pixels."""
+    return 0.5 * width / math.tan(0.5 * angle_x)
+
+
+def pixel_rays(
+    camera_to_world: Tensor, rows: Tensor, columns: Tensor, *, focal: float, height: int, width: int
+) -> tuple[Tensor, Tensor]:
+    """Cast one ray through each named pixel.
+
+    Args:
+        camera_to_world: Pose of the camera of each ray. [R, 4, 4] or [4, 4]
+        rows: Pixel rows, from 0 at the top; fractions are allowed. [R]
+        columns: Pixel columns, from 0 at the left. [R]
+        focal: Focal length in pixels.
+        height: Image height in pixels.
+        width: Image width in pixels.
+
+    Returns:
+        Origins and unit directions in the world. [R, 3], [R, 3]
+    """
+    right = (columns + 0.5 - 0.5 * width) / focal
+    up = (0.5 * height - 0.5 - rows) / focal
+    local = torch.stack([right, up, -torch.ones_like(right)], dim=-1)
+    local = local / local.norm(dim=-1, keepdim=True)
+    rotation = camera_to_world[..., :3, :3]
+    directions = (rotation @ local[..., None])[..., 0]
+    return camera_to_world[..., :3, 3].expand_as(directions), directions
+
+
+def look_at(position: Tensor, target: Tensor | None = None) -> Tensor:
+    """Camera-to-world matrices of cameras at ``position`` that look at ``target``, world z up.
+
+    Args:
+        position: Camera centres. [N, 3]
+        target: Points looked at; the origin when None. [N, 3] or [3]
+
+    Returns:
+        Poses; a camera straight above or below its target takes world y as up. [N, 4, 4]
+    """
+    backward = position if target is None else position - target
+    backward = backward / backward.norm(dim=-1, keepdim=True)
+    up = torch.zeros_like(backward)
+    vertical = backward[..., 2].abs() > 1 - 1e-6
+    up[..., 2] = (~vertical).to(up.dtype)
+    up[..., 1] = vertical.to(up.dtype)
+    right = torch.linalg.cross(up, backward, dim=-1)
+    right = right / right.norm(dim=-1, keepdim=True)
+    pose = torch.eye(4, dtype=position.dtype, device=position.device).repeat(len(position), 1, 1)
+    pose[:, :3, 0] = right
+    pose[:, :3, 1] = torch.linalg.cross(backward, right, dim=-1)
+    pose[:, :3, 2] = backward
+    pose[:, :3, 3] = position
+    return pose
+
+
+def orbit(count: int, *, radius: float, elevation: float, target: Tensor | None = None) -> Tensor:
+    """Poses evenly spaced on a circle around ``target`` (the origin when None).
+
+    Args:
+        count: Number of cameras.
+        radius: Distance to the target, in world units.
+        elevation: Height angle above the horizontal plane, in degrees.
+
+    Returns:
+        Camera-to-world matrices; the first camera stands on the -y side. [count, 4, 4]
+    """
+    azimuth = torch.arange(count) * (2 * math.pi / max(count, 1)) - 0.5 * math.pi
+    height = math.radians(elevation)
+    offset = radius * torch.stack(
+        [
+            azimuth.cos() * math.cos(height),
+            azimuth.sin() * math.cos(height),
+            torch.full_like(azimuth, math.sin(height)),
+        ],
+        dim=-1,
+    )
+    centre = torch.zeros(3) if target is None else target
+    return look_at(offset + centre, centre)

@@ -1,0 +1,64 @@
+"""Pictures of an assembly, with smooth edges and straight alpha."""
+
+import random
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from xplanes.scenes.cameras import focal_length, look_at, pixel_rays
+from xplanes.scenes.demo.posed import Posed
+
+CAMERA_ANGLE_X = 0.6911112070083618
+"""Field of view of D-NeRF's cameras, in radians."""
+
+CAMERA_DISTANCE = 4.031128874149275
+"""Distance of D-NeRF's cameras from the origin."""
+
+
+def film(posed: Posed, camera_to_world: Tensor, resolution: int, samples: int = 2) -> NDArray:
+    """Render one picture.
+
+    Args:
+        posed: What stands before the camera.
+        camera_to_world: Camera pose. [4, 4]
+        resolution: Rows and columns of the picture.
+        samples: Rays per pixel and axis.
+
+    Returns:
+        Straight-alpha RGBA. uint8 [resolution, resolution, 4]
+    """
+    steps = (torch.arange(resolution * samples) + 0.5) / samples - 0.5
+    rows, columns = torch.meshgrid(steps, steps, indexing="ij")
+    origins, directions = pixel_rays(
+        camera_to_world.float(),
+        rows.flatten(),
+        columns.flatten(),
+        focal=focal_length(CAMERA_ANGLE_X, resolution),
+        height=resolution,
+        width=resolution,
+    )
+    hits = posed.cast(origins, directions)
+    layers = torch.cat([hits.colour, (hits.part >= 0).float()[:, None]], dim=-1)
+    layers = layers.reshape(resolution, samples, resolution, samples, 4).mean(dim=(1, 3))
+    alpha = layers[..., 3:]
+    straight = torch.cat([layers[..., :3] / alpha.clamp_min(1e-6), alpha], dim=-1)
+    return (straight.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+def hemisphere_cameras(count: int, draw: random.Random) -> Tensor:
+    """Cameras spread at random over the upper half of the sphere. [count, 4, 4]"""
+    places = np.empty((count, 3))
+    for place in places:
+        height, turn = draw.uniform(0.02, 0.98), draw.uniform(0, 2 * np.pi)
+        flat = np.sqrt(1 - height * height)
+        place[:] = flat * np.cos(turn), flat * np.sin(turn), height
+    return look_at(torch.from_numpy(places) * CAMERA_DISTANCE)
+
+
+def camera_at(azimuth: float, elevation: float) -> Tensor:
+    """Camera in a direction given in degrees, azimuth from +x towards +y. [4, 4]"""
+    turn, rise = np.radians(azimuth), np.radians(elevation)
+    place = np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
+    return look_at(torch.from_numpy(place)[None] * CAMERA_DISTANCE)[0]

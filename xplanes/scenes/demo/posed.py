@@ -1,0 +1,210 @@
+"""Solids at their places in the world, and what rays and points find there."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from xplanes.scenes.demo.primitives import MISS, Box, Primitive
+from xplanes.scenes.demo.shading import Light
+from xplanes.scenes.demo.surfaces import Surface
+
+CHUNK = 16384
+"""Rays handled at a time, so that temporaries stay in the cache."""
+
+
+@dataclass(frozen=True)
+class PosedPart:
+    """A shape at its place in the world.
+
+    Attributes:
+        shape: The solid.
+        surface: Its colours.
+        rotation: From the part's coordinates to the world's. [3, 3]
+        translation: The part's centre in the world. [3]
+    """
+
+    shape: Primitive
+    surface: Surface
+    rotation: Tensor
+    translation: Tensor
+
+    def to_own(self, points: Tensor) -> Tensor:
+        """World positions in the part's coordinates. [N, 3]"""
+        return (points - self.translation.to(points)) @ self.rotation.to(points)
+
+    def hit(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """Distance along each ray to the part, inf where missed. [N]"""
+        return self.shape.hit(self.to_own(origins), directions @ self.rotation.to(directions))
+
+    def inside(self, points: Tensor) -> Tensor:
+        """Which world positions lie inside. bool [N]"""
+        return self.shape.inside(self.to_own(points))
+
+    def colour(self, points: Tensor) -> Tensor:
+        """Colours of the part at world positions, without light. [N, 3]"""
+        return self.surface.colour(self.to_own(points))
+
+
+class Hits(NamedTuple):
+    """What rays see.
+
+    Attributes:
+        distance: Distance to the first surface, inf where a ray misses. [N]
+        normal: Outward unit normal there, 0 where missed. [N, 3]
+        colour: Colour, shaded if there is a light, 0 where missed. [N, 3]
+        part: Number of the part, -1 where missed. [N]
+    """
+
+    distance: Tensor
+    normal: Tensor
+    colour: Tensor
+    part: Tensor
+
+
+@dataclass(frozen=True)
+class Posed:
+    """An assembly at one moment.
+
+    Attributes:
+        parts: The parts at their places.
+        light: Light of the scene; None leaves the colours as painted.
+    """
+
+    parts: tuple[PosedPart, ...]
+    light: Light | None = None
+    _centres: Tensor = field(init=False, repr=False, compare=False)
+    _radii: Tensor = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if not self.parts:
+            raise ValueError("an assembly needs at least one part")
+        object.__setattr__(self, "_centres", torch.stack([p.translation for p in self.parts]))
+        radii = torch.tensor([p.shape.radius_around for p in self.parts])
+        object.__setattr__(self, "_radii", radii)
+
+    def cast(self, origins: Tensor, directions: Tensor) -> Hits:
+        """First surface that each ray meets.
+
+        Args:
+            origins: Where the rays start. [N, 3]
+            directions: Unit directions. [N, 3]
+        """
+        hits = Hits(
+            torch.full_like(directions[:, 0], MISS),
+            torch.zeros_like(directions),
+            torch.zeros_like(directions),
+            torch.full_like(directions[:, 0], -1, dtype=torch.long),
+        )
+        low, high = (corner.to(origins) for corner in self.bounds())
+        block = Box(tuple((0.5 * (high - low) + 1e-3).tolist()))
+        reached = block.hit(origins - 0.5 * (low + high), directions).isfinite()
+        for rays in reached.nonzero()[:, 0].split(CHUNK):
+            for whole, chunk in zip(hits, self._cast(origins[rays], directions[rays]), strict=True):
+                whole[rays] = chunk
+        return hits
+
+    def nearest(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Distance to the first part on each ray, and its number (inf, -1 for none). [N], [N]"""
+        best = torch.full_like(directions[:, 0], MISS)
+        part = torch.full_like(best, -1, dtype=torch.long)
+        for number, rays in self._candidates(origins, directions):
+            distance = self.parts[number].hit(origins[rays], directions[rays])
+            closer = distance < best[rays]
+            rays = rays[closer]
+            best[rays], part[rays] = distance[closer], number
+        return best, part
+
+    def inside(self, points: Tensor) -> Tensor:
+        """Which positions lie inside any part. bool [N]"""
+        result = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        for part in self.parts:
+            result |= part.inside(points)
+        return result
+
+    def signed_distance(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Distance to the nearest part, negative inside, and that part's number. [N], [N]"""
+        gaps = torch.stack([p.shape.signed_distance(p.to_own(points)) for p in self.parts])
+        distance, part = gaps.min(dim=0)
+        return distance, part
+
+    def colour(self, points: Tensor, part: Tensor | None = None) -> Tensor:
+        """Painted colours, without light.
+
+        Args:
+            points: Positions. [N, 3]
+            part: Whose colour to take, by number; the nearest part's when None. [N]
+
+        Returns:
+            Colours in [0, 1]. [N, 3]
+        """
+        if part is None:
+            part = self.signed_distance(points)[1]
+        result = torch.zeros_like(points)
+        for number in part.unique().tolist():
+            chosen = (part == number).nonzero()[:, 0]
+            result[chosen] = self.parts[number].colour(points[chosen])
+        return result
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Corners of an upright box that holds every part. [3], [3]"""
+        reach = torch.stack(
+            [p.rotation.abs() @ p.rotation.new_tensor(p.shape.extent) for p in self.parts]
+        )
+        return (self._centres - reach).amin(dim=0), (self._centres + reach).amax(dim=0)
+
+    def _candidates(self, origins: Tensor, directions: Tensor) -> Iterator[tuple[int, Tensor]]:
+        """Parts with the rays that pass through the ball around them."""
+        centres = self._centres.to(origins)
+        # Widened by more than float32 loses in the squares below.
+        radii = (self._radii.to(origins) * 1.01 + 1e-3)[:, None]
+        one = torch.ones_like(origins[:, :1])
+        # Two matrix products give, for every part and ray, the squared distance from the origin
+        # to the centre less the squared radius, and how far along the ray the centre lies.
+        spare = centres.square().sum(dim=-1, keepdim=True) - radii.square()
+        beyond = torch.cat([-2 * centres, spare, torch.ones_like(radii)], dim=-1) @ (
+            torch.cat([origins, one, origins.square().sum(dim=-1, keepdim=True)], dim=-1).T
+        )
+        start = (origins * directions).sum(dim=-1, keepdim=True)
+        along = torch.cat([centres, -torch.ones_like(radii)], dim=-1) @ (
+            torch.cat([directions, start], dim=-1).T
+        )
+        through = (beyond < along.square()) & (along > -radii)
+        part, rays = through.nonzero(as_tuple=True)
+        counts = torch.bincount(part, minlength=len(self.parts)).tolist()
+        for number, chosen in enumerate(rays.split(counts)):
+            if len(chosen):
+                yield number, chosen
+
+    def _cast(self, origins: Tensor, directions: Tensor) -> Hits:
+        distance, part = self.nearest(origins, directions)
+        normal, colour = torch.zeros_like(directions), torch.zeros_like(directions)
+        found = (part >= 0).nonzero()[:, 0]
+        if len(found) == 0:
+            return Hits(distance, normal, colour, part)
+        points = origins[found] + distance[found, None] * directions[found]
+        own = part[found]
+        normals, colours = torch.empty_like(points), torch.empty_like(points)
+        for number in own.unique().tolist():
+            chosen, posed = (own == number).nonzero()[:, 0], self.parts[number]
+            local = posed.to_own(points[chosen])
+            normals[chosen] = posed.shape.normal(local) @ posed.rotation.to(points).T
+            colours[chosen] = posed.surface.colour(local)
+        if self.light is not None:
+            colours = self.light.shade(colours, normals, self._shadowed(points, normals))
+        normal[found], colour[found] = normals, colours
+        return Hits(distance, normal, colour, part)
+
+    def _shadowed(self, points: Tensor, normals: Tensor) -> Tensor | None:
+        """Which surface points have a part between them and the sun. bool [N]"""
+        if self.light is None or not self.light.shadow:
+            return None
+        sun = self.light.direction(points)
+        # Faces turned away receive no sun anyway.
+        lit = (normals @ sun > 0).nonzero()[:, 0]
+        starts = points[lit] + 1e-3 * normals[lit]
+        shadowed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        shadowed[lit] = self.nearest(starts, sun.expand_as(starts))[1] >= 0
+        return shadowed

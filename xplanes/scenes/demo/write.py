@@ -1,0 +1,202 @@
+"""Demo scenes as folders in the layout of D-NeRF's scenes."""
+
+import hashlib
+import json
+import os
+import random
+import secrets
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from xplanes.scenes.demo.assembly import Assembly
+from xplanes.scenes.demo.film import CAMERA_ANGLE_X, camera_at, film, hemisphere_cameras
+from xplanes.scenes.demo.scenes import build_demo_scene, demo_scene
+
+VERSION = 1
+"""Raised when the same scene would come out as other pictures."""
+
+RECORD = "demo.json"
+"""File that says what a folder holds; written last."""
+
+USUAL_VIEWS = {"train": 50, "val": 10, "test": 12}
+"""Pictures of each split; other numbers are part of the folder's name."""
+
+VIDEO_FRAMES = 50
+"""Frames of the fixed-camera video."""
+
+_RENDERING = threading.Lock()
+
+
+def ensure_demo_scene(
+    root: Path,
+    name: str,
+    *,
+    resolution: int,
+    seed: int = 0,
+    train_views: int = USUAL_VIEWS["train"],
+    val_views: int = USUAL_VIEWS["val"],
+    test_views: int = USUAL_VIEWS["test"],
+    announce: Callable[[str], None] | None = None,
+) -> Path:
+    """Render a demo scene unless its folder is there already.
+
+    The folder appears complete or not at all, also when several processes ask for it at once.
+
+    Args:
+        root: Folder for demo scenes; made if missing.
+        name: Name of the scene.
+        resolution: Rows and columns of the pictures.
+        seed: Changes colours, phases of motions and cameras.
+        train_views: Training pictures, one random view per time, times evenly spaced.
+        val_views: Validation pictures.
+        test_views: Test pictures.
+        announce: Told in one line that a wait begins; printed when None.
+
+    Returns:
+        The scene's folder.
+
+    Raises:
+        ValueError: No scene has that name, or a count is too small.
+    """
+    counts = {"train": train_views, "val": val_views, "test": test_views}
+    for key, value in {
+        "resolution": resolution,
+        **{f"{k}_views": v for k, v in counts.items()},
+    }.items():
+        if value < 1:
+            raise ValueError(f"{key} is {value}; a demo scene needs at least 1")
+    assembly = build_demo_scene(name, seed)
+    record = _record(name, assembly, resolution, seed, counts)
+    folder = Path(root) / _folder_name(name, resolution, seed, counts)
+    if _holds(folder, record):
+        return folder
+    total = sum(counts.values()) + VIDEO_FRAMES
+    (announce or print)(
+        f"Rendering demo scene {name} ({total} pictures of {resolution} pixels) to {folder}"
+    )
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    fresh = _sibling(folder)
+    try:
+        with _one_thread():
+            for split, shots in _shots(name, seed, counts).items():
+                _write_split(fresh, split, shots, assembly, resolution)
+        (fresh / RECORD).write_text(json.dumps(record, indent=2) + "\n")
+        _publish(fresh, folder, record)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+    return folder
+
+
+Shot = tuple[float, Tensor]
+"""Time and camera pose [4, 4] of a picture."""
+
+
+def _shots(name: str, seed: int, counts: dict[str, int]) -> dict[str, list[Shot]]:
+    """Times and cameras of every split; each split draws from its own stream."""
+    scene = demo_scene(name)
+    shots = {}
+    for split, count in counts.items():
+        draw = random.Random(f"{split} {seed}")
+        cameras = hemisphere_cameras(count, draw)
+        # Held-out pictures fall between the training times, one in each share of the whole; every
+        # split starts at 0 because readers of this format expect it.
+        held_out = [0.0, *((i + draw.random()) / count for i in range(1, count))]
+        times = _even(count) if split == "train" else held_out
+        shots[split] = list(zip(times, cameras, strict=True))
+    camera = camera_at(scene.azimuth, scene.elevation)
+    shots["video"] = [(time, camera) for time in _even(VIDEO_FRAMES)]
+    return shots
+
+
+def _even(count: int) -> list[float]:
+    return [i / max(count - 1, 1) for i in range(count)]
+
+
+def _write_split(
+    folder: Path, split: str, shots: list[Shot], assembly: Assembly, resolution: int
+) -> None:
+    (folder / split).mkdir()
+    frames = []
+    for number, (time, camera) in enumerate(shots):
+        file = f"./{split}/r_{number:03d}"
+        picture = film(assembly.pose(time), camera, resolution)
+        Image.fromarray(picture).save(folder / f"{file}.png", compress_level=6)
+        frames.append({"file_path": file, "time": time, "transform_matrix": camera.tolist()})
+    index = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
+    (folder / f"transforms_{split}.json").write_text(json.dumps(index, indent=1) + "\n")
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Keep PyTorch to one thread: to share out these many small operations costs more."""
+    with _RENDERING:
+        before = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(before)
+
+
+def _record(
+    name: str, assembly: Assembly, resolution: int, seed: int, counts: dict[str, int]
+) -> dict[str, Any]:
+    return {
+        "version": VERSION,
+        "scene": name,
+        "seed": seed,
+        "resolution": resolution,
+        "views": {**counts, "video": VIDEO_FRAMES},
+        # The parts and motions themselves, so that an edited scene is rendered anew.
+        "assembly": hashlib.sha256(repr(assembly).encode()).hexdigest(),
+    }
+
+
+def _folder_name(name: str, resolution: int, seed: int, counts: dict[str, int]) -> str:
+    suffix = "" if counts == USUAL_VIEWS else "_" + "-".join(map(str, counts.values()))
+    return f"{name}_{resolution}px_s{seed}{suffix}"
+
+
+def _holds(folder: Path, record: dict[str, Any]) -> bool:
+    """Whether a folder is what the record says, with no file missing."""
+    try:
+        if json.loads((folder / RECORD).read_text()) != record:
+            return False
+    except (OSError, ValueError):
+        return False
+    return all(
+        (folder / f"transforms_{split}.json").is_file()
+        and all((folder / split / f"r_{number:03d}.png").is_file() for number in range(count))
+        for split, count in record["views"].items()
+    )
+
+
+def _sibling(folder: Path) -> Path:
+    """A new empty folder beside ``folder``, of a name that no other writer uses."""
+    sibling = folder.with_name(f".{folder.name}.{os.getpid()}.{secrets.token_hex(4)}")
+    sibling.mkdir()
+    return sibling
+
+
+def _publish(fresh: Path, folder: Path, record: dict[str, Any]) -> None:
+    """Move a finished folder to its place, unless another writer was first."""
+    while not _holds(folder, record):
+        stale = _sibling(folder)
+        try:
+            if folder.exists():
+                folder.replace(stale)
+            fresh.rename(folder)
+            return
+        except OSError:
+            # Another writer moved the old folder away or its own into place: look again.
+            continue
+        finally:
+            shutil.rmtree(stale, ignore_errors=True)

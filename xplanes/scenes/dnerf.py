@@ -1,0 +1,132 @@
+"""Scenes on disk in the format of D-NeRF and Blender: transforms_train.json and its images."""
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+from torch import Tensor
+
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.images import load_images
+from xplanes.scenes.transforms import Transforms, read_transforms
+from xplanes.scenes.views import Scene, Views
+
+__all__ = ["SceneError", "read_scene"]
+
+GET_DATA = (
+    "Set data.root and data.scene to a folder that holds transforms_train.json, get the D-NeRF "
+    "scenes with `python -m xplanes download dnerf`, or take the built-in scene with data=demo."
+)
+
+
+def read_scene(
+    folder: Path, *, resolution: int | None, splits: Sequence[str], views: int | None = None
+) -> Scene:
+    """Read a scene and check all of it, so that nothing fails after training has begun.
+
+    Args:
+        folder: Folder of transforms_train.json and the images.
+        resolution: Pixels per side of the (square) images; None keeps the native size.
+        splits: Names of the splits to read, such as train, val, test.
+        views: Number of views to keep of the train split, spread evenly over time;
+            None keeps all.
+
+    Returns:
+        The scene, with ``video`` where transforms_video.json exists.
+
+    Raises:
+        SceneError: Anything is missing, damaged or inconsistent; the message says what to do.
+    """
+    folder = Path(folder)
+    _check_folder(folder)
+    paths = {split: _transforms_path(folder, split) for split in dict.fromkeys(splits)}
+    listed = {split: read_transforms(path) for split, path in paths.items()}
+    if views is not None and "train" in listed:
+        listed["train"] = _spread(listed["train"], views, folder)
+    scene_views = {split: _load(transforms, resolution) for split, transforms in listed.items()}
+    return Scene(folder.resolve().name, scene_views, video=_read_video(folder, resolution))
+
+
+def _check_folder(folder: Path) -> None:
+    if folder.is_dir():
+        return
+    kind = "is not a folder" if folder.exists() else "does not exist"
+    root = next(parent for parent in folder.absolute().parents if parent.is_dir())
+    names = _scenes_in(root)
+    nearby = f"Scenes in {root}: {', '.join(names)}." if names else f"There is no scene in {root}."
+    raise SceneError(f"The scene folder {folder.absolute()} {kind}. {nearby} {GET_DATA}")
+
+
+def _transforms_path(folder: Path, split: str) -> Path:
+    path = folder / f"transforms_{split}.json"
+    if path.is_file():
+        return path
+    found = sorted(
+        other.stem.removeprefix("transforms_") for other in folder.glob("transforms_*.json")
+    )
+    if not found:
+        names = _scenes_in(folder)
+        inside = f" Scenes inside it: {', '.join(names)}." if names else ""
+        raise SceneError(f"{folder} holds no transforms_{split}.json.{inside} {GET_DATA}")
+    way_out = "Name one of these, or add the file."
+    if split != "train" and "val" in found:
+        way_out = "Evaluate on the validation views with data.eval_split=val, or add the file."
+    raise SceneError(f"{path} does not exist. Splits of this scene: {', '.join(found)}. {way_out}")
+
+
+def _scenes_in(folder: Path) -> list[str]:
+    return sorted(path.parent.name for path in folder.glob("*/transforms_train.json"))
+
+
+def _spread(transforms: Transforms, count: int, folder: Path) -> Transforms:
+    """Keep ``count`` frames at even ranks in time, the first and the last among them."""
+    total = len(transforms.files)
+    if not 1 <= count <= total:
+        raise SceneError(
+            f"data.views={count}, but the train split of {folder} has {total} views. Give a "
+            f"number from 1 to {total}, or null for all."
+        )
+    by_time = transforms.times.argsort(stable=True).tolist()
+    ranks = [round(i * (total - 1) / max(count - 1, 1)) for i in range(count)]
+    return transforms.subset(sorted(by_time[rank] for rank in ranks))
+
+
+def _read_video(folder: Path, resolution: int | None) -> Views | None:
+    path = folder / "transforms_video.json"
+    if not path.is_file():
+        return None
+    transforms = read_transforms(path)
+    poses = transforms.camera_to_world
+    if not poses.allclose(poses[:1].expand_as(poses), atol=1e-4):
+        raise SceneError(
+            f"{path} holds a camera that moves. It must hold the frames of one fixed camera: "
+            f"correct it, or rename the file and it is not read."
+        )
+    return _load(transforms, resolution)
+
+
+def _load(transforms: Transforms, resolution: int | None) -> Views:
+    images = load_images(transforms.paths, resolution)
+    _warn_of_empty(images, transforms)
+    return Views(
+        images=images,
+        camera_to_world=transforms.camera_to_world,
+        times=transforms.times,
+        focal=transforms.focal_per_width * images.shape[2],
+        files=transforms.files,
+    )
+
+
+def _warn_of_empty(images: Tensor, transforms: Transforms) -> None:
+    empty = [
+        file
+        for file, image in zip(transforms.files, images, strict=True)
+        if not image[..., 3].any()
+    ]
+    if empty:
+        warnings.warn(
+            f"{len(empty)} of {len(images)} images show nothing (alpha is 0 everywhere): "
+            f"{', '.join(empty[:5])}{', ...' if len(empty) > 5 else ''} in "
+            f"{transforms.paths[0].parent}.",
+            stacklevel=4,
+        )

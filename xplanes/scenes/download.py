@@ -1,0 +1,176 @@
+"""The public D-NeRF scenes, downloaded, checked and unpacked."""
+
+import hashlib
+import json
+import shutil
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path, PurePosixPath
+
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.fetch import FetchError, check_space, fetch
+
+# Named by the README of github.com/albertpumarola/D-NeRF; with dl=1 it sends the file itself.
+# Nobody publishes a checksum of the archive, so its own CRCs and the table below must do.
+DNERF_URL = "https://www.dropbox.com/s/0bf6fl0ye2vz3vr/data.zip?dl=1"
+ARCHIVE = "dnerf.zip"
+
+# Number of training views of each scene, as its readers and configurations state it.
+TRAIN_VIEWS = {
+    "bouncingballs": 150,
+    "hellwarrior": 100,
+    "hook": 100,
+    "jumpingjacks": 200,
+    "lego": 50,
+    "mutant": 150,
+    "standup": 150,
+    "trex": 200,
+}
+TEST_VIEWS = 20
+SPLITS = ("train", "val", "test")
+
+
+def download_dnerf(
+    root: Path,
+    *,
+    url: str = DNERF_URL,
+    sha256: str | None = None,
+    announce: Callable[[str], None] = print,
+) -> Path:
+    """Put the eight D-NeRF scenes into ``root``, each whole or not at all.
+
+    An interrupted download continues at the next call. Scenes that are already there stay as
+    they are. An archive fetched by hand is used if it lies in ``root`` as dnerf.zip.
+
+    Args:
+        root: Folder that will hold one folder per scene; made if absent.
+        url: Address of the archive.
+        sha256: Checksum that the archive must have, in hexadecimal; None skips the comparison.
+        announce: Takes lines about progress.
+
+    Returns:
+        The folder that holds the scenes: the value for data.root.
+
+    Raises:
+        SceneError: The archive cannot be fetched, is damaged, or is not the expected one.
+    """
+    root = Path(root).absolute()
+    missing = [name for name in TRAIN_VIEWS if not (root / name / "transforms_train.json").exists()]
+    if not missing:
+        announce(f"All D-NeRF scenes are already in {root}")
+        return root
+    for name in missing:
+        if (root / name).exists():
+            raise SceneError(
+                f"{root / name} is in the way: it holds no transforms_train.json, so it is not "
+                f"the scene. Move it elsewhere and try again."
+            )
+    root.mkdir(parents=True, exist_ok=True)
+    archive = root / ARCHIVE
+    by_hand = archive.exists()
+    try:
+        if by_hand:
+            announce(f"Using {archive}, which is already there")
+        else:
+            announce(f"Downloading {url} to {archive}")
+            # Images hardly compress: unpacked they take about as much room again.
+            fetch(url, archive, announce=announce, space_factor=2.1)
+        _check_sum(archive, sha256)
+        _install(archive, root, missing, announce)
+    except FetchError as problem:
+        raise SceneError(
+            f"{problem} Try again later to continue; or fetch {DNERF_URL} by hand, save it as "
+            f"{archive} and run this again; or train on the built-in scene with data=demo."
+        ) from problem
+    except _BadArchiveError as problem:
+        if not by_hand:
+            archive.unlink()
+        fate = "Replace it or delete it" if by_hand else "It was deleted: try again"
+        raise SceneError(
+            f"{archive} cannot be used: {problem}. {fate}. The archive is published at {DNERF_URL}."
+        ) from problem
+    if not by_hand:
+        archive.unlink()
+    announce(f"Scenes in {root}: {', '.join(sorted(TRAIN_VIEWS))}")
+    return root
+
+
+class _BadArchiveError(Exception):
+    """The archive is damaged or not the expected one."""
+
+
+def _check_sum(archive: Path, sha256: str | None) -> None:
+    if sha256 is None:
+        return
+    with archive.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    if found != sha256.lower():
+        raise _BadArchiveError(f"its SHA-256 is {found}, but {sha256.lower()} was asked for")
+
+
+def _install(archive: Path, root: Path, names: list[str], announce: Callable[[str], None]) -> None:
+    """Unpack beside the target, check everything, and only then move scenes into place."""
+    workspace = root / ".dnerf-unpacking"
+    shutil.rmtree(workspace, ignore_errors=True)
+    try:
+        _unpack(archive, workspace, names)
+        for name in names:
+            _check_scene(workspace / name, announce)
+        for name in names:
+            (workspace / name).rename(root / name)
+    finally:
+        shutil.rmtree(workspace, ignore_errors=True)
+
+
+def _unpack(archive: Path, workspace: Path, names: list[str]) -> None:
+    try:
+        with zipfile.ZipFile(archive) as source:
+            files = [member for member in source.infolist() if not member.is_dir()]
+            targets = [_target(member.filename) for member in files]
+            wanted = [
+                (member, target)
+                for member, target in zip(files, targets, strict=True)
+                if target is not None and target.parts[0] in names
+            ]
+            check_space(archive.parent, sum(member.file_size for member, _ in wanted))
+            for member, target in wanted:
+                path = workspace / target
+                path.parent.mkdir(parents=True, exist_ok=True)
+                # Reading to the end compares the member's CRC.
+                with source.open(member) as packed, path.open("wb") as file:
+                    shutil.copyfileobj(packed, file, 1 << 20)
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as problem:
+        raise _BadArchiveError(f"it is damaged or no zip file ({problem})") from problem
+
+
+def _target(member: str) -> PurePosixPath | None:
+    """Where a member belongs, as scene/...; None for what is no part of a scene."""
+    path = PurePosixPath(member)
+    if path.is_absolute() or ".." in path.parts or "\\" in member or ":" in member:
+        raise _BadArchiveError(f"its member {member!r} leads out of the folder")
+    parts = path.parts[1:] if path.parts[:1] == ("data",) else path.parts
+    return PurePosixPath(*parts) if len(parts) > 1 and parts[0] in TRAIN_VIEWS else None
+
+
+def _check_scene(folder: Path, announce: Callable[[str], None]) -> None:
+    """Compare an unpacked scene with what the data set is known to hold."""
+    name = folder.name
+    for split in SPLITS:
+        try:
+            content = json.loads((folder / f"transforms_{split}.json").read_text(encoding="utf-8"))
+            files = [frame["file_path"] for frame in content["frames"]]
+        except (OSError, ValueError, KeyError, TypeError) as problem:
+            raise _BadArchiveError(
+                f"{name}/transforms_{split}.json is missing or unreadable ({problem})"
+            ) from problem
+        for file in files:
+            if not (folder / f"{file}.png").is_file():
+                raise _BadArchiveError(f"{name} lacks {file}.png, which its {split} split names")
+        if split == "train" and len(files) != TRAIN_VIEWS[name]:
+            raise _BadArchiveError(
+                f"{name} has {len(files)} training views instead of {TRAIN_VIEWS[name]}"
+            )
+        # Only the training views are known for certain, so a difference here is just said.
+        if split == "test" and len(files) != TEST_VIEWS:
+            announce(f"Note: {name} has {len(files)} test views; {TEST_VIEWS} are usual")

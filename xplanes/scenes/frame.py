@@ -1,0 +1,105 @@
+"""The field's frame: the cube [-1, 1]^3 and how the world maps into it."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.silhouettes import silhouette_hull
+from xplanes.scenes.views import Views
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A similarity from the world to the field's frame: ``scale * rotation @ (p - centre)``.
+
+    Attributes:
+        scale: Field units per world unit.
+        rotation: Turns world axes into the field's. [3, 3]
+        centre: World point that becomes the origin. [3]
+    """
+
+    scale: float
+    rotation: Tensor
+    centre: Tensor
+
+    def points(self, world: Tensor) -> Tensor:
+        """World points in the field's frame. [..., 3]"""
+        return self.scale * (world - self.centre) @ self.rotation.T
+
+    def rays(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Rays in the field's frame; directions keep their length. [R, 3], [R, 3]"""
+        return self.points(origins), directions @ self.rotation.T
+
+    def to_world(self, points: Tensor) -> Tensor:
+        """Points of the field's frame in the world. [..., 3]"""
+        return points @ self.rotation / self.scale + self.centre
+
+
+def cube_frame(half_side: float, centre: Tensor) -> Frame:
+    """The frame in which a world-aligned cube becomes [-1, 1]^3."""
+    return Frame(1 / half_side, torch.eye(3), centre)
+
+
+def optical_centre(views: Views) -> Tensor:
+    """The point nearest to all optical axes, in the least-squares sense. [3]
+
+    Cameras that all look the same way leave the depth open; the point then lies where their mean
+    distance to the origin puts it.
+    """
+    origin = views.camera_to_world[:, :3, 3].double()
+    axis = -views.camera_to_world[:, :3, 2].double()
+    projector = torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]
+    normal = projector.mean(dim=0)
+    eigenvalues = torch.linalg.eigvalsh(normal)
+    if eigenvalues[0] < 1e-4:
+        # One direction is free: pull weakly towards the world's origin.
+        projector = projector + 1e-3 * torch.eye(3, dtype=torch.float64)
+        normal = projector.mean(dim=0)
+        target = ((projector - 1e-3 * torch.eye(3)) @ origin[..., None])[..., 0].mean(dim=0)
+    else:
+        target = (projector @ origin[..., None])[..., 0].mean(dim=0)
+    return torch.linalg.solve(normal, target).float()
+
+
+def scene_frame(views: Views, half_side: float | None = None, *, resolution: int = 48) -> Frame:
+    """Frame a scene: the smallest cube that its cameras and silhouettes leave room for.
+
+    The cameras' common view gives a first cube around the point that they look at; the silhouettes,
+    where images have alpha, shrink it.
+
+    Args:
+        views: Training views.
+        half_side: Half the side of the cube in world units, if known; None finds it.
+        resolution: Cells along each side of the grid that is tried against the silhouettes.
+
+    Raises:
+        SceneError: If silhouettes leave nothing.
+    """
+    centre = optical_centre(views)
+    if half_side is not None:
+        return cube_frame(half_side, centre)
+    offset = views.camera_to_world[:, :3, 3] - centre
+    distance = -(offset * -views.camera_to_world[:, :3, 2]).sum(dim=-1)
+    extent = 0.5 * max(views.height, views.width) / views.focal
+    half = float((distance.clamp_min(0) * extent).max())
+    if not math.isfinite(half) or half <= 0:
+        raise SceneError(
+            "the cameras look away from one another, so the scene's bounds cannot be found: set "
+            "data.half_side, in world units"
+        )
+    centres = (torch.arange(resolution) + 0.5) * (2 / resolution) - 1
+    grid = torch.stack(torch.meshgrid(centres, centres, centres, indexing="ij"), dim=-1)
+    points = grid.view(-1, 3) * half + centre
+    filled = silhouette_hull(views, points, radius=half * math.sqrt(3) / resolution).any(dim=0)
+    if not filled.any():
+        raise SceneError(
+            "no point in space is inside the silhouettes of the training views: check the poses, "
+            "or set data.half_side and sampler.silhouettes=false"
+        )
+    margin = 2 * half / resolution
+    lower = points[filled].amin(dim=0) - margin
+    upper = points[filled].amax(dim=0) + margin
+    return cube_frame(float((upper - lower).max()) / 2, (upper + lower) / 2)

@@ -1,0 +1,48 @@
+"""Smoothness of planes, as gradients written straight into ``.grad``.
+
+The loss of a step is a handful of rays, that of the planes' smoothness is every texel: through
+autograd it would cost more than all else. Its gradient is a stencil, so it is added directly, every
+few steps with as many times the weight.
+"""
+
+import torch
+from torch import Tensor
+
+
+def total_variation(plane: Tensor, dims: tuple[int, ...]) -> Tensor:
+    """Sum over ``dims`` of the mean squared difference between neighbours. [P, H, W, C] -> []"""
+    terms = [plane.diff(dim=dim).square().mean() for dim in dims if plane.shape[dim] > 1]
+    return torch.stack(terms).sum() if terms else plane.new_zeros(())
+
+
+def time_smoothness(planes: Tensor) -> Tensor:
+    """Mean squared second difference along the rows of time. [P, T, H, C] -> []"""
+    return planes.diff(n=2, dim=1).square().mean() if planes.shape[1] > 2 else planes.new_zeros(())
+
+
+@torch.no_grad()
+def add_total_variation_gradient(
+    gradient: Tensor, plane: Tensor, dims: tuple[int, ...], weight: float
+) -> None:
+    """Add ``weight`` times the gradient of `total_variation` to ``gradient``."""
+    for dim in dims:
+        length = plane.shape[dim] - 1
+        if length < 1:
+            continue
+        difference = plane.diff(dim=dim)
+        scale = 2 * weight / difference.numel()
+        gradient.narrow(dim, 1, length).add_(difference, alpha=scale)
+        gradient.narrow(dim, 0, length).sub_(difference, alpha=scale)
+
+
+@torch.no_grad()
+def add_time_smoothness_gradient(gradient: Tensor, planes: Tensor, weight: float) -> None:
+    """Add ``weight`` times the gradient of `time_smoothness` to ``gradient``."""
+    length = planes.shape[1] - 2
+    if length < 1:
+        return
+    bend = planes.diff(n=2, dim=1)
+    scale = 2 * weight / bend.numel()
+    gradient.narrow(1, 0, length).add_(bend, alpha=scale)
+    gradient.narrow(1, 1, length).add_(bend, alpha=-2 * scale)
+    gradient.narrow(1, 2, length).add_(bend, alpha=scale)

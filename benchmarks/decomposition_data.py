@@ -1,5 +1,7 @@
-"""Feature-like matrices for the decomposition benchmarks: a standing texture with slow drift, two
-moving discs that hide it, and noise on every entry."""
+"""Feature-like matrices for the decomposition benchmarks.
+
+A standing texture with slow drift, two moving discs that hide it, and noise on every entry.
+"""
 
 import math
 

@@ -1,18 +1,21 @@
-"""Run time against error of robust PCA: the default, the paper's ADMM with a full SVD, and with Gram.
+"""Run time against error of robust PCA: measures one method on one matrix and appends to the table.
 
-    python benchmarks/decomposition_speed.py run --frames 50 --weight 0.009 --part reference
-    python benchmarks/decomposition_speed.py run --frames 50 --weight 0.009 --part adaptive
-    python benchmarks/decomposition_speed.py report
+    python benchmarks/decomposition_speed.py --frames 50 --weight 0.009 --part reference
+    python benchmarks/decomposition_speed.py --frames 50 --weight 0.009 --part adaptive
+    python benchmarks/decomposition_speed_report.py
 
-Parts: reference (once per case, long, float64), then svd, gram, adaptive, growing, admm. Errors are
-computed outside the clock. Every point of adaptive, growing and admm is a run of its own that was
-stopped there, results written out included.
+Parts: reference (first, once per matrix: long, float64), then svd (the paper's ADMM with a full
+singular value decomposition), gram (the same with the Gram matrix), and the package's adaptive,
+growing and admm. Errors are computed outside the clock. Every point of the package's methods is a
+run of its own that was stopped there, results written out included.
 """
 
 import argparse
 import csv
 import math
 import time
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -23,70 +26,73 @@ from xplanes.decomposition import robust_pca
 from xplanes.decomposition.passes import Step, Workspace, iterate, start
 from xplanes.decomposition.svt import shrinkage_from_gram
 
-RESULTS = Path(__file__).parent / "results"
-TABLE = RESULTS / "decomposition_speed.csv"
-FIELDS = ("frames", "weight", "part", "iterations", "seconds", "residual", "objective", "low_rank", "sparse", "rank")  # fmt: skip
-STOPS = (2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 23, 26, 29, 32, 36, 40, 45, 50, 56, 64, 72, 84, 96, 112, 128, 150, 180, 220)  # fmt: skip
-NAMES = {
-    "svd": "(a) paper's ADMM, full SVD",
-    "gram": "(b) paper's ADMM, Gram matrix",
-    "admm": "paper's ADMM, fused passes",
-    "growing": "growing penalty (inexact ALM)",
-    "adaptive": "default (adaptive)",
-}
+TABLE = Path(__file__).parent / "results" / "decomposition_speed.csv"
+FIELDS = (
+    *("frames", "weight", "part", "iterations", "seconds"),
+    *("residual", "objective", "low_rank", "sparse", "rank"),
+)
+STOPS = (
+    *(2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 23, 26, 29, 32, 36, 40, 45, 50, 56, 64),
+    *(72, 84, 96, 112, 128, 150, 180, 220),
+)
+Point = tuple[int, float, Tensor, Tensor, int]
 
 
-def nuclear_norm(matrix: Tensor) -> float:
-    total = sum(block.double().mT @ block.double() for block in matrix.split(20000))
-    return torch.linalg.eigvalsh(total).clamp_min(0).sqrt().sum().item()
+def squared(*parts: Tensor, signs: tuple[int, ...] = (1,)) -> float:
+    """Squared norm of a signed sum, in float64 by blocks."""
+    total = 0.0
+    for blocks in zip(*(part.split(20000) for part in parts), strict=True):
+        summed = sum(sign * block.double() for sign, block in zip(signs, blocks, strict=True))
+        total += torch.as_tensor(summed).square().sum().item()
+    return total
 
 
 def objective(low_rank: Tensor, matrix: Tensor, weight: float) -> float:
     """Objective of the feasible pair (L, Y - L)."""
-    rest = sum((y.double() - l.double()).abs().sum().item() for y, l in zip(matrix.split(20000), low_rank.split(20000), strict=True))  # fmt: skip
-    return nuclear_norm(low_rank) + weight * rest
+    gram, rest = 0, 0.0
+    for low, y in zip(low_rank.split(20000), matrix.split(20000), strict=True):
+        gram = gram + low.double().mT @ low.double()
+        rest += (y.double() - low.double()).abs().sum().item()
+    return torch.linalg.eigvalsh(gram).clamp_min(0).sqrt().sum().item() + weight * rest
 
 
 def make_reference(matrix: Tensor, weight: float, seconds: float, path: Path) -> None:
-    """Long float64 run with a dual bound: the multiplier, made feasible, bounds the optimum below."""
+    """Long float64 run; its multiplier, made feasible, bounds the optimum from below."""
     y = matrix.double()
-    state, frames = torch.empty_like(y), y.shape[1]
+    state = torch.empty_like(y)
     work = Workspace(y, state)
-    gram, penalty, before, best, begin, count = start(work), 0.03, 0.03, math.inf, time.time(), 0
-    low_rank, sparse = torch.empty_like(y), torch.empty_like(y)
-    while time.time() - begin < seconds:
+    gram, penalty, before, count, begin = start(work), 0.03, 0.03, 0, time.time()
+    while True:
         basis, factors, _ = shrinkage_from_gram(gram, 1 / penalty)
-        limit = weight / penalty
-        after = penalty if count < 20 or count > 200 else penalty * 1.01
-        step = Step(basis, factors, weight / before, limit, before / penalty, penalty / after, 1.6)
-        if time.time() - begin > seconds - 3:
-            # What `finish` does, keeping the state.
-            clipped = state.clamp(-step.old_limit, step.old_limit)
-            torch.mm(y - state + (1 + step.rescale) * clipped, (basis * factors) @ basis.mT, out=low_rank)
-            state.copy_(y - low_rank + step.rescale * clipped)
+        old, limit, rescale = weight / before, weight / penalty, before / penalty
+        if time.time() - begin > seconds:
             break
-        gram, norms = iterate(work, step, norms=False, changes=True)
+        after = penalty * 1.01 if 20 < count < 200 else penalty
+        step = Step(basis, factors, old, limit, rescale, penalty / after, relaxation=1.6)
+        gram, _ = iterate(work, step, norms=False, changes=False)
         before, penalty, count = penalty, after, count + 1
+    # One plain step that keeps the state, and with it the multiplier.
+    clipped = state.clamp(-old, old)
+    low_rank = (y - state + (1 + rescale) * clipped) @ ((basis * factors) @ basis.mT)
+    state = y - low_rank + rescale * clipped
     dual = penalty * state.clamp(-limit, limit)
-    sparse.copy_(state - dual / penalty)
+    sparse = state - dual / penalty
     spectral = torch.linalg.eigvalsh(dual.mT @ dual)[-1].sqrt().item()
     lower = (y * dual).sum().item() / max(1.0, spectral, dual.abs().max().item() / weight)
     value = objective(low_rank, y, weight)
-    print(f"{count} iterations, objective {value:.8g}, dual bound {lower:.8g}, gap {value / lower - 1:.1e}, rank {len(factors)}, last norms {norms}", flush=True)  # fmt: skip
-    torch.save({"low_rank": low_rank.float(), "sparse": sparse.float(), "objective": value, "gap": value / lower - 1}, path)  # fmt: skip
+    print(
+        f"reference: {count} iterations, objective {value:.9g}, dual bound {lower:.9g}, "
+        f"gap {value / lower - 1:.1e}, rank {len(factors)}",
+        flush=True,
+    )
+    parts = {"low_rank": low_rank.float(), "sparse": sparse.float(), "objective": value}
+    torch.save(parts, path)
 
 
-def difference(part: Tensor, truth: Tensor) -> float:
-    pairs = zip(part.split(20000), truth.split(20000), strict=True)
-    gap = sum((p.double() - t.double()).square().sum().item() for p, t in pairs)
-    return math.sqrt(gap / sum(t.double().square().sum().item() for t in truth.split(20000)))
-
-
-def plain(matrix: Tensor, weight: float, svd: bool, budget: float):
-    """The paper's Algorithm 1, written plainly; yields (iteration, seconds, L, S, rank)."""
-    penalty = 0.05
+def plain(matrix: Tensor, weight: float, svd: bool, budget: float) -> Iterator[Point]:
+    """The paper's Algorithm 1, written plainly."""
+    penalty, spent = 0.05, 0.0
     sparse, multiplier = torch.zeros_like(matrix), torch.zeros_like(matrix)
-    spent = 0.0
     for iteration in range(1, STOPS[-1] + 1):
         begin = time.perf_counter()
         argument = matrix - sparse - multiplier / penalty
@@ -102,7 +108,7 @@ def plain(matrix: Tensor, weight: float, svd: bool, budget: float):
         sparse = argument.sign() * (argument.abs() - weight / penalty).clamp_min(0)
         gap = low_rank + sparse - matrix
         multiplier = multiplier + penalty * gap
-        gap.norm() / matrix.norm()
+        _ = gap.norm() / matrix.norm()
         spent += time.perf_counter() - begin
         if iteration in STOPS:
             yield iteration, spent, low_rank, sparse, int((shrunk > 0).sum())
@@ -110,11 +116,18 @@ def plain(matrix: Tensor, weight: float, svd: bool, budget: float):
             return
 
 
-def ours(matrix: Tensor, weight: float, method: str, budget: float):
+def package(matrix: Tensor, weight: float, method: str, budget: float) -> Iterator[Point]:
     spent = 0.0
     for stop in STOPS:
         begin = time.perf_counter()
-        result = robust_pca(matrix, sparsity_weight=weight, tolerance=1e-12, max_iterations=stop, method=method, progress=False)  # fmt: skip
+        result = robust_pca(
+            matrix,
+            sparsity_weight=weight,
+            tolerance=1e-12,
+            max_iterations=stop,
+            method=method,
+            progress=False,
+        )
         seconds = time.perf_counter() - begin
         spent += seconds
         yield stop, seconds, result.low_rank, result.sparse, result.rank
@@ -122,104 +135,49 @@ def ours(matrix: Tensor, weight: float, method: str, budget: float):
             return
 
 
-def run(frames: int, weight_name: str, part: str, budget: float, work: Path) -> None:
-    matrix = feature_matrix(frames)
-    weight = len(matrix) ** -0.5 if weight_name == "auto" else float(weight_name)
-    path = work / f"reference_{frames}_{weight_name}.pt"
-    if part == "reference":
-        make_reference(matrix, weight, budget, path)
-        return
+def measure(options: argparse.Namespace, matrix: Tensor, weight: float, path: Path) -> None:
     truth = torch.load(path)
-    source = plain(matrix, weight, part == "svd", budget) if part in ("svd", "gram") else ours(matrix, weight, part, budget)  # fmt: skip
+    plainly = options.part in ("svd", "gram")
+    points = (
+        plain(matrix, weight, options.part == "svd", options.budget)
+        if plainly
+        else package(matrix, weight, options.part, options.budget)
+    )
     fresh = not TABLE.exists()
     with TABLE.open("a", newline="") as file:
         writer = csv.writer(file)
         if fresh:
             writer.writerow(FIELDS)
-        norm = matrix.double().norm().item()
-        for iterations, seconds, low_rank, sparse, rank in source:
-            residual = math.sqrt(sum((l + s - y).double().square().sum().item() for l, s, y in zip(low_rank.split(20000), sparse.split(20000), matrix.split(20000), strict=True))) / norm  # fmt: skip
-            gap = objective(low_rank, matrix, weight) / truth["objective"] - 1
-            row = (frames, weight_name, part, iterations, f"{seconds:.3f}", f"{residual:.2e}", f"{gap:.2e}", f"{difference(low_rank, truth['low_rank']):.2e}", f"{difference(sparse, truth['sparse']):.2e}", rank)  # fmt: skip
+        for iterations, seconds, low_rank, sparse, rank in points:
+            gap = squared(low_rank, sparse, matrix, signs=(1, 1, -1)) / squared(matrix)
+            errors = [math.sqrt(gap), objective(low_rank, matrix, weight) / truth["objective"] - 1]
+            for part, name in ((low_rank, "low_rank"), (sparse, "sparse")):
+                far = squared(part, truth[name], signs=(1, -1)) / squared(truth[name])
+                errors.append(math.sqrt(far))
+            row = [options.frames, options.weight, options.part, iterations, f"{seconds:.3f}"]
+            row += [*(f"{error:.2e}" for error in errors), rank]
             writer.writerow(row)
             print(*row, flush=True)
 
 
-TARGETS = (
-    ("residual", (1e-3, 1e-5, 1e-7)),
-    ("objective", (1e-2, 1e-3, 1e-4)),
-    ("low_rank", (1e-2, 1e-3)),
-    ("sparse", (1e-2, 1e-3)),
-)
-
-
-def reached(rows: list[dict], name: str, bound: float) -> float | None:
-    """Seconds after which the error stays below the bound."""
-    answer = None
-    for row in sorted(rows, key=lambda row: -int(row["iterations"])):
-        if abs(float(row[name])) > bound:
-            break
-        answer = float(row["seconds"])
-    return answer
-
-
-def report() -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    with TABLE.open() as file:
-        rows = list(csv.DictReader(file))
-    cases = sorted({(int(row["frames"]), row["weight"]) for row in rows}, key=lambda c: (c[1], c[0]))
-    figure, axes = plt.subplots(len(cases), 3, figsize=(14, 3.4 * len(cases)), squeeze=False)
-    lines = [
-        "# Robust PCA: run time against error",
-        "",
-        "163,840 rows (64 x 64 x 40 features), float32, two cores of an AMD EPYC, torch 2.13, times in",
-        "seconds, one run each. Errors against a long float64 run: objective of the feasible pair",
-        "(L, Y - L), relative difference of L and of S. `-`: not reached in the time it was given (last",
-        "column). Script: `benchmarks/decomposition_speed.py`; all points: `decomposition_speed.csv`.",
-    ]  # fmt: skip
-    for index, (frames, weight) in enumerate(cases):
-        lines += ["", f"## {frames} frames, sparsity weight {weight}", ""]
-        heads = [f"{name} {bound:.0e}" for name, bounds in TARGETS for bound in bounds]
-        lines += ["| method | s per iteration | " + " | ".join(heads) + " | given |", "|" + "---|" * (len(heads) + 3)]  # fmt: skip
-        times = {}
-        for part, title in NAMES.items():
-            chosen = [row for row in rows if int(row["frames"]) == frames and row["weight"] == weight and row["part"] == part]  # fmt: skip
-            if not chosen:
-                continue
-            chosen.sort(key=lambda row: int(row["iterations"]))
-            times[part] = [reached(chosen, name, bound) for name, bounds in TARGETS for bound in bounds]  # fmt: skip
-            final = chosen[-1]
-            each = float(final["seconds"]) / int(final["iterations"])
-            cells = ["-" if value is None else f"{value:.2f}" for value in times[part]]
-            lines.append(f"| {title} | {each:.3f} | " + " | ".join(cells) + f" | {final['seconds']} |")
-            for axis, name in zip(axes[index], ("residual", "objective", "low_rank"), strict=True):
-                axis.loglog([float(r["seconds"]) for r in chosen], [abs(float(r[name])) for r in chosen], ".-", label=title)  # fmt: skip
-                axis.set(xlabel="seconds", ylabel=f"{name} error" if name != "residual" else name, title=f"{frames} frames, weight {weight}")  # fmt: skip
-                axis.grid(alpha=0.3)
-        if "svd" in times and "adaptive" in times:
-            gains = [f"{a / b:.0f}x" if a and b else "-" for a, b in zip(times["svd"], times["adaptive"], strict=True)]  # fmt: skip
-            lines.append("| **(a) over default** | | " + " | ".join(gains) + " | |")
-    axes[0][0].legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(RESULTS / "decomposition_speed.png", dpi=80)
-    (RESULTS / "decomposition_speed.md").write_text("\n".join(lines) + "\n")
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--frames", type=int, default=50)
+    parser.add_argument("--weight", default="0.009", help="a number or auto")
+    parser.add_argument("--part", default="adaptive")
+    parser.add_argument("--budget", type=float, default=100, help="seconds of measured time")
+    parser.add_argument("--work", type=Path, default=Path("build/decomposition_speed"))
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    options.work.mkdir(parents=True, exist_ok=True)
+    matrix = feature_matrix(options.frames)
+    weight = len(matrix) ** -0.5 if options.weight == "auto" else float(options.weight)
+    path = options.work / f"reference_{options.frames}_{options.weight}.pt"
+    if options.part == "reference":
+        make_reference(matrix, weight, options.budget, path)
+    else:
+        measure(options, matrix, weight, path)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("action", choices=("run", "report"))
-    parser.add_argument("--frames", type=int, default=50)
-    parser.add_argument("--weight", default="0.009")
-    parser.add_argument("--part", choices=("reference", *NAMES), default="adaptive")
-    parser.add_argument("--budget", type=float, default=100, help="seconds of measured time")
-    parser.add_argument("--work", type=Path, default=Path("/tmp/decomposition_speed"))
-    options = parser.parse_args()
-    if options.action == "report":
-        report()
-    else:
-        options.work.mkdir(exist_ok=True)
-        run(options.frames, options.weight, options.part, options.budget, options.work)
+    main()

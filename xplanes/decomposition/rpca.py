@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from xplanes.decomposition.reference import plain_admm
-from xplanes.decomposition.solver import SCHEDULES, Progress, minimise
+from xplanes.decomposition.schedule import SCHEDULES
+from xplanes.decomposition.solver import CHANGE_OVER_TOLERANCE, Progress, minimise
 from xplanes.decomposition.svt import block_rows
 
 METHODS = (*SCHEDULES, "exact")
@@ -253,7 +254,8 @@ def _result(
         rank=end.rank,
         iterations=end.iterations,
         residual=residual,
-        converged=residual <= tolerance and (not adaptive or end.change <= 10 * tolerance),
+        converged=residual <= tolerance
+        and (not adaptive or end.change <= CHANGE_OVER_TOLERANCE * tolerance),
         change=end.change,
         sparsity=count / matrix.numel(),
         low_rank_energy=low_energy / whole if whole else 0.0,

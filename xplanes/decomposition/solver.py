@@ -1,4 +1,4 @@
-"""The loop of robust PCA: which penalty, how many passes, when to stop."""
+"""The loop of robust PCA: passes until the residual and the change are small."""
 
 import math
 from collections.abc import Callable
@@ -8,38 +8,11 @@ import torch
 from torch import Tensor
 
 from xplanes.decomposition.passes import Step, Workspace, finish, iterate, start
+from xplanes.decomposition.schedule import Norms, Penalty, Schedule
 from xplanes.decomposition.svt import needs_double, shrinkage_from_gram
 
-_WARM_UP = 10
 _CHECK_EVERY = 4
-_LARGEST_PENALTY = 1e6
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """How the penalty moves and how far each step is stretched.
-
-    Attributes:
-        relaxation: Over-relaxation of the low-rank part; 1 is plain ADMM.
-        growth: Factor on the penalty per iteration where it grows; 1 keeps it fixed.
-        adaptive: Set the penalty from the iterates for ten iterations, then let it grow only
-            while the residual is large beside the change; also wait for the change at the end.
-        ratio: What ``penalty * |S| / |multiplier|`` is brought to at first.
-        balance: Grow while ``|L + S - Y| / |S|`` exceeds this many times the relative change.
-    """
-
-    relaxation: float = 1.0
-    growth: float = 1.0
-    adaptive: bool = False
-    ratio: float = 1.5
-    balance: float = 0.35
-
-
-SCHEDULES = {
-    "adaptive": Schedule(relaxation=1.6, growth=1.2, adaptive=True),
-    "growing": Schedule(growth=1.2),
-    "admm": Schedule(),
-}
+CHANGE_OVER_TOLERANCE = 10.0
 
 
 @dataclass
@@ -51,8 +24,8 @@ class Progress:
         rank: Rank of the low-rank part.
         penalty: Penalty of the last pass, absolute.
         residual: ``|L + S - Y| / |Y|`` at the last check, Frobenius norms.
-        change: The larger of ``|L + S - Y| / |S|`` and the change of S over the scaled
-            multiplier at the last check: the size of the step still being taken.
+        change: At the last check the larger of ``|L + S - Y| / |S|`` and the change of S over the
+            scaled multiplier: the relative size of the step still being taken.
     """
 
     iterations: int = 0
@@ -95,25 +68,23 @@ def minimise(
     gram = start(work)
     norm = gram.trace().sqrt().item()
     single = matrix.dtype == torch.float32
+    path = Penalty(schedule, penalty, norm)
     progress = Progress()
-    before = now = after = penalty
-    growing = schedule.growth > 1 and not schedule.adaptive
     last = max_iterations == 1
     while True:
-        basis, factors, singular = shrinkage_from_gram(gram, 1 / now)
-        largest = singular[-1].item()
+        basis, factors, singular = shrinkage_from_gram(gram, 1 / path.now)
         progress.iterations += 1
         progress.rank = len(factors)
-        progress.penalty = now
+        progress.penalty = path.now
         step = Step(
             basis,
             factors,
-            old_limit=sparsity_weight / before,
-            limit=sparsity_weight / now,
-            rescale=before / now,
-            next_rescale=now / after,
+            old_limit=sparsity_weight / path.before,
+            limit=sparsity_weight / path.now,
+            rescale=path.before / path.now,
+            next_rescale=path.now / path.after,
             relaxation=schedule.relaxation,
-            double=not single or needs_double(largest, 1 / after),
+            double=not single or needs_double(singular[-1].item(), 1 / path.after),
         )
         if last:
             finish(work, low_rank, step)
@@ -121,26 +92,18 @@ def minimise(
                 on_iteration(progress)
             return progress
 
-        warm = schedule.adaptive and progress.iterations <= _WARM_UP
         check = progress.iterations % _CHECK_EVERY == 0
-        gram, norms = iterate(work, step, norms=warm, changes=check)
-        sparse_norm, multiplier_norm, sparse_change, residual_norm = norms
+        gram, values = iterate(work, step, norms=path.warm(progress.iterations), changes=check)
+        norms = Norms(*values)
         if check:
-            primal = residual_norm / max(sparse_norm, 1e-3 * norm)
-            dual = sparse_change / max(multiplier_norm, 1e-30 * norm)
-            progress.residual = residual_norm / norm
-            progress.change = max(primal, dual)
+            progress.residual = norms.residual / norm
+            progress.change = max(path.relative(norms))
+            feasible = progress.residual <= 0.1 * tolerance
+            path.balance(progress.iterations, norms, feasible=feasible)
             last = progress.residual <= tolerance
             if schedule.adaptive:
-                growing = primal > schedule.balance * dual
-                last = last and progress.change <= 10 * tolerance
+                last = last and progress.change <= CHANGE_OVER_TOLERANCE * tolerance
         last = last or progress.iterations >= max_iterations - 1
+        path.advance(progress.iterations, norms)
         if on_iteration:
             on_iteration(progress)
-
-        before, now = now, after
-        if warm:
-            target = schedule.ratio * before * multiplier_norm / max(sparse_norm, 1e-3 * norm)
-            after = min(max(target, now / 3), now * 3)
-        elif growing:
-            after = min(now * schedule.growth, max(now, _LARGEST_PENALTY / norm))

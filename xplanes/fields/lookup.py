@@ -24,6 +24,7 @@ SPACE_COLUMNS = (0, 0, 1)
 SPACE_ROWS = (1, 2, 2)
 """Axes (x = 0, y = 1, z = 2) along columns and rows of the planes xy, xz, yz."""
 
+
 def time_plane_axes(rows: Rows) -> list[int]:
     """Space axis along the columns of each time plane of a plane set, in order of the planes."""
     axes: dict[int, int] = {}
@@ -93,9 +94,7 @@ class _Features(torch.autograd.Function):
         axes = torch.tensor(time_plane_axes(rows), dtype=torch.int64)
         features = space.new_empty(count, 3, channels)
         factors = space.new_empty(count, len(moving), channels)
-        cpu.gather(
-            *_arrays(space, moving, points, times, pairs, axes), *_arrays(features, factors)
-        )
+        cpu.gather(*_arrays(space, moving, points, times, pairs, axes), *_arrays(features, factors))
         ctx.save_for_backward(points, times, pairs, axes, factors)
         ctx.shapes = (space.shape, moving.shape)
         return features

@@ -137,9 +137,7 @@ def random_planes(
         Planes by name. [C, rows, columns] each
     """
     square = (channels, resolution, resolution)
-    planes = {
-        name: space_scale * torch.randn(square, generator=generator) for name in SPACE_PLANES
-    }
+    planes = {name: space_scale * torch.randn(square, generator=generator) for name in SPACE_PLANES}
     strip = (channels, time_resolution, resolution)
     for name in TIME_PLANES[plane_set]:
         planes[name] = time_scale * torch.randn(strip, generator=generator)

@@ -23,7 +23,9 @@ def step_generator(seed: int, step: int, stream: int = 0) -> torch.Generator:
         stream: Tells independent uses apart: the rank of a process, or another purpose.
     """
     # Odd constants spread neighbouring triples over 64 bits (splitmix64).
-    key = (seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9 + stream * 0x94D049BB133111EB) % 2**64
+    key = (
+        seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9 + stream * 0x94D049BB133111EB
+    ) % 2**64
     key = ((key ^ (key >> 30)) * 0xBF58476D1CE4E5B9) % 2**64
     key = ((key ^ (key >> 27)) * 0x94D049BB133111EB) % 2**64
     return torch.Generator().manual_seed(key ^ (key >> 31))

@@ -63,6 +63,7 @@ class RadianceModule(LightningModule):
         self.unusable = 0
         self.unusable_in_a_row = 0
         self.last: dict[str, float] = {}
+        self.improved = False
 
     @property
     def progress(self) -> float:
@@ -77,9 +78,7 @@ class RadianceModule(LightningModule):
             {"params": [self.field.space], "lr": self.options.plane_lr, "name": "space"}
         ]
         if self.field.time is not None:
-            groups.append(
-                {"params": [self.field.time], "lr": self.options.time_lr, "name": "time"}
-            )
+            groups.append({"params": [self.field.time], "lr": self.options.time_lr, "name": "time"})
         decoder = [p for p in self.field.decoder.parameters() if p.requires_grad]
         if decoder:
             groups.append({"params": decoder, "lr": self.options.decoder_lr, "name": "decoder"})

@@ -1,0 +1,91 @@
+"""Table and plot of the run times that decomposition_speed.py measured.
+
+python benchmarks/decomposition_speed_report.py
+"""
+
+import csv
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+RESULTS = Path(__file__).parent / "results"
+NAMES = {
+    "svd": "(a) paper's ADMM, full SVD",
+    "gram": "(b) paper's ADMM, Gram matrix",
+    "admm": "paper's ADMM, fused passes",
+    "growing": "growing penalty (inexact ALM)",
+    "adaptive": "default (adaptive)",
+}
+TARGETS = (
+    ("residual", (1e-3, 1e-5, 1e-7)),
+    ("objective", (1e-2, 1e-3, 1e-4)),
+    ("low_rank", (1e-2, 1e-3)),
+    ("sparse", (1e-2, 1e-3)),
+)
+HEAD = """# Robust PCA: run time against error
+
+163,840 rows (64 x 64 cells of 40 features), float32, two cores of an AMD EPYC, torch 2.13. Seconds
+until an error falls below a bound and stays there. Residual: |L + S - Y| / |Y|. Errors against a
+long float64 run: objective of the feasible pair (L, Y - L), relative difference of L and of S.
+`-`: not reached within the seconds given (last column). Scripts: `decomposition_speed.py` and
+`decomposition_speed_report.py` in benchmarks; all points: `decomposition_speed.csv`.
+"""
+
+
+def reached(rows: list[dict[str, str]], name: str, bound: float) -> float | None:
+    """Seconds after which the error stays below the bound."""
+    answer = None
+    for row in reversed(rows):
+        if abs(float(row[name])) > bound:
+            break
+        answer = float(row["seconds"])
+    return answer
+
+
+def main() -> None:
+    with (RESULTS / "decomposition_speed.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    cases = sorted({(row["weight"], int(row["frames"])) for row in rows})
+    figure, axes = plt.subplots(len(cases), 3, figsize=(13, 3.2 * len(cases)), squeeze=False)
+    bounds = [(name, bound) for name, values in TARGETS for bound in values]
+    lines = [HEAD]
+    for line, (weight, frames) in zip(axes, cases, strict=True):
+        heads = " | ".join(f"{name} {bound:.0e}" for name, bound in bounds)
+        lines.append(f"\n## {frames} frames, sparsity weight {weight}\n")
+        lines.append(f"| method | s per iteration | {heads} | given |")
+        lines.append("|" + "---|" * (len(bounds) + 3))
+        times: dict[str, list[float | None]] = {}
+        for part, title in NAMES.items():
+            key = (weight, str(frames), part)
+            chosen = [row for row in rows if (row["weight"], row["frames"], row["part"]) == key]
+            if not chosen:
+                continue
+            chosen.sort(key=lambda row: int(row["iterations"]))
+            times[part] = [reached(chosen, name, bound) for name, bound in bounds]
+            cells = " | ".join("-" if t is None else f"{t:.2f}" for t in times[part])
+            given = chosen[-1]["seconds"]
+            each = float(given) / int(chosen[-1]["iterations"])
+            lines.append(f"| {title} | {each:.3f} | {cells} | {float(given):.0f} |")
+            for axis, name in zip(line, ("residual", "objective", "low_rank"), strict=True):
+                seconds = [float(row["seconds"]) for row in chosen]
+                axis.loglog(seconds, [abs(float(row[name])) for row in chosen], ".-", label=title)
+                axis.set(xlabel="seconds", ylabel=name.replace("_", "-"))
+                axis.set_title(f"{frames} frames, weight {weight}", fontsize=9)
+                axis.grid(alpha=0.3)
+        if {"svd", "adaptive"} <= set(times):
+            pairs = zip(times["svd"], times["adaptive"], strict=True)
+            gains = " | ".join(
+                f"**{slow / fast:.0f}x**" if slow and fast else "-" for slow, fast in pairs
+            )
+            lines.append(f"| (a) over the default | | {gains} | |")
+    axes[0][0].legend(fontsize=7)
+    figure.tight_layout()
+    figure.savefig(RESULTS / "decomposition_speed.png", dpi=75)
+    (RESULTS / "decomposition_speed.md").write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

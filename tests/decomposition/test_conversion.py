@@ -1,0 +1,110 @@
+import pytest
+import torch
+from torch.nn.functional import grid_sample
+
+from xplanes.decomposition import TIME_PLANES, TIME_ROWS, space_planes, time_planes
+from xplanes.decomposition.conversion import frame_profiles
+
+
+def triplanes(frames=5, channels=3, size=8, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(frames, 3, channels, size, size, generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("frames", [1, 4, 5])
+def test_static_choices(frames):
+    low = triplanes(frames)
+    for static, expected in (
+        ("middle", low[frames // 2]),
+        ("mean", low.mean(0)),
+        ("median", low.quantile(0.5, dim=0)),
+    ):
+        planes = space_planes(low, static=static)
+        assert torch.allclose(planes, expected.permute(0, 2, 3, 1))
+        assert planes.is_contiguous()
+
+
+@pytest.mark.parametrize("resolution", [4, 12, 16])
+def test_another_resolution_samples_the_same_function(resolution):
+    low = triplanes(1)
+    planes = space_planes(low, resolution=resolution)
+    centres = (torch.arange(resolution, dtype=torch.float64) + 0.5) / resolution * 2 - 1
+    rows, columns = torch.meshgrid(centres, centres, indexing="ij")
+    grid = torch.stack([columns, rows], -1).expand(3, -1, -1, -1)
+    expected = grid_sample(low[0], grid, padding_mode="zeros", align_corners=False)
+    assert torch.allclose(planes, expected.permute(0, 2, 3, 1))
+
+
+def test_oblong_triplanes_become_square_planes():
+    low = torch.randn(3, 3, 2, 6, 10)
+    assert space_planes(low, resolution=8).shape == (3, 8, 8, 2)
+    with pytest.raises(ValueError, match="name a resolution"):
+        space_planes(low)
+
+
+def test_storage_order_and_rows_agree():
+    axes = {"xy": ("xt", "yt"), "xz": ("xt", "zt"), "yz": ("yt", "zt")}
+    for plane_set, names in TIME_PLANES.items():
+        for pair, expected in zip(TIME_ROWS[plane_set], axes.values(), strict=True):
+            assert (names[pair[0]], names[pair[1]]) == expected
+
+
+@pytest.mark.parametrize("dynamic", ["random", "rank1"])
+@pytest.mark.parametrize(("plane_set", "count"), [("six", 3), ("nine", 6)])
+def test_shapes_noise_and_seed(dynamic, plane_set, count):
+    sparse = triplanes().float()
+    options = {"plane_set": plane_set, "dynamic": dynamic, "resolution": 16, "time_resolution": 9}
+
+    def make(noise, seed=3):
+        generator = torch.Generator().manual_seed(seed)
+        return time_planes(sparse, noise=noise, generator=generator, **options)
+
+    planes = make(0.01)
+    assert planes.shape == (count, 9, 16, 3)
+    assert torch.equal(planes, make(0.01))
+    assert (planes - make(0.0)).std() == pytest.approx(0.01, rel=0.1)
+    if dynamic == "random":
+        assert not make(0.0).any()
+
+
+def test_frames_own_rows_and_other_row_counts_interpolate():
+    sparse = triplanes(5)
+    own = time_planes(sparse, plane_set="nine", noise=0)
+    fine = time_planes(sparse, plane_set="nine", noise=0, time_resolution=9)
+    assert torch.allclose(fine[:, ::2], own)
+    assert torch.allclose(fine[:, 1::2], (own[:, 1:] + own[:, :-1]) / 2)
+    single = time_planes(sparse, plane_set="nine", noise=0, time_resolution=1)
+    assert torch.allclose(single[:, 0], own[:, 2])
+
+
+def test_profiles_follow_grid_sample():
+    planes = torch.randn(3, 7, 12, 2, dtype=torch.float64)
+    frames = torch.tensor([0, 3, 10])
+    values = frame_profiles(planes, frames, 11, 8)
+    width = (torch.arange(8, dtype=torch.float64) + 0.5) / 8 * 2 - 1
+    time = frames.double() / 10 * 2 - 1
+    # Along time align_corners=True: the same node at align_corners=False of 7 rows.
+    time = time * 6 / 7
+    grid = torch.stack(torch.meshgrid(width, time, indexing="xy"), -1).expand(3, -1, -1, -1)
+    expected = grid_sample(planes.permute(0, 3, 1, 2), grid, align_corners=False)
+    assert torch.allclose(values, expected.permute(0, 2, 3, 1))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"plane_set": "four"}, "six, nine"),
+        ({"plane_set": "six", "dynamic": "svd"}, "random, rank1"),
+        ({"plane_set": "six", "noise": -1.0}, "noise"),
+        ({"plane_set": "six", "resolution": 0}, "resolution"),
+        ({"plane_set": "six", "time_resolution": 0}, "time_resolution"),
+    ],
+)
+def test_refuses_options_out_of_range(options, words):
+    with pytest.raises(ValueError, match=words):
+        time_planes(triplanes(), **options)
+
+
+def test_refuses_another_static_choice():
+    with pytest.raises(ValueError, match="middle, median, mean"):
+        space_planes(triplanes(), static="first")

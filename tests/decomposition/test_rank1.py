@@ -1,0 +1,115 @@
+import pytest
+import torch
+
+from xplanes.decomposition import TIME_ROWS, time_planes, unexplained_energy
+from xplanes.decomposition.rank1 import rank1_factors, shared_factors
+
+
+def moving(frames=6, channels=3, size=12, seed=0):
+    """Discs that move, different in every orientation, with exact zeros around them."""
+    generator = torch.Generator().manual_seed(seed)
+    sparse = torch.zeros(frames, 3, channels, size, size, dtype=torch.float64)
+    grid = torch.arange(size, dtype=torch.float64)
+    for frame in range(frames):
+        for index in range(3):
+            x, y = 4 + 0.6 * frame, 5 + index - 0.3 * frame
+            inside = (grid - x) ** 2 + (grid[:, None] - y) ** 2 < 9
+            colour = torch.randn(channels, 1, 1, generator=generator, dtype=torch.float64)
+            sparse[frame, index] = inside * (colour + 0.3 * torch.sin(grid[:, None]))
+    return sparse
+
+
+def products(first, second):
+    return second.mT[..., None] * first.mT[..., None, :]
+
+
+def test_nine_planes_reach_the_best_rank_one_residual():
+    planes = moving()[:, 0]
+    wide, tall = rank1_factors(planes)
+    values = torch.linalg.svdvals(planes)
+    best = values[..., 1:].square().sum()
+    left = (planes - products(wide, tall)).square().sum()
+    assert left <= best * (1 + 1e-6) + 1e-12
+    # Half of the magnitude lies in each factor.
+    assert torch.allclose(wide.norm(dim=1), values[..., 0].sqrt())
+    assert torch.allclose(tall.norm(dim=1), values[..., 0].sqrt())
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e6])
+def test_random_slices_of_any_scale(scale):
+    generator = torch.Generator().manual_seed(0)
+    planes = scale * torch.randn(4, 2, 9, 11, generator=generator)
+    wide, tall = rank1_factors(planes)
+    best = torch.linalg.svdvals(planes)[..., 1:].double().square().sum()
+    left = (planes - products(wide, tall)).double().square().sum()
+    assert left <= best * 1.02
+
+
+def test_zero_slices_stay_zero():
+    planes = moving()[:, 0]
+    planes[2] = 0
+    planes[:, 1] = 0
+    wide, tall = rank1_factors(planes)
+    assert not wide[2].any()
+    assert not tall[..., 1].any()
+    assert torch.isfinite(wide).all()
+
+
+def test_signs_do_not_jump_between_frames():
+    wide, tall = rank1_factors(moving()[:, 0].abs() * torch.tensor([1, -1, 1.0])[:, None, None])
+    agreement = (wide[1:] * wide[:-1]).sum(1) + (tall[1:] * tall[:-1]).sum(1)
+    assert (agreement >= -1e-12).all()
+
+
+def loss(sparse, factors):
+    pairs = TIME_ROWS["six"]
+    return sum(
+        (sparse[:, index] - products(factors[a], factors[b])).square().sum()
+        for index, (a, b) in enumerate(pairs)
+    )
+
+
+def test_six_planes_end_where_no_single_plane_can_be_improved():
+    sparse = moving()
+    factors = shared_factors(sparse)
+    value = loss(sparse, factors)
+    for index in range(3):
+        for _ in range(3):
+            moved = list(factors)
+            moved[index] = moved[index] + 1e-3 * torch.randn_like(moved[index])
+            assert loss(sparse, moved) > value * (1 - 1e-3)
+    assert value < 0.9 * sparse.square().sum()
+
+
+def test_six_planes_recover_shared_factors():
+    generator = torch.Generator().manual_seed(1)
+    truth = [torch.randn(5, 8, 2, generator=generator, dtype=torch.float64) for _ in range(3)]
+    sparse = torch.stack([products(truth[a], truth[b]) for a, b in TIME_ROWS["six"]], 1)
+    assert loss(sparse, shared_factors(sparse)) < 1e-6 * sparse.square().sum()
+
+
+@pytest.mark.parametrize("plane_set", ["six", "nine"])
+def test_rank_one_leaves_less_than_a_random_start(plane_set):
+    sparse = moving()
+    rows = TIME_ROWS[plane_set]
+    left = {
+        dynamic: unexplained_energy(
+            time_planes(sparse, plane_set=plane_set, dynamic=dynamic), sparse, rows=rows
+        )
+        for dynamic in ("random", "rank1")
+    }
+    assert left["random"] == pytest.approx(1, abs=0.01)
+    assert left["rank1"] < 0.6
+
+
+def test_nothing_moves():
+    sparse = torch.zeros(3, 3, 2, 4, 4)
+    for plane_set, rows in TIME_ROWS.items():
+        planes = time_planes(sparse, plane_set=plane_set, noise=0)
+        assert not planes.any()
+        assert unexplained_energy(planes, sparse, rows=rows) == 0
+
+
+def test_six_planes_need_square_triplanes():
+    with pytest.raises(ValueError, match="square"):
+        time_planes(torch.ones(2, 3, 1, 4, 6), plane_set="six", resolution=4)

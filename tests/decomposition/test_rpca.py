@@ -1,0 +1,275 @@
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from rpca_oracle import objective, oracle, relative
+
+from xplanes.decomposition import robust_pca
+
+
+def mixture(rows=400, columns=12, rank=2, noise=0.01, share=0.05, seed=0, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
+    low = draw(rows, rank) @ draw(rank, columns) / rank**0.5
+    hit = torch.rand(rows, columns, generator=generator) < share
+    return (low + hit * 3 * draw(rows, columns) + noise * draw(rows, columns)).to(dtype)
+
+
+@pytest.mark.parametrize(
+    ("weight", "method"),
+    [(0.02, "adaptive"), (0.05, "adaptive"), (0.2, "adaptive"), (0.2, "admm"), (0.2, "exact")],
+)
+def test_agrees_with_the_oracle(weight, method):
+    matrix = mixture()
+    low, sparse = oracle(matrix, weight)
+    result = robust_pca(
+        matrix, sparsity_weight=weight, tolerance=1e-7, max_iterations=3000, method=method
+    )
+    assert result.converged
+    assert relative(result.low_rank, low) < 1e-4
+    assert relative(result.sparse, sparse) < 1e-3
+    best = objective(low, matrix, weight)
+    assert abs(objective(result.low_rank, matrix, weight) / best - 1) < 1e-5
+
+
+def test_growing_penalty_is_feasible_soon_and_near_the_optimum():
+    matrix = mixture()
+    low, _ = oracle(matrix, 0.05)
+    result = robust_pca(matrix, sparsity_weight=0.05, tolerance=1e-7, method="growing")
+    assert result.converged
+    best = objective(low, matrix, 0.05)
+    assert objective(result.low_rank, matrix, 0.05) / best - 1 < 5e-3
+
+
+def test_the_fused_passes_repeat_the_plain_iteration():
+    matrix = mixture()
+    options = {"sparsity_weight": 0.05, "penalty": 0.1, "tolerance": 1e-15, "max_iterations": 9}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        plain = robust_pca(matrix, method="exact", **options)
+        fused = robust_pca(matrix, method="admm", **options)
+    assert torch.allclose(plain.low_rank, fused.low_rank, atol=1e-9)
+    assert torch.allclose(plain.sparse, fused.sparse, atol=1e-9)
+    assert plain.rank == fused.rank
+
+
+@pytest.mark.parametrize("columns", [30, 120])
+def test_several_blocks_and_both_layouts_give_the_same(columns, monkeypatch):
+    matrix = mixture(rows=1000, columns=columns)
+    whole = robust_pca(matrix, sparsity_weight="auto")
+    monkeypatch.setattr("xplanes.decomposition.passes.block_rows", lambda _: 96)
+    blocks = robust_pca(matrix, sparsity_weight="auto")
+    frames_first = robust_pca(matrix.mT.contiguous().mT, sparsity_weight="auto")
+    for other in (blocks, frames_first):
+        assert torch.allclose(whole.low_rank, other.low_rank, atol=1e-7)
+        assert torch.allclose(whole.sparse, other.sparse, atol=1e-7)
+
+
+@pytest.mark.parametrize("rank", [1, 5, 10])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_recovers_low_rank_plus_sparse(rank, dtype):
+    generator = torch.Generator().manual_seed(rank)
+    low = torch.randn(4000, rank, generator=generator) @ torch.randn(rank, 200, generator=generator)
+    hit = torch.rand(4000, 200, generator=generator) < 0.05
+    sparse = hit * 10.0 * torch.randn(4000, 200, generator=generator).sign()
+    result = robust_pca((low + sparse).to(dtype), sparsity_weight="auto", tolerance=1e-5)
+    assert result.converged
+    assert result.rank == rank
+    assert relative(result.low_rank, low.double().numpy()) < 1e-4
+    assert relative(result.sparse, sparse.double().numpy()) < 1e-4
+
+
+@pytest.mark.parametrize("exponent", [-25, -6, -3, 0, 3, 6, 25])
+def test_every_scale_has_the_same_answer(exponent):
+    matrix = mixture(dtype=torch.float32)
+    unit = robust_pca(matrix, sparsity_weight=0.05)
+    scaled = robust_pca(matrix * 10.0**exponent, sparsity_weight=0.05)
+    assert scaled.iterations == unit.iterations
+    assert scaled.rank == unit.rank
+    assert scaled.converged
+    assert (
+        relative(scaled.low_rank.double() / 10.0**exponent, unit.low_rank.double().numpy()) < 1e-5
+    )
+    assert scaled.unit == pytest.approx(unit.unit * 10.0**exponent, rel=1e-5)
+
+
+def test_an_absolute_penalty_depends_on_the_scale():
+    matrix = mixture()
+    options = {"method": "admm", "max_iterations": 10, "sparsity_weight": 0.05}
+    with pytest.warns(UserWarning, match="10 iterations"):
+        small = robust_pca(matrix * 0.1, scale="none", **options)
+    with pytest.warns(UserWarning, match="10 iterations"):
+        same = robust_pca(matrix * 0.1, scale="rms", **options)
+    with pytest.warns(UserWarning, match="10 iterations"):
+        unit = robust_pca(matrix, scale="rms", **options)
+    assert small.unit == 1.0
+    assert relative(same.low_rank * 10, unit.low_rank.numpy()) < 1e-9
+    assert relative(small.low_rank * 10, unit.low_rank.numpy()) > 1e-3
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+def test_types(dtype):
+    matrix = mixture(dtype=torch.float32).to(dtype)
+    copy = matrix.clone()
+    result = robust_pca(matrix, sparsity_weight=0.05)
+    truth = robust_pca(matrix.double(), sparsity_weight=0.05)
+    expected = torch.float64 if dtype == torch.float64 else torch.float32
+    assert result.low_rank.dtype == result.sparse.dtype == expected
+    assert relative(result.low_rank, truth.low_rank.numpy()) < 1e-4
+    assert torch.equal(matrix, copy)
+
+
+def test_strided_and_differentiable_input():
+    matrix = mixture(rows=800, columns=24)
+    view = matrix[::2, ::2].requires_grad_()
+    result = robust_pca(view, sparsity_weight=0.05)
+    same = robust_pca(view.detach().contiguous(), sparsity_weight=0.05)
+    assert torch.allclose(result.low_rank, same.low_rank, atol=1e-12)
+    assert not result.low_rank.requires_grad
+    expanded = torch.randn(50, 1).expand(50, 7)
+    assert robust_pca(expanded, sparsity_weight=0.1).rank == 1
+
+
+def test_zeros():
+    result = robust_pca(torch.zeros(20, 5))
+    assert (result.rank, result.iterations, result.residual, result.converged) == (0, 0, 0.0, True)
+    assert not result.low_rank.any()
+    assert not result.sparse.any()
+    assert result.drift == result.sparsity == 0
+
+
+@pytest.mark.parametrize("columns", [1, 2, 40])
+def test_a_constant_sequence_stands_still(columns):
+    matrix = torch.randn(500, 1, generator=torch.Generator().manual_seed(0)).repeat(1, columns)
+    result = robust_pca(matrix, sparsity_weight="auto", tolerance=1e-6)
+    low, _ = oracle(matrix, 500**-0.5)
+    assert result.converged
+    assert result.drift < 1e-5
+    assert (result.low_rank - torch.from_numpy(low)).norm() < 1e-4 * matrix.norm()
+    if columns == 40:
+        assert result.rank == 1
+        assert result.sparse.abs().max() < 1e-4
+
+
+@pytest.mark.parametrize(("weight", "kept"), [(0.03, 0.0), (0.09, 1.0)])
+def test_a_single_column_goes_where_it_costs_less(weight, kept):
+    # For one column the two norms compete as a whole: all sparse, or all low-rank.
+    matrix = torch.linspace(-1, 1, 400, dtype=torch.float64)[:, None]
+    low, _ = oracle(matrix, weight)
+    result = robust_pca(matrix, sparsity_weight=weight, tolerance=1e-7, max_iterations=3000)
+    assert result.converged
+    assert result.low_rank_energy == pytest.approx(kept, abs=1e-4)
+    assert (result.low_rank - torch.from_numpy(low)).norm() < 1e-4 * matrix.norm()
+
+
+def test_a_single_moving_entry_is_sparse():
+    matrix = torch.randn(600, 1, generator=torch.Generator().manual_seed(1)).repeat(1, 20)
+    still = matrix.clone()
+    matrix[17, 5] += 4
+    result = robust_pca(matrix, sparsity_weight="auto", tolerance=1e-6)
+    assert result.rank == 1
+    assert relative(result.low_rank, still.numpy()) < 1e-4
+    assert result.sparse.abs().argmax() == 17 * 20 + 5
+    assert result.sparse.abs().max() == pytest.approx(4, rel=1e-3)
+
+
+def test_a_corrupted_frame_is_split_as_the_oracle_does():
+    generator = torch.Generator().manual_seed(2)
+    matrix = torch.randn(600, 1, generator=generator).repeat(1, 20)
+    matrix[:, 7] = 5 * torch.randn(600, generator=generator)
+    low, sparse = oracle(matrix, 0.03)
+    result = robust_pca(matrix, sparsity_weight=0.03, tolerance=1e-6)
+    assert relative(result.low_rank, low) < 1e-3
+    assert relative(result.sparse, sparse) < 1e-3
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_refuses_what_is_not_finite(bad):
+    matrix = torch.ones(10, 3)
+    matrix[4, 1] = bad
+    with pytest.raises(ValueError, match="NaN or infinity"):
+        robust_pca(matrix)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"sparsity_weight": 0}, "sparsity_weight"),
+        ({"sparsity_weight": -1.0}, "sparsity_weight"),
+        ({"sparsity_weight": float("nan")}, "sparsity_weight"),
+        ({"sparsity_weight": "best"}, "'auto'"),
+        ({"penalty": 0}, "penalty"),
+        ({"tolerance": -1e-3}, "tolerance"),
+        ({"max_iterations": 0}, "max_iterations"),
+        ({"method": "pcp"}, "adaptive, growing"),
+        ({"scale": "max"}, "rms, none"),
+    ],
+)
+def test_refuses_options_out_of_range(options, words):
+    with pytest.raises(ValueError, match=words):
+        robust_pca(torch.ones(4, 2), **options)
+
+
+@pytest.mark.parametrize("shape", [(3,), (2, 3, 4), (0, 3), (3, 0)])
+def test_refuses_other_shapes(shape):
+    with pytest.raises(ValueError, match="non-empty matrix"):
+        robust_pca(torch.ones(shape))
+
+
+def test_refuses_integers():
+    with pytest.raises(TypeError, match="int64"):
+        robust_pca(torch.ones(3, 3, dtype=torch.int64))
+
+
+@pytest.mark.parametrize("method", ["adaptive", "growing", "admm", "exact"])
+def test_the_limit_is_reported_once(method):
+    with pytest.warns(UserWarning, match="raise max_iterations") as caught:
+        result = robust_pca(mixture(), tolerance=1e-9, max_iterations=3, method=method)
+    assert len(caught) == 1
+    assert not result.converged
+    assert result.iterations == 3
+
+
+def test_the_residual_and_the_shares_are_measured_on_the_result():
+    matrix = mixture(dtype=torch.float32)
+    result = robust_pca(matrix, sparsity_weight=0.05)
+    low, sparse = result.low_rank.double(), result.sparse.double()
+    norm = matrix.double().norm()
+    assert result.residual == pytest.approx(
+        ((low + sparse - matrix).norm() / norm).item(), rel=1e-2
+    )
+    assert result.sparsity == pytest.approx((sparse != 0).double().mean().item())
+    assert result.low_rank_energy == pytest.approx((low.norm() / norm).item() ** 2)
+    assert result.sparse_energy == pytest.approx((sparse.norm() / norm).item() ** 2)
+    assert result.drift == pytest.approx(((low - low[:, 6:7]).norm() / low.norm()).item(), rel=1e-4)
+    assert np.linalg.matrix_rank(low.numpy(), tol=1e-6 * norm.item()) == result.rank
+
+
+def test_the_report_holds_builtins_only():
+    report = robust_pca(mixture(), sparsity_weight=0.05).report()
+    assert {type(value) for value in report.values()} <= {int, float, bool, str}
+    assert "low_rank" not in report
+    assert {"rank", "iterations", "residual", "converged", "sparsity", "drift"} <= set(report)
+
+
+def test_reduced_precision_settings_do_not_leak_in_or_out():
+    matrix = mixture(dtype=torch.float32)
+    plain = robust_pca(matrix, sparsity_weight=0.05)
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
+    try:
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            guarded = robust_pca(matrix, sparsity_weight=0.05)
+        assert torch.get_float32_matmul_precision() == "medium"
+    finally:
+        torch.set_float32_matmul_precision(before)
+    assert torch.equal(plain.low_rank, guarded.low_rank)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_on_a_gpu():
+    matrix = mixture(dtype=torch.float32)
+    here = robust_pca(matrix, sparsity_weight=0.05)
+    there = robust_pca(matrix.cuda(), sparsity_weight=0.05)
+    assert relative(there.low_rank.cpu(), here.low_rank.numpy()) < 1e-4

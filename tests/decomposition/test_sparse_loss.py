@@ -1,0 +1,110 @@
+import itertools
+
+import pytest
+import torch
+from torch.nn.functional import grid_sample
+
+from xplanes.decomposition import TIME_ROWS, sparse_product_loss, time_planes
+
+FRAMES, CHANNELS, HEIGHT, WIDTH = 5, 2, 6, 6
+
+
+def case(plane_set, resolution=9, rows=7, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    planes = draw(3 if plane_set == "six" else 6, rows, resolution, CHANNELS)
+    return planes, draw(FRAMES, 3, CHANNELS, HEIGHT, WIDTH)
+
+
+def full_sum(planes, sparse, plane_set):
+    """Entry by entry: every cell of every frame looked up with grid_sample on its own."""
+    rows, total = planes.shape[1], 0.0
+    for frame, index in itertools.product(range(FRAMES), range(3)):
+        first, second = TIME_ROWS[plane_set][index]
+
+        def value(plane, cell, size, frame=frame):
+            along = (cell + 0.5) / size * 2 - 1
+            time = (frame / (FRAMES - 1) * (rows - 1) + 0.5) / rows * 2 - 1
+            grid = torch.tensor([[[[along, time]]]], dtype=torch.float64)
+            image = planes[plane].permute(2, 0, 1)[None]
+            return grid_sample(image, grid, align_corners=False)[0, :, 0, 0]
+
+        for row, column in itertools.product(range(HEIGHT), range(WIDTH)):
+            product = value(first, column, WIDTH) * value(second, row, HEIGHT)
+            total += (sparse[frame, index, :, row, column] - product).square().sum()
+    return total / sparse.numel()
+
+
+@pytest.mark.parametrize("plane_set", ["six", "nine"])
+@pytest.mark.parametrize(("resolution", "rows"), [(6, 5), (9, 7), (4, 3)])
+def test_all_frames_give_the_full_sum(plane_set, resolution, rows):
+    planes, sparse = case(plane_set, resolution, rows)
+    value = sparse_product_loss(planes, sparse, torch.arange(FRAMES), rows=TIME_ROWS[plane_set])
+    assert value == pytest.approx(full_sum(planes, sparse, plane_set).item(), rel=1e-10)
+
+
+@pytest.mark.parametrize("draws", [1, 2])
+def test_the_mean_over_all_draws_is_the_full_loss(draws):
+    planes, sparse = case("nine")
+    rows = TIME_ROWS["nine"]
+    full = sparse_product_loss(planes, sparse, torch.arange(FRAMES), rows=rows)
+    values = [
+        sparse_product_loss(planes, sparse, torch.tensor(frames), rows=rows)
+        for frames in itertools.product(range(FRAMES), repeat=draws)
+    ]
+    assert torch.stack(values).mean() == pytest.approx(full.item(), rel=1e-12)
+
+
+@pytest.mark.parametrize("plane_set", ["six", "nine"])
+def test_gradients(plane_set):
+    planes, sparse = case(plane_set, resolution=4, rows=3)
+    frames = torch.tensor([0, 3, 3])
+    torch.autograd.gradcheck(
+        lambda p: sparse_product_loss(p, sparse, frames, rows=TIME_ROWS[plane_set]),
+        planes.requires_grad_(),
+    )
+
+
+def test_nine_planes_with_equal_twins_are_six_planes():
+    planes, sparse = case("six")
+    xt, yt, zt = planes
+    twins = torch.stack([xt, yt, xt, zt, yt, zt])
+    frames = torch.tensor([1, 4])
+    six = sparse_product_loss(planes, sparse, frames, rows=TIME_ROWS["six"])
+    nine = sparse_product_loss(twins, sparse, frames, rows=TIME_ROWS["nine"])
+    assert six == nine
+
+
+def test_descent_from_noise_ends_at_the_rank_one_start():
+    _, sparse = case("nine")
+    rows, frames = TIME_ROWS["nine"], torch.arange(FRAMES)
+    best = sparse_product_loss(
+        time_planes(sparse, plane_set="nine", noise=0), sparse, frames, rows=rows
+    )
+    planes = time_planes(
+        sparse,
+        plane_set="nine",
+        dynamic="random",
+        noise=0.3,
+        generator=torch.Generator().manual_seed(0),
+    ).requires_grad_()
+    optimizer = torch.optim.Adam([planes], lr=0.05)
+    for _ in range(600):
+        optimizer.zero_grad()
+        value = sparse_product_loss(planes, sparse, frames, rows=rows)
+        value.backward()
+        optimizer.step()
+    assert best.item() <= value.item() * (1 + 1e-4)
+    assert value.item() <= best.item() * 1.1
+
+
+def test_one_frame_and_half_precision_targets():
+    planes, sparse = case("six", rows=1)
+    value = sparse_product_loss(
+        planes.float(), sparse[:1].half(), torch.tensor([0]), rows=TIME_ROWS["six"]
+    )
+    assert value.dtype == torch.float32
+    assert torch.isfinite(value)

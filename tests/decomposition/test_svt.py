@@ -1,0 +1,43 @@
+import pytest
+import torch
+
+from xplanes.decomposition.svt import needs_double, singular_value_threshold
+
+
+def conditioned(rows, columns, condition, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(0)
+    left = torch.linalg.qr(torch.randn(rows, columns, generator=generator, dtype=torch.float64)).Q
+    right = torch.linalg.qr(
+        torch.randn(columns, columns, generator=generator, dtype=torch.float64)
+    ).Q
+    values = torch.logspace(0, -torch.log10(torch.tensor(condition)).item(), columns)
+    return ((left * values.double()) @ right).to(dtype)
+
+
+@pytest.mark.parametrize("condition", [1e1, 1e3, 1e6])
+@pytest.mark.parametrize("threshold", [0.5, 1e-2, 1e-4])
+def test_gram_ties_to_the_exact_decomposition(condition, threshold):
+    matrix = conditioned(3000, 20, condition)
+    fast, rank = singular_value_threshold(matrix, threshold)
+    slow, expected = singular_value_threshold(matrix, threshold, exact=True)
+    assert rank == expected
+    assert (fast - slow).norm() < 1e-8 * slow.norm()
+
+
+@pytest.mark.parametrize("condition", [1e1, 1e3, 1e6])
+def test_float32_stays_near_the_float64_answer(condition):
+    matrix = conditioned(3000, 20, condition)
+    fast, _ = singular_value_threshold(matrix.float(), 1e-3)
+    slow, _ = singular_value_threshold(matrix, 1e-3, exact=True)
+    assert (fast.double() - slow).norm() < 1e-6 * slow.norm()
+
+
+def test_a_threshold_above_everything_gives_zero():
+    shrunk, rank = singular_value_threshold(torch.ones(10, 3), 100.0)
+    assert rank == 0
+    assert not shrunk.any()
+
+
+def test_double_is_asked_for_when_squaring_would_cost_accuracy():
+    assert not needs_double(100.0, 1.0)
+    assert needs_double(1e4, 1.0)

@@ -1,0 +1,1 @@
+"""After training: scores, pictures, films and tables from run directories."""

@@ -1,0 +1,130 @@
+"""What a run says of itself: its first lines, metrics.json, TensorBoard's HParams, its last lines."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from xplanes import __version__, backend
+from xplanes.config import TrainConfig
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.views import Scene
+from xplanes.training.module import RadianceModule
+from xplanes.training.scorer import device_memory
+from xplanes.training.scoring import ViewScore, mean
+
+
+def header(
+    config: TrainConfig,
+    run: Path,
+    scene: Scene,
+    frame: Frame,
+    module: RadianceModule,
+    device: str,
+    overrides: list[str],
+) -> str:
+    """The lines printed before training: what is about to happen, on what."""
+    counts = " / ".join(f"{len(views)} {name}" for name, views in scene.splits.items())
+    train = scene.splits["train"]
+    size = sum(views.nbytes for views in scene.splits.values()) / 2**20
+    trainable = sum(p.numel() for p in module.parameters() if p.requires_grad)
+    frozen = sum(p.numel() for p in module.parameters()) - trainable
+    planes = " ".join(module.field.planes)
+    moving = "" if module.field.time is not None else " · one moment only: no planes of time"
+    budget = f"{config.trainer.max_steps} steps"
+    if config.trainer.max_seconds is not None:
+        budget += f" or {config.trainer.max_seconds:g} s, whichever comes first"
+    lines = {
+        "xplanes": f"{__version__} · torch {torch.__version__} · {device} · "
+        f"{torch.get_num_threads()} threads · precision {config.trainer.precision} · "
+        f"{backend.name(torch.device('cuda' if device.startswith('cuda') else 'cpu'))}",
+        "run": str(run),
+        "data": f"{config.data.name} {scene.name} · {counts} views · "
+        f"{train.width}x{train.height} px · {size:.1f} MB · cube {2 / frame.scale:.2f} wide",
+        "model": f"{config.model.name} ({planes}) · {config.model.channels} channels · "
+        f"{trainable:,} parameters, {frozen:,} frozen{moving}",
+        "start": "planes at random" if config.lrm.name == "none" else config.lrm.name,
+        "space": f"{100 * module.grid.occupied_fraction:.0f}% of the cube may be occupied",
+        "plan": budget,
+        "changed": " ".join(overrides) or "(nothing)",
+    }
+    return "\n".join(f"{name:<9}{text}" for name, text in lines.items())
+
+
+def summary(
+    module: RadianceModule,
+    scores: list[ViewScore],
+    split: str,
+    seconds: dict[str, Any],
+    background_skipped: float,
+) -> dict[str, Any]:
+    """The content of metrics.json."""
+    counts = module.counts
+    candidates = max(1, counts["candidates"])
+    return {
+        "split": split,
+        "test": {
+            "psnr": mean([s.psnr for s in scores]),
+            "ssim": mean([s.ssim for s in scores]),
+        },
+        "views": [{"file": s.file, "time": s.time, "psnr": s.psnr, "ssim": s.ssim} for s in scores],
+        "step": module.global_step,
+        "seconds": seconds,
+        "rays_per_second": counts["rays"] / max(module.clock, 1e-9),
+        "samples_per_ray": counts["samples"] / max(1, counts["rays"]),
+        "skipped": {
+            "empty": counts["empty"] / candidates,
+            "occluded": counts["occluded"] / candidates,
+            "background": background_skipped,
+        },
+        "steps_skipped": module.unusable,
+        "parameters": sum(p.numel() for p in module.parameters()),
+        "peak_memory_bytes": device_memory(module.device),
+    }
+
+
+def write_hparams(run: Path, config: TrainConfig, metrics: dict[str, Any]) -> None:
+    """One HParams entry per run, with its final scores."""
+    from torch.utils.tensorboard.writer import SummaryWriter
+
+    parameters = {
+        "scene": config.data.scene,
+        "views": config.data.views or 0,
+        "model": config.model.name,
+        "resolution": config.model.resolution,
+        "channels": config.model.channels,
+        "lrm": config.lrm.name,
+        "seed": config.seed,
+        "plane_lr": config.trainer.plane_lr,
+    }
+    scores = {f"test/{name}": value for name, value in metrics["test"].items()}
+    scores["time/train_s"] = metrics["seconds"]["train"]
+    with SummaryWriter(str(run / "tb")) as writer:
+        writer.add_hparams(parameters, scores, run_name=".", global_step=metrics["step"])
+
+
+def closing(run: Path, metrics: dict[str, Any]) -> str:
+    """The lines printed at the end: scores, time, paths, and what to do next."""
+    seconds, skipped = metrics["seconds"], metrics["skipped"]
+    prepare = sum(seconds["prepare"].values())
+    return "\n".join(
+        [
+            "",
+            f"{metrics['split']:<9}psnr {metrics['test']['psnr']:.2f}  ssim "
+            f"{metrics['test']['ssim']:.4f}  over {len(metrics['views'])} views, step "
+            f"{metrics['step']}",
+            f"time     prepare {prepare:.1f} s + train {seconds['train']:.1f} s · scoring "
+            f"{seconds['evaluate']:.1f} s · {seconds['total']:.1f} s in all · "
+            f"{metrics['rays_per_second'] / 1000:.1f}k rays/s",
+            f"skipped  {100 * skipped['empty']:.0f}% of samples in empty space, "
+            f"{100 * skipped['occluded']:.0f}% behind surfaces, "
+            f"{100 * skipped['background']:.0f}% of pixels as background; "
+            f"{metrics['samples_per_ray']:.1f} samples a ray remained",
+            f"wrote    {run}",
+            f"         metrics.json  curve.csv  checkpoints/last.ckpt  {metrics.get('media', '')}",
+            f"next     tensorboard --logdir {run}",
+            f"         python -m xplanes render {run}",
+            f"         python train.py resume={run} trainer.max_seconds="
+            f"{2 * max(1, round(seconds['train']))}",
+        ]
+    )

@@ -1,0 +1,145 @@
+"""The command line of train.py before Hydra sees it: typing errors and resumed runs.
+
+Must stay quick: it imports neither torch nor lightning.
+"""
+
+import difflib
+import re
+from pathlib import Path
+from typing import Any
+
+from xplanes.config import ConfigError, register_schemas
+from xplanes.files import read_json
+
+CONF = Path(__file__).resolve().parent.parent / "conf"
+
+_OVERRIDE = re.compile(r"^(?P<mark>\+\+?|~)?(?P<key>[\w./@-]+)=(?P<value>.*)$", re.DOTALL)
+
+
+def prepare(arguments: list[str], conf: Path = CONF) -> list[str]:
+    """Check overrides and turn ``resume=`` into the overrides of the run that goes on.
+
+    Args:
+        arguments: What follows ``train.py`` on the command line.
+        conf: The configuration folder.
+
+    Returns:
+        Arguments for Hydra.
+
+    Raises:
+        ConfigError: For an unknown key, with near matches, or a run that cannot be resumed.
+    """
+    check_keys(arguments, conf)
+    values = dict(_split(arguments))
+    resume = values.get("resume", "null")
+    if resume in ("null", "", "None"):
+        return arguments
+    folder = values.get("hydra.run.dir")
+    if resume == "auto":
+        if _is_multirun(arguments):
+            return arguments
+        own = [a for a in arguments if not a.startswith("resume=")]
+        found = Path(folder) if folder else _latest(Path("outputs"), own)
+        if found is None or not (found / "run.json").is_file():
+            return [*own, "resume=null"]
+        resume = str(found)
+    if _is_multirun(arguments):
+        raise ConfigError(f"resume={resume} with --multirun: resume one run at a time, or auto")
+    if folder is not None and Path(folder).resolve() != Path(resume).resolve():
+        raise ConfigError(
+            f"resume={resume} with hydra.run.dir={folder}: a run goes on in its own folder; leave "
+            "hydra.run.dir out"
+        )
+    return _resumed(Path(resume), arguments)
+
+
+def _resumed(run: Path, arguments: list[str]) -> list[str]:
+    """The run's own overrides, then the new ones, in the run's own folder."""
+    path = run / "overrides.txt"
+    if not path.is_file():
+        raise ConfigError(f"resume={run}: not a run directory, no overrides.txt in it")
+    new = [a for a in arguments if not a.startswith(("resume=", "hydra.run.dir="))]
+    changed = {key for key, _ in _split(new)}
+    old = [
+        line
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if line and not {key for key, _ in _split([line])} & changed
+    ]
+    return [*old, *new, f"hydra.run.dir={run}", f"resume={run}"]
+
+
+def _latest(outputs: Path, overrides: list[str]) -> Path | None:
+    """The newest unfinished run with the same overrides."""
+    wanted = sorted(overrides)
+    for record in sorted(outputs.glob("*/run.json"), key=_mtime, reverse=True):
+        listed = record.parent / "overrides.txt"
+        try:
+            done = read_json(record).get("status") == "finished"
+            same = sorted(filter(None, listed.read_text().splitlines())) == wanted
+        except (OSError, ValueError):
+            continue
+        if same and not done:
+            return record.parent
+    return None
+
+
+def _mtime(path: Path) -> float:
+    return path.stat().st_mtime
+
+
+def check_keys(arguments: list[str], conf: Path = CONF) -> None:
+    """Refuse overrides of keys that do not exist, naming those that are spelled alike."""
+    groups = {str(p.relative_to(conf)) for p in conf.rglob("*") if p.is_dir()}
+    pairs = [
+        (match["key"], match["value"])
+        for match in map(_OVERRIDE.match, arguments)
+        if match and not match["mark"] and not match["key"].startswith("hydra")
+    ]
+    chosen = [f"{key}={value.split(',')[0]}" for key, value in pairs if key in groups]
+    keys = _known_keys(conf, chosen)
+    for key, _ in pairs:
+        if key in groups or key in keys:
+            continue
+        if any(known.startswith(f"{key}.") for known in keys):
+            continue
+        near = difflib.get_close_matches(key, sorted(keys | groups), n=3, cutoff=0.5)
+        near = near or [k for k in sorted(keys) if k.rsplit(".", 1)[-1] == key.rsplit(".", 1)[-1]]
+        hint = f" Did you mean {' or '.join(near)}?" if near else ""
+        raise ConfigError(
+            f"{key}: there is no such setting.{hint} All are in docs/configuration.md"
+        )
+
+
+def _known_keys(conf: Path, overrides: list[str]) -> set[str]:
+    """Dotted names of all settings under a choice of groups."""
+    from hydra import compose, initialize_config_dir
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+
+    register_schemas()
+    try:
+        with initialize_config_dir(str(conf), version_base="1.3"):
+            config = compose("train", overrides)
+    except HydraException:
+        # An unknown option of a group: Hydra's own message lists those that exist.
+        with initialize_config_dir(str(conf), version_base="1.3"):
+            config = compose("train")
+    return set(_dotted(OmegaConf.to_container(config, resolve=False)))
+
+
+def _dotted(node: Any, prefix: str = "") -> list[str]:
+    if not isinstance(node, dict):
+        return [prefix]
+    names = []
+    for key, value in node.items():
+        names += _dotted(value, f"{prefix}.{key}" if prefix else str(key))
+    return names
+
+
+def _split(arguments: list[str]) -> list[tuple[str, str]]:
+    matches = map(_OVERRIDE.match, arguments)
+    return [(match["key"], match["value"]) for match in matches if match]
+
+
+def _is_multirun(arguments: list[str]) -> bool:
+    return "-m" in arguments or "--multirun" in arguments

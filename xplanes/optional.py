@@ -1,0 +1,18 @@
+"""Packages that are only needed for extras."""
+
+import importlib
+from types import ModuleType
+
+
+def require(module: str, *, extra: str) -> ModuleType:
+    """Import ``module``, or say which extra brings it.
+
+    Raises:
+        ImportError: If it is not installed; the message names the extra.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(
+            f'{module.split(".")[0]} is not installed: pip install "xplanes[{extra}]"'
+        ) from error

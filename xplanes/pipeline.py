@@ -1,0 +1,169 @@
+"""The whole job of train.py: build, prepare, fit, evaluate, report."""
+
+import logging
+import os
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from lightning import seed_everything
+
+from xplanes.config import ConfigError, TrainConfig, parse
+from xplanes.evaluation.media import film_times, orbit_poses, render_path, write_film
+from xplanes.evaluation.report import closing, header, summary, write_hparams
+from xplanes.files import write_json, write_text
+from xplanes.scenes.datamodule import RayDataModule
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.frame import Frame, scene_frame
+from xplanes.scenes.views import Scene
+from xplanes.training.builder import build_batches, build_module, build_scene
+from xplanes.training.fit import fit
+from xplanes.training.module import RadianceModule, TrainingError
+from xplanes.training.record import RunRecord, claim
+
+logger = logging.getLogger(__name__)
+
+KNOWN_ERRORS = (ConfigError, SceneError, TrainingError)
+"""Errors whose message says all; their traceback goes to train.log alone."""
+
+FILM_FRAMES, FILM_FPS, FILM_SIZE = 48, 16, 200
+
+
+def run(config: dict[str, Any], folder: Path, overrides: list[str], *, resume: bool) -> float:
+    """Train and score one field.
+
+    Args:
+        config: The resolved configuration, builtins only.
+        folder: The run directory.
+        overrides: What the command line changed.
+        resume: Whether to go on with the run in ``folder``.
+
+    Returns:
+        PSNR of the scored split in dB; NaN in helper processes of a distributed run.
+
+    Raises:
+        ConfigError, SceneError, TrainingError: With a message that says what to do.
+        KeyboardInterrupt: If the user stopped it; the state is saved.
+    """
+    typed = parse(config)
+    if int(os.environ.get("LOCAL_RANK", "0")):
+        train(typed, folder, resume=resume)
+        return float("nan")
+    claim(folder, resume=resume)
+    write_text(folder / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    write_text(folder / "overrides.txt", "".join(f"{line}\n" for line in overrides))
+    record = RunRecord(folder, typed.seed)
+    with _logged(folder / "train.log"):
+        try:
+            metrics = train(typed, folder, resume=resume, record=record, overrides=overrides)
+            record.end("finished")
+        except KeyboardInterrupt:
+            record.end("interrupted")
+            say(f"\nstopped. Go on with: python train.py resume={folder}")
+            raise
+        except BaseException as error:
+            record.end("failed", f"{type(error).__name__}: {error}")
+            logger.error("failed\n%s", traceback.format_exc())
+            raise
+    return metrics["test"]["psnr"]
+
+
+def train(
+    config: TrainConfig,
+    folder: Path,
+    *,
+    resume: bool,
+    record: RunRecord | None = None,
+    overrides: list[str] | None = None,
+) -> dict[str, Any]:
+    """Build, fit, score and report; only the process with a ``record`` reports.
+
+    Returns:
+        The content of metrics.json; empty without a ``record``.
+    """
+    seed_everything(config.seed, verbose=False)
+    started = time.monotonic()
+    scene = build_scene(config.data)
+    frame = scene_frame(scene.splits["train"], config.data.half_side)
+    module = build_module(config, scene, frame)
+    data = RayDataModule(scene, frame, lambda rank: build_batches(config, scene, frame, rank))
+    loaded = time.monotonic() - started
+    if record is not None:
+        device = _device(config)
+        record.note(
+            device=device,
+            precision=config.trainer.precision,
+            files={name: list(views.files) for name, views in scene.splits.items()},
+        )
+        text = header(config, folder, scene, frame, module, device, overrides or [])
+        logger.info("\n%s", text)
+        say(text + "\n")
+    scorer = fit(config, module, data, folder, resume=resume)
+    if record is None:
+        return {}
+    seconds = {
+        "load": loaded,
+        "prepare": {"fixed_view": 0.0, "lrm": 0.0, "decomposition": 0.0, "convert": 0.0},
+        "train": module.clock,
+        "evaluate": scorer.seconds,
+    }
+    skipped = build_batches(config, scene, frame, 0).skipped
+    metrics = summary(module, scorer.latest, config.data.eval_split, seconds, skipped)
+    if config.trainer.media:
+        metrics["media"] = str(_film(module, frame, scene, folder).relative_to(folder))
+    seconds["total"] = record.total_seconds
+    write_json(folder / "metrics.json", metrics)
+    write_hparams(folder, config, metrics)
+    text = closing(folder, metrics)
+    logger.info("\n%s", text)
+    say(text)
+    return metrics
+
+
+def say(text: str) -> None:
+    """Print a line at once."""
+    print(text, flush=True)
+
+
+def _film(module: RadianceModule, frame: Frame, scene: Scene, folder: Path) -> Path:
+    """The scene turning once while its time runs forth and back."""
+    views = scene.splits["train"]
+    say(f"filming {FILM_FRAMES} frames of the turning scene ...")
+    size = min(FILM_SIZE, views.width)
+    frames = render_path(
+        module.field,
+        module.renderer,
+        frame,
+        orbit_poses(views, frame, FILM_FRAMES),
+        film_times(FILM_FRAMES),
+        focal=views.focal * size / views.width,
+        size=size,
+        background=scene.background,
+    )
+    return write_film(folder / "media" / "orbit.webp", frames, fps=FILM_FPS)
+
+
+def _device(config: TrainConfig) -> str:
+    if torch.cuda.is_available() and config.trainer.accelerator != "cpu":
+        return f"cuda {torch.cuda.get_device_name()}"
+    return "cpu"
+
+
+@contextmanager
+def _logged(path: Path) -> Iterator[None]:
+    """Send log records and warnings to a file for the time of the block."""
+    handler = logging.FileHandler(path)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    root = logging.getLogger()
+    root.addHandler(handler)
+    logging.captureWarnings(True)
+    try:
+        yield
+    finally:
+        root.removeHandler(handler)
+        handler.close()

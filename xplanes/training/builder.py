@@ -1,0 +1,140 @@
+"""From settings to objects: the only place that turns names into classes."""
+
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from xplanes.config import DataConfig, DemoConfig, ModelConfig, SamplerConfig, TrainConfig
+from xplanes.fields import Decoder, XPlanes
+from xplanes.fields.xplanes import random_planes
+from xplanes.rendering.carving import carve
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.renderer import DIAGONAL, Renderer
+from xplanes.scenes.batches import RayBatches, step_generator
+from xplanes.scenes.demo import ensure_demo_scene
+from xplanes.scenes.dnerf import read_scene
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.views import Scene, Views
+from xplanes.training.module import RadianceModule
+
+START_STREAM = 1_000_033
+"""Random stream of the start values."""
+
+
+def build_scene(config: DataConfig, splits: tuple[str, ...] | None = None) -> Scene:
+    """Read the scene, or render it first where it is a procedural one.
+
+    Args:
+        config: The data group.
+        splits: Splits to read; the training views and the scored split when None.
+    """
+    folder = Path(config.root) / config.scene
+    if isinstance(config, DemoConfig):
+        folder = ensure_demo_scene(
+            Path(config.root),
+            config.scene,
+            resolution=config.resolution or 128,
+            seed=config.seed,
+            train_views=config.train_views,
+            val_views=config.val_views,
+            test_views=config.test_views,
+        )
+    scene = read_scene(
+        folder,
+        resolution=config.resolution,
+        splits=splits or ("train", config.eval_split),
+        views=config.views,
+    )
+    return Scene(config.scene, scene.splits, scene.video, scene.background)
+
+
+def is_still(views: Views) -> bool:
+    """Whether all views show one moment, so that nothing can move."""
+    return bool((views.times == views.times[0]).all())
+
+
+def build_field(config: ModelConfig, times: Tensor, seed: int) -> XPlanes:
+    """A field with random planes and a fresh decoder.
+
+    Args:
+        config: The model group.
+        times: Times of the training views; planes of time are left out where all are equal. [V]
+        seed: The run's seed.
+    """
+    distinct = len(times.unique())
+    plane_set = config.plane_set if distinct > 1 else "three"
+    generator = step_generator(seed, 0, START_STREAM)
+    planes = random_planes(
+        plane_set,
+        channels=config.channels,
+        resolution=config.resolution,
+        time_resolution=config.time_resolution or max(2, math.ceil(distinct / 2)),
+        space_scale=config.space_scale,
+        time_scale=config.time_scale,
+        generator=generator,
+    )
+    options = config.decoder
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(generator.initial_seed())
+        decoder = Decoder(
+            config.channels,
+            width=options.width,
+            hidden=options.hidden,
+            activation=options.activation,  # type: ignore[arg-type]
+            density=options.density,  # type: ignore[arg-type]
+            density_scale=options.density_scale,
+        )
+    with torch.no_grad():
+        decoder.layers[-1].bias[0] += options.density_start  # type: ignore[index]
+    decoder.requires_grad_(not options.freeze)
+    return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set)
+
+
+def build_renderer(config: SamplerConfig, *, still: bool) -> Renderer:
+    """The renderer with a grid in which everything may be occupied."""
+    grid = OccupancyGrid(
+        config.grid_resolution,
+        1 if still else config.time_bins,
+        step=DIAGONAL / config.samples,
+        threshold=config.threshold,
+        decay=config.decay,
+    )
+    return Renderer(
+        grid,
+        config.samples,
+        skip_empty=config.skip_empty,
+        occlusion=config.occlusion if config.skip_occluded else 0.0,
+    )
+
+
+def build_module(config: TrainConfig, scene: Scene, frame: Frame) -> RadianceModule:
+    """Field, renderer and training in one module."""
+    views = scene.splits["train"]
+    field = build_field(config.model, views.times, config.seed)
+    renderer = build_renderer(config.sampler, still=is_still(views))
+    if config.sampler.silhouettes:
+        carve(renderer.grid, views, frame)
+    return RadianceModule(
+        field,
+        renderer,
+        loss=config.loss,
+        sampler=config.sampler,
+        trainer=config.trainer,
+        seed=config.seed,
+    )
+
+
+def build_batches(config: TrainConfig, scene: Scene, frame: Frame, rank: int) -> RayBatches:
+    """The ray batches of one process."""
+    return RayBatches(
+        scene.splits["train"],
+        frame,
+        rays=config.trainer.rays_per_batch,
+        seed=config.seed,
+        background=config.loss.background,
+        skip_background=config.data.skip_background,
+        background_share=config.data.background_share,
+        rank=rank,
+    )

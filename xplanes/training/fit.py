@@ -1,0 +1,96 @@
+"""Setting up Lightning's trainer and running it."""
+
+import logging
+import warnings
+from pathlib import Path
+
+import torch
+from lightning import Trainer
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from xplanes.config import ConfigError, TrainConfig
+from xplanes.scenes.datamodule import RayDataModule
+from xplanes.training.bar import StepBar
+from xplanes.training.checkpoints import LAST, Checkpoints
+from xplanes.training.clock import TrainingClock
+from xplanes.training.module import RadianceModule
+from xplanes.training.scalars import Scalars
+from xplanes.training.scorer import Scorer
+
+
+def fit(
+    config: TrainConfig, module: RadianceModule, data: RayDataModule, run: Path, *, resume: bool
+) -> Scorer:
+    """Train to the end of the budget, or from the last checkpoint on.
+
+    Args:
+        config: The run's settings.
+        module: The module to train, changed in place.
+        data: Its rays.
+        run: The run directory.
+        resume: Whether to go on from ``checkpoints/last.ckpt``.
+
+    Returns:
+        The scorer, whose ``latest`` holds the final scores on rank 0.
+    """
+    quiet_lightning()
+    options = config.trainer
+    split = config.data.eval_split
+    clock = TrainingClock(options.max_seconds)
+    scorer = Scorer(
+        data.scene.splits[split],
+        split,
+        data.frame,
+        data.scene.background,
+        at=options.evaluate_at,
+        count=options.evaluate_views,
+        run=run,
+        clock=clock,
+    )
+    checkpoints = Checkpoints(run / "checkpoints", options.checkpoint_every, clock)
+    bar = StepBar(options.max_steps, options.max_seconds, split)
+    trainer = Trainer(
+        accelerator=_accelerator(options.accelerator),
+        devices=options.devices,
+        strategy=options.strategy,
+        precision="bf16-mixed" if options.precision == "bf16" else "32-true",
+        max_steps=options.max_steps,
+        callbacks=[clock, Scalars(options.log_every), scorer, checkpoints, bar],
+        logger=TensorBoardLogger(run, name="", version="tb"),
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        deterministic=options.deterministic,
+        log_every_n_steps=10**9,
+        use_distributed_sampler=False,
+    )
+    last = run / "checkpoints" / LAST
+    trainer.fit(
+        module, data, ckpt_path=str(last) if resume and last.is_file() else None, weights_only=True
+    )
+    if trainer.interrupted:
+        raise KeyboardInterrupt
+    return scorer
+
+
+def _accelerator(name: str) -> str:
+    if name == "gpu" and not torch.cuda.is_available():
+        raise ConfigError(
+            "trainer.accelerator=gpu: no GPU found; set trainer.accelerator=cpu or auto"
+        )
+    return name
+
+
+def quiet_lightning() -> None:
+    """Hide, by name, what Lightning says that a user of this program cannot act on."""
+    for name in ("lightning.pytorch.utilities.rank_zero", "lightning.pytorch.accelerators.cuda"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for message in (
+        ".*does not have many workers.*",
+        ".*treespec.*",
+        ".*LeafSpec.*",
+        ".*litlogger.*",
+        ".*`IterableDataset` has `__len__` defined.*",
+        ".*Checkpoint directory .* exists and is not empty.*",
+    ):
+        warnings.filterwarnings("ignore", message=message)

@@ -1,0 +1,124 @@
+"""run.json: what ran, where, and how it ended."""
+
+import os
+import platform
+import subprocess
+import time
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal
+
+from xplanes import __version__
+from xplanes.config import ConfigError
+from xplanes.files import read_json, write_json
+
+Status = Literal["running", "finished", "failed", "interrupted"]
+
+_PACKAGES = (
+    "torch",
+    "lightning",
+    "hydra-core",
+    "omegaconf",
+    "torchmetrics",
+    "tensorboard",
+    "numba",
+)
+
+
+class RunRecord:
+    """Keeps run.json true from the start of a run to its end.
+
+    Args:
+        run: The run directory.
+        seed: The run's seed.
+    """
+
+    def __init__(self, run: Path, seed: int) -> None:
+        self.path = run / "run.json"
+        self._began = time.monotonic()
+        earlier = read_json(self.path) if self.path.is_file() else {}
+        self._before = float(earlier.get("total_seconds", 0.0))
+        self.content: dict[str, Any] = {
+            "status": "running",
+            "started": earlier.get("started", _now()),
+            "ended": None,
+            "total_seconds": self._before,
+            "resumed": earlier.get("resumed", 0) + bool(earlier),
+            "seed": seed,
+            "xplanes": __version__,
+            "commit": _commit(),
+            "python": platform.python_version(),
+            "versions": {name: _version(name) for name in _PACKAGES},
+            "platform": platform.platform(),
+            "cpus": os.cpu_count(),
+        }
+        write_json(self.path, self.content)
+
+    def note(self, **entries: Any) -> None:
+        """Add facts, such as the device."""
+        self.content.update(entries)
+        write_json(self.path, self.content)
+
+    def end(self, status: Status, reason: str | None = None) -> None:
+        """Set how the run ended."""
+        total = self._before + time.monotonic() - self._began
+        self.content.update(
+            status=status, ended=_now(), total_seconds=round(total, 3), reason=reason
+        )
+        write_json(self.path, self.content)
+
+    @property
+    def total_seconds(self) -> float:
+        """Wall time of this run so far, earlier parts included."""
+        return self._before + time.monotonic() - self._began
+
+
+def run_status(run: Path) -> str | None:
+    """Status in run.json; None where the folder holds no run."""
+    path = run / "run.json"
+    return read_json(path).get("status") if path.is_file() else None
+
+
+def claim(run: Path, *, resume: bool) -> None:
+    """Refuse a folder that holds a run, unless it is to be resumed.
+
+    Raises:
+        ConfigError: If there is a run and ``resume`` is off, or none and it is on.
+    """
+    status = run_status(run)
+    if status is not None and not resume:
+        raise ConfigError(
+            f"{run} holds a run already ({status}). Go on with it: python train.py resume={run}; or "
+            "choose another hydra.run.dir"
+        )
+    if status is None and resume:
+        raise ConfigError(f"resume={run}: no run.json there, so no run to go on with")
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def _commit() -> str | None:
+    """Commit of the source tree, with a mark if it was changed; None outside a checkout."""
+    folder = Path(__file__).resolve().parent
+    try:
+        run = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=5,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return run.stdout.strip()

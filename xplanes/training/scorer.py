@@ -1,0 +1,141 @@
+"""The callback that scores views while training goes on."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback
+from torch import Tensor
+
+from xplanes.rendering.pictures import plane_sheet, strip, write_png
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.views import Views
+from xplanes.training.clock import TrainingClock
+from xplanes.training.module import RadianceModule
+from xplanes.training.scoring import Curve, ViewScore, mean, score_view, spread
+
+SHOWN = 4
+"""Views whose pictures go to TensorBoard at each evaluation."""
+
+
+class Scorer(Callback):
+    """Scores the views at set shares of the budget, off the training clock.
+
+    Args:
+        views: The views that are scored.
+        split: Their name.
+        frame: The field's frame.
+        background: Colour behind them. [3]
+        at: Shares of the budget, from 0 to 1. The end is always scored, on all views.
+        count: Views scored on the way, spread evenly; None for all.
+        run: The run directory.
+        clock: Paused after each evaluation.
+    """
+
+    def __init__(
+        self,
+        views: Views,
+        split: str,
+        frame: Frame,
+        background: Tensor,
+        *,
+        at: list[float],
+        count: int | None,
+        run: Path,
+        clock: TrainingClock,
+    ) -> None:
+        self.views, self.split, self.frame, self.background = views, split, frame, background
+        self.at = sorted(share for share in at if share < 1)
+        self.indices = spread(count or len(views), len(views))
+        self.run, self.clock = run, clock
+        self.curve: Curve | None = None
+        self.latest: list[ViewScore] = []
+        self.best = float("-inf")
+        self.seconds = 0.0
+        self._next = 0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, RadianceModule)
+        if trainer.is_global_zero:
+            self.curve = Curve(self.run / "curve.csv", until=trainer.global_step)
+        fresh = trainer.global_step == 0
+        self._next = sum(share <= pl_module.progress for share in self.at)
+        if fresh and self.at and self.at[0] == 0:
+            self._score(trainer, pl_module, self.indices)
+        self.clock.pause()
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        assert isinstance(pl_module, RadianceModule)
+        due = sum(share <= pl_module.progress for share in self.at)
+        if due > self._next and pl_module.progress < 1 and not trainer.should_stop:
+            self._next = due
+            self._score(trainer, pl_module, self.indices)
+            self.clock.pause()
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, RadianceModule)
+        self._score(trainer, pl_module, list(range(len(self.views))))
+
+    def _score(self, trainer: Trainer, module: RadianceModule, indices: list[int]) -> None:
+        if not trainer.is_global_zero:
+            return
+        assert self.curve is not None
+        began = time.perf_counter()
+        module.eval()
+        self.latest = [
+            score_view(module.field, module.renderer, self.frame, self.views, i, self.background)
+            for i in indices
+        ]
+        module.train()
+        step = trainer.global_step
+        self.curve.add(module.clock, step, self.split, self.latest)
+        scores = {
+            f"{self.split}/psnr": mean([s.psnr for s in self.latest]),
+            f"{self.split}/ssim": mean([s.ssim for s in self.latest]),
+        }
+        module.last.update(scores)
+        self._log(trainer, module, scores, step)
+        if scores[f"{self.split}/psnr"] > self.best:
+            self.best = scores[f"{self.split}/psnr"]
+            module.improved = True
+        self.seconds += time.perf_counter() - began
+
+    def _log(
+        self, trainer: Trainer, module: RadianceModule, scores: dict[str, float], step: int
+    ) -> None:
+        sheet = plane_sheet(module.field.planes)
+        write_png(self.run / "media" / "planes.png", sheet)
+        for place in spread(SHOWN, len(self.latest)):
+            score = self.latest[place]
+            picture = strip(score.truth, score.colour, score.depth)
+            name = f"{self.split}_{score.file.replace('/', '_').removesuffix('.png')}"
+            write_png(self.run / "media" / f"step{step:06d}" / f"{name}.png", picture)
+            self._image(trainer, f"{self.split}/{score.file}", picture, step)
+        self._image(trainer, "planes", sheet, step)
+        if trainer.logger is not None:
+            trainer.logger.log_metrics({**scores, "time/train_s": module.clock}, step)
+
+    @staticmethod
+    def _image(trainer: Trainer, tag: str, picture: Tensor, step: int) -> None:
+        if trainer.logger is not None:
+            writer: Any = trainer.logger.experiment  # type: ignore[attr-defined]
+            writer.add_image(tag, picture.clamp(0, 1), step, dataformats="HWC")
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"best": self.best, "seconds": self.seconds}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.best, self.seconds = state_dict["best"], state_dict["seconds"]
+
+
+def device_memory(device: torch.device) -> int:
+    """Most bytes held so far: on the device if it is a GPU, else by this process."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

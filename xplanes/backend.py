@@ -1,9 +1,11 @@
 """Which implementation of the inner loops a tensor gets."""
 
 import functools
+import importlib
 import importlib.util
 import logging
 import os
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,6 +33,11 @@ def cpu_loops(tensor: Tensor) -> bool:
         and os.environ.get("XPLANES_CPU_LOOPS", "1") != "0"
         and numba_found()
     )
+
+
+def compiled(module: str) -> Any:
+    """A module of compiled loops; loading the first takes a second, compiling a few more, once."""
+    return importlib.import_module(module)
 
 
 def name(device: torch.device) -> str:

@@ -84,6 +84,9 @@ class SamplerConfig:
     skip_occluded: bool = MISSING  # Skip samples behind opaque surfaces.
     occlusion: float = MISSING  # Light left behind a surface below which it is opaque.
     silhouettes: bool = MISSING  # Rule out cells that the images' alpha shows to be empty.
+    coarse_steps: int = MISSING  # First steps, in which samples lie twice as far apart.
+    sweep_at: list[int] = MISSING  # Steps at which all occupied cells are looked at.
+    sweep_every: int = MISSING  # Steps between such sweeps later on.
     update_every: int = MISSING  # Steps between looks at cells that no ray samples.
     update_cells: int = MISSING  # Cells per look.
 
@@ -206,7 +209,7 @@ def parse(config: dict[str, Any]) -> TrainConfig:
 _POSITIVE = """data.resolution data.views data.half_side data.train_views data.test_views
 data.val_views model.resolution model.time_resolution model.channels model.decoder.width
 model.decoder.density_scale sampler.samples sampler.grid_resolution sampler.time_bins
-sampler.threshold sampler.update_every sampler.update_cells loss.every trainer.devices
+sampler.threshold sampler.sweep_every sampler.update_every sampler.update_cells loss.every trainer.devices
 trainer.max_steps trainer.max_seconds trainer.rays_per_batch trainer.samples_per_batch
 trainer.accumulate trainer.plane_lr trainer.time_lr trainer.decoder_lr trainer.checkpoint_every
 trainer.evaluate_views trainer.log_every""".split()

@@ -23,7 +23,7 @@ def ssim(prediction: Tensor, truth: Tensor) -> float:
 
     if min(truth.shape[:2]) < 11:
         return float("nan")
-    images = [t.clamp(0, 1).float().permute(2, 0, 1)[None] for t in (prediction, truth)]
-    score = structural_similarity_index_measure(*images, data_range=1.0)
+    first, second = (t.clamp(0, 1).float().permute(2, 0, 1)[None] for t in (prediction, truth))
+    score = structural_similarity_index_measure(first, second, data_range=1.0)
     assert isinstance(score, Tensor)
     return float(score)

@@ -1,5 +1,7 @@
-"""Run directories as trained scenes."""
+"""Run directories: finding them, and loading them as trained scenes."""
 
+import difflib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,11 +10,16 @@ import torch
 import yaml
 
 from xplanes.config import ConfigError, TrainConfig, parse
+from xplanes.files import read_json
 from xplanes.scenes.frame import Frame, scene_frame
-from xplanes.scenes.views import Scene
+from xplanes.scenes.views import Scene, Views
 from xplanes.training.builder import build_module, build_scene
 from xplanes.training.checkpoints import load_checkpoint
 from xplanes.training.module import RadianceModule
+
+OUTPUTS = Path("outputs")
+LISTED = 5
+"""Runs that an error message lists."""
 
 
 @dataclass(frozen=True)
@@ -22,18 +29,71 @@ class TrainedRun:
     Attributes:
         path: The run directory.
         config: Its settings.
-        scene: The training views and the scored split.
+        scene: The training views and one split beside them.
+        split: Name of that split.
         frame: The field's frame.
         module: The trained module, in evaluation mode.
+        checkpoint: ``last`` or ``best``.
         step: Step of the checkpoint.
     """
 
     path: Path
     config: TrainConfig
     scene: Scene
+    split: str
     frame: Frame
     module: RadianceModule
+    checkpoint: str
     step: int
+
+    @property
+    def views(self) -> Views:
+        """The views of the split."""
+        return self.scene.splits[self.split]
+
+    @property
+    def is_still(self) -> bool:
+        """Whether the field has no time."""
+        return self.module.field.time is None
+
+
+def find_run(path: Path, outputs: Path = OUTPUTS) -> Path:
+    """Check that ``path`` is a run directory.
+
+    Raises:
+        ConfigError: If it is not; the message lists runs with a similar name, or the newest.
+    """
+    if is_run(path):
+        return path
+    inside = find_runs(path) if path.is_dir() else []
+    if inside:
+        names = _listed(inside[:LISTED])
+        raise ConfigError(f"{path} is a folder of {len(inside)} runs; name one of them:{names}")
+    problem = "is not a run directory" if path.exists() else "does not exist"
+    runs = {str(run): run for folder in (outputs, path.parent) for run in find_runs(folder)}
+    if not runs:
+        raise ConfigError(f"{path} {problem}, and there are no runs in {outputs}: python train.py")
+    near = difflib.get_close_matches(str(path), list(runs), n=LISTED, cutoff=0.75)
+    if near:
+        raise ConfigError(f"{path} {problem}. Similar names:{_listed([runs[n] for n in near])}")
+    newest = sorted(runs.values(), key=lambda run: run.stat().st_mtime, reverse=True)
+    raise ConfigError(f"{path} {problem}. The newest runs:{_listed(newest[:LISTED])}")
+
+
+def is_run(path: Path) -> bool:
+    """Whether a folder holds a run, finished or not."""
+    return (path / "run.json").is_file() or (path / "config.yaml").is_file()
+
+
+def find_runs(folder: Path) -> list[Path]:
+    """Runs in a folder, up to three levels down: outputs/sweeps/<sweep>/<run>."""
+    patterns = ("*", "*/*", "*/*/*")
+    found = {record.parent for p in patterns for record in folder.glob(f"{p}/run.json")}
+    return sorted(found)
+
+
+def _listed(runs: list[Path]) -> str:
+    return "".join(f"\n  {run}" for run in runs)
 
 
 def read_config(run: Path) -> dict[str, Any]:
@@ -47,7 +107,7 @@ def read_config(run: Path) -> dict[str, Any]:
         raise ConfigError(f"{run} is not a run directory: no config.yaml in it")
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is damaged: {error}") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{path} is damaged: not a mapping")
@@ -55,27 +115,90 @@ def read_config(run: Path) -> dict[str, Any]:
 
 
 def load_run(
-    run: Path, *, checkpoint: str = "last", split: str | None = None, device: str | None = None
+    run: Path,
+    *,
+    checkpoint: str = "last",
+    split: str | None = None,
+    device: str | None = None,
+    announce: Callable[[str], None] | None = None,
 ) -> TrainedRun:
-    """Load a trained run.
+    """Load a trained run, exactly as it was when the checkpoint was written.
 
     Args:
         run: The run directory.
         checkpoint: ``last`` or ``best``.
         split: Split to read beside the training views; the run's own when None.
-        device: Where to put the field; a GPU if there is one when None.
+        device: Where to put the field; the kind of device that trained it when None.
+        announce: Takes the lines that say what is being loaded.
 
     Raises:
-        ConfigError, SceneError: If the run or its data are missing or damaged.
+        ConfigError, SceneError: If the run or its data are missing, damaged or changed.
     """
-    typed = parse(read_config(run))
-    if split is not None:
-        typed.data.eval_split = split
+    config = _parsed(run)
+    split = split or config.data.eval_split
+    device = device or _device(config)
     state = load_checkpoint(run / "checkpoints" / f"{checkpoint}.ckpt")
-    scene = build_scene(typed.data)
-    frame = scene_frame(scene.splits["train"], typed.data.half_side)
-    module = build_module(typed, scene, frame)
-    module.load_state_dict(state["state_dict"])
+    step = state.get("global_step")
+    if not isinstance(step, int) or "state_dict" not in state or "progress" not in state:
+        raise ConfigError(f"{run}/checkpoints/{checkpoint}.ckpt is not a checkpoint of train.py")
+    if announce is not None:
+        announce(f"run         {run}")
+        announce(f"checkpoint  {checkpoint}.ckpt, step {step}, on {device}")
+    config.data.root = _data_root(run, config.data.root)
+    scene = build_scene(config.data, ("train", split))
+    _check_views(run, scene.splits["train"])
+    frame = scene_frame(scene.splits["train"], config.data.half_side)
+    module = build_module(config, scene, frame)
+    try:
+        module.load_state_dict(state["state_dict"])
+    except RuntimeError as error:
+        raise ConfigError(
+            f"{run}/checkpoints/{checkpoint}.ckpt does not fit {run}/config.yaml: {error}"
+        ) from error
     module.on_load_checkpoint(state)
-    module.to(device or ("cuda" if torch.cuda.is_available() else "cpu")).eval()
-    return TrainedRun(run, typed, scene, frame, module, state["global_step"])
+    module.to(device).eval()
+    return TrainedRun(run, config, scene, split, frame, module, checkpoint, step)
+
+
+def _parsed(run: Path) -> TrainConfig:
+    content = read_config(run)
+    try:
+        return parse(content)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(
+            f"{run}/config.yaml cannot be used ({type(error).__name__}: {error}): it is damaged, or "
+            "from another version of xplanes"
+        ) from error
+
+
+def _device(config: TrainConfig) -> str:
+    gpu = torch.cuda.is_available() and config.trainer.accelerator != "cpu"
+    return "cuda" if gpu else "cpu"
+
+
+def _record(run: Path) -> dict[str, Any]:
+    """run.json, or nothing if it is missing or damaged: it only helps here."""
+    try:
+        return read_json(run / "run.json")
+    except (OSError, ValueError):
+        return {}
+
+
+def _data_root(run: Path, root: str) -> str:
+    """Where the scenes are: a relative folder may be relative to where training was started."""
+    started = _record(run).get("directory")
+    if Path(root).exists() or not isinstance(started, str):
+        return root
+    there = Path(started) / root
+    return str(there) if there.exists() else root
+
+
+def _check_views(run: Path, views: Views) -> None:
+    """Refuse other training views than the run's: the frame and the field's size depend on them."""
+    files = _record(run).get("files")
+    recorded = files.get("train") if isinstance(files, dict) else None
+    if isinstance(recorded, list) and recorded != list(views.files):
+        raise ConfigError(
+            f"{run} was trained on {len(recorded)} views, but the scene now lists "
+            f"{len(views.files)} others or in another order: restore the scene's files"
+        )

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from xplanes.backend import cpu_loops
+from xplanes.backend import compiled, cpu_loops
 
 Rows = tuple[tuple[int, int], ...]
 """For each space plane, the two time planes whose product is added to it."""
@@ -85,8 +85,7 @@ class _Features(torch.autograd.Function):
     def forward(
         ctx: Any, space: Tensor, time: Tensor | None, points: Tensor, times: Tensor, rows: Rows
     ) -> Tensor:
-        from xplanes.fields import cpu
-
+        cpu = compiled("xplanes.fields.cpu")
         moving = space.new_zeros(0, 1, 1, space.shape[3]) if time is None else time
         count, channels = len(points), space.shape[3]
         points, times = points.to(space.dtype).contiguous(), times.to(space.dtype).contiguous()
@@ -101,11 +100,12 @@ class _Features(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        from xplanes.fields import cpu
-
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        cpu = compiled("xplanes.fields.cpu")
         points, times, pairs, axes, factors = ctx.saved_tensors
-        gradient = gradient.to(factors.dtype).contiguous()
+        gradient = gradients[0].to(factors.dtype).contiguous()
         space = time = None
         if ctx.needs_input_grad[0]:
             space = gradient.new_zeros(ctx.shapes[0])

@@ -74,7 +74,7 @@ class XPlanes(nn.Module):
     @property
     def planes(self) -> dict[str, Tensor]:
         """The planes by name, as views of the parameters. [C, rows, columns] each"""
-        stacks = [(SPACE_PLANES, self.space)]
+        stacks: list[tuple[tuple[str, ...], Tensor]] = [(SPACE_PLANES, self.space)]
         if self.time is not None:
             stacks.append((TIME_PLANES[self.plane_set], self.time))
         return {

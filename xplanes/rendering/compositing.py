@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from xplanes.backend import cpu_loops
+from xplanes.backend import compiled, cpu_loops
 
 OPAQUE = 80.0
 """Optical depth beyond which nothing is seen: exp(-80) is 2e-35."""
@@ -68,8 +68,7 @@ class _Composite(torch.autograd.Function):
     def forward(
         ctx: Any, optical_depth: Tensor, colour: Tensor, distances: Tensor, starts: Tensor
     ) -> tuple[Tensor, Tensor]:
-        from xplanes.rendering import cpu
-
+        cpu = compiled("xplanes.rendering.cpu")
         inputs = [t.contiguous() for t in (optical_depth, colour, distances, starts)]
         weights = torch.empty_like(optical_depth)
         total = optical_depth.new_empty(len(starts), 5)
@@ -81,9 +80,10 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
-        from xplanes.rendering import cpu
-
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        cpu = compiled("xplanes.rendering.cpu")
         *inputs, weights = ctx.saved_tensors
         d_depth, d_colour = torch.empty_like(inputs[0]), torch.empty_like(inputs[1])
         arrays = [t.detach().numpy() for t in inputs]
@@ -91,7 +91,7 @@ class _Composite(torch.autograd.Function):
             *arrays,
             OPAQUE,
             weights.numpy(),
-            gradient.to(weights.dtype).contiguous().numpy(),
+            gradients[0].to(weights.dtype).contiguous().numpy(),
             d_depth.numpy(),
             d_colour.numpy(),
         )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xplanes.backend import cpu_loops
+from xplanes.backend import compiled, cpu_loops
 from xplanes.rendering.box import ray_box
 from xplanes.rendering.compositing import depth_before
 from xplanes.rendering.occupancy import OccupancyGrid
@@ -136,8 +136,7 @@ def _march_cpu(
     skip: bool,
     limit: float,
 ) -> Samples:
-    from xplanes.rendering import cpu
-
+    cpu = compiled("xplanes.rendering.cpu")
     near, far = ray_box(origins, directions)
     half = 0.5 * grid.resolution
     origins, directions = origins.contiguous(), directions.contiguous()

@@ -1,6 +1,7 @@
 """Where a scene holds anything, and when: a grid of cells over space and time."""
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from xplanes.rendering.box import Field
@@ -64,6 +65,36 @@ class OccupancyGrid(nn.Module):
         seen = torch.maximum(self.density[cells] * self.decay, density.float())
         self.density.scatter_reduce_(0, cells, seen, "amax", include_self=False)
         self.occupied[cells] = self.density[cells] > self.empty_density
+
+    @torch.no_grad()
+    def sweep(self, field: Field, generator: torch.Generator, chunk: int = 2**15) -> None:
+        """Look into every occupied cell once and empty those that show nothing.
+
+        A cell stays if it or a neighbour in space shows density at one random point and time, so
+        that a single look cannot lose a thin surface.
+
+        Args:
+            field: From points [N, 3] and times [N] to colour [N, 3] and density [N].
+            generator: Source of randomness.
+            chunk: Points per call of the field.
+        """
+        device = self.density.device
+        cells = self.occupied.nonzero()[:, 0]
+        seen = torch.zeros_like(self.density)
+        for part in cells.split(chunk):
+            uniform = torch.rand(len(part), 4, generator=generator).to(device)
+            seen[part] = field(*self.draw(part, uniform))[1].float()
+        size = self.resolution
+        around = F.max_pool3d(
+            seen.view(1, self.time_bins, size, size, size), 3, stride=1, padding=1
+        )
+        keep = self.occupied & (around.view(-1) > self.empty_density)
+        # A cell kept for its neighbour's sake has one look to show something of its own.
+        floor = self.empty_density / self.decay * 1.001
+        kept = seen.clamp_min(floor)
+        lost = self.density.clamp_max(0.5 * self.empty_density)
+        self.density.copy_(torch.where(keep, kept, lost))
+        self.occupied.copy_(keep)
 
     @torch.no_grad()
     def update(self, field: Field, count: int, generator: torch.Generator) -> None:

@@ -24,9 +24,9 @@ def colour_map(values: Tensor) -> Tensor:
     return torch.lerp(ramp[lower], ramp[lower + 1], (place - lower)[..., None])
 
 
-def depth_picture(depth: Tensor) -> Tensor:
-    """Depth as colours, near is light; 0 (nothing there) is white. [H, W] -> [H, W, 3]"""
-    seen = depth > 0
+def depth_picture(depth: Tensor, opacity: Tensor) -> Tensor:
+    """Depth as colours, near is light, see-through is white. [H, W], [H, W] -> [H, W, 3]"""
+    seen = opacity > 0.5
     if not seen.any():
         return torch.ones(*depth.shape, 3)
     near, far = depth[seen].aminmax()
@@ -34,10 +34,20 @@ def depth_picture(depth: Tensor) -> Tensor:
     return torch.where(seen[..., None], colours, 1.0)
 
 
-def strip(truth: Tensor, colour: Tensor, depth: Tensor) -> Tensor:
-    """Truth, prediction, error (x 4) and depth side by side. [H, W, 3] twice, [H, W] -> [H, 4 W, 3]"""
+def strip(truth: Tensor, colour: Tensor, depth: Tensor, opacity: Tensor) -> Tensor:
+    """Truth, prediction, error (x 4) and depth side by side.
+
+    Args:
+        truth: True colours. [H, W, 3]
+        colour: Rendered colours. [H, W, 3]
+        depth: Rendered depth. [H, W]
+        opacity: Rendered opacity. [H, W]
+
+    Returns:
+        One picture. [H, 4 W, 3]
+    """
     error = colour_map(4 * (colour - truth).abs().mean(dim=-1))
-    return torch.cat([truth, colour, error, depth_picture(depth)], dim=1)
+    return torch.cat([truth, colour, error, depth_picture(depth, opacity)], dim=1)
 
 
 def plane_sheet(planes: Mapping[str, Tensor], columns: int = 3, side: int = 128) -> Tensor:

@@ -63,6 +63,7 @@ class Renderer:
         times: Tensor,
         background: Tensor,
         jitter: Tensor | None = None,
+        stride: int = 1,
     ) -> Rendering:
         """Render rays.
 
@@ -73,23 +74,25 @@ class Renderer:
             times: Time of each ray, from 0 to 1. [R]
             background: Colour behind the scene. [3] or [R, 3]
             jitter: Place of each ray's samples within their steps; the middle when None. [R]
+            stride: Steps that one sample stands for.
 
         Returns:
             One value per ray; gradients reach the field.
         """
+        step = self.step * stride
         samples = march(
             origins,
             directions,
             times,
             torch.full_like(times, 0.5) if jitter is None else jitter,
             self.grid,
-            step=self.step,
+            step=step,
             skip_empty=self.skip_empty,
             occlusion=self.occlusion,
         )
         colour, density = field(samples.points, times[samples.ray])
         total, _ = composite(
-            density * self.step, colour, samples.distances, samples.ray, samples.starts
+            density * step, colour, samples.distances, samples.ray, samples.starts
         )
         opacity = total[:, 3]
         return Rendering(
@@ -108,6 +111,8 @@ class Renderer:
         directions: Tensor,
         time: float,
         background: Tensor,
+        *,
+        stride: int = 1,
         chunk: int = 8192,
     ) -> dict[str, Tensor]:
         """Render any number of rays of one moment, a chunk at a time.
@@ -119,7 +124,7 @@ class Renderer:
         for start in range(0, len(origins), chunk):
             rays = origins[start : start + chunk], directions[start : start + chunk]
             times = torch.full_like(rays[0][:, 0], time)
-            part = self.render(field, *rays, times, background)
+            part = self.render(field, *rays, times, background, stride=stride)
             parts.append((part.colour, part.opacity, part.depth))
         colour, opacity, depth = (torch.cat(part) for part in zip(*parts, strict=True))
         return {"colour": colour, "opacity": opacity, "depth": depth}

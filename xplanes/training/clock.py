@@ -7,6 +7,8 @@ import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
+from xplanes.training.module import RadianceModule
+
 
 class TrainingClock(Callback):
     """Counts the seconds spent on training steps into ``module.clock`` and stops at the budget.
@@ -28,6 +30,7 @@ class TrainingClock(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
+        assert isinstance(pl_module, RadianceModule)
         now = time.perf_counter()
         spent = now - self._mark
         if trainer.world_size > 1:

@@ -83,8 +83,8 @@ def _accelerator(name: str) -> str:
 
 def quiet_lightning() -> None:
     """Hide, by name, what Lightning says that a user of this program cannot act on."""
-    for name in ("lightning.pytorch.utilities.rank_zero", "lightning.pytorch.accelerators.cuda"):
-        logging.getLogger(name).setLevel(logging.WARNING)
+    for name in ("utilities.rank_zero", "trainer.connectors.checkpoint_connector"):
+        logging.getLogger(f"lightning.pytorch.{name}").setLevel(logging.WARNING)
     for message in (
         ".*does not have many workers.*",
         ".*treespec.*",

@@ -100,6 +100,7 @@ class RadianceModule(LightningModule):
             rays["times"],
             rays["background"],
             rays["jitter"],
+            stride=2 if self.global_step < self.sampler.coarse_steps else 1,
         )
         loss = (rendering.colour - rays["target"]).square().mean()
         value = float(loss.detach())
@@ -122,8 +123,10 @@ class RadianceModule(LightningModule):
             self._regularise()
         optimizer.step()
         optimizer.zero_grad()
-        if step % self.sampler.update_every == 0:
-            generator = step_generator(self.seed, step, GRID_STREAM)
+        generator = step_generator(self.seed, step, GRID_STREAM)
+        if step in self.sampler.sweep_at or (step and step % self.sampler.sweep_every == 0):
+            self.grid.sweep(self.field, generator)
+        elif step % self.sampler.update_every == 0:
             self.grid.update(self.field, self.sampler.update_cells, generator)
 
     def _regularise(self) -> None:

@@ -111,7 +111,7 @@ class Scorer(Callback):
         write_png(self.run / "media" / "planes.png", sheet)
         for place in spread(SHOWN, len(self.latest)):
             score = self.latest[place]
-            picture = strip(score.truth, score.colour, score.depth)
+            picture = strip(score.truth, score.colour, score.depth, score.opacity)
             name = f"{self.split}_{score.file.replace('/', '_').removesuffix('.png')}"
             write_png(self.run / "media" / f"step{step:06d}" / f"{name}.png", picture)
             self._image(trainer, f"{self.split}/{score.file}", picture, step)

@@ -28,6 +28,7 @@ class ViewScore:
         truth: True colours. [H, W, 3]
         colour: Rendered colours. [H, W, 3]
         depth: Rendered depth in the field's frame. [H, W]
+        opacity: Rendered opacity. [H, W]
     """
 
     file: str
@@ -37,6 +38,7 @@ class ViewScore:
     truth: Tensor
     colour: Tensor
     depth: Tensor
+    opacity: Tensor
 
 
 def render_view(
@@ -44,8 +46,9 @@ def render_view(
 ) -> dict[str, Tensor]:
     """Render one view whole: ``colour`` [H, W, 3], ``opacity`` and ``depth`` [H, W], on the CPU."""
     device = renderer.grid.density.device
-    rays = (ray.to(device) for ray in frame.rays(*views.image_rays(index)))
-    image = renderer.image(field, *rays, float(views.times[index]), background.to(device))
+    origins, directions = (ray.to(device) for ray in frame.rays(*views.image_rays(index)))
+    time = float(views.times[index])
+    image = renderer.image(field, origins, directions, time, background.to(device))
     shape = (views.height, views.width)
     return {name: value.cpu().view(*shape, *value.shape[1:]) for name, value in image.items()}
 
@@ -65,6 +68,7 @@ def score_view(
         truth=truth,
         colour=colour,
         depth=image["depth"].float(),
+        opacity=image["opacity"].float(),
     )
 
 

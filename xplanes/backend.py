@@ -35,6 +35,15 @@ def cpu_loops(tensor: Tensor) -> bool:
     )
 
 
+def fast_bf16(device: torch.device) -> bool:
+    """Whether a device multiplies bfloat16 matrices faster than float32 ones, in hardware."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    if device.type == "cpu":
+        return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+    return False
+
+
 def compiled(module: str) -> Any:
     """A module of compiled loops; loading the first takes a second, compiling a few more, once."""
     return importlib.import_module(module)

@@ -110,7 +110,7 @@ class TrainerConfig:
     accelerator: str = MISSING  # auto, cpu or gpu.
     devices: int = MISSING  # Processes; rays are split between them.
     strategy: str = MISSING  # auto, or ddp for several devices.
-    precision: str = MISSING  # 32, or bf16 for the decoder.
+    precision: str = MISSING  # Of the decoder: 32, bf16, or auto: bf16 where the hardware has it.
     max_steps: int = MISSING  # Steps at most.
     max_seconds: float | None = MISSING  # Training clock at most; null for no limit.
     rays_per_batch: int = MISSING  # Rays of a step at most.
@@ -224,7 +224,7 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "loss.background": ("white", "random"),
     "trainer.accelerator": ("auto", "cpu", "gpu"),
     "trainer.strategy": ("auto", "ddp"),
-    "trainer.precision": ("32", "bf16"),
+    "trainer.precision": ("auto", "32", "bf16"),
 }
 
 

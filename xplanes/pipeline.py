@@ -21,7 +21,12 @@ from xplanes.scenes.datamodule import RayDataModule
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, scene_frame
 from xplanes.scenes.views import Scene
-from xplanes.training.builder import build_batches, build_module, build_scene
+from xplanes.training.builder import (
+    build_batches,
+    build_module,
+    build_scene,
+    training_device,
+)
 from xplanes.training.fit import fit
 from xplanes.training.module import RadianceModule, TrainingError
 from xplanes.training.record import RunRecord, claim
@@ -94,10 +99,10 @@ def train(
     data = RayDataModule(scene, frame, lambda rank: build_batches(config, scene, frame, rank))
     loaded = time.monotonic() - started
     if record is not None:
-        device = _device(config)
+        device = training_device(config.trainer.accelerator)
         record.note(
-            device=device,
-            precision=config.trainer.precision,
+            device=torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
+            precision=module.field.decoder.precision,
             files={name: list(views.files) for name, views in scene.splits.items()},
         )
         text = header(config, folder, scene, frame, module, device, overrides or [])
@@ -146,12 +151,6 @@ def _film(module: RadianceModule, frame: Frame, scene: Scene, folder: Path) -> P
         background=scene.background,
     )
     return write_film(folder / "media" / "orbit.webp", frames, fps=FILM_FPS)
-
-
-def _device(config: TrainConfig) -> str:
-    if torch.cuda.is_available() and config.trainer.accelerator != "cpu":
-        return f"cuda {torch.cuda.get_device_name()}"
-    return "cpu"
 
 
 @contextmanager

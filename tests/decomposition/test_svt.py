@@ -39,5 +39,6 @@ def test_a_threshold_above_everything_gives_zero():
 
 
 def test_double_is_asked_for_when_squaring_would_cost_accuracy():
-    assert not needs_double(100.0, 1.0)
-    assert needs_double(1e4, 1.0)
+    assert not needs_double(100.0, 1.0, 1e-4)
+    assert needs_double(1e4, 1.0, 1e-4)
+    assert needs_double(100.0, 1.0, 1e-6)

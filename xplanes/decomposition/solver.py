@@ -84,7 +84,7 @@ def minimise(
             rescale=path.before / path.now,
             next_rescale=path.now / path.after,
             relaxation=schedule.relaxation,
-            double=not single or needs_double(singular[-1].item(), 1 / path.after),
+            double=not single or needs_double(singular[-1].item(), 1 / path.after, tolerance),
         )
         if last:
             finish(work, low_rank, step)

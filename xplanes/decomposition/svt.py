@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 _BLOCK_ELEMENTS = {"cpu": 1 << 20, "cuda": 1 << 27}
-_SINGLE_PRECISION_RANGE = 400.0
+_SINGLE_PRECISION_ERROR = 3e-9
 
 
 def block_rows(matrix: Tensor) -> int:
@@ -26,19 +26,19 @@ def add_gram(total: Tensor, block: Tensor, *, double: bool) -> None:
     total += block.mT @ block
 
 
-def needs_double(largest: float, threshold: float) -> bool:
+def needs_double(largest: float, threshold: float, tolerance: float) -> bool:
     """Whether a float32 Gram matrix is too coarse for this threshold.
 
     Squaring leaves an error of about 1e-8 times the largest SQUARED singular value (rounding within
-    a block; the sum over blocks is float64). Its effect on the thresholded matrix, relative to that
-    matrix, was measured as 3e-9 ``largest / threshold``; below the limit used here it stays near
-    the rounding of the float32 product itself.
+    a block; the sum over blocks is float64). Relative to the thresholded matrix it was measured as
+    3e-9 to 1e-8 ``largest / threshold``; a tenth of the tolerance is left to the smaller figure.
 
     Args:
         largest: Largest singular value.
         threshold: Threshold of the singular values, in the same unit.
+        tolerance: Relative accuracy that is wanted.
     """
-    return largest > _SINGLE_PRECISION_RANGE * threshold
+    return _SINGLE_PRECISION_ERROR * largest > 0.1 * tolerance * threshold
 
 
 def shrinkage_from_gram(gram: Tensor, threshold: float) -> tuple[Tensor, Tensor, Tensor]:

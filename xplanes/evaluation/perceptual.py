@@ -51,10 +51,13 @@ def lpips(network: str, side: int, device: str, *, download: bool) -> Metric:
     file = Path(torch.hub.get_dir()) / "checkpoints" / Path(url).name
     if not file.is_file() and not download:
         raise UnavailableError(f"{file} is missing: --lpips {network} downloads its {size}")
-    from torchmetrics.functional.image.lpips import _NoTrainLpips
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     try:
-        distance = _NoTrainLpips(net=network).to(device).eval()  # type: ignore[arg-type]
+        metric = LearnedPerceptualImagePatchSimilarity(
+            net_type=network,  # type: ignore[arg-type]
+            normalize=True,
+        ).to(device)
     except (OSError, RuntimeError) as error:
         raise UnavailableError(
             f"its weights cannot be loaded ({error}): put {url} at {file}"
@@ -63,6 +66,6 @@ def lpips(network: str, side: int, device: str, *, download: bool) -> Metric:
     @torch.no_grad()
     def measure(prediction: Tensor, truth: Tensor) -> float:
         images = [t.clamp(0, 1).float().permute(2, 0, 1)[None] for t in (prediction, truth)]
-        return float(distance(*(image.to(device) for image in images), normalize=True).mean())
+        return float(metric(*(image.to(device) for image in images)))
 
     return measure

@@ -20,7 +20,7 @@ def header(
     scene: Scene,
     frame: Frame,
     module: RadianceModule,
-    device: str,
+    device: torch.device,
     overrides: list[str],
 ) -> str:
     """The lines printed before training: what is about to happen, on what."""
@@ -36,8 +36,8 @@ def header(
         budget += f" or {config.trainer.max_seconds:g} s, whichever comes first"
     lines = {
         "xplanes": f"{__version__} · torch {torch.__version__} · {device} · "
-        f"{torch.get_num_threads()} threads · precision {config.trainer.precision} · "
-        f"{backend.name(torch.device('cuda' if device.startswith('cuda') else 'cpu'))}",
+        f"{torch.get_num_threads()} threads · decoder {module.field.decoder.precision} · "
+        f"{backend.name(device)}",
         "run": str(run),
         "data": f"{config.data.name} {scene.name} · {counts} views · "
         f"{train.width}x{train.height} px · {size:.1f} MB · cube {2 / frame.scale:.2f} wide",

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 Activation = Literal["relu", "silu"]
 DensityActivation = Literal["softplus", "exp"]
+Precision = Literal["32", "bf16"]
 
 _ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"relu": F.relu, "silu": F.silu}
 
@@ -27,6 +28,7 @@ class Decoder(nn.Module):
         activation: Between layers.
         density: Activation of the density.
         density_scale: Factor on the density.
+        precision: "bf16" multiplies in bfloat16 and keeps all else in float32.
         colour_margin: Widens the sigmoid of the colour by this much on either side of [0, 1].
 
     Source: X-Planes, Eq. 14; OpenLRM 1.1; TripoSR.
@@ -41,6 +43,7 @@ class Decoder(nn.Module):
         activation: Activation = "relu",
         density: DensityActivation = "softplus",
         density_scale: float = 1.0,
+        precision: Precision = "32",
         colour_margin: float = 0.001,
     ) -> None:
         super().__init__()
@@ -49,14 +52,17 @@ class Decoder(nn.Module):
         self.activation = _ACTIVATIONS[activation]
         self.density_activation: DensityActivation = density
         self.density_scale = density_scale
+        self.precision: Precision = precision
         self.colour_margin = colour_margin
 
     def logits(self, features: Tensor) -> Tensor:
         """The last layer's output before the activations. [N, 3 C] -> [N, 4]"""
-        hidden = features
-        for layer in self.layers[:-1]:
-            hidden = self.activation(layer(hidden))
-        return self.layers[-1](hidden)
+        bf16 = self.precision == "bf16"
+        with torch.autocast(features.device.type, torch.bfloat16, enabled=bf16):
+            hidden = features
+            for layer in self.layers[:-1]:
+                hidden = self.activation(layer(hidden))
+            return self.layers[-1](hidden)
 
     def activate(self, logits: Tensor) -> tuple[Tensor, Tensor]:
         """Colour and density from logits, in float32 whatever the logits' type. [N, 4] -> [N, 3], [N]"""

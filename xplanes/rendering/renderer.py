@@ -91,9 +91,7 @@ class Renderer:
             occlusion=self.occlusion,
         )
         colour, density = field(samples.points, times[samples.ray])
-        total, _ = composite(
-            density * step, colour, samples.distances, samples.ray, samples.starts
-        )
+        total, _ = composite(density * step, colour, samples.distances, samples.ray, samples.starts)
         opacity = total[:, 3]
         return Rendering(
             colour=total[:, :3] + (1 - opacity)[:, None] * background,

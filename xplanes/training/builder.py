@@ -6,8 +6,18 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from xplanes.config import DataConfig, DemoConfig, ModelConfig, SamplerConfig, TrainConfig
+from xplanes.backend import fast_bf16
+from xplanes.config import (
+    ConfigError,
+    DataConfig,
+    DemoConfig,
+    ModelConfig,
+    SamplerConfig,
+    TrainConfig,
+    TrainerConfig,
+)
 from xplanes.fields import Decoder, XPlanes
+from xplanes.fields.decoder import Precision
 from xplanes.fields.xplanes import random_planes
 from xplanes.rendering.carving import carve
 from xplanes.rendering.occupancy import OccupancyGrid
@@ -50,18 +60,41 @@ def build_scene(config: DataConfig, splits: tuple[str, ...] | None = None) -> Sc
     return Scene(config.scene, scene.splits, scene.video, scene.background)
 
 
+def training_device(name: str) -> torch.device:
+    """The device of ``trainer.accelerator``: a CUDA GPU where there is one, else the CPU.
+
+    Raises:
+        ConfigError: If a GPU is asked for and none is found.
+    """
+    if name == "gpu" and not torch.cuda.is_available():
+        raise ConfigError(
+            "trainer.accelerator=gpu: no GPU found; set trainer.accelerator=cpu or auto"
+        )
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def decoder_precision(trainer: TrainerConfig) -> Precision:
+    """The precision of ``trainer.precision``, settled for the device where it says auto."""
+    if trainer.precision == "auto":
+        return "bf16" if fast_bf16(training_device(trainer.accelerator)) else "32"
+    return "bf16" if trainer.precision == "bf16" else "32"
+
+
 def is_still(views: Views) -> bool:
     """Whether all views show one moment, so that nothing can move."""
     return bool((views.times == views.times[0]).all())
 
 
-def build_field(config: ModelConfig, times: Tensor, seed: int) -> XPlanes:
+def build_field(
+    config: ModelConfig, times: Tensor, seed: int, precision: Precision = "32"
+) -> XPlanes:
     """A field with random planes and a fresh decoder.
 
     Args:
         config: The model group.
         times: Times of the training views; planes of time are left out where all are equal. [V]
         seed: The run's seed.
+        precision: Of the decoder's products.
     """
     distinct = len(times.unique())
     plane_set = config.plane_set if distinct > 1 else "three"
@@ -85,6 +118,7 @@ def build_field(config: ModelConfig, times: Tensor, seed: int) -> XPlanes:
             activation=options.activation,  # type: ignore[arg-type]
             density=options.density,  # type: ignore[arg-type]
             density_scale=options.density_scale,
+            precision=precision,
         )
     with torch.no_grad():
         decoder.layers[-1].bias[0] += options.density_start  # type: ignore[index]
@@ -112,7 +146,8 @@ def build_renderer(config: SamplerConfig, *, still: bool) -> Renderer:
 def build_module(config: TrainConfig, scene: Scene, frame: Frame) -> RadianceModule:
     """Field, renderer and training in one module."""
     views = scene.splits["train"]
-    field = build_field(config.model, views.times, config.seed)
+    precision = decoder_precision(config.trainer)
+    field = build_field(config.model, views.times, config.seed, precision)
     renderer = build_renderer(config.sampler, still=is_still(views))
     if config.sampler.silhouettes:
         carve(renderer.grid, views, frame)

@@ -4,13 +4,13 @@ import logging
 import warnings
 from pathlib import Path
 
-import torch
 from lightning import Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from xplanes.config import ConfigError, TrainConfig
+from xplanes.config import TrainConfig
 from xplanes.scenes.datamodule import RayDataModule
 from xplanes.training.bar import StepBar
+from xplanes.training.builder import training_device
 from xplanes.training.checkpoints import LAST, Checkpoints
 from xplanes.training.clock import TrainingClock
 from xplanes.training.module import RadianceModule
@@ -50,10 +50,9 @@ def fit(
     checkpoints = Checkpoints(run / "checkpoints", options.checkpoint_every, clock)
     bar = StepBar(options.max_steps, options.max_seconds, split)
     trainer = Trainer(
-        accelerator=_accelerator(options.accelerator),
+        accelerator="gpu" if training_device(options.accelerator).type == "cuda" else "cpu",
         devices=options.devices,
         strategy=options.strategy,
-        precision="bf16-mixed" if options.precision == "bf16" else "32-true",
         max_steps=options.max_steps,
         callbacks=[clock, Scalars(options.log_every), scorer, checkpoints, bar],
         logger=TensorBoardLogger(run, name="", version="tb"),
@@ -71,14 +70,6 @@ def fit(
     if trainer.interrupted:
         raise KeyboardInterrupt
     return scorer
-
-
-def _accelerator(name: str) -> str:
-    if name == "gpu" and not torch.cuda.is_available():
-        raise ConfigError(
-            "trainer.accelerator=gpu: no GPU found; set trainer.accelerator=cpu or auto"
-        )
-    return name
 
 
 def quiet_lightning() -> None:

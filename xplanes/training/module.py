@@ -105,13 +105,14 @@ class RadianceModule(LightningModule):
         loss = (rendering.colour - rays["target"]).square().mean()
         value = float(loss.detach())
         self.batches += 1
-        if not math.isfinite(value):
+        # All ranks must skip a step together: one that waits for the others' gradients would hang.
+        usable = self.trainer.strategy.reduce_boolean_decision(math.isfinite(value), all=True)
+        if not usable:
             self._refuse(value, rendering.density)
             return
         self.unusable_in_a_row = 0
-        if len(rendering.samples):
-            self.manual_backward(loss / self.options.accumulate)
-            self.grid.observe(rendering.samples.cells, rendering.density)
+        self.manual_backward(loss / self.options.accumulate)
+        self.grid.observe(rendering.samples.cells, rendering.density)
         self._count(rendering.samples, len(rays["times"]))
         self.last = {"loss": value, "psnr": -10 * math.log10(max(value, 1e-10))}
         if self.batches % self.options.accumulate == 0:

@@ -1,0 +1,227 @@
+"""What the runs of a sweep say of themselves, whatever state they are in.
+
+Must stay quick, and a damaged file must not hide the other runs: every problem ends as a run's
+status.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from xplanes.files import read_json
+
+SCORES = {
+    "psnr": ("test", "psnr"),
+    "ssim": ("test", "ssim"),
+    "steps": ("step",),
+    "prepare_seconds": ("seconds", "prepare"),
+    "train_seconds": ("seconds", "train"),
+    "samples_per_ray": ("samples_per_ray",),
+    "parameters": ("parameters",),
+}
+"""Where metrics.json holds each column's number."""
+
+
+@dataclass(frozen=True)
+class RunRow:
+    """One run, or one job of a sweep that left none.
+
+    Attributes:
+        name: Folder of the run relative to the sweep's.
+        settings: Settings by dotted name.
+        overridden: Names of those that the command line set.
+        scores: Numbers by the names of `SCORES`, as far as they are known.
+        status: How it ended, with the reason where it is not ``finished``.
+    """
+
+    name: str
+    settings: dict[str, Any] = field(default_factory=dict)
+    overridden: frozenset[str] = frozenset()
+    scores: dict[str, float] = field(default_factory=dict)
+    status: str = "finished"
+
+
+def read_rows(folder: Path) -> list[RunRow]:
+    """All runs in a folder, however deep, and the jobs of sweeps that left no run."""
+    rows = []
+    for place, runs in _groups(folder):
+        rows += [read_run(run, _name(run, folder)) for run in runs]
+        rows += _missing_jobs(place, folder, [run_overrides(run) for run in runs])
+    return rows
+
+
+def _name(path: Path, folder: Path) -> str:
+    relative = path.relative_to(folder)
+    return str(relative) if relative.parts else path.resolve().name
+
+
+def _groups(folder: Path) -> Iterator[tuple[Path, list[Path]]]:
+    """Folders that hold runs or are a sweep, each with the runs right in it."""
+    if _is_job(folder):
+        yield folder, [folder]
+        return
+    inside = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()]
+    inside = sorted((p for p in inside if not p.name.startswith(".")), key=_natural)
+    runs = [path for path in inside if _is_job(path)]
+    if runs or (folder / "multirun.yaml").is_file():
+        yield folder, runs
+    for path in inside:
+        if path not in runs:
+            yield from _groups(path)
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Sorts 2_... before 10_..."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(int(part), "") if part.isdigit() else (0, part) for part in parts]
+
+
+def _is_job(folder: Path) -> bool:
+    names = ("run.json", "metrics.json", "config.yaml", ".hydra/overrides.yaml")
+    return any((folder / name).is_file() for name in names)
+
+
+def read_run(run: Path, name: str) -> RunRow:
+    """One run directory as a row."""
+    problems: list[str] = []
+    config = _read_yaml(run, ("config.yaml", ".hydra/config.yaml"), problems)
+    record = _read_json(run / "run.json", problems)
+    metrics = _read_json(run / "metrics.json", problems)
+    scores = _scores(metrics) if metrics else {}
+    if metrics and not {"psnr", "ssim"} <= scores.keys():
+        problems.append("metrics.json lacks scores")
+    status = _status(record, metrics)
+    if problems and status == "finished":
+        status = "damaged"
+    return RunRow(
+        name=name,
+        settings=flatten(config) if isinstance(config, dict) else {},
+        overridden=frozenset(_key(line) for line in run_overrides(run)),
+        scores=scores,
+        status="; ".join([status, *problems]),
+    )
+
+
+def _status(record: dict[str, Any] | None, metrics: dict[str, Any] | None) -> str:
+    if record is None:
+        return "finished" if metrics else "failed before it began"
+    status, reason = record.get("status"), record.get("reason")
+    if status == "finished" and metrics is None:
+        return "finished without metrics.json"
+    if status == "running":
+        return f"running, or killed, since {record.get('started')}"
+    return f"{status}: {reason}" if reason else str(status)
+
+
+def _scores(metrics: dict[str, Any]) -> dict[str, float]:
+    found = {}
+    for name, path in SCORES.items():
+        value: Any = metrics
+        for key in path:
+            value = value.get(key) if isinstance(value, dict) else None
+        if isinstance(value, dict) and value:
+            parts = list(value.values())
+            value = sum(parts) if all(_is_number(part) for part in parts) else None
+        if _is_number(value):
+            found[name] = value
+    return found
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted name."""
+    flat: dict[str, Any] = {}
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        flat.update(flatten(value, f"{name}.") if isinstance(value, dict) else {name: value})
+    return flat
+
+
+def run_overrides(run: Path) -> list[str]:
+    """What the command line set, from Hydra's record of it or our own."""
+    content = _read_yaml(run, (".hydra/overrides.yaml",), [])
+    if isinstance(content, list):
+        return [str(line) for line in content]
+    try:
+        return (run / "overrides.txt").read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return []
+
+
+def _key(override: str) -> str:
+    return override.split("=", 1)[0].lstrip("+~")
+
+
+def _value(override: str) -> Any:
+    text = override.split("=", 1)[-1]
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return text
+
+
+def _missing_jobs(sweep: Path, folder: Path, done: list[list[str]]) -> list[RunRow]:
+    """Rows for the jobs in multirun.yaml whose overrides belong to no run."""
+    content = _read_yaml(sweep, ("multirun.yaml",), [])
+    if not isinstance(content, dict):
+        return []
+    left = Counter(tuple(sorted(lines)) for lines in done)
+    rows = []
+    for number, job in enumerate(_jobs(content)):
+        key = tuple(sorted(job))
+        if left[key]:
+            left[key] -= 1
+            continue
+        settings = {_key(line): _value(line) for line in job}
+        name = str(Path(_name(sweep, folder) if sweep != folder else "") / f"job {number}")
+        rows.append(RunRow(name, settings, frozenset(settings), status="missing: no run"))
+    return rows
+
+
+def _jobs(multirun: dict[str, Any]) -> list[list[str]]:
+    """Overrides of each job of a sweep over a grid; none for other sweepers."""
+    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        settings = multirun["hydra"]
+        if not settings["sweeper"]["_target_"].endswith(".BasicSweeper"):
+            return []
+        params = [f"{key}={value}" for key, value in (settings["sweeper"]["params"] or {}).items()]
+        lines = [*params, *settings["overrides"]["task"]]
+        parsed = OverridesParser.create().parse_overrides(lines)
+        return BasicSweeper.split_arguments(parsed, None)[0]
+    except (KeyError, TypeError, AttributeError, HydraException):
+        return []
+
+
+def _read_yaml(folder: Path, names: tuple[str, ...], problems: list[str]) -> Any:
+    """The first of the files that exists; None, and a problem noted, if it is damaged."""
+    for name in names:
+        try:
+            return yaml.safe_load((folder / name).read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            continue
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            problems.append(f"{name} is damaged ({type(error).__name__})")
+            return None
+    return None
+
+
+def _read_json(path: Path, problems: list[str]) -> dict[str, Any] | None:
+    try:
+        return read_json(path)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError):
+        problems.append(f"{path.name} is damaged")
+        return None

@@ -1,0 +1,152 @@
+"""The table of a sweep: table.md and table.csv, and the Hydra callback that writes them."""
+
+import atexit
+import os
+import traceback
+from collections.abc import MutableMapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+from xplanes.config import ConfigError
+from xplanes.evaluation.sweep import RunRow, read_rows
+from xplanes.evaluation.tabulate import (
+    SEED,
+    align,
+    differing,
+    markdown,
+    run_table,
+    seed_groups,
+    seed_table,
+)
+from xplanes.files import write_json, write_rows, write_text
+
+
+def write_tables(folder: Path, out: Path | None = None) -> str:
+    """Tabulate all runs in a folder.
+
+    Args:
+        folder: A sweep, or any folder of runs.
+        out: Where table.md, table.csv and, with several seeds, table_seeds.csv go; ``folder`` when
+            None.
+
+    Returns:
+        What table.md holds.
+
+    Raises:
+        ConfigError: If there are no runs in the folder.
+    """
+    if not folder.is_dir():
+        raise ConfigError(f"{folder} is not a folder")
+    rows = align(read_rows(folder))
+    if not rows:
+        raise ConfigError(f"{folder}: no runs in it (folders with run.json)")
+    out = out or folder
+    names = differing(rows)
+    text = [f"# {folder.resolve().name}", counts(rows), markdown(*run_table(rows, names))]
+    write_rows(out / "table.csv", *run_table(rows, names, exact=True))
+    seeds = seed_groups(rows)
+    if seeds:
+        over = [name for name in names if name != SEED]
+        text += ["Mean and standard deviation over seeds:", markdown(*seed_table(seeds, over))]
+        write_rows(out / "table_seeds.csv", *seed_table(seeds, over, exact=True))
+    else:
+        (out / "table_seeds.csv").unlink(missing_ok=True)
+    whole = "\n\n".join(text) + "\n"
+    write_text(out / "table.md", whole)
+    return whole
+
+
+def counts(rows: Sequence[RunRow]) -> str:
+    """How many runs ended how, and what their scores are of."""
+    kinds = [row.status.split(":")[0].split(",")[0].split(";")[0] for row in rows]
+    tally = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+    splits = {row.settings["data.eval_split"] for row in rows if "data.eval_split" in row.settings}
+    scored = f" Scores of the {splits.pop()} split." if len(splits) == 1 else ""
+    return f"{len(rows)} runs: {tally}.{scored}"
+
+
+class SweepTable(Callback):
+    """Says how each job of a multirun ended, and writes and prints the table at its end.
+
+    The table comes at the end of the process, whichever that is: Hydra leaves out
+    ``on_multirun_end`` when a job has failed or the sweep is stopped.
+    """
+
+    def __init__(self) -> None:
+        self._folder: Path | None = None
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        self._folder = Path(config.hydra.sweep.dir).absolute()
+        atexit.register(self._finish)
+
+    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
+        if config.hydra.mode == RunMode.MULTIRUN:
+            gpu = choose_gpu(config.hydra.job.num, os.environ)
+            if gpu is not None:
+                _say(f"job {config.hydra.job.num} on GPU {gpu}")
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
+        if config.hydra.mode != RunMode.MULTIRUN:
+            return
+        run = Path(config.hydra.runtime.output_dir)
+        # The public property raises the job's own error.
+        value = job_return._return_value
+        if job_return.status != JobStatus.FAILED:
+            _say(f"job {config.hydra.job.num} finished: psnr {value:.2f}  {run.name}")
+            return
+        reason = f"{type(value).__name__}: {value}"
+        _say(f"job {config.hydra.job.num} failed: {reason}  {run.name}")
+        if not (run / "run.json").exists():
+            # It failed before it could keep a record of its own.
+            write_json(run / "run.json", {"status": "failed", "reason": reason})
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        self._finish()
+
+    def _finish(self) -> None:
+        folder, self._folder = self._folder, None
+        if folder is None or not folder.is_dir():
+            return
+        atexit.unregister(self._finish)
+        try:
+            _say(f"\n{write_tables(folder)}\nwrote {folder / 'table.md'} and table.csv")
+        except ConfigError:
+            return  # No job has begun.
+        except Exception:
+            # The runs are there and whole; only their table is not.
+            traceback.print_exc()
+            _say(f"no table: python -m xplanes table {folder}")
+
+
+def choose_gpu(job: int, environment: MutableMapping[str, str]) -> str | None:
+    """Give jobs that run side by side a GPU each: number of the job modulo number of GPUs.
+
+    A process keeps the GPU of its first job, because CUDA asks once which devices it may see.
+
+    Args:
+        job: Number of the job within the sweep.
+        environment: Its ``CUDA_VISIBLE_DEVICES`` is read, and set to the GPU chosen.
+
+    Returns:
+        The GPU; None where there is no choice.
+    """
+    listed = environment.get("CUDA_VISIBLE_DEVICES")
+    if listed is None:
+        import torch
+
+        gpus = [str(number) for number in range(torch.cuda.device_count())]
+    else:
+        gpus = [name.strip() for name in listed.split(",") if name.strip()]
+    if len(gpus) < 2:
+        return None
+    environment["CUDA_VISIBLE_DEVICES"] = gpu = gpus[job % len(gpus)]
+    return gpu
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)

@@ -1,0 +1,162 @@
+"""Rows of runs as tables: which columns they need, means over seeds, and markdown."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from xplanes.evaluation.sweep import SCORES, RunRow
+
+SEED = "seed"
+UNLISTED = ("resume",)
+"""Settings that say nothing about a result."""
+
+LABELS = {
+    "prepare_seconds": "prepare s",
+    "train_seconds": "train s",
+    "samples_per_ray": "samples/ray",
+    "parameters": "params",
+}
+FORMATS = {"psnr": ".2f", "ssim": ".4f", "steps": ".0f", "parameters": ",.0f"}
+LONGEST = 120
+"""Letters of a status in markdown; the CSV has all of it."""
+
+
+def align(rows: list[RunRow]) -> list[RunRow]:
+    """Settings of jobs without a run, by the names that runs have: ``model`` is ``model.name``."""
+    known = {name for row in rows for name in row.settings if name.endswith(".name")}
+    return [
+        replace(
+            row,
+            settings={
+                f"{key}.name" if f"{key}.name" in known else key: value
+                for key, value in row.settings.items()
+            },
+        )
+        for row in rows
+    ]
+
+
+def differing(rows: Sequence[RunRow]) -> list[str]:
+    """Settings in which runs differ, without those that only follow from a group's choice."""
+    known = [row for row in rows if row.settings]
+    whole = [row for row in known if not row.status.startswith("missing")]
+    overridden = {name for row in rows for name in row.overridden}
+    found = []
+    for name in dict.fromkeys(name for row in known for name in row.settings):
+        # Jobs without a run know only what was overridden.
+        among = known if name in overridden or name.endswith(".name") else whole
+        values = {_text(row.settings.get(name)) for row in among if _has(row, name)}
+        if len(values) < 2 or name in UNLISTED:
+            continue
+        group = f"{name.split('.')[0]}.name"
+        if name == group or name in overridden or not _follows(whole, name, group):
+            found.append(name)
+    return found
+
+
+def _has(row: RunRow, name: str) -> bool:
+    return name in row.settings or not row.status.startswith("missing")
+
+
+def _follows(rows: Sequence[RunRow], name: str, group: str) -> bool:
+    """Whether the group's name decides the setting."""
+    pairs = {(_text(row.settings.get(group)), _text(row.settings.get(name))) for row in rows}
+    return len(pairs) == len({choice for choice, _ in pairs})
+
+
+def run_table(
+    rows: Sequence[RunRow], names: Sequence[str], *, exact: bool = False
+) -> tuple[list[str], list[list[str]]]:
+    """Header and one line per run; ``exact`` keeps all digits, for CSV."""
+    header = ["run", *(_label(n, exact) for n in names), *(_label(n, exact) for n in SCORES)]
+    lines = [
+        [
+            row.name,
+            *(_text(row.settings[n]) if n in row.settings else "" for n in names),
+            *(_number(row.scores.get(n), n, exact) for n in SCORES),
+            row.status,
+        ]
+        for row in rows
+    ]
+    return [*header, "status"], lines
+
+
+def seed_groups(rows: Sequence[RunRow]) -> list[list[RunRow]]:
+    """Finished runs that differ in nothing but their seed, if there are two such runs at all."""
+    groups: dict[str, list[RunRow]] = {}
+    for row in rows:
+        if row.settings and {"psnr", "ssim"} <= row.scores.keys():
+            rest = {k: v for k, v in row.settings.items() if k not in (SEED, *UNLISTED)}
+            groups.setdefault(json.dumps(rest, sort_keys=True, default=str), []).append(row)
+    several = any(len(group) > 1 for group in groups.values())
+    return list(groups.values()) if several else []
+
+
+def seed_table(
+    groups: Sequence[Sequence[RunRow]], names: Sequence[str], *, exact: bool = False
+) -> tuple[list[str], list[list[str]]]:
+    """Header and one line per setting; quality with its standard deviation, the rest as means."""
+    header = [*(_label(n, exact) for n in names), "seeds"]
+    for name in SCORES:
+        label = _label(name, exact)
+        spread = name in ("psnr", "ssim")
+        header += [label, f"{name}_std"] if spread and exact else [label]
+    lines = []
+    for group in groups:
+        settings = group[0].settings
+        line = [_text(settings[n]) if n in settings else "" for n in names] + [str(len(group))]
+        for name in SCORES:
+            values = [row.scores[name] for row in group if name in row.scores]
+            mean = math.fsum(values) / len(values) if values else None
+            shown = _number(mean, name, exact)
+            if name not in ("psnr", "ssim"):
+                line.append(shown)
+                continue
+            std = _number(_deviation(values), name, exact)
+            line += [shown, std] if exact else [f"{shown} ± {std}" if std else shown]
+        lines.append(line)
+    return header, lines
+
+
+def _deviation(values: Sequence[float]) -> float | None:
+    """Standard deviation of the population that the values are a sample of; None for one value."""
+    if len(values) < 2:
+        return None
+    mean = math.fsum(values) / len(values)
+    return math.sqrt(math.fsum((value - mean) ** 2 for value in values) / (len(values) - 1))
+
+
+def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """A table whose columns also line up where it is read as text."""
+    cells = [[_cell(text) for text in line] for line in (header, *lines)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    cells.insert(1, ["-" * width for width in widths])
+    padded = [
+        [text.ljust(width) for text, width in zip(line, widths, strict=True)] for line in cells
+    ]
+    return "\n".join(f"| {' | '.join(line)} |" for line in padded)
+
+
+def _cell(text: str) -> str:
+    text = " ".join(text.split())
+    if len(text) > LONGEST:
+        text = text[: LONGEST - 3] + "..."
+    return text.replace("|", "\\|")
+
+
+def _label(name: str, exact: bool) -> str:
+    return name if exact else LABELS.get(name, name.removesuffix(".name"))
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    return json.dumps(value, default=str)
+
+
+def _number(value: float | None, name: str, exact: bool) -> str:
+    if value is None:
+        return ""
+    return repr(value) if exact else format(value, FORMATS.get(name, ".1f"))

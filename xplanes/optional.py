@@ -4,15 +4,19 @@ import importlib
 from types import ModuleType
 
 
+class MissingExtraError(ImportError):
+    """A package of an extra is not installed; the message names the extra."""
+
+
 def require(module: str, *, extra: str) -> ModuleType:
     """Import ``module``, or say which extra brings it.
 
     Raises:
-        ImportError: If it is not installed; the message names the extra.
+        MissingExtraError: If it is not installed; the message names the extra.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise ImportError(
+        raise MissingExtraError(
             f'{module.split(".")[0]} is not installed: pip install "xplanes[{extra}]"'
         ) from error

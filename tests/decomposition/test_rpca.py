@@ -267,6 +267,26 @@ def test_reduced_precision_settings_do_not_leak_in_or_out():
     assert torch.equal(plain.low_rank, guarded.low_rank)
 
 
+@pytest.mark.parametrize("progress", [True, False])
+def test_a_short_run_shows_no_bar(progress, capfd):
+    robust_pca(mixture(), sparsity_weight=0.05, progress=progress)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_long_run_shows_a_bar_unless_told_not_to(capfd, monkeypatch):
+    now = [0.0]
+
+    def tick():
+        now[0] += 1.0
+        return now[0]
+
+    monkeypatch.setattr("time.time", tick)
+    robust_pca(mixture(), sparsity_weight=0.05)
+    assert "robust PCA" in capfd.readouterr().err
+    robust_pca(mixture(), sparsity_weight=0.05, progress=False)
+    assert capfd.readouterr().err == ""
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_on_a_gpu():
     matrix = mixture(dtype=torch.float32)

@@ -139,6 +139,7 @@ def robust_pca(
             if method == "adaptive":
                 begin = penalty * math.sqrt(work.numel()) / _norm(work)
             elif method == "growing":
+                # Lin et al. start from 1.25 over the spectral norm; the Frobenius norm is at hand.
                 begin = 1.25 / _norm(work)
             end = minimise(
                 work, low_rank, sparse, sparsity_weight=weight, penalty=begin,

@@ -31,7 +31,13 @@ def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
     rows = []
     for index in progress(range(len(views)), len(views), "views"):
         score = score_view(
-            module.field, module.renderer, trained.frame, views, index, trained.scene.background
+            module.field,
+            module.renderer,
+            trained.frame,
+            views,
+            index,
+            trained.scene.background,
+            stride=trained.stride,
         )
         rows.append(_row(score, tag, metric))
     names = [name for name in rows[0] if name not in ("file", "time")] if rows else []
@@ -78,8 +84,10 @@ def score_table(scores: dict[str, Any]) -> str:
     names = list(scores["test"])
     width = max([len(row["file"]) for row in scores["views"]] + [len("mean of 000 views")])
     lines = [f"{'view':<{width}}   time" + "".join(f"{name:>12}" for name in names)]
-    for row in scores["views"]:
-        lines.append(f"{row['file']:<{width}}  {row['time']:.3f}" + _numbers(row, names))
+    lines += [
+        f"{row['file']:<{width}}  {row['time']:.3f}" + _numbers(row, names)
+        for row in scores["views"]
+    ]
     label = f"mean of {len(scores['views'])} views"
     lines.append(f"{label:<{width}}       " + _numbers(scores["test"], names))
     lines += [f"{tag} not computed ({reason})" for tag, reason in scores["not_computed"].items()]

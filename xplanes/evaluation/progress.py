@@ -26,8 +26,8 @@ def progress(
         what: Their name in the plural.
         stream: Where to write; standard error when None.
     """
-    stream = stream or sys.stderr
-    live = stream.isatty()
+    out: TextIO = sys.stderr if stream is None else stream
+    live = out.isatty()
     began = time.monotonic()
     due = began + PATIENCE_SECONDS
     width = 0
@@ -37,12 +37,12 @@ def progress(
             if now >= due and done < total:
                 left = (now - began) * (total - done) / done
                 line = f"{what} {done}/{total}  {int(left) // 60}:{int(left) % 60:02d} left"
-                stream.write("\r" + line.ljust(width) if live else line + "\n")
-                stream.flush()
+                out.write("\r" + line.ljust(width) if live else line + "\n")
+                out.flush()
                 width = len(line)
                 due = now + (LIVE_SECONDS if live else PIPED_SECONDS)
             yield item
     finally:
         if live and width:
-            stream.write("\r" + " " * width + "\r")
-            stream.flush()
+            out.write("\r" + " " * width + "\r")
+            out.flush()

@@ -95,8 +95,8 @@ def film(trained: TrainedRun, options: FilmOptions, out: str | None = None) -> P
         ImportError: For .mp4 without the extra ``video``.
     """
     options.check()
+    check_out(out, options)
     target, folder = destination(trained.path, options, out, trained.checkpoint)
-    check_film(target, frames=options.count, folder=folder)
     views = trained.scene.splits["train"]
     size = options.size or views.width
     frames = render_path(
@@ -109,9 +109,21 @@ def film(trained: TrainedRun, options: FilmOptions, out: str | None = None) -> P
         size=size,
         background=trained.scene.background,
         what=options.what,
+        stride=trained.stride,
     )
     shown = progress(frames, options.count, "frames")
     return write_film(target, shown, fps=options.fps, folder=folder)
+
+
+def check_out(out: str | None, options: FilmOptions) -> None:
+    """Refuse an ``--out`` that could not be written, before the run is loaded.
+
+    Raises:
+        ConfigError: As `xplanes.evaluation.media.check_film`.
+        ImportError: For .mp4 without the extra ``video``.
+    """
+    target, folder = destination(Path(), options, out, "last")
+    check_film(target, frames=options.count, folder=folder)
 
 
 def destination(

@@ -1,4 +1,4 @@
-"""What a run says of itself: its first lines, metrics.json, TensorBoard's HParams, its last lines."""
+"""What a run says of itself: its first lines, metrics.json, TensorBoard, its last lines."""
 
 from pathlib import Path
 from typing import Any

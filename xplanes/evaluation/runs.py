@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
 
 from xplanes.config import ConfigError, TrainConfig, parse
 from xplanes.files import read_json
 from xplanes.scenes.frame import Frame, scene_frame
 from xplanes.scenes.views import Scene, Views
-from xplanes.training.builder import build_module, build_scene
+from xplanes.training.builder import build_module, build_scene, training_device
 from xplanes.training.checkpoints import load_checkpoint
 from xplanes.training.module import RadianceModule
 
@@ -50,6 +49,11 @@ class TrainedRun:
     def views(self) -> Views:
         """The views of the split."""
         return self.scene.splits[self.split]
+
+    @property
+    def stride(self) -> int:
+        """Steps that one sample stood for when this step was scored."""
+        return self.module.stride_at(self.step)
 
     @property
     def is_still(self) -> bool:
@@ -128,15 +132,17 @@ def load_run(
         run: The run directory.
         checkpoint: ``last`` or ``best``.
         split: Split to read beside the training views; the run's own when None.
-        device: Where to put the field; the kind of device that trained it when None.
+        device: Where to put the field; as ``trainer.accelerator`` says when None.
         announce: Takes the lines that say what is being loaded.
 
     Raises:
         ConfigError, SceneError: If the run or its data are missing, damaged or changed.
     """
     config = _parsed(run)
-    split = split or config.data.eval_split
-    device = device or _device(config)
+    name = split or config.data.eval_split
+    if config.trainer.accelerator == "gpu":
+        config.trainer.accelerator = "auto"  # Trained on a GPU, looked at where there may be none.
+    device = device or str(training_device(config.trainer.accelerator))
     state = load_checkpoint(run / "checkpoints" / f"{checkpoint}.ckpt")
     step = state.get("global_step")
     if not isinstance(step, int) or "state_dict" not in state or "progress" not in state:
@@ -145,7 +151,7 @@ def load_run(
         announce(f"run         {run}")
         announce(f"checkpoint  {checkpoint}.ckpt, step {step}, on {device}")
     config.data.root = _data_root(run, config.data.root)
-    scene = build_scene(config.data, ("train", split))
+    scene = build_scene(config.data, ("train", name))
     _check_views(run, scene.splits["train"])
     frame = scene_frame(scene.splits["train"], config.data.half_side)
     module = build_module(config, scene, frame)
@@ -157,7 +163,7 @@ def load_run(
         ) from error
     module.on_load_checkpoint(state)
     module.to(device).eval()
-    return TrainedRun(run, config, scene, split, frame, module, checkpoint, step)
+    return TrainedRun(run, config, scene, name, frame, module, checkpoint, step)
 
 
 def _parsed(run: Path) -> TrainConfig:
@@ -166,14 +172,9 @@ def _parsed(run: Path) -> TrainConfig:
         return parse(content)
     except (KeyError, TypeError, AttributeError) as error:
         raise ConfigError(
-            f"{run}/config.yaml cannot be used ({type(error).__name__}: {error}): it is damaged, or "
-            "from another version of xplanes"
+            f"{run}/config.yaml cannot be used ({type(error).__name__}: {error}): it is damaged, "
+            "or from another version of xplanes"
         ) from error
-
-
-def _device(config: TrainConfig) -> str:
-    gpu = torch.cuda.is_available() and config.trainer.accelerator != "cpu"
-    return "cuda" if gpu else "cpu"
 
 
 def _record(run: Path) -> dict[str, Any]:

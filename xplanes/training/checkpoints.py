@@ -39,9 +39,19 @@ class Checkpoints(Callback):
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.save(trainer, LAST)
-        self._save_best(trainer, pl_module)
+
+    def on_exception(
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
+    ) -> None:
+        if isinstance(exception, KeyboardInterrupt) and trainer.global_step:
+            self.save(trainer, LAST)
+
+    def finish(self, trainer: Trainer, module: LightningModule) -> None:
+        """Keep the final model as the best, if it is."""
+        self._save_best(trainer, module)
 
     def _save_best(self, trainer: Trainer, module: LightningModule) -> None:
+        """Keep the model if its score is the best so far."""
         assert isinstance(module, RadianceModule)
         # All ranks take part in saving, but only the first knows the scores.
         if trainer.strategy.broadcast(module.improved):

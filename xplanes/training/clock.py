@@ -25,6 +25,9 @@ class TrainingClock(Callback):
         self._mark = 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, RadianceModule)
+        if self.max_seconds is not None and pl_module.clock >= self.max_seconds:
+            trainer.should_stop = True
         self.pause()
 
     def on_train_batch_end(

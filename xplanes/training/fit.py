@@ -13,6 +13,7 @@ from xplanes.training.bar import StepBar
 from xplanes.training.builder import training_device
 from xplanes.training.checkpoints import LAST, Checkpoints
 from xplanes.training.clock import TrainingClock
+from xplanes.training.interrupt import Interrupt
 from xplanes.training.module import RadianceModule
 from xplanes.training.scalars import Scalars
 from xplanes.training.scorer import Scorer
@@ -36,7 +37,7 @@ def fit(
     quiet_lightning()
     options = config.trainer
     split = config.data.eval_split
-    clock = TrainingClock(options.max_seconds)
+    clock, interrupt = TrainingClock(options.max_seconds), Interrupt()
     scorer = Scorer(
         data.scene.splits[split],
         split,
@@ -46,6 +47,7 @@ def fit(
         count=options.evaluate_views,
         run=run,
         clock=clock,
+        interrupt=interrupt,
     )
     checkpoints = Checkpoints(run / "checkpoints", options.checkpoint_every, clock)
     bar = StepBar(options.max_steps, options.max_seconds, split)
@@ -54,7 +56,7 @@ def fit(
         devices=options.devices,
         strategy=options.strategy,
         max_steps=options.max_steps,
-        callbacks=[clock, Scalars(options.log_every), scorer, checkpoints, bar],
+        callbacks=[clock, Scalars(options.log_every), scorer, checkpoints, bar, interrupt],
         logger=TensorBoardLogger(run, name="", version="tb"),
         enable_checkpointing=False,
         enable_progress_bar=False,
@@ -64,11 +66,15 @@ def fit(
         use_distributed_sampler=False,
     )
     last = run / "checkpoints" / LAST
-    trainer.fit(
-        module, data, ckpt_path=str(last) if resume and last.is_file() else None, weights_only=True
-    )
-    if trainer.interrupted:
-        raise KeyboardInterrupt
+    with interrupt.listening():
+        trainer.fit(
+            module,
+            data,
+            ckpt_path=str(last) if resume and last.is_file() else None,
+            weights_only=True,
+        )
+        scorer.finish(trainer, module)
+        checkpoints.finish(trainer, module)
     return scorer
 
 

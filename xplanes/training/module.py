@@ -73,6 +73,15 @@ class RadianceModule(LightningModule):
             share = max(share, self.clock / self.options.max_seconds)
         return min(1.0, share)
 
+    @property
+    def stride(self) -> int:
+        """Steps that one sample stands for: the first training steps look at half the samples."""
+        return self.stride_at(self.global_step)
+
+    def stride_at(self, step: int) -> int:
+        """The stride of a training step, and of scores at that step."""
+        return 2 if step < self.sampler.coarse_steps else 1
+
     def configure_optimizers(self) -> torch.optim.Optimizer:
         groups: list[dict[str, Any]] = [
             {"params": [self.field.space], "lr": self.options.plane_lr, "name": "space"}
@@ -100,7 +109,7 @@ class RadianceModule(LightningModule):
             rays["times"],
             rays["background"],
             rays["jitter"],
-            stride=2 if self.global_step < self.sampler.coarse_steps else 1,
+            stride=self.stride,
         )
         loss = (rendering.colour - rays["target"]).square().mean()
         value = float(loss.detach())

@@ -46,6 +46,7 @@ class RunRecord:
             "total_seconds": self._before,
             "resumed": earlier.get("resumed", 0) + bool(earlier),
             "seed": seed,
+            "directory": str(Path.cwd()),  # Where relative paths of the settings start.
             "xplanes": __version__,
             "commit": _commit(),
             "python": platform.python_version(),

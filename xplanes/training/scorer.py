@@ -13,6 +13,7 @@ from xplanes.rendering.pictures import plane_sheet, strip, write_png
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
 from xplanes.training.clock import TrainingClock
+from xplanes.training.interrupt import Interrupt
 from xplanes.training.module import RadianceModule
 from xplanes.training.scoring import Curve, ViewScore, mean, score_view, spread
 
@@ -32,6 +33,7 @@ class Scorer(Callback):
         count: Views scored on the way, spread evenly; None for all.
         run: The run directory.
         clock: Paused after each evaluation.
+        interrupt: Asked between views.
     """
 
     def __init__(
@@ -45,11 +47,12 @@ class Scorer(Callback):
         count: int | None,
         run: Path,
         clock: TrainingClock,
+        interrupt: Interrupt,
     ) -> None:
         self.views, self.split, self.frame, self.background = views, split, frame, background
         self.at = sorted(share for share in at if share < 1)
         self.indices = spread(count or len(views), len(views))
-        self.run, self.clock = run, clock
+        self.run, self.clock, self.interrupt = run, clock, interrupt
         self.curve: Curve | None = None
         self.latest: list[ViewScore] = []
         self.best = float("-inf")
@@ -58,12 +61,10 @@ class Scorer(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, RadianceModule)
-        if trainer.is_global_zero:
-            self.curve = Curve(self.run / "curve.csv", until=trainer.global_step)
         fresh = trainer.global_step == 0
         self._next = sum(share <= pl_module.progress for share in self.at)
         if fresh and self.at and self.at[0] == 0:
-            self._score(trainer, pl_module, self.indices)
+            self._score(trainer, pl_module, self.indices, pl_module.stride)
         self.clock.pause()
 
     def on_train_batch_end(
@@ -73,23 +74,37 @@ class Scorer(Callback):
         due = sum(share <= pl_module.progress for share in self.at)
         if due > self._next and pl_module.progress < 1 and not trainer.should_stop:
             self._next = due
-            self._score(trainer, pl_module, self.indices)
+            self._score(trainer, pl_module, self.indices, pl_module.stride)
             self.clock.pause()
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, RadianceModule)
-        self._score(trainer, pl_module, list(range(len(self.views))))
+    def finish(self, trainer: Trainer, module: RadianceModule) -> None:
+        """Score all views with all samples: the figures of the final model."""
+        self._score(trainer, module, list(range(len(self.views))), stride=1)
 
-    def _score(self, trainer: Trainer, module: RadianceModule, indices: list[int]) -> None:
+    def _score(
+        self, trainer: Trainer, module: RadianceModule, indices: list[int], stride: int
+    ) -> None:
         if not trainer.is_global_zero:
             return
-        assert self.curve is not None
+        if self.curve is None:
+            self.curve = Curve(self.run / "curve.csv", until=trainer.global_step)
         began = time.perf_counter()
         module.eval()
-        self.latest = [
-            score_view(module.field, module.renderer, self.frame, self.views, i, self.background)
-            for i in indices
-        ]
+        latest = []
+        for index in indices:
+            self.interrupt.check()
+            latest.append(
+                score_view(
+                    module.field,
+                    module.renderer,
+                    self.frame,
+                    self.views,
+                    index,
+                    self.background,
+                    stride=stride,
+                )
+            )
+        self.latest = latest
         module.train()
         step = trainer.global_step
         self.curve.add(module.clock, step, self.split, self.latest)

@@ -1,0 +1,214 @@
+"""The commands after training: `python -m xplanes COMMAND ...`.
+
+Must stay quick: what is heavy is imported by the command that needs it.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from xplanes import __version__
+
+if TYPE_CHECKING:
+    from xplanes.evaluation.runs import TrainedRun
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        arguments: What follows ``python -m xplanes``; taken from the command line when None.
+
+    Returns:
+        The exit code: 0, 1 after an error that was explained in words, 130 if interrupted.
+    """
+    options = build_parser().parse_args(arguments)
+    try:
+        options.command(options)
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        print("\nstopped", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The reader, such as head, has seen enough; closing keeps Python from complaining.
+        sys.stderr.close()
+        return 0
+    except Exception as error:
+        if not isinstance(error, _known_errors()):
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _known_errors() -> tuple[type[Exception], ...]:
+    """Errors whose message says all."""
+    from xplanes.config import ConfigError
+    from xplanes.optional import MissingExtraError
+    from xplanes.scenes.errors import SceneError
+
+    return ConfigError, SceneError, MissingExtraError, PermissionError
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """All commands and their options."""
+    parser = argparse.ArgumentParser(
+        prog="python -m xplanes",
+        description="What comes after training, which is `python train.py key=value ...`.",
+    )
+    parser.add_argument("--version", action="version", version=f"xplanes {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for add in (_add_download, _add_evaluate, _add_render, _add_view, _add_table):
+        add(commands)
+    return parser
+
+
+def _add_download(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser("download", help="get public scenes")
+    parser.add_argument("dataset", choices=["dnerf"], help="the eight D-NeRF scenes")
+    parser.add_argument(
+        "--root", type=Path, default=Path("data/dnerf"), help="default: %(default)s"
+    )
+    parser.set_defaults(command=_download)
+
+
+def _download(options: argparse.Namespace) -> None:
+    from xplanes.scenes.download import download_dnerf
+
+    root = download_dnerf(options.root)
+    print(f"train with: python train.py data=dnerf data.root={root} data.scene=lego")
+
+
+def _add_run(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path, metavar="RUN", help="the run directory")
+    parser.add_argument(
+        "--checkpoint", choices=["last", "best"], default="last", help="default: %(default)s"
+    )
+
+
+def _load(options: argparse.Namespace, split: str | None = None) -> "TrainedRun":
+    from xplanes.evaluation.runs import find_run, load_run
+
+    run = find_run(options.run)
+    return load_run(run, checkpoint=options.checkpoint, split=split, announce=_say)
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
+def _add_evaluate(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser("evaluate", help="score every view of a split")
+    _add_run(parser)
+    parser.add_argument(
+        "--split", choices=["test", "val", "train"], help="default: the split scored in training"
+    )
+    parser.add_argument(
+        "--lpips",
+        choices=["vgg", "alex", "none"],
+        help="network of LPIPS, downloaded if need be; default: vgg if it is on this machine",
+    )
+    parser.set_defaults(command=_evaluate)
+
+
+def _evaluate(options: argparse.Namespace) -> None:
+    from xplanes.evaluation.evaluate import evaluate, score_table, write_scores
+
+    trained = _load(options, options.split)
+    views = trained.views
+    _say(f"split       {trained.split}, {len(views)} views of {views.width}x{views.height} px\n")
+    scores = evaluate(trained, options.lpips)
+    _say(score_table(scores))
+    _say(f"wrote {write_scores(trained.path, scores)}")
+
+
+def _add_render(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser("render", help="film along a path of cameras and times")
+    _add_run(parser)
+    parser.add_argument(
+        "--path",
+        default="orbit",
+        help="camera: orbit, fixed, or view:FILE with the name of a view; default: %(default)s",
+    )
+    parser.add_argument(
+        "--time",
+        default="forth-and-back",
+        help="sweep, forth-and-back, or a number from 0 to 1; default: %(default)s",
+    )
+    parser.add_argument("--frames", type=int, help="default: 48, or 1 where nothing moves")
+    parser.add_argument("--fps", type=int, default=16, help="default: %(default)s")
+    parser.add_argument("--size", type=int, help="pixels per side; default: as the training views")
+    parser.add_argument(
+        "--elevation",
+        type=float,
+        default=20.0,
+        help="height angle of orbit and fixed in degrees; default: %(default)s",
+    )
+    parser.add_argument(
+        "--what", choices=["colour", "depth"], default="colour", help="default: %(default)s"
+    )
+    parser.add_argument(
+        "--out", help="FILE.webp, FILE.mp4, FILE.png, or a folder with / at its end for PNGs"
+    )
+    parser.set_defaults(command=_render)
+
+
+def _render(options: argparse.Namespace) -> None:
+    from xplanes.evaluation.render import FilmOptions, check_out, film
+
+    wanted = FilmOptions(
+        path=options.path,
+        time=options.time,
+        frames=options.frames,
+        fps=options.fps,
+        size=options.size,
+        elevation=options.elevation,
+        what=options.what,
+    )
+    wanted.check()
+    check_out(options.out, wanted)
+    trained = _load(options)
+    size = options.size or trained.scene.splits["train"].width
+    camera = f"{options.path} camera, time {options.time}"
+    _say(f"frames      {wanted.count} of {size}x{size} px, {options.what}, {camera}\n")
+    _say(f"wrote {film(trained, wanted, options.out)}")
+
+
+def _add_view(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser("view", help="look around in the browser (extra: viewer)")
+    _add_run(parser)
+    parser.add_argument("--port", type=int, default=8080, help="default: %(default)s")
+    parser.set_defaults(command=_view)
+
+
+def _view(options: argparse.Namespace) -> None:
+    from xplanes.evaluation.viewer import Viewer
+    from xplanes.optional import require
+
+    require("viser", extra="viewer")
+    viewer = Viewer(_load(options), options.port)
+    port = viewer.port
+    _say(f"\nopen        http://localhost:{port}")
+    _say(f"from afar   ssh -L {port}:localhost:{port} USER@THIS_MACHINE, then the same address")
+    _say("stop        Ctrl-C")
+    try:
+        viewer.run()
+    finally:
+        viewer.close()
+
+
+def _add_table(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser("table", help="put the runs of a sweep side by side")
+    parser.add_argument("folder", type=Path, metavar="SWEEP_DIR", help="a sweep or folder of runs")
+    parser.add_argument(
+        "--out", type=Path, metavar="FOLDER", help="of table.md and table.csv; default: SWEEP_DIR"
+    )
+    parser.set_defaults(command=_table)
+
+
+def _table(options: argparse.Namespace) -> None:
+    from xplanes.evaluation.table import write_tables
+
+    print(write_tables(options.folder, options.out), end="")

@@ -21,7 +21,7 @@ GROUPS: dict[str, dict[str, type]] = {
     "lrm": {"none": schemas.LRMConfig},
     "sampler": {"occupancy": schemas.SamplerConfig},
     "loss": {"default": schemas.LossConfig},
-    "trainer": {name: schemas.TrainerConfig for name in ("default", "cpu", "gpu", "ddp", "debug")},
+    "trainer": dict.fromkeys(("default", "cpu", "gpu", "ddp", "debug"), schemas.TrainerConfig),
 }
 
 

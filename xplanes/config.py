@@ -209,7 +209,8 @@ def parse(config: dict[str, Any]) -> TrainConfig:
 _POSITIVE = """data.resolution data.views data.half_side data.train_views data.test_views
 data.val_views model.resolution model.time_resolution model.channels model.decoder.width
 model.decoder.density_scale sampler.samples sampler.grid_resolution sampler.time_bins
-sampler.threshold sampler.sweep_every sampler.update_every sampler.update_cells loss.every trainer.devices
+sampler.threshold sampler.sweep_every sampler.update_every sampler.update_cells loss.every
+trainer.devices
 trainer.max_steps trainer.max_seconds trainer.rays_per_batch trainer.samples_per_batch
 trainer.accumulate trainer.plane_lr trainer.time_lr trainer.decoder_lr trainer.checkpoint_every
 trainer.evaluate_views trainer.log_every""".split()

@@ -205,9 +205,7 @@ def test_one_bad_batch_costs_one_step(
     assert (content["steps_skipped"], content["step"]) == (1, 6)
 
 
-def test_scene_of_one_moment_trains_without_planes_of_time(
-    scenes: Path, tmp_path: Path
-) -> None:
+def test_scene_of_one_moment_trains_without_planes_of_time(scenes: Path, tmp_path: Path) -> None:
     config = small_config(scenes, "trainer.max_steps=2", "trainer.evaluate_at=[]")
     run(config, tmp_path / "moving", [], resume=False)
     (folder,) = [p for p in scenes.iterdir() if p.is_dir()]

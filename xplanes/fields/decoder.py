@@ -18,8 +18,8 @@ class Decoder(nn.Module):
     """Features of three planes to colour and density, in the shape that public LRMs share.
 
     Channel 0 of the last layer is the density's logit, channels 1 to 3 are the colour's. Density is
-    ``scale * softplus(logit - 1)`` (OpenLRM) or ``scale * exp(logit - 1)`` (TripoSR), per unit length
-    of the field's frame; it does not depend on the viewing direction.
+    ``scale * softplus(logit - 1)`` (OpenLRM) or ``scale * exp(logit - 1)`` (TripoSR), per unit
+    length of the field's frame; it does not depend on the viewing direction.
 
     Args:
         channels: Channels of one plane; the input has three times as many.
@@ -65,7 +65,7 @@ class Decoder(nn.Module):
             return self.layers[-1](hidden)
 
     def activate(self, logits: Tensor) -> tuple[Tensor, Tensor]:
-        """Colour and density from logits, in float32 whatever the logits' type. [N, 4] -> [N, 3], [N]"""
+        """Colour and density from logits, at least in float32. [N, 4] -> [N, 3], [N]"""
         if logits.dtype in (torch.float16, torch.bfloat16):
             logits = logits.float()
         raw = logits[:, 0] - 1

@@ -1,7 +1,7 @@
 """Reading feature planes at points, and writing gradients back.
 
-A plane is stored channels-last, [H, W, C]: the C numbers of a texel lie side by side, so one read of
-memory brings them all. Plane "ab" has axis a along its columns and axis b along its rows.
+A plane is stored channels-last, [H, W, C]: the C numbers of a texel lie side by side, so one read
+of memory brings them all. Plane "ab" has axis a along its columns and axis b along its rows.
 
 Space axes follow the LRMs' convention: coordinates from -1 to 1 run over the whole texels
 (``align_corners=False``) and beyond the border there is zero. The time axis runs from the first row

@@ -15,8 +15,8 @@ PLANE_SETS: dict[str, Rows] = {
 }
 """Which two time planes each of xy, xz, yz multiplies.
 
-six: xt, yt, zt, each shared by two rows. nine: xt, yt | xt', zt | yt', zt'. three: none, a scene that
-stands still.
+six: xt, yt, zt, each shared by two rows. nine: xt, yt | xt', zt | yt', zt'. three: none, a scene
+that stands still.
 """
 
 SPACE_PLANES = ("xy", "xz", "yz")

@@ -18,8 +18,8 @@ def ray_box(origins: Tensor, directions: Tensor, half: float = 1.0) -> tuple[Ten
         half: Half the side of the cube.
 
     Returns:
-        Near and far, near >= 0 (0 from inside). A ray that misses the cube, or has no direction, has
-        near = far = 0. [R], [R]
+        Near and far, near >= 0 (0 from inside). A ray that misses the cube, or has no direction,
+        has near = far = 0. [R], [R]
     """
     # A ray parallel to a face divides by zero: infinities of the right sign are what the slab test
     # wants, and 0 * inf (a ray that runs along a face) counts as inside that slab.

@@ -117,7 +117,7 @@ class OccupancyGrid(nn.Module):
         self.observe(cells, field(points, times)[1])
 
     def draw(self, cells: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
-        """Points and times inside cells, placed by numbers from 0 to 1. [N], [N, 4] -> [N, 3], [N]"""
+        """Points and times in cells, by numbers from 0 to 1. [N], [N, 4] -> [N, 3], [N]"""
         size = self.resolution
         index = torch.stack(
             [

@@ -41,8 +41,8 @@ class RayBatches:
         seed: The run's seed.
         background: "white", or "random": another colour behind each ray, in the target too.
         skip_background: Whether rays far from the silhouettes are drawn at ``background_share``
-            instead of at their share of the pixels. They show nothing but background, and teach only
-            while the grid of occupied cells is wrong.
+            instead of at their share of the pixels. They show nothing but background, and teach
+            only while the grid of occupied cells is wrong.
         background_share: Share of a batch drawn far from the silhouettes.
         rank: Number of this process among those that split the rays.
     """
@@ -75,8 +75,8 @@ class RayBatches:
         """The batch of a step.
 
         Returns:
-            ``origins`` and unit ``directions`` in the field's frame [R, 3], ``times`` [R], ``target``
-            colour in front of ``background`` [R, 3] each, and ``jitter`` from 0 to 1 [R].
+            ``origins`` and unit ``directions`` in the field's frame [R, 3], ``times`` [R],
+            ``target`` colour in front of ``background`` [R, 3] each, and ``jitter`` from 0 to 1 [R].
         """
         generator = step_generator(self.seed, step, self.rank)
         uniform = torch.rand(self.rays, 3, generator=generator, dtype=torch.float64)

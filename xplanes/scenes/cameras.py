@@ -72,6 +72,7 @@ def orbit(count: int, *, radius: float, elevation: float, target: Tensor | None 
         count: Number of cameras.
         radius: Distance to the target, in world units.
         elevation: Height angle above the horizontal plane, in degrees.
+        target: World point in the middle. [3]
 
     Returns:
         Camera-to-world matrices; the first camera stands on the -y side. [count, 4, 4]

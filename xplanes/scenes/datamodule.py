@@ -27,8 +27,8 @@ class _Endless(IterableDataset):
 class RayDataModule(LightningDataModule):
     """Serves the training rays of a scene.
 
-    Lightning does not restore the place of an endless data set, so the batch counter is part of this
-    module's state and a resumed run draws exactly the rays that an uninterrupted one would have.
+    Lightning does not restore the place of an endless data set, so the batch counter is part of
+    this module's state and a resumed run draws the very rays of an uninterrupted one.
 
     Args:
         scene: Images and cameras.

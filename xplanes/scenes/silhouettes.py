@@ -19,10 +19,10 @@ def foreground(views: Views, margin: int) -> Tensor:
 def silhouette_hull(views: Views, points: Tensor, *, radius: float) -> Tensor:
     """Where and when something may be: the visual hull over short spans of time.
 
-    A point holds something at a view's time only if every view of some span of time around it shows
-    foreground where the point projects to. The span is short (`WINDOW`), so that motion stays inside
-    the hull; where all views have one time, all must agree. Points out of a view's sight are not
-    ruled out by it, and images without alpha rule out nothing.
+    A point holds something at a view's time only if every view of some span of time around it
+    shows foreground where the point projects to. The span is short (`WINDOW`), so that motion
+    stays inside the hull; where all views have one time, all must agree. Points out of a view's
+    sight are not ruled out by it, and images without alpha rule out nothing.
 
     Args:
         views: Images with alpha.

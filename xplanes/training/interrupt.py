@@ -12,7 +12,7 @@ from lightning.pytorch.callbacks import Callback
 
 
 class Interrupt(Callback):
-    """Turns the first SIGINT or SIGTERM into a stop after the current step; a second one is at once."""
+    """Turns the first SIGINT or SIGTERM into a stop after the step; a second one is at once."""
 
     def __init__(self) -> None:
         self.asked = False

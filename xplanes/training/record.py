@@ -90,8 +90,8 @@ def claim(run: Path, *, resume: bool) -> None:
     status = run_status(run)
     if status is not None and not resume:
         raise ConfigError(
-            f"{run} holds a run already ({status}). Go on with it: python train.py resume={run}; or "
-            "choose another hydra.run.dir"
+            f"{run} holds a run already ({status}). Go on with it: python train.py resume={run}; "
+            "or choose another hydra.run.dir"
         )
     if status is None and resume:
         raise ConfigError(f"resume={run}: no run.json there, so no run to go on with")

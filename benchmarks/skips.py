@@ -1,0 +1,144 @@
+"""What each saving saves, and what it costs: same steps and rays, one saving off at a time.
+
+    python benchmarks/skips.py [--lego FOLDER] [--steps 400] [--resolution 100]
+
+Writes results/skips.md and results/skips.csv beside this file. Seconds are the training clock of
+one process with nothing else running; compare them within one scene only.
+"""
+
+import os
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import argparse
+import json
+import platform
+import tempfile
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_dir
+
+from xplanes.config import register_schemas, to_plain
+from xplanes.files import write_rows, write_text
+from xplanes.launch import CONF
+from xplanes.pipeline import run
+
+RESULTS = Path(__file__).resolve().parent / "results"
+
+SWITCHES = {
+    "all savings": (),
+    "empty space off": ("sampler.skip_empty=false",),
+    "occlusion off": ("sampler.skip_occluded=false",),
+    "silhouettes off": ("sampler.silhouettes=false",),
+    "background off": ("data.skip_background=false",),
+    "coarse start off": ("sampler.coarse_steps=0",),
+    "all off": (
+        "sampler.skip_empty=false",
+        "sampler.skip_occluded=false",
+        "sampler.silhouettes=false",
+        "data.skip_background=false",
+        "sampler.coarse_steps=0",
+    ),
+}
+
+COLUMNS = (
+    "scene",
+    "savings",
+    "steps",
+    "seconds",
+    "times slower",
+    "psnr",
+    "psnr change",
+    "samples a ray",
+    "empty",
+    "occluded",
+    "background",
+)
+
+
+def measure(scene: tuple[str, ...], switches: tuple[str, ...], work: Path, args) -> dict:
+    """metrics.json of one run."""
+    overrides = [
+        *scene,
+        f"data.resolution={args.resolution}",
+        f"trainer.max_steps={args.steps}",
+        "trainer.max_seconds=null",
+        "trainer.rays_per_batch=512",
+        # No limit on samples, so that every run sees the same rays at the same step.
+        "trainer.samples_per_batch=1000000",
+        "trainer.evaluate_at=[]",
+        "trainer.media=false",
+        "trainer.accelerator=cpu",
+        *switches,
+    ]
+    register_schemas()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = to_plain(compose("train", overrides))
+    folder = Path(tempfile.mkdtemp(dir=work)) / "run"
+    run(config, folder, overrides, resume=False)
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--lego", type=Path, default=Path("../shared/scenes/lego"))
+    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--resolution", type=int, default=100)
+    args = parser.parse_args()
+    scenes = {
+        "demo excavator": ("data.scene=excavator",),
+        "demo balls": ("data.scene=balls",),
+    }
+    if args.lego.is_dir():
+        scenes["lego (val)"] = (
+            "data=dnerf",
+            f"data.root={args.lego.parent}",
+            f"data.scene={args.lego.name}",
+            "data.eval_split=val",
+        )
+    rows = []
+    with tempfile.TemporaryDirectory() as work:
+        # Compile the loops before anything is timed.
+        measure((), ("trainer.max_steps=3", "data.resolution=32"), Path(work), args)
+        for name, scene in scenes.items():
+            base: dict = {}
+            for label, switches in SWITCHES.items():
+                metrics = measure(scene, switches, Path(work), args)
+                base = base or metrics
+                seconds, psnr = metrics["seconds"]["train"], metrics["test"]["psnr"]
+                rows.append(
+                    (
+                        name,
+                        label,
+                        metrics["step"],
+                        f"{seconds:.1f}",
+                        f"{seconds / base['seconds']['train']:.2f}",
+                        f"{psnr:.2f}",
+                        f"{psnr - base['test']['psnr']:+.2f}",
+                        f"{metrics['samples_per_ray']:.1f}",
+                        *(
+                            f"{100 * metrics['skipped'][kind]:.0f}%"
+                            for kind in ("empty", "occluded", "background")
+                        ),
+                    )
+                )
+    write_rows(RESULTS / "skips.csv", COLUMNS, rows)
+    lines = [
+        "# Savings, one switched off at a time",
+        "",
+        f"{args.steps} steps of 512 rays, {args.resolution} px, six planes at random; "
+        f"{os.cpu_count()} cores, {platform.processor() or platform.machine()}, torch "
+        f"{torch.__version__}. Script: `benchmarks/skips.py`.",
+        "",
+        "empty and occluded: shares of the samples in the box; background: share of the pixels.",
+        "",
+        "| " + " | ".join(COLUMNS) + " |",
+        "|" + "---|" * len(COLUMNS),
+        *("| " + " | ".join(map(str, row)) + " |" for row in rows),
+    ]
+    write_text(RESULTS / "skips.md", "\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

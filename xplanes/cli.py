@@ -184,9 +184,12 @@ def _add_view(commands: "argparse._SubParsersAction") -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
+    from xplanes.config import ConfigError
     from xplanes.evaluation.viewer import Viewer
     from xplanes.optional import require
 
+    if not 1 <= options.port <= 65535:
+        raise ConfigError(f"--port {options.port}: must lie between 1 and 65535")
     require("viser", extra="viewer")
     viewer = Viewer(_load(options), options.port)
     port = viewer.port
@@ -195,6 +198,8 @@ def _view(options: argparse.Namespace) -> None:
     _say("stop        Ctrl-C")
     try:
         viewer.run()
+    except KeyboardInterrupt:
+        _say("")
     finally:
         viewer.close()
 

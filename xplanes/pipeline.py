@@ -124,7 +124,7 @@ def train(
     seconds["total"] = record.total_seconds
     write_json(folder / "metrics.json", metrics)
     write_hparams(folder, config, metrics)
-    text = closing(folder, metrics)
+    text = closing(folder, config, metrics)
     logger.info("\n%s", text)
     say(text)
     return metrics

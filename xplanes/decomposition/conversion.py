@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from xplanes.decomposition.decompose import check_triplanes
-from xplanes.decomposition.interpolation import frame_times, space_weights, time_weights
+from xplanes.decomposition.interpolation import space_weights, time_weights
 from xplanes.decomposition.rank1 import rank1_factors, shared_factors
 
 STATIC = ("middle", "median", "mean")
@@ -149,8 +149,13 @@ def frame_profiles(planes: Tensor, frames: Tensor, count: int, size: int) -> Ten
     Returns:
         Values along the spatial axis. [P, B, size, C]
     """
-    rows = time_weights(frame_times(frames, count), planes.shape[1], planes)
-    values = torch.einsum("bt,ptac->pbac", rows, planes)
+    last = planes.shape[1] - 1
+    position = frames.to(planes.device).double() / max(count - 1, 1) * last
+    before = position.floor().long().clamp(0, last)
+    share = (position - before).to(planes.dtype)[:, None, None]
+    # One gather for both neighbours: its gradient is written to the planes once.
+    rows = planes[:, torch.cat([before, (before + 1).clamp_max(last)])]
+    values = rows[:, : len(before)].lerp(rows[:, len(before) :], share)
     if planes.shape[2] == size:
         return values
     return space_weights(size, planes.shape[2], planes) @ values

@@ -36,11 +36,6 @@ def time_weights(times: Tensor, size: int, like: Tensor) -> Tensor:
     return _hat(position, size).to(like.dtype)
 
 
-def frame_times(frames: Tensor, count: int) -> Tensor:
-    """Times of numbered frames when ``count`` frames fill [0, 1]. [B]"""
-    return frames.double() / max(count - 1, 1)
-
-
 def _hat(positions: Tensor, size: int) -> Tensor:
     nodes = torch.arange(size, dtype=torch.float64, device=positions.device)
     return (1 - (positions[:, None] - nodes).abs()).clamp_min(0)

@@ -60,6 +60,15 @@ def shared_factors(sparse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     Returns:
         Factors along x, y and z. [T, N, C], [T, N, C], [T, N, C]
     """
+    few = max(1, _SLICES // sparse.shape[2])
+    parts = [_shared_in_cache(frames) for frames in sparse.split(few)]
+    x, y, z = (torch.cat(factors) for factors in zip(*parts, strict=True))
+    signs = _running_signs(x, y, z)
+    # The product of any two keeps its value only if all three are flipped together.
+    return x * signs, y * signs, z * signs
+
+
+def _shared_in_cache(sparse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     pairs = [[f.mT[..., None] for f in rank1_factors(sparse[:, i])] for i in range(3)]
     (x1, y1), (x2, z1), (y2, z2) = pairs
     x2, z1 = (factor * _sign(x1, x2) for factor in (x2, z1))
@@ -70,10 +79,7 @@ def shared_factors(sparse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         x = _solve(xy.mT @ y + xz.mT @ z, y, z)
         y = _solve(xy @ x + yz.mT @ z, x, z)
         z = _solve(xz @ x + yz @ y, x, y)
-    x, y, z = (factor[..., 0].mT for factor in (x, y, z))
-    signs = _running_signs(x, y, z)
-    # The product of any two keeps its value only if all three are flipped together.
-    return x * signs, y * signs, z * signs
+    return x[..., 0].mT, y[..., 0].mT, z[..., 0].mT
 
 
 def _solve(right_side: Tensor, first: Tensor, second: Tensor) -> Tensor:

@@ -37,7 +37,6 @@ def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
             views,
             index,
             trained.scene.background,
-            stride=trained.stride,
         )
         rows.append(_row(score, tag, metric))
     names = [name for name in rows[0] if name not in ("file", "time")] if rows else []

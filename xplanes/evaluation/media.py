@@ -44,7 +44,6 @@ def render_path(
     size: int,
     background: Tensor,
     what: str = "colour",
-    stride: int = 1,
 ) -> Iterator[Tensor]:
     """Render square frames along a path of cameras and times, one at a time.
 
@@ -58,7 +57,6 @@ def render_path(
         size: Pixels per side.
         background: Colour behind the scene. [3]
         what: ``colour``, or ``depth`` as colours whose scale is the same in all frames.
-        stride: Steps that one sample stands for.
 
     Yields:
         Pictures. uint8 [size, size, 3]
@@ -67,7 +65,7 @@ def render_path(
     for pose, time in zip(poses, times.tolist(), strict=True):
         origins, directions = frame.rays(*camera_rays(pose, focal, size, size))
         rays = origins.to(device), directions.to(device)
-        image = renderer.image(field, *rays, time, background.to(device), stride=stride)
+        image = renderer.image(field, *rays, time, background.to(device))
         picture = image["colour"]
         if what == "depth":
             picture = _depth(image, float(origins[0].norm()))

@@ -54,13 +54,17 @@ def lpips(network: str, side: int, device: str, *, download: bool) -> Metric:
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     try:
+        if file.is_file():
+            # torchvision would read the file as a pickle, which may run code.
+            torch.load(file, map_location="cpu", weights_only=True)
         metric = LearnedPerceptualImagePatchSimilarity(
             net_type=network,  # type: ignore[arg-type]
             normalize=True,
         ).to(device)
-    except (OSError, RuntimeError) as error:
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise UnavailableError(
-            f"its weights cannot be loaded ({error}): put {url} at {file}"
+            f"its weights cannot be loaded ({reason}): put {url} at {file}"
         ) from error
 
     @torch.no_grad()

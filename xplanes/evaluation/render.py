@@ -109,7 +109,6 @@ def film(trained: TrainedRun, options: FilmOptions, out: str | None = None) -> P
         size=size,
         background=trained.scene.background,
         what=options.what,
-        stride=trained.stride,
     )
     shown = progress(frames, options.count, "frames")
     return write_film(target, shown, fps=options.fps, folder=folder)

@@ -103,9 +103,12 @@ def write_hparams(run: Path, config: TrainConfig, metrics: dict[str, Any]) -> No
         writer.add_hparams(parameters, scores, run_name=".", global_step=metrics["step"])
 
 
-def closing(run: Path, metrics: dict[str, Any]) -> str:
+def closing(run: Path, config: TrainConfig, metrics: dict[str, Any]) -> str:
     """The lines printed at the end: scores, time, paths, and what to do next."""
     seconds, skipped = metrics["seconds"], metrics["skipped"]
+    more = f"trainer.max_steps={2 * metrics['step']}"
+    if config.trainer.max_seconds is not None:
+        more = f"trainer.max_seconds={2 * config.trainer.max_seconds:g}"
     prepare = sum(seconds["prepare"].values())
     return "\n".join(
         [
@@ -124,7 +127,6 @@ def closing(run: Path, metrics: dict[str, Any]) -> str:
             f"         metrics.json  curve.csv  checkpoints/last.ckpt  {metrics.get('media', '')}",
             f"next     tensorboard --logdir {run}",
             f"         python -m xplanes render {run}",
-            f"         python train.py resume={run} trainer.max_seconds="
-            f"{2 * max(1, round(seconds['train']))}",
+            f"         python train.py resume={run} {more}",
         ]
     )

@@ -51,11 +51,6 @@ class TrainedRun:
         return self.scene.splits[self.split]
 
     @property
-    def stride(self) -> int:
-        """Steps that one sample stood for when this step was scored."""
-        return self.module.stride_at(self.step)
-
-    @property
     def is_still(self) -> bool:
         """Whether the field has no time."""
         return self.module.field.time is None
@@ -74,12 +69,13 @@ def find_run(path: Path, outputs: Path = OUTPUTS) -> Path:
         names = _listed(inside[:LISTED])
         raise ConfigError(f"{path} is a folder of {len(inside)} runs; name one of them:{names}")
     problem = "is not a run directory" if path.exists() else "does not exist"
-    runs = {str(run): run for folder in (outputs, path.parent) for run in find_runs(folder)}
+    runs = {run.resolve(): run for folder in (outputs, path.parent) for run in find_runs(folder)}
     if not runs:
         raise ConfigError(f"{path} {problem}, and there are no runs in {outputs}: python train.py")
-    near = difflib.get_close_matches(str(path), list(runs), n=LISTED, cutoff=0.75)
+    names = difflib.get_close_matches(path.name, {run.name for run in runs}, n=LISTED)
+    near = [run for name in names for run in runs.values() if run.name == name]
     if near:
-        raise ConfigError(f"{path} {problem}. Similar names:{_listed([runs[n] for n in near])}")
+        raise ConfigError(f"{path} {problem}. Similar names:{_listed(near[:LISTED])}")
     newest = sorted(runs.values(), key=lambda run: run.stat().st_mtime, reverse=True)
     raise ConfigError(f"{path} {problem}. The newest runs:{_listed(newest[:LISTED])}")
 

@@ -26,6 +26,8 @@ SCORES = {
 }
 """Where metrics.json holds each column's number."""
 
+STATES = ("running", "finished", "failed", "interrupted")
+
 
 @dataclass(frozen=True)
 class RunRow:
@@ -95,15 +97,21 @@ def read_run(run: Path, name: str) -> RunRow:
     scores = _scores(metrics) if metrics else {}
     if metrics and not {"psnr", "ssim"} <= scores.keys():
         problems.append("metrics.json lacks scores")
+    if not isinstance(config, dict) and (run / "config.yaml").is_file() and not problems:
+        problems.append("config.yaml is damaged")
+    if record is not None and record.get("status") not in STATES:
+        problems.append("run.json is damaged")
+        record = None
     status = _status(record, metrics)
-    if problems and status == "finished":
-        status = "damaged"
+    if problems:
+        ended = record is not None and record["status"] != "finished"
+        status = f"{status if ended else 'damaged'}; {', '.join(problems)}"
     return RunRow(
         name=name,
         settings=flatten(config) if isinstance(config, dict) else {},
         overridden=frozenset(_key(line) for line in run_overrides(run)),
         scores=scores,
-        status="; ".join([status, *problems]),
+        status=status,
     )
 
 

@@ -75,7 +75,6 @@ def draw(
         directions.to(device),
         moment,
         trained.scene.background.to(device),
-        stride=trained.stride,
     )
     if what == "depth":
         shape = (height, width)

@@ -36,7 +36,8 @@ def time_taps(value, size):
     safe = position if position > 0 else type(value)(0)
     safe = safe if safe < size - 1 else type(value)(size - 1)
     lower = max(min(np.int64(safe), size - 2), 0)
-    fraction = safe - type(value)(lower)
+    # A NaN passes no comparison above: it must still show in the result.
+    fraction = safe - type(value)(lower) if position == position else position
     return lower, min(lower + 1, size - 1), type(value)(1) - fraction, fraction
 
 

@@ -11,6 +11,9 @@ Activation = Literal["relu", "silu"]
 DensityActivation = Literal["softplus", "exp"]
 Precision = Literal["32", "bf16"]
 
+MOST_EXPONENT = 60.0
+"""Logits beyond it give the density of this one: an infinite density has gradients that are NaN."""
+
 _ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"relu": F.relu, "silu": F.silu}
 
 
@@ -69,7 +72,10 @@ class Decoder(nn.Module):
         if logits.dtype in (torch.float16, torch.bfloat16):
             logits = logits.float()
         raw = logits[:, 0] - 1
-        density = F.softplus(raw) if self.density_activation == "softplus" else raw.exp()
+        if self.density_activation == "softplus":
+            density = F.softplus(raw)
+        else:
+            density = raw.clamp_max(MOST_EXPONENT).exp()
         colour = logits[:, 1:].sigmoid()
         if self.colour_margin:
             colour = colour * (1 + 2 * self.colour_margin) - self.colour_margin

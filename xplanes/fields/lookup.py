@@ -62,6 +62,8 @@ def plane_features_reference(
     space: Tensor, time: Tensor | None, points: Tensor, times: Tensor, rows: Rows
 ) -> Tensor:
     """The same as `plane_features`, written for reading: one ``grid_sample`` per plane."""
+    # Beyond 2 nothing is left of any plane; infinities would make NaNs out of that nothing.
+    points, times = points.to(space.dtype).clamp(-4, 4), times.to(space.dtype)
 
     def sample(plane: Tensor, columns: Tensor, line: Tensor) -> Tensor:
         grid = torch.stack([columns, line], dim=-1)[None, None]

@@ -107,6 +107,8 @@ def _stack(planes: Mapping[str, Tensor], names: Sequence[str]) -> Tensor:
     first = shapes[names[0]]
     if len(first) != 3 or any(shape != first for shape in shapes.values()):
         raise ValueError(f"planes {shapes}: must all have one shape [C, rows, columns]")
+    if 0 in first:
+        raise ValueError(f"planes {shapes}: must have at least one channel, row and column")
     return torch.stack([planes[name].permute(1, 2, 0) for name in names]).contiguous()
 
 

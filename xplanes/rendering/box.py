@@ -18,8 +18,8 @@ def ray_box(origins: Tensor, directions: Tensor, half: float = 1.0) -> tuple[Ten
         half: Half the side of the cube.
 
     Returns:
-        Near and far, near >= 0 (0 from inside). A ray that misses the cube, or has no direction,
-        has near = far = 0. [R], [R]
+        Near and far, near >= 0 (0 from inside). A ray that misses the cube, has no direction or
+        holds a NaN has near = far = 0. [R], [R]
     """
     # A ray parallel to a face divides by zero: infinities of the right sign are what the slab test
     # wants, and 0 * inf (a ray that runs along a face) counts as inside that slab.
@@ -28,5 +28,5 @@ def ray_box(origins: Tensor, directions: Tensor, half: float = 1.0) -> tuple[Ten
     near = torch.minimum(first, second).nan_to_num(-torch.inf, torch.inf, -torch.inf)
     far = torch.maximum(first, second).nan_to_num(torch.inf, torch.inf, -torch.inf)
     near, far = near.amax(dim=-1).clamp_min(0), far.amin(dim=-1)
-    hit = (far > near) & far.isfinite()
+    hit = (far > near) & (far + origins.sum(dim=-1) + directions.sum(dim=-1)).isfinite()
     return torch.where(hit, near, 0), torch.where(hit, far, 0)

@@ -46,7 +46,9 @@ def composite_reference(
 ) -> tuple[Tensor, Tensor]:
     """The same as `composite`, written for reading."""
     depth = optical_depth.clamp(0, OPAQUE)
-    weights = depth_before(depth, ray, starts).neg().exp().to(depth.dtype) * -torch.expm1(-depth)
+    # A NaN must not reach other rays through the running sum; it stays in its own sample's weight.
+    before = depth_before(depth.nan_to_num(0), ray, starts)
+    weights = before.neg().exp().to(depth.dtype) * -torch.expm1(-depth)
     values = torch.cat([colour, torch.ones_like(distances)[:, None], distances[:, None]], dim=1)
     total = torch.zeros(len(starts), 5, dtype=depth.dtype, device=depth.device)
     return total.index_add(0, ray, weights[:, None] * values), weights.detach()

@@ -10,13 +10,16 @@ from numba import njit, prange
 
 COMPILE = {"cache": True, "nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
 
+EXACT = {**COMPILE, "fastmath": False}
+"""For loops that must come to the same numbers twice: a fused product may round otherwise."""
 
-@njit(inline="always", **COMPILE)
+
+@njit(inline="always", **EXACT)
 def cell(place, size):
     return min(max(np.int64(place), 0), size - 1)
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True, **EXACT)
 def count_samples(
     start, slope, near, far, jitter, bins, occupied, density, size, step, limit, skip, counts
 ):
@@ -40,7 +43,7 @@ def count_samples(
         counts[0, r], counts[1, r], counts[2, r] = candidates, found, visible
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True, **EXACT)
 def fill_samples(
     origins,
     directions,
@@ -124,6 +127,8 @@ def composite_backward(
             )
             # Light that leaves sample n, against what all later samples lose as it thickens.
             d_depth[n] = np.exp(-before) * value - behind
+            if optical_depth[n] < 0 or optical_depth[n] > opaque:
+                d_depth[n] = 0
             before -= max(min(np.float64(optical_depth[n]), opaque), 0.0)
             behind += weights[n] * value
             for c in range(3):

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from xplanes.backend import compiled, cpu_loops
 from xplanes.rendering.box import ray_box
-from xplanes.rendering.compositing import depth_before
+from xplanes.rendering.compositing import OPAQUE, depth_before
 from xplanes.rendering.occupancy import OccupancyGrid
 
 
@@ -104,7 +104,8 @@ def march_reference(
     distances, cells = distances[ray, place], cells[ray, place]
     candidates, found = int(inside.sum()), len(ray)
     if math.isfinite(limit) and found:
-        depth = depth_before(grid.density[cells] * step, ray, _starts(ray, len(near)))
+        depth = (grid.density[cells].double() * step).clamp_max(OPAQUE)
+        depth = depth_before(depth, ray, _starts(ray, len(near)))
         visible = (depth < limit).nonzero()[:, 0]
         ray, distances, cells = ray[visible], distances[visible], cells[visible]
     return Samples(

@@ -5,6 +5,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from xplanes.rendering.box import Field
+from xplanes.rendering.compositing import OPAQUE
 
 
 class OccupancyGrid(nn.Module):
@@ -39,6 +40,7 @@ class OccupancyGrid(nn.Module):
         self.resolution, self.time_bins = resolution, time_bins
         self.decay = decay
         self.empty_density = threshold / step
+        self.opaque_density = OPAQUE / step
         cells = time_bins * resolution**3
         self.register_buffer("allowed", torch.ones(cells, dtype=torch.bool))
         self.register_buffer("density", torch.full((cells,), 4 * self.empty_density))
@@ -49,8 +51,11 @@ class OccupancyGrid(nn.Module):
         return (times * self.time_bins).long().clamp_(0, self.time_bins - 1)
 
     def allow(self, allowed: Tensor) -> None:
-        """Rule out cells for good. bool [time_bins, G, G, G], axes z, y, x"""
-        self.allowed.copy_(allowed.reshape(-1))
+        """Rule out cells for good. bool [time_bins, G, G, G], axes z, y, x
+
+        A cell that was ruled out before stays so, whatever ``allowed`` says.
+        """
+        self.allowed.logical_and_(allowed.reshape(-1))
         self.density.mul_(self.allowed)
         torch.gt(self.density, self.empty_density, out=self.occupied)
 
@@ -61,8 +66,9 @@ class OccupancyGrid(nn.Module):
 
     @torch.no_grad()
     def observe(self, cells: Tensor, density: Tensor) -> None:
-        """Take in the field's density at samples. [N], [N]"""
-        seen = torch.maximum(self.density[cells] * self.decay, density.float())
+        """Take in the field's density at samples; cells ruled out stay empty. [N], [N]"""
+        density = self._usable(density)
+        seen = torch.maximum(self.density[cells] * self.decay, density) * self.allowed[cells]
         self.density.scatter_reduce_(0, cells, seen, "amax", include_self=False)
         self.occupied[cells] = self.density[cells] > self.empty_density
 
@@ -83,14 +89,14 @@ class OccupancyGrid(nn.Module):
         seen = torch.zeros_like(self.density)
         for part in cells.split(chunk):
             uniform = torch.rand(len(part), 4, generator=generator).to(device)
-            seen[part] = field(*self.draw(part, uniform))[1].float()
+            seen[part] = self._usable(field(*self.draw(part, uniform))[1])
         size = self.resolution
         around = F.max_pool3d(
             seen.view(1, self.time_bins, size, size, size), 3, stride=1, padding=1
         )
         keep = self.occupied & (around.view(-1) > self.empty_density)
         # A cell kept for its neighbour's sake has one look to show something of its own.
-        floor = self.empty_density / self.decay * 1.001
+        floor = self.empty_density / max(self.decay, 1e-3) * 1.001
         kept = seen.clamp_min(floor)
         lost = self.density.clamp_max(0.5 * self.empty_density)
         self.density.copy_(torch.where(keep, kept, lost))
@@ -115,6 +121,10 @@ class OccupancyGrid(nn.Module):
         cells = candidates[pick]
         points, times = self.draw(cells, torch.rand(count, 4, generator=generator).to(device))
         self.observe(cells, field(points, times)[1])
+
+    def _usable(self, density: Tensor) -> Tensor:
+        """Densities up to what is opaque in one step, so that a cell can empty; NaN shows nothing."""
+        return density.float().nan_to_num(0.0).clamp_max(self.opaque_density)
 
     def draw(self, cells: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Points and times in cells, by numbers from 0 to 1. [N], [N, 4] -> [N, 3], [N]"""

@@ -119,7 +119,7 @@ class Renderer:
             ``colour`` [R, 3], ``opacity`` [R] and ``depth`` [R], on the rays' device.
         """
         parts = []
-        for start in range(0, len(origins), chunk):
+        for start in range(0, max(len(origins), 1), chunk):
             rays = origins[start : start + chunk], directions[start : start + chunk]
             times = torch.full_like(rays[0][:, 0], time)
             part = self.render(field, *rays, times, background, stride=stride)

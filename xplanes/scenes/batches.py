@@ -76,7 +76,7 @@ class RayBatches:
 
         Returns:
             ``origins`` and unit ``directions`` in the field's frame [R, 3], ``times`` [R],
-            ``target`` colour in front of ``background`` [R, 3] each, and ``jitter`` from 0 to 1 [R].
+            ``target`` colour before ``background`` [R, 3] each, and ``jitter`` from 0 to 1 [R].
         """
         generator = step_generator(self.seed, step, self.rank)
         uniform = torch.rand(self.rays, 3, generator=generator, dtype=torch.float64)

@@ -7,8 +7,10 @@ import torch
 from torch import Tensor
 
 from xplanes.scenes.errors import SceneError
-from xplanes.scenes.silhouettes import silhouette_hull
 from xplanes.scenes.views import Views
+
+MARGIN = 1.03
+"""Room around the farthest thing that any view shows."""
 
 
 @dataclass(frozen=True)
@@ -64,25 +66,25 @@ def optical_centre(views: Views) -> Tensor:
     return torch.linalg.solve(normal, target).float()
 
 
-def scene_frame(views: Views, half_side: float | None = None, *, resolution: int = 48) -> Frame:
+def scene_frame(views: Views, half_side: float | None = None) -> Frame:
     """Frame a scene: the smallest cube that its cameras and silhouettes leave room for.
 
-    The cameras' common view gives a first cube around the point that they look at; the silhouettes,
-    where images have alpha, shrink it.
+    The cameras' common view gives a first cube around the point that they look at. No ray through
+    the foreground passes the centre farther away than the scene reaches, and over views from many
+    sides the farthest comes close to it: that distance, with a margin, shrinks the cube.
 
     Args:
         views: Training views.
         half_side: Half the side of the cube in world units, if known; None finds it.
-        resolution: Cells along each side of the grid that is tried against the silhouettes.
 
     Raises:
-        SceneError: If silhouettes leave nothing.
+        SceneError: If the cameras see no common volume.
     """
     centre = optical_centre(views)
     if half_side is not None:
         return cube_frame(half_side, centre)
     offset = views.camera_to_world[:, :3, 3] - centre
-    distance = -(offset * -views.camera_to_world[:, :3, 2]).sum(dim=-1)
+    distance = (offset * views.camera_to_world[:, :3, 2]).sum(dim=-1)
     extent = 0.5 * max(views.height, views.width) / views.focal
     half = float((distance.clamp_min(0) * extent).max())
     if not math.isfinite(half) or half <= 0:
@@ -90,16 +92,17 @@ def scene_frame(views: Views, half_side: float | None = None, *, resolution: int
             "the cameras look away from one another, so the scene's bounds cannot be found: set "
             "data.half_side, in world units"
         )
-    centres = (torch.arange(resolution) + 0.5) * (2 / resolution) - 1
-    grid = torch.stack(torch.meshgrid(centres, centres, centres, indexing="ij"), dim=-1)
-    points = grid.view(-1, 3) * half + centre
-    filled = silhouette_hull(views, points, radius=half * math.sqrt(3) / resolution).any(dim=0)
-    if not filled.any():
-        raise SceneError(
-            "no point in space is inside the silhouettes of the training views: check the poses, "
-            "or set data.half_side and sampler.silhouettes=false"
-        )
-    margin = 2 * half / resolution
-    lower = points[filled].amin(dim=0) - margin
-    upper = points[filled].amax(dim=0) + margin
-    return cube_frame(float((upper - lower).max()) / 2, (upper + lower) / 2)
+    return cube_frame(min(half, MARGIN * _reach(views, centre)), centre)
+
+
+def _reach(views: Views, centre: Tensor) -> float:
+    """Largest distance from ``centre`` at which a ray through the foreground passes it."""
+    largest = 0.0
+    for index in range(len(views)):
+        seen = (views.images[index, ..., 3] > 0).flatten()
+        origins, directions = (ray[seen] for ray in views.image_rays(index))
+        if len(origins):
+            offset = centre - origins
+            along = (offset * directions).sum(dim=-1, keepdim=True)
+            largest = max(largest, float((offset - along * directions).norm(dim=-1).max()))
+    return largest if largest > 0 else math.inf

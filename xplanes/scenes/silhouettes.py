@@ -9,6 +9,9 @@ from xplanes.scenes.views import Views
 WINDOW = 0.06
 """Share of the time span over which content is taken to stand still when silhouettes are joined."""
 
+MOST_VIEWS = 5
+"""Views of such a span at most: more rule out little empty space, but ever more of what moves."""
+
 
 def foreground(views: Views, margin: int) -> Tensor:
     """Pixels with alpha above 0, or within ``margin`` pixels of such. bool [V, H, W]"""
@@ -32,22 +35,23 @@ def silhouette_hull(views: Views, points: Tensor, *, radius: float) -> Tensor:
     Returns:
         For each view's time and point, whether something may be there. bool [V, N]
     """
-    distance = (views.camera_to_world[:, :3, 3] - points.mean(dim=0)).norm(dim=-1)
-    margin = max(1, int(torch.ceil(radius * views.focal / distance.min()).item()))
-    if margin >= min(views.height, views.width) // 2:
-        return torch.ones(len(views), len(points), dtype=torch.bool)
-    masks = foreground(views, margin)
     inside = torch.ones(len(views), len(points), dtype=torch.bool)
     for index, pose in enumerate(views.camera_to_world):
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         depth = -local[:, 2]
         column = (local[:, 0] / depth * views.focal + 0.5 * views.width).floor()
         row = (-local[:, 1] / depth * views.focal + 0.5 * views.height).floor()
-        seen = (depth > 0) & (column >= 0) & (column < views.width)
+        seen = (depth > radius) & (column >= 0) & (column < views.width)
         seen &= (row >= 0) & (row < views.height)
-        inside[index, seen] = masks[index, row[seen].long(), column[seen].long()]
+        if not seen.any():
+            continue
+        # How far a ball of this radius reaches from the pixel of its centre, on either axis.
+        slant = torch.hypot(depth, local[:, :2].abs().amax(dim=-1))
+        margin = (views.focal * radius * slant / (depth * (depth - radius))).ceil()[seen]
+        steps = _steps_to_foreground(views.images[index, ..., 3] > 0, int(margin.max()))
+        inside[index, seen] = steps[row[seen].long(), column[seen].long()] <= margin
     still = bool((views.times == views.times[0]).all())
-    span = len(views) if still else max(1, round(WINDOW * len(views)))
+    span = len(views) if still else max(1, min(MOST_VIEWS, round(WINDOW * len(views))))
     order = views.times.argsort(stable=True)
     runs = inside[order].unfold(0, span, 1).all(dim=-1)
     held = torch.zeros_like(inside)
@@ -56,3 +60,21 @@ def silhouette_hull(views: Views, points: Tensor, *, radius: float) -> Tensor:
     result = torch.empty_like(held)
     result[order] = held
     return result
+
+
+def _steps_to_foreground(mask: Tensor, most: int) -> Tensor:
+    """Pixels to the nearest foreground along rows, columns or diagonals. [H, W] -> int16 [H, W]
+
+    Farther than ``most`` shows as ``most + 1``.
+    """
+    most = min(most, max(mask.shape))
+    steps = (~mask).to(torch.int16)
+    for _ in range(most):
+        wide = mask.clone()
+        wide[1:] |= mask[:-1]
+        wide[:-1] |= mask[1:]
+        mask = wide.clone()
+        mask[:, 1:] |= wide[:, :-1]
+        mask[:, :-1] |= wide[:, 1:]
+        steps += ~mask
+    return steps

@@ -76,11 +76,7 @@ class RadianceModule(LightningModule):
     @property
     def stride(self) -> int:
         """Steps that one sample stands for: the first training steps look at half the samples."""
-        return self.stride_at(self.global_step)
-
-    def stride_at(self, step: int) -> int:
-        """The stride of a training step, and of scores at that step."""
-        return 2 if step < self.sampler.coarse_steps else 1
+        return 2 if self.global_step < self.sampler.coarse_steps else 1
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         groups: list[dict[str, Any]] = [

@@ -1,0 +1,124 @@
+"""Films: the paths they follow and the files they end in."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from xplanes.config import ConfigError
+from xplanes.evaluation.media import write_film
+from xplanes.evaluation.render import FilmOptions, check_out, film, poses, times, view_pose
+from xplanes.evaluation.runs import TrainedRun, load_run
+from xplanes.optional import MissingExtraError
+from xplanes.rendering.pictures import to_bytes
+from xplanes.training.scoring import render_view
+
+
+@pytest.fixture(scope="module")
+def trained(trained_run: Path) -> TrainedRun:
+    return load_run(trained_run)
+
+
+def test_ways_through_time():
+    assert times("sweep", 5).tolist() == [0, 0.25, 0.5, 0.75, 1]
+    assert times("forth-and-back", 4).tolist() == [0, 0.5, 1, 0.5]
+    assert times("0.3", 2).tolist() == pytest.approx([0.3, 0.3])
+
+
+@pytest.mark.parametrize("name", ["1.1", "-0.1", "nan", "soon"])
+def test_other_times_are_refused(name):
+    with pytest.raises(ConfigError, match="from 0 to 1"):
+        times(name, 3)
+
+
+def test_camera_paths(trained: TrainedRun):
+    centre = trained.frame.centre
+    orbit = poses(trained, FilmOptions(frames=6, elevation=30))
+    reach = (orbit[:, :3, 3] - centre).norm(dim=-1)
+    assert reach.tolist() == pytest.approx([float(reach[0])] * 6, rel=1e-5)
+    height = (orbit[:, 2, 3] - centre[2]) / reach
+    assert height.tolist() == pytest.approx([0.5] * 6, abs=1e-5)
+    fixed = poses(trained, FilmOptions(path="fixed", frames=3, elevation=30))
+    assert torch.equal(fixed, orbit[:1].expand(3, 4, 4))
+
+
+def test_a_view_is_found_by_its_name(trained: TrainedRun):
+    splits = trained.scene.splits
+    expected = splits["test"].camera_to_world[1]
+    for name in ("test/r_001.png", "test/r_001"):
+        assert torch.equal(view_pose(splits, name), expected)
+    with pytest.raises(ConfigError, match=r"test/r_00\d\.png"):
+        view_pose(splits, "test/r_0011")
+
+
+def test_the_camera_of_a_view_renders_that_view(trained: TrainedRun, tmp_path: Path):
+    views = trained.views
+    options = FilmOptions(path="view:test/r_001", time=str(float(views.times[1])))
+    assert options.count == 1
+    path = film(trained, options, str(tmp_path / "view.png"))
+    expected = render_view(
+        trained.module.field, trained.module.renderer, trained.frame, views, 1, torch.ones(3)
+    )
+    assert np.array_equal(np.asarray(Image.open(path)), to_bytes(expected["colour"]).numpy())
+
+
+def test_a_webp_is_the_default(trained: TrainedRun):
+    options = FilmOptions(frames=3, size=20, fps=10, time="sweep", what="depth")
+    path = film(trained, options)
+    assert path == trained.path / "media" / "render_orbit_sweep_depth.webp"
+    with Image.open(path) as picture:
+        assert (picture.n_frames, picture.size) == (3, (20, 20))  # type: ignore[attr-defined]
+        picture.load()
+        assert picture.info["duration"] == 100
+
+
+def test_a_folder_takes_a_png_per_frame_and_no_others(trained: TrainedRun, tmp_path: Path):
+    options = FilmOptions(frames=2, size=16)
+    folder = film(trained, options, f"{tmp_path}/frames/")
+    assert sorted(p.name for p in folder.iterdir()) == ["frame_0000.png", "frame_0001.png"]
+    with pytest.raises(ConfigError, match="holds files already"):
+        film(trained, options, f"{tmp_path}/frames/")
+
+
+def test_an_mp4_keeps_its_frames(tmp_path: Path):
+    imageio = pytest.importorskip("imageio.v2")
+    pytest.importorskip("imageio_ffmpeg")
+    frames = [torch.full((35, 50, 3), value, dtype=torch.uint8) for value in (20, 120, 220)]
+    path = write_film(tmp_path / "film.mp4", frames, fps=8)
+    read = imageio.mimread(path)
+    assert len(read) == 3
+    assert read[0].shape == (34, 50, 3)
+    assert [float(frame.mean()) for frame in read] == pytest.approx([20, 120, 220], abs=4)
+
+
+def test_an_mp4_without_the_extra_names_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(MissingExtraError, match=r"xplanes\[video\]"):
+        check_out("film.mp4", FilmOptions())
+
+
+@pytest.mark.parametrize(
+    ("out", "words"), [("film.gif", "end in .webp"), ("film", "end in"), ("a.png", "not 48")]
+)
+def test_other_files_are_refused(out: str, words: str):
+    with pytest.raises(ConfigError, match=words):
+        check_out(out, FilmOptions())
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (FilmOptions(path="spiral"), "--path spiral"),
+        (FilmOptions(time="2"), "--time 2"),
+        (FilmOptions(frames=0), "--frames 0"),
+        (FilmOptions(fps=0), "--fps 0"),
+        (FilmOptions(size=-4), "--size -4"),
+        (FilmOptions(elevation=100), "--elevation 100"),
+    ],
+)
+def test_options_out_of_range_are_refused(options: FilmOptions, words: str):
+    with pytest.raises(ConfigError, match=words):
+        options.check()

@@ -1,0 +1,126 @@
+"""Finding and loading run directories, and saying what is wrong with them."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from xplanes.config import ConfigError
+from xplanes.evaluation.runs import find_run, load_run
+
+
+@pytest.fixture
+def copied(trained_run: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(trained_run, tmp_path / "run"))
+
+
+def make(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    (folder / "run.json").write_text("{}")
+    return folder
+
+
+def refusal(run: Path, outputs: Path) -> str:
+    with pytest.raises(ConfigError) as error:
+        find_run(run, outputs)
+    return str(error.value)
+
+
+def test_a_run_is_found(tmp_path):
+    run = make(tmp_path / "a")
+    assert find_run(run, tmp_path) == run
+
+
+def test_a_misspelt_run_lists_similar_names(tmp_path):
+    near = make(tmp_path / "outputs" / "2026-01-02_lego_six_planes_s0")
+    make(tmp_path / "outputs" / "zzz")
+    text = refusal(tmp_path / "outputs" / "2026-01-02_lego_six_plane_s0", tmp_path / "outputs")
+    assert "does not exist. Similar names:" in text
+    assert str(near) in text
+    assert "zzz" not in text
+
+
+def test_an_unknown_run_lists_the_newest(tmp_path):
+    run = make(tmp_path / "outputs" / "sweeps" / "planes" / "0_lego")
+    text = refusal(Path("qqq"), tmp_path / "outputs")
+    assert "The newest runs:" in text
+    assert str(run) in text
+
+
+def test_a_sweep_is_told_from_a_run(tmp_path):
+    make(tmp_path / "sweep" / "0_a")
+    make(tmp_path / "sweep" / "1_b")
+    text = refusal(tmp_path / "sweep", tmp_path)
+    assert "folder of 2 runs; name one of them" in text
+    assert "0_a" in text
+
+
+def test_no_runs_at_all_says_how_to_make_one(tmp_path):
+    assert "python train.py" in refusal(tmp_path / "x", tmp_path / "outputs")
+
+
+def test_what_is_loaded_is_announced_first(trained_run: Path):
+    lines: list[str] = []
+    trained = load_run(trained_run, checkpoint="best", announce=lines.append)
+    assert str(trained_run) in lines[0]
+    assert f"best.ckpt, step {trained.step}" in lines[1]
+    assert not trained.module.training
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "words"),
+    [
+        ("config.yaml", "a: [", "damaged"),
+        ("config.yaml", "seed: 0\n", "damaged, or from another version"),
+        ("config.yaml", "text\n", "not a mapping"),
+        ("checkpoints/last.ckpt", "text", "cannot be read"),
+    ],
+)
+def test_damaged_files_are_named(copied: Path, file: str, content: str, words: str):
+    (copied / file).write_text(content)
+    with pytest.raises(ConfigError, match=words) as error:
+        load_run(copied)
+    assert str(copied / file) in str(error.value)
+
+
+def test_a_run_without_checkpoint_says_so(copied: Path):
+    (copied / "checkpoints" / "last.ckpt").unlink()
+    with pytest.raises(ConfigError, match="before its first checkpoint"):
+        load_run(copied)
+
+
+def test_a_foreign_checkpoint_is_refused(copied: Path):
+    torch.save({"weights": torch.zeros(3)}, copied / "checkpoints" / "last.ckpt")
+    with pytest.raises(ConfigError, match=r"not a checkpoint of train\.py"):
+        load_run(copied)
+
+
+def test_another_model_than_the_checkpoints_is_refused(copied: Path):
+    config = yaml.safe_load((copied / "config.yaml").read_text())
+    config["model"]["channels"] *= 2
+    (copied / "config.yaml").write_text(yaml.safe_dump(config))
+    with pytest.raises(ConfigError, match="does not fit"):
+        load_run(copied)
+
+
+def test_other_training_views_are_refused(copied: Path):
+    record = json.loads((copied / "run.json").read_text())
+    record["files"]["train"] = record["files"]["train"][:-1]
+    (copied / "run.json").write_text(json.dumps(record))
+    with pytest.raises(ConfigError, match="trained on 9 views"):
+        load_run(copied)
+
+
+def test_a_relative_data_folder_is_found_from_elsewhere(copied: Path, monkeypatch, tmp_path):
+    config = yaml.safe_load((copied / "config.yaml").read_text())
+    root = Path(config["data"]["root"])
+    config["data"]["root"] = root.name
+    (copied / "config.yaml").write_text(yaml.safe_dump(config))
+    record = json.loads((copied / "run.json").read_text())
+    (copied / "run.json").write_text(json.dumps(record | {"directory": str(root.parent)}))
+    monkeypatch.chdir(tmp_path)
+    assert load_run(copied).config.data.root == str(root)
+    assert not (tmp_path / root.name).exists()

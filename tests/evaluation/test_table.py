@@ -1,0 +1,211 @@
+"""The table of a sweep: what differs, how runs ended, means over seeds; nothing stops it."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from xplanes.config import ConfigError
+from xplanes.evaluation.sweep import read_rows
+from xplanes.evaluation.table import write_tables
+
+
+def make(
+    folder: Path,
+    *,
+    model: str = "six_planes",
+    resolution: int = 64,
+    seed: int = 0,
+    psnr: float | None = 20.0,
+    status: str = "finished",
+    reason: str | None = None,
+    overrides: tuple[str, ...] = (),
+) -> Path:
+    """A run directory with the files that tables read."""
+    folder.mkdir(parents=True)
+    config: dict[str, Any] = {
+        "seed": seed,
+        "resume": None,
+        "data": {"eval_split": "test", "scene": "lego"},
+        "model": {"name": model, "plane_set": model.split("_")[0], "resolution": resolution},
+        "lrm": {"name": "none"},
+    }
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    (folder / "overrides.txt").write_text("".join(f"{line}\n" for line in overrides))
+    record = {"status": status, "reason": reason, "started": "2026-01-01T00:00:00+00:00"}
+    (folder / "run.json").write_text(json.dumps(record))
+    if psnr is not None:
+        metrics = {
+            "test": {"psnr": psnr, "ssim": psnr / 40},
+            "step": 300,
+            "seconds": {"prepare": {"lrm": 1.5, "convert": 0.5}, "train": 60.25},
+            "samples_per_ray": 12.5,
+            "parameters": 1234567,
+        }
+        (folder / "metrics.json").write_text(json.dumps(metrics))
+    return folder
+
+
+def table(folder: Path) -> list[dict[str, str]]:
+    write_tables(folder)
+    with (folder / "table.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_columns_are_the_settings_that_differ(tmp_path):
+    make(tmp_path / "0_a", model="six_planes")
+    make(tmp_path / "1_b", model="nine_planes", psnr=21.0)
+    text = write_tables(tmp_path)
+    header = [cell.strip() for cell in text.splitlines()[4].strip("|").split("|")]
+    assert header == [
+        *("run", "model", "psnr", "ssim", "steps"),
+        *("prepare s", "train s", "samples/ray", "params", "status"),
+    ]
+    row = [cell.strip() for cell in text.splitlines()[6].strip("|").split("|")]
+    assert row == [
+        *("0_a", "six_planes", "20.00", "0.5000", "300"),
+        *("2.0", "60.2", "12.5", "1,234,567", "finished"),
+    ]
+    assert "2 runs: 2 finished. Scores of the test split." in text
+    assert (tmp_path / "table.md").read_text() == text
+    assert table(tmp_path)[1]["psnr"] == "21.0"
+
+
+def test_a_setting_that_was_swept_is_shown_even_if_the_model_decides_it(tmp_path):
+    make(tmp_path / "0", model="six_planes", resolution=32, overrides=("model.resolution=32",))
+    make(tmp_path / "1", model="nine_planes", resolution=64, overrides=("model.resolution=64",))
+    rows = table(tmp_path)
+    assert [row["model.resolution"] for row in rows] == ["32", "64"]
+    assert "model.plane_set" not in rows[0]
+
+
+def test_runs_stand_in_the_order_of_their_numbers(tmp_path):
+    for number in (10, 2, 1):
+        make(tmp_path / f"{number}_a", seed=number)
+    assert [row["run"] for row in table(tmp_path)] == ["1_a", "2_a", "10_a"]
+
+
+def test_nested_runs_are_found_and_their_insides_left_alone(tmp_path):
+    make(tmp_path / "deep" / "er" / "run")
+    make(tmp_path / "run" / "media" / "not_a_run", psnr=1.0)
+    make(tmp_path / "run2")
+    shutil.copy(tmp_path / "run2" / "run.json", tmp_path / "run" / "run.json")
+    assert [row["run"] for row in table(tmp_path)] == ["run", "run2", "deep/er/run"]
+
+
+def test_seeds_are_averaged(tmp_path):
+    for seed, psnr in ((0, 20.0), (1, 22.0), (2, 27.0)):
+        make(tmp_path / f"{seed}", seed=seed, psnr=psnr)
+    make(tmp_path / "3", seed=0, resolution=32, psnr=10.0, overrides=("model.resolution=32",))
+    make(tmp_path / "4", seed=3, psnr=None, status="failed", reason="x")
+    text = write_tables(tmp_path)
+    assert "Mean and standard deviation over seeds" in text
+    assert "23.00 ± 3.61" in text  # Of the sample: sqrt((9 + 1 + 16) / 2).
+    with (tmp_path / "table_seeds.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["seeds"] for row in rows] == ["3", "1"]
+    assert float(rows[0]["psnr_std"]) == pytest.approx(13**0.5)
+    assert rows[1]["psnr_std"] == ""
+    assert "seed" not in rows[0]
+
+
+def test_without_two_seeds_there_are_no_means(tmp_path):
+    make(tmp_path / "0", resolution=32)
+    make(tmp_path / "1", resolution=64)
+    (tmp_path / "table_seeds.csv").write_text("old")
+    assert "standard deviation" not in write_tables(tmp_path)
+    assert not (tmp_path / "table_seeds.csv").exists()
+
+
+def test_runs_that_did_not_finish_are_rows_with_their_reason(tmp_path):
+    make(tmp_path / "0", psnr=None, status="failed", reason="TrainingError: a | b\nmore")
+    make(tmp_path / "1", psnr=None, status="interrupted")
+    make(tmp_path / "2", psnr=None, status="running")
+    make(tmp_path / "3", psnr=None)
+    (tmp_path / "4" / ".hydra").mkdir(parents=True)
+    (tmp_path / "4" / ".hydra" / "overrides.yaml").write_text("- seed=1\n")
+    status = [row["status"] for row in table(tmp_path)]
+    assert status == [
+        "failed: TrainingError: a | b\nmore",
+        "interrupted",
+        "running, or killed, since 2026-01-01T00:00:00+00:00",
+        "finished without metrics.json",
+        "failed before it began",
+    ]
+    assert "failed: TrainingError: a \\| b more " in write_tables(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["run.json", "metrics.json", "config.yaml"])
+@pytest.mark.parametrize("content", [b"{", b"\xff\xfe\x00", b"", b"[1]", b'{"test": 3}'])
+def test_a_damaged_file_is_a_row_not_a_crash(tmp_path, name, content):
+    make(tmp_path / "0", seed=1)
+    damaged = make(tmp_path / "1")
+    (damaged / name).write_bytes(content)
+    rows = table(tmp_path)
+    assert rows[0]["status"] == "finished"
+    assert len(rows) == 2
+    if name == "config.yaml" and content == b'{"test": 3}':
+        return  # Nothing wrong with that, as far as a table goes.
+    assert f"{name} " in rows[1]["status"]
+    assert not rows[1]["status"].startswith("finished")
+    assert rows[1]["psnr"] == ("" if name == "metrics.json" else "20.0")
+
+
+def test_jobs_without_a_run_are_rows(tmp_path):
+    sweep = {
+        "hydra": {
+            "sweeper": {
+                "_target_": "hydra._internal.core_plugins.basic_sweeper.BasicSweeper",
+                "params": None,
+            },
+            "overrides": {"task": ["model=six_planes,nine_planes", "seed=range(0,2)", "a.b='x,y'"]},
+        }
+    }
+    (tmp_path / "multirun.yaml").write_text(yaml.safe_dump(sweep))
+    lines = ("model=six_planes", "seed=0", "a.b='x,y'")
+    make(tmp_path / "0_a", model="six_planes", seed=0, overrides=lines)
+    rows = read_rows(tmp_path)
+    assert [(row.name, row.status) for row in rows[1:]] == [
+        ("job 1", "missing: no run"),
+        ("job 2", "missing: no run"),
+        ("job 3", "missing: no run"),
+    ]
+    written = table(tmp_path)
+    assert [row["model.name"] for row in written] == [*["six_planes"] * 2, *["nine_planes"] * 2]
+    assert [row["seed"] for row in written] == ["0", "1", "0", "1"]
+    assert "model.plane_set" not in written[0]
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["hydra: 3", "[", "hydra: {sweeper: {_target_: optuna.Sweeper}}", "hydra: {sweeper: null}"],
+)
+def test_an_unknown_sweeper_lists_no_jobs(tmp_path, content):
+    (tmp_path / "multirun.yaml").write_text(content)
+    make(tmp_path / "0")
+    assert len(table(tmp_path)) == 1
+
+
+def test_a_folder_without_runs_says_so(tmp_path):
+    with pytest.raises(ConfigError, match="no runs in it"):
+        write_tables(tmp_path)
+    with pytest.raises(ConfigError, match="not a folder"):
+        write_tables(tmp_path / "x")
+
+
+def test_tables_can_go_elsewhere(tmp_path):
+    make(tmp_path / "sweep" / "0")
+    write_tables(tmp_path / "sweep", tmp_path / "out")
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["table.csv", "table.md"]
+    assert not (tmp_path / "sweep" / "table.md").exists()
+
+
+def test_a_run_is_a_table_of_itself(trained_run):
+    row = read_rows(trained_run)[0]
+    assert (row.name, row.status) == (trained_run.name, "finished")
+    assert row.settings["model.name"] == "six_planes"
+    assert {"psnr", "steps", "train_seconds", "parameters"} <= row.scores.keys()

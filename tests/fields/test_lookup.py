@@ -1,0 +1,301 @@
+"""Plane lookup: compiled loops, readable twin and NumPy oracle come to the same numbers."""
+
+import numba
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.oracles import plane_features as oracle
+from xplanes.fields.lookup import plane_features, plane_features_reference, time_plane_axes
+from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES
+
+SETS = ("three", "six", "nine")
+TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-13}
+
+
+def stacks(plane_set, dtype=torch.float64, *, size=5, time_rows=4, time_size=7, channels=3, seed=0):
+    """Space planes [3, H, H, C] and time planes [P, T, H', C] of different resolutions."""
+    generator = torch.Generator().manual_seed(seed)
+    space = torch.randn(3, size, size, channels, generator=generator, dtype=dtype)
+    count = len(TIME_PLANES[plane_set])
+    time = torch.randn(count, time_rows, time_size, channels, generator=generator, dtype=dtype)
+    return space, time if count else None
+
+
+def named(plane_set, space, time):
+    planes = dict(zip(SPACE_PLANES, space, strict=True))
+    planes.update(zip(TIME_PLANES[plane_set], [] if time is None else time, strict=True))
+    return {name: plane.permute(2, 0, 1).numpy() for name, plane in planes.items()}
+
+
+def scattered(count, dtype=torch.float64, seed=1, reach=1.4):
+    generator = torch.Generator().manual_seed(seed)
+    points = (2 * torch.rand(count, 3, generator=generator, dtype=dtype) - 1) * reach
+    times = torch.rand(count, generator=generator, dtype=dtype) * 1.4 - 0.2
+    return points, times
+
+
+def both(plane_set, space, time, points, times):
+    """Values and gradients of the compiled loops and of the readable twin."""
+    results = []
+    for function in (plane_features, plane_features_reference):
+        leaves = [p.clone().requires_grad_() for p in (space, time) if p is not None]
+        moving = leaves[1] if time is not None else None
+        value = function(leaves[0], moving, points, times, PLANE_SETS[plane_set])
+        pull = torch.linspace(-1, 1, value.numel(), dtype=value.dtype).view_as(value)
+        gradients = torch.autograd.grad((value * pull).sum(), leaves)
+        results.append((value.detach(), *gradients))
+    return results
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("plane_set", SETS)
+def test_values_are_those_of_equation_15(plane_set, dtype):
+    space, time = stacks(plane_set, dtype)
+    points, times = scattered(40, dtype)
+    expected = oracle(named(plane_set, space, time), plane_set, points, times)
+    for value, *_ in both(plane_set, space, time, points, times):
+        assert value.dtype == dtype
+        np.testing.assert_allclose(value.numpy(), expected, atol=4 * TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("plane_set", SETS)
+def test_gradients_of_loops_and_twin_agree(plane_set, dtype):
+    space, time = stacks(plane_set, dtype)
+    points, times = scattered(300, dtype)
+    compiled, reference = both(plane_set, space, time, points, times)
+    assert len(compiled) == (2 if plane_set == "three" else 3)
+    for ours, theirs in zip(compiled, reference, strict=True):
+        assert ours.dtype == dtype
+        torch.testing.assert_close(ours, theirs, atol=60 * TOLERANCE[dtype], rtol=1e-5)
+        assert theirs.abs().max() > 0.1
+
+
+@pytest.mark.parametrize("plane_set", SETS)
+def test_gradients_are_finite_differences(plane_set):
+    space, time = stacks(plane_set, size=3, time_rows=3, time_size=2, channels=2)
+    points, times = scattered(7)
+    planes = [p.requires_grad_() for p in (space, time) if p is not None]
+
+    def features(space, time=None):
+        return plane_features(space, time, points, times, PLANE_SETS[plane_set])
+
+    assert torch.autograd.gradcheck(features, planes)
+
+
+def test_only_the_planes_that_ask_get_gradients():
+    space, time = stacks("six")
+    points, times = scattered(9)
+    for leaf in (space, time):
+        leaf.requires_grad_()
+        value = plane_features(space, time, points, times, PLANE_SETS["six"])
+        value.sum().backward()
+        assert leaf.grad is not None
+        assert (space.grad is None) == (leaf is not space)
+        assert (time.grad is None) == (leaf is not time)
+        leaf.requires_grad_(False).grad = None
+
+
+@pytest.mark.parametrize("coordinate", [-1.0, 1.0, -0.8, 0.8, -1.2, 1.2, -1.2000001, 5.0, 1e30])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_borders_and_beyond(coordinate, dtype):
+    # Five texels of width 0.4: centres at -0.8 .. 0.8, the last influence ends at 1.2.
+    space, time = stacks("six", dtype)
+    points = torch.zeros(6, 3, dtype=dtype)
+    points[:3] += coordinate * torch.eye(3, dtype=dtype)
+    points[3:] -= coordinate * torch.eye(3, dtype=dtype)
+    times = torch.linspace(0, 1, 6, dtype=dtype)
+    expected = oracle(named("six", space, time), "six", points, times)
+    for value, *gradients in both("six", space, time, points, times):
+        np.testing.assert_allclose(value.numpy(), expected, atol=4 * TOLERANCE[dtype])
+        assert all(g.isfinite().all() for g in gradients)
+
+
+def test_texel_centres_return_the_texels():
+    space, time = stacks("six", size=5, time_rows=4, time_size=5)
+    centre = -0.8 + 0.4 * torch.arange(5, dtype=torch.float64)
+    points = torch.stack([centre, centre.flip(0), centre], dim=-1)
+    value = plane_features(space, None, points, torch.zeros(5).double(), PLANE_SETS["six"])
+    step = torch.arange(5)
+    torch.testing.assert_close(value[:, 0], space[0, 4 - step, step])  # xy: rows y, columns x
+    torch.testing.assert_close(value[:, 1], space[1, step, step])
+    torch.testing.assert_close(value[:, 2], space[2, step, 4 - step])  # yz: rows z, columns y
+    rows = torch.arange(4, dtype=torch.float64) / 3
+    moving = plane_features(0 * space, time, points[:4], rows, PLANE_SETS["six"])
+    step = torch.arange(4)
+    torch.testing.assert_close(moving[:, 0], time[0, step, step] * time[1, step, 4 - step])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_infinite_points_are_outside_and_nan_stays_nan(dtype):
+    space, time = stacks("six", dtype)
+    points = torch.zeros(6, 3, dtype=dtype)
+    for place, bad in enumerate([torch.inf, -torch.inf, torch.nan, 3e38, -3e38]):
+        points[place, 0] = bad
+    times = torch.full((6,), 0.4, dtype=dtype)
+    times[5] = torch.nan
+    for value, *_ in both("six", space, time, points, times):
+        untouched = [0, 1, 3, 4]
+        assert (value[untouched, :2] == 0).all()  # xy and xz see x; yz does not
+        assert value[untouched, 2].isfinite().all()
+        assert value[2, :2].isnan().all()
+        assert value[2, 2].isfinite().all()
+        assert value[5].isnan().all()
+
+
+def test_bad_points_leave_the_gradients_of_others_alone():
+    space, time = stacks("six")
+    points, times = scattered(5)
+    far = torch.cat([points, torch.tensor([[1e30, -1e30, 1e30], [9.0, 9.0, 9.0]]).double()])
+    late = torch.cat([times, torch.tensor([0.5, 0.5]).double()])
+    for which in (0, 1):
+        alone = [g * 1 for g in both_sum(space, time, points, times)[which]]
+        together = both_sum(space, time, far, late)[which]
+        for a, b in zip(alone, together, strict=True):
+            torch.testing.assert_close(a, b, atol=1e-12, rtol=0)
+
+
+def both_sum(space, time, points, times):
+    results = []
+    for function in (plane_features, plane_features_reference):
+        leaves = [space.clone().requires_grad_(), time.clone().requires_grad_()]
+        value = function(*leaves, points, times, PLANE_SETS["six"]).sum()
+        results.append(torch.autograd.grad(value, leaves))
+    return results
+
+
+@pytest.mark.parametrize("plane_set", SETS)
+@pytest.mark.parametrize("count", [0, 1])
+def test_no_point_and_one_point(plane_set, count):
+    space, time = stacks(plane_set)
+    points, times = scattered(count)
+    compiled, reference = both(plane_set, space, time, points, times)
+    assert compiled[0].shape == (count, 3, 3)
+    for ours, theirs in zip(compiled, reference, strict=True):
+        torch.testing.assert_close(ours, theirs)
+        assert count or (ours == 0).all()
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+@pytest.mark.parametrize("size", [1, 2])
+def test_planes_of_one_texel_or_one_row(rows, size):
+    space, time = stacks("nine", size=size, time_rows=rows, time_size=size)
+    points, times = scattered(30)
+    expected = oracle(named("nine", space, time), "nine", points, times)
+    compiled, reference = both("nine", space, time, points, times)
+    np.testing.assert_allclose(compiled[0], expected, atol=1e-12)
+    for ours, theirs in zip(compiled, reference, strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-12, rtol=0)
+
+
+def test_one_row_of_time_is_the_same_at_all_times():
+    space, time = stacks("six", time_rows=1)
+    points, _ = scattered(3)
+    early = plane_features(space, time, points, torch.zeros(3).double(), PLANE_SETS["six"])
+    late = plane_features(space, time, points, torch.ones(3).double(), PLANE_SETS["six"])
+    assert torch.equal(early, late)
+
+
+def test_nine_planes_with_equal_twins_are_six_planes():
+    space, time = stacks("six", torch.float32)
+    xt, yt, zt = time
+    twins = torch.stack([xt, yt, xt, zt, yt, zt])
+    points, times = scattered(200, torch.float32)
+    for function in (plane_features, plane_features_reference):
+        six = function(space, time, points, times, PLANE_SETS["six"])
+        nine = function(space, twins, points, times, PLANE_SETS["nine"])
+        assert torch.equal(six, nine)
+
+
+def test_a_still_scene_ignores_the_rows_of_its_set():
+    space, _ = stacks("six")
+    points, times = scattered(20)
+    still = plane_features(space, None, points, times, PLANE_SETS["three"])
+    assert torch.equal(still, plane_features(space, None, points, times, PLANE_SETS["six"]))
+
+
+def test_planes_and_points_need_not_be_contiguous():
+    space, time = stacks("six")
+    points, times = scattered(50)
+    plain = both("six", space, time, points, times)[0]
+    strided = both(
+        "six",
+        space.permute(3, 0, 1, 2).contiguous().permute(1, 2, 3, 0),
+        time.flip(1).flip(1).repeat_interleave(2, dim=2)[:, :, ::2],
+        points.T.contiguous().T,
+        times.repeat_interleave(2)[::2],
+    )[0]
+    for a, b in zip(plain, strided, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_points_of_another_precision_are_taken_in_the_planes():
+    space, time = stacks("six", torch.float32)
+    points, times = scattered(20, torch.float64)
+    for function in (plane_features, plane_features_reference):
+        value = function(space, time, points, times, PLANE_SETS["six"])
+        assert value.dtype == torch.float32
+
+
+def test_without_the_loops_the_numbers_are_the_same(monkeypatch):
+    space, time = stacks("nine", torch.float32)
+    points, times = scattered(100, torch.float32)
+    compiled = plane_features(space, time, points, times, PLANE_SETS["nine"])
+    monkeypatch.setenv("XPLANES_CPU_LOOPS", "0")
+    plain = plane_features(space, time, points, times, PLANE_SETS["nine"])
+    reference = plane_features_reference(space, time, points, times, PLANE_SETS["nine"])
+    assert torch.equal(plain, reference)
+    torch.testing.assert_close(compiled, plain, atol=4e-6, rtol=1e-5)
+
+
+def test_half_precision_planes_take_the_torch_path():
+    space, time = stacks("six", torch.bfloat16)
+    points, times = scattered(20, torch.float32, reach=0.9)
+    value = plane_features(space, time, points, times, PLANE_SETS["six"])
+    full = plane_features(space.float(), time.float(), points, times, PLANE_SETS["six"])
+    assert value.dtype == torch.bfloat16
+    torch.testing.assert_close(value.float(), full, atol=0.4, rtol=0.1)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_number_of_threads_changes_no_bit(threads):
+    space, time = stacks("nine", torch.float32, size=16, channels=8)
+    points, times = scattered(5000, torch.float32)
+    usual = both("nine", space, time, points, times)[0]
+    before, torch_before = numba.get_num_threads(), torch.get_num_threads()
+    try:
+        numba.set_num_threads(min(threads, before))
+        torch.set_num_threads(threads)
+        again = both("nine", space, time, points, times)[0]
+    finally:
+        numba.set_num_threads(before)
+        torch.set_num_threads(torch_before)
+    for a, b in zip(usual, again, strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("plane_set", "axes"), [("three", []), ("six", [0, 1, 2]), ("nine", [0, 1, 0, 2, 1, 2])]
+)
+def test_axes_of_time_planes_are_those_of_their_names(plane_set, axes):
+    assert time_plane_axes(PLANE_SETS[plane_set]) == axes
+    assert ["xyz".index(name[0]) for name in TIME_PLANES[plane_set]] == axes
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    size=st.integers(1, 6),
+    rows=st.integers(1, 5),
+    time_size=st.integers(1, 6),
+    point=st.tuples(*[st.floats(-1.5, 1.5, width=32)] * 3),
+    time=st.floats(-0.5, 1.5, width=32),
+)
+def test_any_point_of_any_resolution(size, rows, time_size, point, time):
+    space, moving = stacks("six", size=size, time_rows=rows, time_size=time_size, channels=2)
+    points, times = torch.tensor([point]).double(), torch.tensor([time]).double()
+    expected = oracle(named("six", space, moving), "six", points, times)
+    for value, *_ in both("six", space, moving, points, times):
+        np.testing.assert_allclose(value.numpy(), expected, atol=1e-12)

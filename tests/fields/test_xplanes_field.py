@@ -1,0 +1,157 @@
+"""The field: names and shapes of planes, gradients to all parameters, start values."""
+
+import pytest
+import torch
+
+from tests.oracles import plane_features as oracle
+from xplanes.fields import Decoder, XPlanes
+from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES, random_planes
+
+SETS = tuple(PLANE_SETS)
+
+
+def planes_of(plane_set, seed=0, **changes):
+    sizes = {"channels": 4, "resolution": 6, "time_resolution": 3}
+    return random_planes(
+        plane_set,
+        **{**sizes, **changes},
+        space_scale=0.3,
+        time_scale=0.5,
+        generator=torch.Generator().manual_seed(seed),
+    )
+
+
+def field_of(plane_set, dtype=torch.float32, **changes):
+    torch.manual_seed(0)
+    decoder = Decoder(changes.get("channels", 4), width=8, hidden=2)
+    return XPlanes(planes=planes_of(plane_set, **changes), decoder=decoder, plane_set=plane_set).to(
+        dtype
+    )
+
+
+def scattered(count, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(5)
+    points = 2 * torch.rand(count, 3, generator=generator) - 1
+    return points.to(dtype), torch.rand(count, generator=generator).to(dtype)
+
+
+@pytest.mark.parametrize("plane_set", SETS)
+def test_features_come_from_the_planes_of_their_names(plane_set):
+    field = field_of(plane_set, torch.float64)
+    points, times = scattered(20, torch.float64)
+    planes = {name: plane.detach().numpy() for name, plane in field.planes.items()}
+    expected = torch.from_numpy(oracle(planes, plane_set, points, times)).flatten(1)
+    torch.testing.assert_close(field.features(points, times), expected, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("plane_set", SETS)
+def test_planes_come_back_as_they_were_given(plane_set):
+    given = planes_of(plane_set)
+    field = XPlanes(planes=given, decoder=Decoder(4), plane_set=plane_set)
+    assert list(field.planes) == ["xy", "xz", "yz", *TIME_PLANES[plane_set]]
+    for name, plane in field.planes.items():
+        assert torch.equal(plane, given[name])
+
+
+def test_planes_are_views_of_the_parameters():
+    field = field_of("six")
+    with torch.no_grad():
+        field.planes["yt"].fill_(7.0)
+    assert (field.time[1] == 7).all()
+    assert (field.time[0] != 7).all()
+
+
+@pytest.mark.parametrize("plane_set", SETS)
+def test_gradients_reach_every_parameter(plane_set):
+    field = field_of(plane_set)
+    colour, density = field(*scattered(200))
+    (colour.sum() + density.sum()).backward()
+    for name, parameter in field.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+        if name in ("space", "time"):
+            assert (parameter.grad.flatten(1).abs().amax(dim=1) > 0).all(), name
+        else:
+            assert parameter.grad.abs().max() > 0, name
+
+
+@pytest.mark.parametrize("plane_set", SETS)
+def test_colours_and_densities_are_in_range(plane_set):
+    colour, density = field_of(plane_set)(*scattered(300))
+    assert colour.shape == (300, 3)
+    assert density.shape == (300,)
+    assert colour.min() >= -0.001
+    assert colour.max() <= 1.001
+    assert density.min() > 0
+
+
+def test_no_points_give_no_colours():
+    for plane_set in SETS:
+        colour, density = field_of(plane_set)(torch.zeros(0, 3), torch.zeros(0))
+        assert colour.shape == (0, 3)
+        assert density.shape == (0,)
+
+
+def test_state_goes_round_through_a_state_dict():
+    first, second = field_of("nine"), field_of("nine", seed=9)
+    points, times = scattered(10)
+    assert not torch.equal(first(points, times)[1], second(points, times)[1])
+    second.load_state_dict(first.state_dict())
+    assert torch.equal(first(points, times)[1], second(points, times)[1])
+
+
+def test_time_moves_six_and_nine_but_not_three():
+    points, _ = scattered(50)
+    for plane_set in SETS:
+        field = field_of(plane_set)
+        early, late = (field.features(points, torch.full((50,), t)) for t in (0.1, 0.9))
+        assert torch.equal(early, late) == (plane_set == "three")
+
+
+def test_the_time_planes_may_have_another_resolution_than_space():
+    planes = planes_of("six")
+    for name in TIME_PLANES["six"]:
+        planes[name] = torch.randn(4, 9, 11)
+    field = XPlanes(planes=planes, decoder=Decoder(4), plane_set="six")
+    assert field.time.shape == (3, 9, 11, 4)
+    assert field(*scattered(5))[1].isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"yz": None}, "needs xy, xz, yz, xt, yt, zt"),
+        ({"qt": torch.zeros(4, 3, 6)}, "qt"),
+        ({"xy": torch.zeros(4, 6, 5)}, "xy"),
+        ({"yt": torch.zeros(4, 2, 6)}, "yt"),
+        ({"xy": torch.zeros(6, 6)}, "xy"),
+        ({name: torch.zeros(4, 6, 5) for name in ("xy", "xz", "yz")}, "C, H, H"),
+        ({name: torch.zeros(5, 3, 6) for name in ("xt", "yt", "zt")}, "channels"),
+        ({name: torch.zeros(4, 0, 6) for name in ("xt", "yt", "zt")}, "at least one"),
+        ({name: torch.zeros(4, 0, 0) for name in ("xy", "xz", "yz")}, "at least one"),
+    ],
+)
+def test_planes_that_do_not_fit_are_refused_in_words(change, words):
+    planes = {k: v for k, v in {**planes_of("six"), **change}.items() if v is not None}
+    with pytest.raises(ValueError, match=words):
+        XPlanes(planes=planes, decoder=Decoder(4), plane_set="six")
+
+
+def test_an_unknown_plane_set_is_refused_with_the_choices():
+    with pytest.raises(ValueError, match=r"'seven'.*three, six, nine"):
+        XPlanes(planes=planes_of("six"), decoder=Decoder(4), plane_set="seven")
+
+
+def test_planes_of_another_set_are_refused():
+    with pytest.raises(ValueError, match="nine"):
+        XPlanes(planes=planes_of("six"), decoder=Decoder(4), plane_set="nine")
+
+
+@pytest.mark.parametrize("plane_set", SETS)
+def test_random_planes_repeat_with_their_seed_and_have_their_scale(plane_set):
+    first, again, other = (planes_of(plane_set, seed, resolution=64) for seed in (0, 0, 1))
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert not any(torch.equal(first[name], other[name]) for name in first)
+    assert float(first["xy"].std()) == pytest.approx(0.3, rel=0.05)
+    for name in TIME_PLANES[plane_set]:
+        assert float(first[name].std()) == pytest.approx(0.5, rel=0.15)

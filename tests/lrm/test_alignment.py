@@ -1,0 +1,297 @@
+"""The similarity from a scene to a model's frame."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import xplanes.lrm
+from tests.lrm import openlrm_oracle, triposr_oracle
+from tests.lrm.checks import load
+from tests.lrm.reference import VERSIONS, arrays, compare, needs_reference
+from tests.lrm.test_oracles import FILL, openlrm_query, triposr_query
+from xplanes.fields import XPlanes
+from xplanes.lrm import LRMError
+from xplanes.lrm.alignment import align, focal_mismatch
+from xplanes.lrm.canonical import OPENLRM_VIEW, TRIPOSR_VIEW
+from xplanes.lrm.images import Crop
+from xplanes.lrm.openlrm import turn_third_plane
+from xplanes.lrm.triposr import CHORD
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.renderer import DIAGONAL, Renderer
+from xplanes.scenes.cameras import focal_length, look_at, pixel_rays
+
+VIEWS = {"openlrm": OPENLRM_VIEW, "triposr": TRIPOSR_VIEW}
+DNERF_FOCAL = focal_length(0.6911112, 400)
+
+
+def random_pose(seed, distance=4.03):
+    generator = torch.Generator().manual_seed(seed)
+    position = torch.nn.functional.normalize(torch.randn(1, 3, generator=generator), dim=-1)
+    return look_at(distance * position)[0]
+
+
+def transformed(frame, pose):
+    """A pose in the model's frame, in double precision. [4, 4]"""
+    result = torch.eye(4, dtype=torch.float64)
+    result[:3, :3] = frame.rotation.double() @ pose[:3, :3].double()
+    centre = pose[:3, 3].double() - frame.centre.double()
+    result[:3, 3] = frame.scale * frame.rotation.double() @ centre
+    return result
+
+
+@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize("seed", range(5))
+def test_source_camera_becomes_the_models_where_focal_lengths_agree(name, seed):
+    view, pose = VIEWS[name], random_pose(seed)
+    target = pose[:3, 3] - 3.3 * pose[:3, 2]
+    alignment = align(pose, focal=view.focal * 400, height=400, width=400, target=target, view=view)
+    compare(transformed(alignment.frame, pose), view.camera_to_world(), atol=2e-6)
+    assert alignment.frame.scale == pytest.approx(view.distance / 3.3, rel=1e-6)
+    assert alignment.density_factor == alignment.frame.scale
+    assert alignment.mismatch.largest < 1e-3
+    compare(alignment.field_frame.points(target[None]), torch.zeros(1, 3), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "distance"),
+    [
+        ("openlrm", 0.9188, 3.704),
+        ("triposr", 0.4765, 1.921),
+    ],
+)
+def test_sizes_agree_at_the_target_where_focal_lengths_differ(name, scale, distance):
+    view, pose = VIEWS[name], random_pose(1, 4.03113)
+    alignment = align(
+        pose, focal=DNERF_FOCAL, height=400, width=400, target=torch.zeros(3), view=view
+    )
+    assert alignment.frame.scale == pytest.approx(scale, rel=1e-3)
+    centre = transformed(alignment.frame, pose)[:3, 3]
+    assert float(centre.norm()) == pytest.approx(distance, rel=1e-3)
+    # A point beside the target is seen at the same place by both cameras.
+    point = 0.3 * pose[:3, 0]
+    source = DNERF_FOCAL / 400 * 0.3 / 4.03113
+    predicted = view.focal * (alignment.frame.points(point).norm()) / view.distance
+    assert float(predicted) == pytest.approx(source, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "radius", "largest", "mean"),
+    [
+        ("openlrm", 0.5, 0.015, 0.005),
+        ("openlrm", 0.8, 0.047, 0.012),
+        ("openlrm", 1.0, 0.088, 0.020),
+        ("triposr", 0.3, 0.0002, 0.0001),
+        ("triposr", 0.5, 0.0008, 0.0002),
+        ("triposr", 0.6, 0.0013, 0.0003),
+    ],
+)
+def test_mismatch_of_dnerf_cameras(name, radius, largest, mean):
+    found = focal_mismatch(VIEWS[name], DNERF_FOCAL / 400, 400, radius=radius)
+    assert found.largest / 400 == pytest.approx(largest, abs=0.0006 if name == "openlrm" else 6e-5)
+    assert found.mean / 400 == pytest.approx(mean, abs=0.0006 if name == "openlrm" else 6e-5)
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_padding_makes_the_focal_lengths_agree(name):
+    view, pose = VIEWS[name], random_pose(2)
+    options = {"focal": DNERF_FOCAL, "height": 400, "width": 400, "target": torch.zeros(3)}
+    plain = align(pose, view=view, **options)
+    padded = align(pose, view=view, matching="pad", **options)
+    assert DNERF_FOCAL / padded.crop.side == pytest.approx(view.focal, rel=2e-3)
+    assert padded.crop.top == padded.crop.left == (400 - padded.crop.side) // 2
+    assert padded.mismatch.largest < 0.3
+    assert padded.mismatch.largest < plain.mismatch.largest
+    compare(transformed(padded.frame, pose), view.camera_to_world(), atol=0.01)
+
+
+def test_crop_moves_the_centre_to_its_middle():
+    pose, crop = random_pose(3), Crop(100, 180, 160)
+    alignment = align(
+        pose, focal=500, height=400, width=400, target=torch.zeros(3), view=TRIPOSR_VIEW, crop=crop
+    )
+    local = pose[:3, :3].T @ (alignment.frame.centre - pose[:3, 3])
+    column, row = 200 + 500 * local[0] / -local[2], 200 - 500 * local[1] / -local[2]
+    assert (float(column), float(row)) == pytest.approx((260, 180), abs=1e-3)
+    assert float(-local[2]) == pytest.approx(4.03, rel=1e-5)
+    share = 500 / 160
+    assert alignment.frame.scale == pytest.approx(1.9 * share / 4.03 / TRIPOSR_VIEW.focal)
+
+
+def test_wrong_cameras_are_refused():
+    pose = random_pose(4)
+    options = {"height": 400, "width": 400, "view": OPENLRM_VIEW}
+    with pytest.raises(LRMError, match="looks away"):
+        align(pose, focal=500, target=2 * pose[:3, 3], **options)
+    with pytest.raises(LRMError, match="too short"):
+        align(pose, focal=100, target=torch.zeros(3), **options)
+    with pytest.raises(LRMError, match="pad"):
+        align(
+            pose, focal=500, target=torch.zeros(3), matching="pad", crop=Crop(0, 0, 10), **options
+        )
+
+
+@needs_reference
+@pytest.mark.parametrize(("kind", "distance"), [("auto", 2.3), ("dist2", 2.0)])
+def test_published_normalisation_of_poses_is_a_special_case(kind, distance):
+    truth = arrays("cameras/openlrm.npz")
+    poses = torch.eye(4).repeat(4, 1, 1)
+    poses[:, :3] = truth["poses"]
+    alignment = align(
+        poses[0],
+        focal=300,
+        height=400,
+        width=400,
+        target=poses[0, :3, 3] - distance * poses[0, :3, 2],
+        view=replace(OPENLRM_VIEW, distance=distance),
+    )
+    assert alignment.frame.scale == pytest.approx(1)
+    for pose, expected in zip(poses, truth[f"normalized_{kind}"], strict=True):
+        compare(transformed(alignment.frame, pose)[:3], expected, atol=2e-6)
+
+
+SIZE = 14
+
+
+def source_rays(view, seed=5, depth=4.03):
+    """An alignment whose focal lengths agree, and the source camera's rays in the world."""
+    pose = random_pose(seed)
+    focal = view.focal * SIZE
+    target = pose[:3, 3] - depth * pose[:3, 2]
+    alignment = align(pose, focal=focal, height=SIZE, width=SIZE, target=target, view=view)
+    rows, columns = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
+    rays = pixel_rays(pose, rows.flatten(), columns.flatten(), focal=focal, height=SIZE, width=SIZE)
+    return alignment, rays
+
+
+def field_image(model, triplane, alignment, rays, samples=2000):
+    """The un-decomposed triplane through our field, our rays and our compositing. [R, 3]"""
+    planes = dict(zip(("xy", "xz", "yz"), triplane, strict=True))
+    field = XPlanes(planes=planes, decoder=model.field_decoder(), plane_set="three")
+    grid = OccupancyGrid(8, 1, step=DIAGONAL / samples, threshold=0.0, decay=1.0)
+    renderer = Renderer(grid, samples, skip_empty=False, occlusion=0.0)
+    origins, directions = alignment.field_frame.rays(*rays)
+    return renderer.image(field, origins, directions, 0.5, torch.ones(3))["colour"]
+
+
+@needs_reference
+@pytest.mark.parametrize("version", VERSIONS)
+def test_openlrm_picture_through_our_field(version):
+    folder = VERSIONS[version]
+    model, truth = load(xplanes.lrm, folder), arrays(f"{folder}/render.npz")
+    own = truth["planes"][:1]
+    alignment, rays = source_rays(model.view)
+    generator = torch.Generator().manual_seed(0)
+    matrix = torch.tensor([0.75, 0, 0.5, 0, 0.75, 0.5, 0, 0, 1])
+    camera = torch.cat([model.view.camera_to_world().flatten().float(), matrix])[None]
+    origins, directions = openlrm_oracle.window_rays(
+        camera, torch.zeros(1, 2), torch.tensor([float(SIZE)]), SIZE
+    )
+    samples, count = 600, SIZE * SIZE
+    expected = openlrm_oracle.render(
+        openlrm_query(model, own),
+        origins,
+        directions,
+        u_coarse=torch.rand(1, count, samples, 1, generator=generator),
+        u_fine=torch.rand(count, samples, generator=generator),
+        background=torch.ones(1, 1, 1),
+        fill=FILL[version],
+    )["rgb"][0]
+    found = field_image(model, turn_third_plane(own)[0], alignment, rays)
+    assert expected.std(dim=0).mean() > 0.01
+    compare(found, expected, rtol=0, atol=1.5e-3)
+
+
+@needs_reference
+def test_triposr_picture_through_our_field(monkeypatch):
+    model = load(xplanes.lrm, "triposr_tiny")
+    triplane = arrays("triposr_tiny/render.npz")["scene_code"]
+    alignment, rays = source_rays(model.view)
+    pose = model.view.camera_to_world().float()
+    rows, columns = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
+    origins, directions = pixel_rays(
+        pose,
+        rows.flatten(),
+        columns.flatten(),
+        focal=model.view.focal * SIZE,
+        height=SIZE,
+        width=SIZE,
+    )
+    query = triposr_query(model, triplane)
+    found = field_image(model, triplane, alignment, rays, samples=8000)
+    published = triposr_oracle.render(query, origins, directions, samples=2000)
+    # Our box ends where the planes do, TripoSR's renderer stops a thousandth before.
+    monkeypatch.setattr(triposr_oracle, "HALF_SIDE", model.half_side)
+    near, far, _ = triposr_oracle.box_interval(origins, directions)
+
+    def metric(points):
+        colour, density = query(points)
+        return colour, density * ((far - near) / CHORD)[:, None]
+
+    expected = triposr_oracle.render(metric, origins, directions, samples=2000)
+    assert expected.std(dim=0).mean() > 0.01
+    compare(found, expected, rtol=0, atol=1e-3)
+    # TripoSR's own rule scales density with each ray's way through the box, which no field can.
+    assert 1e-3 < (found - published).abs().max() < 0.05
+    central = SIZE // 2 * SIZE + SIZE // 2
+    compare(found[central], published[central], rtol=0, atol=4e-3)
+
+
+def world_query(model, triplane, alignment):
+    """Points of the model's frame, by way of the world and our field, to logits and densities."""
+    planes = dict(zip(("xy", "xz", "yz"), triplane, strict=True))
+    field = XPlanes(planes=planes, decoder=model.field_decoder(), plane_set="three")
+
+    @torch.no_grad()
+    def query(points):
+        world = alignment.frame.to_world(points.reshape(-1, 3))
+        inside = alignment.field_frame.points(world)
+        features = field.features(inside, torch.zeros(len(inside)))
+        colour, density = field.decoder(features)
+        raw = field.decoder.logits(features)[:, :1]
+        density = density[:, None] / alignment.field_density_factor
+        return [values.view(*points.shape[:-1], -1) for values in (colour, density, raw)]
+
+    return query
+
+
+@needs_reference
+def test_recorded_triposr_picture_by_way_of_the_world():
+    model = load(xplanes.lrm, "triposr_tiny")
+    truth = arrays("triposr_tiny/render_canonical.npz")
+    alignment, _ = source_rays(model.view)
+    query = world_query(model, truth["scene_code"], alignment)
+
+    def per_share(points):
+        colour, density, _ = query(points)
+        return colour, density * CHORD
+
+    rays = (truth[key].view(-1, 3) for key in ("rays_o", "rays_d"))
+    found = triposr_oracle.render(per_share, *rays, samples=24)
+    compare(found, truth["images"].view(-1, 3))
+
+
+@needs_reference
+def test_recorded_openlrm_pictures_by_way_of_the_world():
+    folder = VERSIONS["1.1"]
+    model, truth = load(xplanes.lrm, folder), arrays(f"{folder}/render.npz")
+    alignment, _ = source_rays(model.view)
+    queries = [
+        world_query(model, planes, alignment)
+        for planes in turn_third_plane(truth["planes"]).repeat_interleave(2, dim=0)
+    ]
+
+    def per_view(points):
+        values = [query(of_view) for query, of_view in zip(queries, points, strict=True)]
+        return torch.stack([v[0] for v in values]), torch.stack([v[2] for v in values])
+
+    found = openlrm_oracle.render(
+        per_view,
+        truth["rays_o"],
+        truth["rays_d"],
+        u_coarse=truth["u_coarse"],
+        u_fine=truth["u_fine"],
+        background=truth["bg_colors"].view(4, 1, 1),
+        fill=FILL["1.1"],
+    )["rgb"]
+    compare(found.transpose(1, 2).view(2, 2, 3, 12, 12), truth["images_rgb"])

@@ -1,0 +1,201 @@
+"""Weights come from a file, the cache or the hub; a hub of our own stands in for it."""
+
+import hashlib
+import http.server
+import json
+import threading
+import time
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.lrm.reduced import published_shapes, reduced
+from xplanes.lrm import LRMError
+from xplanes.lrm.config import parse_config
+from xplanes.lrm.published import published_config
+from xplanes.lrm.reachable import Probe
+from xplanes.lrm.weights import WeightSource, find_weights, load_source, read_config
+
+safetensors = pytest.importorskip("safetensors.torch")
+pytest.importorskip("huggingface_hub")
+
+SOURCE = WeightSource(
+    architecture="openlrm-small-1.1",
+    repository="somebody/small-1.1",
+    file="model.safetensors",
+    revision="main",
+    licence="CC-BY-NC-4.0",
+    megabytes=446,
+)
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+NOWHERE = "http://127.0.0.1:9"
+
+
+class Hub(http.server.BaseHTTPRequestHandler):
+    """Answers as the hub does for one file."""
+
+    content = b""
+
+    def _answer(self, *, body):
+        type(self).requests.append((self.command, self.path))
+        if self.path != f"/{SOURCE.repository}/resolve/{SOURCE.revision}/{SOURCE.file}" and (
+            self.path != f"/{SOURCE.repository}/resolve/{COMMIT}/{SOURCE.file}"
+        ):
+            self.send_response(404)
+            self.send_header("X-Error-Code", "RepoNotFound")
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+            return
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(self.content)))
+        self.send_header("ETag", f'"{hashlib.sha256(self.content).hexdigest()}"')
+        self.send_header("X-Repo-Commit", COMMIT)
+        self.end_headers()
+        if body:
+            self.wfile.write(self.content)
+
+    def do_HEAD(self):
+        self._answer(body=False)
+
+    def do_GET(self):
+        self._answer(body=True)
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def hub(monkeypatch):
+    """Address of a hub on this machine, and what it was asked for."""
+    for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY", "all_proxy"):
+        monkeypatch.delenv(name, raising=False)
+    handler = type("Handler", (Hub,), {"requests": []})
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_address[1]}", handler
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.fixture
+def small(tmp_path):
+    """A reduced checkpoint with its configuration beside it."""
+    settings, state = reduced("openlrm-1.1")
+    folder = tmp_path / "published"
+    folder.mkdir()
+    safetensors.save_file(state, folder / "model.safetensors")
+    (folder / "config.json").write_text(json.dumps(settings))
+    return folder
+
+
+def test_download_happens_once(hub, small, tmp_path):
+    address, handler = hub
+    handler.content = (small / "model.safetensors").read_bytes()
+    lines = []
+    options = {"announce": lines.append, "endpoint": address, "cache": tmp_path / "cache"}
+    path = find_weights(SOURCE, **options)
+    assert path.read_bytes() == handler.content
+    assert len(lines) == 1
+    assert "446 MB" in lines[0]
+    assert "CC-BY-NC-4.0" in lines[0]
+    handler.requests.clear()
+    assert find_weights(SOURCE, **options) == path
+    assert find_weights(SOURCE, **{**options, "endpoint": NOWHERE}) == path
+    assert not handler.requests
+    assert len(lines) == 1
+
+
+def test_downloaded_weights_of_other_sizes_need_their_configuration(hub, small, tmp_path):
+    address, handler = hub
+    handler.content = (small / "model.safetensors").read_bytes()
+    options = {"announce": lambda line: None, "endpoint": address, "cache": tmp_path / "cache"}
+    model = load_source(replace(SOURCE, config=small / "config.json"), **options)
+    assert model.config.channels == 6
+    with pytest.raises(LRMError, match=r"does not fit openlrm-small-1\.1"):
+        load_source(SOURCE, **options)
+
+
+def test_offline_says_everything_at_once(tmp_path):
+    start = time.monotonic()
+    with pytest.raises(LRMError) as caught:
+        find_weights(SOURCE, endpoint=NOWHERE, cache=tmp_path)
+    assert time.monotonic() - start < 1
+    for part in ("446 MB", "CC-BY-NC-4.0", SOURCE.url, "lrm.weights=FILE", "lrm=none", NOWHERE):
+        assert part in str(caught.value)
+
+
+def test_silent_server_is_given_up_in_a_second(monkeypatch):
+    def hang(*_):
+        time.sleep(2)
+        raise OSError
+
+    monkeypatch.setattr("socket.create_connection", hang)
+    start = time.monotonic()
+    assert not Probe("https://hub.example").answers()
+    assert time.monotonic() - start < 1
+
+
+def test_proxy_is_asked_instead(hub, monkeypatch):
+    address, _ = hub
+    monkeypatch.setenv("http_proxy", address)
+    monkeypatch.setenv("no_proxy", "")
+    assert Probe("http://192.0.2.1").answers()
+
+
+def test_forbidden_download(monkeypatch, tmp_path):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    with pytest.raises(LRMError, match=r"HF_HUB_OFFLINE.*lrm\.weights=FILE"):
+        find_weights(SOURCE, cache=tmp_path)
+
+
+def test_absent_repository(hub, tmp_path):
+    source = replace(SOURCE, repository="somebody/else")
+    with pytest.raises(LRMError, match=r"somebody/else.*cannot be downloaded.*lrm=none"):
+        find_weights(source, announce=lambda line: None, endpoint=hub[0], cache=tmp_path)
+
+
+def test_local_file_needs_no_hub(small, monkeypatch):
+    monkeypatch.setattr("xplanes.lrm.weights.require", lambda *_, **__: 1 / 0)
+    source = replace(SOURCE, weights=small / "model.safetensors")
+    assert find_weights(source) == small / "model.safetensors"
+    with pytest.raises(LRMError, match=r"lrm\.weights=.*absent.*446 MB"):
+        find_weights(replace(SOURCE, weights=small / "absent"))
+
+
+def test_local_file_brings_its_configuration(small):
+    lines = []
+    source = replace(SOURCE, weights=small / "model.safetensors")
+    assert load_source(source, announce=lines.append).config.channels == 6
+    assert "config.json" in lines[0]
+    (small / "config.json").unlink()
+    with pytest.raises(LRMError, match="fits no published model"):
+        load_source(source)
+
+
+def test_another_published_size_is_refused_whatever_lies_beside(tmp_path, monkeypatch):
+    settings = published_config("openlrm-base-1.1")
+    (tmp_path / "config.json").write_text(json.dumps(settings))
+    (tmp_path / "model.safetensors").touch()
+    state = published_state(settings)
+    monkeypatch.setattr("xplanes.lrm.checkpoint.read_weights", lambda path: (state, {}))
+    with pytest.raises(LRMError, match=r"It fits openlrm-base-1\.1 \(lrm=base\)"):
+        load_source(replace(SOURCE, weights=tmp_path / "model.safetensors"))
+
+
+def published_state(settings):
+    shapes = published_shapes(parse_config(settings))
+    return {name: torch.empty(shape, device="meta") for name, shape in shapes.items()}
+
+
+def test_configuration_files(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text("cond_image_size: 96\ntokenizer:\n  plane_size: 6\n")
+    assert read_config(path)["tokenizer"] == {"plane_size": 6}
+    for content in ("[1, 2", "just words", "!!python/object/apply:print [a]"):
+        path.write_text(content)
+        with pytest.raises(LRMError, match=r"config\.yaml"):
+            read_config(path)
+    with pytest.raises(LRMError, match="absent"):
+        read_config(tmp_path / "absent.json")

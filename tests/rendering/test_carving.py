@@ -1,0 +1,135 @@
+"""Carving by silhouettes: content is never ruled out, clearly empty space is."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.synthetic import ball_views, inside_ball, surrounding, swinging
+from xplanes.rendering.carving import carve
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.scenes.frame import Frame, cube_frame
+
+ORIGIN = torch.zeros(3)
+
+
+def carved(views, *, resolution=24, bins=4, frame=None):
+    grid = OccupancyGrid(resolution, bins, step=0.05)
+    carve(grid, views, frame or cube_frame(1.4, ORIGIN))
+    return grid
+
+
+def allowed_at(grid, points, time):
+    """Whether the cells of points in the field's frame are allowed at a time."""
+    x, y, z = ((points + 1) / 2 * grid.resolution).floor().long().unbind(dim=-1)
+    shape = (grid.time_bins, *[grid.resolution] * 3)
+    return grid.allowed.view(shape)[int(grid.bins(torch.tensor([time]))), z, y, x]
+
+
+@pytest.mark.parametrize("size", [24, 64])
+@pytest.mark.parametrize("resolution", [6, 24])
+def test_a_still_ball_is_kept_and_the_corners_are_not(size, resolution):
+    views = ball_views(24, 0.5, size=size, times=torch.zeros(24))
+    grid = carved(views, resolution=resolution, bins=1)
+    frame = cube_frame(1.4, ORIGIN)
+    assert allowed_at(grid, frame.points(inside_ball(4000, 0.5)), 0.0).all()
+    ball = 4 / 3 * math.pi * (0.5 / 1.4) ** 3 / 8
+    around = 4 / 3 * math.pi * (0.5 / 1.4 + 4 / resolution + 8 / size) ** 3 / 8
+    assert ball < grid.allowed.float().mean() < around
+    assert not allowed_at(grid, torch.tensor([[0.95, 0.95, 0.95], [-0.95, 0.9, -0.95]]), 0.0).any()
+
+
+@pytest.mark.parametrize("distance", [1.9, 2.2, 4.0])
+@pytest.mark.parametrize("resolution", [8, 32])
+def test_content_close_to_wide_cameras_is_kept(distance, resolution):
+    centre = torch.tensor([0.6, 0.6, 0.6])
+    poses = surrounding(40, distance)
+    views = ball_views(
+        40, 0.3, centre=lambda _: centre, size=160, angle=1.5, poses=poses, times=torch.zeros(40)
+    )
+    grid = carved(views, resolution=resolution, bins=1, frame=cube_frame(1.0, ORIGIN))
+    assert allowed_at(grid, inside_ball(5000, 0.3) + centre, 0.0).all()
+    assert grid.allowed.float().mean() < 0.5
+
+
+@pytest.mark.parametrize("count", [12, 50, 200])
+def test_a_still_ball_in_a_moving_scene_is_kept(count):
+    # Times differ, so the grid does not know that the ball stands still.
+    grid = carved(ball_views(count, 0.5, size=24))
+    points = cube_frame(1.4, ORIGIN).points(inside_ball(2000, 0.5))
+    for time in torch.linspace(0, 1, 17).tolist():
+        assert allowed_at(grid, points, time).all()
+    assert grid.allowed.float().mean() < 0.8
+
+
+@pytest.mark.parametrize("count", [50, 200])
+@pytest.mark.parametrize(("radius", "turns", "share"), [(0.4, 0.25, 0.0), (0.3, 1, 0.003)])
+def test_a_moving_ball_is_kept(count, radius, turns, share):
+    # In the span over which content is taken to stand still, the slow ball moves by an eighth of its
+    # radius with 50 views, the fast one by its whole radius.
+    path = swinging(0.8, turns)
+    grid = carved(ball_views(count, radius, centre=path, size=48), resolution=32, bins=8)
+    frame, lost, tried = cube_frame(1.4, ORIGIN), 0, 0
+    for number in range(120):
+        time = (number + 0.5) / 120
+        points = frame.points(inside_ball(300, radius, seed=number) + path(time))
+        lost += int((~allowed_at(grid, points, time)).sum())
+        tried += len(points)
+    assert lost <= share * tried
+    assert grid.allowed.float().mean() < 0.4
+
+
+def test_more_views_do_not_rule_out_what_moves():
+    path = swinging(0.8, 2)
+    grid = carved(ball_views(200, 0.15, centre=path, size=48), resolution=32, bins=8)
+    frame, lost = cube_frame(1.4, ORIGIN), 0
+    for number in range(120):
+        time = (number + 0.5) / 120
+        points = frame.points(inside_ball(100, 0.15, seed=number) + path(time))
+        lost += int((~allowed_at(grid, points, time)).sum())
+    assert lost < 0.01 * 12_000
+
+
+def test_a_turned_and_moved_frame_carves_the_same_world():
+    views = ball_views(24, 0.4, centre=lambda _: torch.tensor([0.3, -0.2, 0.1]), times=torch.zeros(24))
+    turn = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    frame = Frame(0.6, turn, torch.tensor([0.2, 0.1, 0.0]))
+    grid = carved(views, resolution=24, bins=1, frame=frame)
+    points = inside_ball(3000, 0.4) + torch.tensor([0.3, -0.2, 0.1])
+    assert allowed_at(grid, frame.points(points), 0.0).all()
+    assert grid.allowed.float().mean() < 0.1
+
+
+def test_images_without_alpha_rule_out_nothing():
+    views = ball_views(6, 0.4)
+    images = views.images.clone()
+    images[..., 3] = 255
+    assert carved(replace(views, images=images)).allowed.all()
+
+
+def test_space_that_no_camera_sees_is_kept():
+    # All cameras look at the ball in the +x half; nothing sees x < -1 of a large frame.
+    views = ball_views(10, 0.3, times=torch.zeros(10), angle=0.3)
+    frame = cube_frame(8.0, ORIGIN)
+    grid = carved(views, resolution=16, bins=1, frame=frame)
+    assert allowed_at(grid, torch.tensor([[-0.97, -0.97, -0.97], [0.97, -0.97, -0.97]]), 0.0).all()
+
+
+def test_a_time_bin_without_views_takes_its_neighbours():
+    times = torch.tensor([0.0, 0.02, 0.04, 0.06, 0.94, 0.96, 0.98, 1.0])
+    views = ball_views(8, 0.5, times=times)
+    grid = carved(views, bins=10)
+    points = cube_frame(1.4, ORIGIN).points(inside_ball(500, 0.5))
+    for time in (0.05, 0.35, 0.55, 0.95):
+        assert allowed_at(grid, points, time).all()
+    bins = grid.allowed.view(10, -1)
+    assert all(torch.equal(bins[5], other) for other in bins[2:9])
+    assert not torch.equal(bins[5], bins[9])
+
+
+def test_one_view_and_views_out_of_order_work():
+    assert allowed_at(carved(ball_views(1, 0.5)), ORIGIN[None], 0.3).all()
+    views = ball_views(20, 0.4, centre=swinging(0.6, 1))
+    shuffled = views.subset(torch.randperm(20, generator=torch.Generator().manual_seed(0)))
+    assert torch.equal(carved(views).allowed, carved(shuffled).allowed)

@@ -1,0 +1,225 @@
+"""Compositing: values and gradients against Beer and Lambert, at every density."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.oracles import composite as oracle
+from tests.oracles import composite_gradient
+from xplanes.rendering.compositing import composite, composite_reference, depth_before
+
+BOTH = pytest.mark.parametrize("merge", [composite, composite_reference])
+COUNTS = (0, 3, 1, 0, 0, 7, 12, 0)
+"""Samples of each ray: none at the ends and in the middle."""
+
+
+def rays_of(counts=COUNTS, dtype=torch.float64, seed=0, scale=1.0):
+    generator = torch.Generator().manual_seed(seed)
+    number = torch.tensor(counts, dtype=torch.long)
+    ray = torch.repeat_interleave(torch.arange(len(counts)), number)
+    starts = number.cumsum(0) - number
+    depth = torch.rand(len(ray), generator=generator, dtype=torch.float64) * scale
+    colour = torch.rand(len(ray), 3, generator=generator, dtype=torch.float64)
+    distances = 2 + torch.rand(len(ray), generator=generator, dtype=torch.float64).cumsum(0)
+    return depth.to(dtype), colour.to(dtype), distances.to(dtype), ray, starts
+
+
+def expected_of(depth, colour, distances, ray, starts):
+    arrays = (t.double().numpy() for t in (depth, colour, distances))
+    return oracle(*arrays, ray.tolist(), len(starts))
+
+
+@BOTH
+@pytest.mark.parametrize("scale", [0.0, 1e-8, 1e-3, 1.0, 30.0])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_values_are_the_oracle_s(merge, scale, dtype):
+    inputs = rays_of(dtype=dtype, scale=scale)
+    total, weights = merge(*inputs)
+    expected, expected_weights = expected_of(*inputs)
+    tolerance = {"atol": 1e-30, "rtol": 1e-6 if dtype == torch.float32 else 1e-7}
+    np.testing.assert_allclose(total, expected, **tolerance)
+    if scale != 1e-8:  # 1 - exp(-x) loses digits in the oracle, not in the code
+        np.testing.assert_allclose(weights, expected_weights, **{**tolerance, "atol": 1e-7})
+    assert total.dtype == weights.dtype == dtype
+
+
+def test_thin_media_keep_their_digits():
+    depth = torch.full((4,), 1e-12, dtype=torch.float64)
+    colour, distances = torch.ones(4, 3).double(), torch.ones(4).double()
+    for dtype in (torch.float32, torch.float64):
+        inputs = (t.to(dtype) for t in (depth, colour, distances))
+        total, _ = composite(*inputs, torch.zeros(4, dtype=torch.long), torch.zeros(1).long())
+        assert float(total[0, 3]) == pytest.approx(4e-12, rel=1e-6)
+
+
+@BOTH
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 20.0])
+def test_gradients_are_the_product_rule_s(merge, scale):
+    depth, colour, *rest = rays_of(scale=scale)
+    depth.requires_grad_()
+    colour.requires_grad_()
+    total, _ = merge(depth, colour, *rest)
+    pull = torch.randn(total.shape, generator=torch.Generator().manual_seed(2)).double()
+    ours = torch.autograd.grad((total * pull).sum(), (depth, colour))
+    arrays = (t.detach().numpy() for t in (depth, colour, rest[0]))
+    theirs = composite_gradient(*arrays, rest[1].tolist(), len(rest[2]), pull.numpy())
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-10)
+
+
+def test_gradients_are_finite_differences():
+    depth, colour, *rest = rays_of((0, 2, 0, 4, 1))
+    depth.requires_grad_()
+    colour.requires_grad_()
+    for merge in (composite, composite_reference):
+        assert torch.autograd.gradcheck(lambda d, c, f=merge: f(d, c, *rest)[0], (depth, colour))
+
+
+DENSITIES = [0.0, 1e-30, 1e-8, 1e-3, 1.0, 30.0, 79.9, 80.1, 1e3, 1e8, 3e38, math.inf]
+
+
+@pytest.mark.parametrize("loops", ["1", "0"])
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32, torch.float64])
+@pytest.mark.parametrize("value", DENSITIES)
+def test_no_density_makes_a_nan(loops, value, dtype, monkeypatch):
+    monkeypatch.setenv("XPLANES_CPU_LOOPS", loops)
+    depth, colour, distances, ray, starts = rays_of(dtype=dtype)
+    depth[1::2] = value
+    depth.requires_grad_()
+    colour.requires_grad_()
+    total, weights = composite(depth, colour, distances, ray, starts)
+    assert total.dtype == (torch.float64 if dtype == torch.float64 else torch.float32)
+    assert total.isfinite().all()
+    assert (weights >= 0).all()
+    sums = torch.zeros(len(starts), dtype=weights.dtype).index_add(0, ray, weights)
+    assert (sums <= 1 + 1e-6).all()
+    total.sum().backward()
+    assert depth.grad.isfinite().all()
+    assert colour.grad.isfinite().all()
+    assert depth.grad.dtype == dtype
+    assert colour.grad.dtype == dtype
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("value", [*DENSITIES, -1e-9, -1.0, -math.inf])
+def test_loops_and_twin_agree_at_every_density(value, dtype):
+    results = []
+    for merge in (composite, composite_reference):
+        depth, colour, *rest = rays_of(dtype=dtype)
+        depth = depth.clone()
+        depth[::3] = value
+        depth.requires_grad_()
+        colour.requires_grad_()
+        total, weights = merge(depth, colour, *rest)
+        gradients = torch.autograd.grad((total * torch.arange(5)).sum(), (depth, colour))
+        results.append((total.detach(), weights, *gradients))
+    for ours, theirs in zip(*results, strict=True):
+        torch.testing.assert_close(ours, theirs, atol=2e-5, rtol=1e-5)
+
+
+@BOTH
+def test_a_nan_stays_on_its_ray(merge):
+    depth, colour, distances, ray, starts = rays_of()
+    clean, _ = merge(depth, colour, distances, ray, starts)
+    depth = depth.clone()
+    depth[5] = math.nan
+    total, _ = merge(depth, colour, distances, ray, starts)
+    broken = int(ray[5])
+    assert total[broken].isnan().all()
+    others = torch.arange(len(starts)) != broken
+    torch.testing.assert_close(total[others], clean[others], atol=1e-14, rtol=0)
+
+
+@BOTH
+def test_rays_without_samples_see_nothing(merge):
+    depth, colour, *rest = rays_of((0, 0, 0))
+    depth.requires_grad_()
+    total, weights = merge(depth, colour, *rest)
+    assert torch.equal(total.detach(), torch.zeros(3, 5).double())
+    assert weights.shape == (0,)
+    total.sum().backward()
+    assert depth.grad.shape == (0,)
+
+
+@BOTH
+def test_no_rays(merge):
+    total, weights = merge(*rays_of(()))
+    assert total.shape == (0, 5)
+    assert weights.shape == (0,)
+
+
+@BOTH
+def test_an_opaque_sample_hides_all_behind_it(merge):
+    inputs = list(rays_of((6,)))
+    inputs[0] = torch.tensor([0.0, 0.0, math.inf, 5.0, 1e8, 1.0]).double()
+    total, weights = merge(*inputs)
+    assert weights.tolist() == pytest.approx([0, 0, 1, 0, 0, 0], abs=1e-30)
+    torch.testing.assert_close(total[0, :3], inputs[1][2])
+    assert float(total[0, 4]) == pytest.approx(float(inputs[2][2]))
+
+
+@BOTH
+def test_weights_carry_no_gradient(merge):
+    depth, colour, *rest = rays_of()
+    _, weights = merge(depth.requires_grad_(), colour, *rest)
+    assert not weights.requires_grad
+
+
+def test_only_what_asks_gets_a_gradient():
+    depth, colour, *rest = rays_of()
+    colour.requires_grad_()
+    composite(depth, colour, *rest)[0].sum().backward()
+    assert colour.grad.abs().max() > 0
+    assert depth.grad is None
+
+
+def test_strided_inputs_give_the_same():
+    depth, colour, distances, ray, starts = rays_of()
+    wide = torch.cat([colour, colour], dim=1)[:, ::2][:, [0, 2, 1]]
+    strided = composite(depth.repeat_interleave(2)[::2], wide, distances, ray, starts)[0]
+    plain = composite(depth, wide.contiguous(), distances, ray, starts)[0]
+    assert torch.equal(strided, plain)
+
+
+def test_without_the_loops_the_numbers_are_the_same(monkeypatch):
+    inputs = rays_of(dtype=torch.float32, scale=3.0)
+    compiled = composite(*inputs)[0]
+    monkeypatch.setenv("XPLANES_CPU_LOOPS", "0")
+    torch.testing.assert_close(compiled, composite(*inputs)[0], atol=1e-6, rtol=1e-6)
+
+
+def test_running_depths_keep_their_digits_behind_opaque_rays():
+    counts = (3,) * 5000
+    _, _, _, ray, starts = rays_of(counts)
+    depth = torch.tensor([80.0, 80.0, 1e-3]).double().repeat(5000)
+    depth[-3:] = torch.tensor([0.1, 0.2, 0.3])
+    before = depth_before(depth, ray, starts)
+    assert before[-3:].tolist() == pytest.approx([0, 0.1, 0.3], abs=1e-8)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    depth=st.lists(
+        st.floats(0, 1e8, width=32) | st.sampled_from([0.0, 1e-30, 80.0, math.inf]),
+        min_size=1,
+        max_size=12,
+    ),
+    split=st.integers(0, 12),
+)
+def test_weights_are_shares_of_the_light(depth, split):
+    split = min(split, len(depth))
+    tau = torch.tensor(depth)
+    colour, distances = torch.ones(len(depth), 3), torch.arange(len(depth)).float()
+    ray = (torch.arange(len(depth)) >= split).long()
+    starts = torch.tensor([0, split])
+    for merge in (composite, composite_reference):
+        total, weights = merge(tau, colour, distances, ray, starts)
+        assert (weights >= 0).all()
+        assert (total[:, :4] <= 1 + 1e-6).all()
+        for r in (0, 1):
+            through = math.exp(-min(700.0, float(tau[ray == r].double().sum())))
+            assert float(total[r, 3]) == pytest.approx(1 - through, abs=1e-6)

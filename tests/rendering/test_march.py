@@ -1,0 +1,273 @@
+"""Sampling: compiled loops, readable twin and NumPy oracle place the same samples.
+
+The three may round differently, so a sample that lies on a border may fall to either side. In float64
+that is not seen with random rays, and they must agree exactly. In float32 the loops compute places in
+float64 and the twin in float32: cells may differ for samples within 1e-5 of a border of their cell,
+and samples may come or go within 1e-5 of where the ray leaves the cube; nothing else may differ.
+"""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.oracles import march as oracle
+from tests.oracles import ray_box
+from xplanes.rendering.marching import march, march_reference
+from xplanes.rendering.occupancy import OccupancyGrid
+
+STEP = 0.07
+
+
+def grid_of(resolution=6, bins=3, *, seed=0, filled=0.4, dense=20.0):
+    """A grid of random densities; some cells are empty but keep a little density."""
+    generator = torch.Generator().manual_seed(seed)
+    grid = OccupancyGrid(resolution, bins, step=STEP)
+    uniform = torch.rand(len(grid.density), generator=generator)
+    grid.density.copy_(dense * torch.rand(len(uniform), generator=generator))
+    grid.occupied.copy_(uniform < filled)
+    return grid
+
+
+def rays_of(count, dtype=torch.float64, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    origins = torch.randn(count, 3, generator=generator, dtype=dtype)
+    origins = 3 * origins / origins.norm(dim=-1, keepdim=True)
+    origins[::4] *= 0.2  # some start inside
+    target = torch.rand(count, 3, generator=generator, dtype=dtype) * 2.4 - 1.2
+    directions = target - origins
+    directions = directions / directions.norm(dim=-1, keepdim=True)
+    times, jitter = torch.rand(2, count, generator=generator, dtype=dtype)
+    return origins, directions, times, jitter
+
+
+def twin(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0):
+    limit = -math.log(occlusion) if occlusion > 0 else math.inf
+    return march_reference(*rays, grid, step=step, skip=skip_empty, limit=limit)
+
+
+def by_oracle(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0):
+    shape = (grid.time_bins, *[grid.resolution] * 3)
+    return oracle(
+        *(ray.double().numpy() for ray in rays),
+        grid.occupied.view(shape).numpy(),
+        grid.density.view(shape).double().numpy(),
+        step=step,
+        skip=skip_empty,
+        occlusion=occlusion,
+    )
+
+
+OPTIONS = [(skip, occlusion) for skip in (True, False) for occlusion in (0.0, 0.001, 0.3)]
+
+
+@pytest.mark.parametrize(("skip", "occlusion"), OPTIONS)
+def test_samples_are_the_oracle_s(skip, occlusion):
+    grid, rays = grid_of(), rays_of(60)
+    kept, counts = by_oracle(rays, grid, skip_empty=skip, occlusion=occlusion)
+    for found in (
+        march(*rays, grid, step=STEP, skip_empty=skip, occlusion=occlusion),
+        twin(rays, grid, skip_empty=skip, occlusion=occlusion),
+    ):
+        assert found.ray.tolist() == [row[0] for row in kept]
+        assert found.cells.tolist() == [row[2] for row in kept]
+        np.testing.assert_allclose(found.distances, [row[1] for row in kept], atol=1e-12)
+        np.testing.assert_allclose(found.points, [row[3:] for row in kept], atol=1e-12)
+        assert (found.candidates, found.empty, found.occluded) == counts
+    assert (counts[1] > 0) == skip
+    assert (counts[2] > 0) == (occlusion > 0)
+
+
+@pytest.mark.parametrize(("skip", "occlusion"), OPTIONS)
+def test_loops_and_twin_agree_on_many_rays(skip, occlusion):
+    grid, rays = grid_of(17, 5), rays_of(3000)
+    ours = march(*rays, grid, step=STEP, skip_empty=skip, occlusion=occlusion)
+    theirs = twin(rays, grid, skip_empty=skip, occlusion=occlusion)
+    for name in ("ray", "starts", "cells"):
+        assert torch.equal(getattr(ours, name), getattr(theirs, name)), name
+    for name in ("points", "distances"):
+        torch.testing.assert_close(
+            getattr(ours, name), getattr(theirs, name), atol=1e-12, rtol=0, msg=name
+        )
+    for name in ("candidates", "empty", "occluded"):
+        assert getattr(ours, name) == getattr(theirs, name), name
+
+
+def test_in_float32_only_samples_on_borders_differ():
+    grid, rays = grid_of(17, 5, filled=1.1), rays_of(3000, torch.float32)
+    ours, theirs = march(*rays, grid, step=STEP), twin(rays, grid)
+    numbers = [
+        {(int(r), round(float(d / STEP - j))): n for n, (r, d, j) in enumerate(zip(*x, strict=True))}
+        for x in (
+            (s.ray, s.distances - near_of(rays)[s.ray], rays[3][s.ray]) for s in (ours, theirs)
+        )
+    ]
+    for key in set(numbers[0]) ^ set(numbers[1]):
+        samples = (ours, theirs)[key not in numbers[0]]
+        point = samples.points[numbers[key not in numbers[0]][key]]
+        assert abs(float(point.abs().max()) - 1) < 1e-5
+    shared = sorted(set(numbers[0]) & set(numbers[1]))
+    assert len(shared) > 50_000
+    first = torch.tensor([numbers[0][key] for key in shared])
+    second = torch.tensor([numbers[1][key] for key in shared])
+    torch.testing.assert_close(ours.points[first], theirs.points[second], atol=2e-6, rtol=0)
+    other = ours.cells[first] != theirs.cells[second]
+    place = (ours.points[first][other] + 1) * (grid.resolution / 2)
+    assert ((place - place.round()).abs().amin(dim=-1) < 1e-4).all()
+    assert other.float().mean() < 1e-4
+
+
+def near_of(rays):
+    origins, directions = (ray.double().numpy() for ray in rays[:2])
+    return torch.tensor([ray_box(o, d)[0] for o, d in zip(origins, directions, strict=True)])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("skip", "occlusion"), OPTIONS)
+def test_counters_add_up_and_samples_are_in_order(skip, occlusion, dtype):
+    grid, rays = grid_of(), rays_of(500, dtype)
+    for found in (
+        march(*rays, grid, step=STEP, skip_empty=skip, occlusion=occlusion),
+        twin(rays, grid, skip_empty=skip, occlusion=occlusion),
+    ):
+        assert found.candidates == found.empty + found.occluded + len(found)
+        assert (found.ray.diff() >= 0).all()
+        same = found.ray[1:] == found.ray[:-1]
+        assert (found.distances.diff()[same] > 0.99 * STEP).all()
+        counts = torch.bincount(found.ray, minlength=500)
+        assert torch.equal(found.starts, counts.cumsum(0) - counts)
+        assert found.points.abs().max() <= 1 + 1e-6
+        assert found.points.dtype == found.distances.dtype == dtype
+        assert not skip or grid.occupied[found.cells].all()
+
+
+def test_cells_are_those_that_hold_the_points_at_their_times():
+    grid, rays = grid_of(5, 4, filled=1.1), rays_of(300)
+    found = march(*rays, grid, step=STEP)
+    x, y, z = ((found.points + 1) * 2.5).floor().clamp(0, 4).long().unbind(dim=-1)
+    time_bin = (rays[2][found.ray] * 4).floor().long()
+    assert torch.equal(found.cells, ((time_bin * 5 + z) * 5 + y) * 5 + x)
+    assert len(time_bin.unique()) == 4
+
+
+def test_samples_lie_at_jitter_plus_whole_steps_from_the_entrance():
+    grid = grid_of(filled=1.1)
+    ray = torch.tensor([[0.0, 0, 3]]).double(), torch.tensor([[0.0, 0, -1]]).double()
+    for jitter in (0.0, 0.25, 1.0):
+        rays = (*ray, torch.zeros(1).double(), torch.tensor([jitter]).double())
+        for found in (march(*rays, grid, step=0.5), twin(rays, grid, step=0.5)):
+            expected = [2 + (n + jitter) * 0.5 for n in range(4) if (n + jitter) * 0.5 < 2]
+            assert found.distances.tolist() == expected
+
+
+def test_rays_that_miss_have_no_samples_and_do_not_shift_the_others():
+    grid, rays = grid_of(filled=1.1), list(rays_of(9))
+    rays[0][::3] = torch.tensor([0.0, 0, 5]).double()
+    rays[1][::3] = torch.tensor([0.0, 0, 1]).double()
+    for found in (march(*rays, grid, step=STEP), twin(rays, grid)):
+        assert not set(found.ray.tolist()) & {0, 3, 6}
+        ends = [*found.starts.tolist()[1:], len(found)]
+        for ray, (start, end) in enumerate(zip(found.starts.tolist(), ends, strict=True)):
+            assert (found.ray[start:end] == ray).all()
+            assert (end == start) == (ray % 3 == 0)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_impossible_rays_have_no_samples(bad):
+    grid, rays = grid_of(filled=1.1), list(rays_of(4))
+    rays[0][1, 2], rays[1][2, 0] = bad, bad
+    for found in (march(*rays, grid, step=STEP), twin(rays, grid)):
+        assert set(found.ray.tolist()) <= {0, 3}
+        assert found.points.isfinite().all()
+
+
+@pytest.mark.parametrize("rays", [rays_of(0), tuple(r + 9 for r in rays_of(3)[:1]) + rays_of(3)[1:]])
+def test_no_rays_or_no_hits(rays):
+    for found in (march(*rays, grid_of(), step=STEP), twin(rays, grid_of())):
+        assert len(found) == found.candidates == found.empty == found.occluded == 0
+        assert found.points.shape == (0, 3)
+        assert found.starts.tolist() == [0] * len(rays[0])
+
+
+def test_an_empty_grid_leaves_nothing():
+    grid, rays = grid_of(filled=-1), rays_of(20)
+    for found in (march(*rays, grid, step=STEP), twin(rays, grid)):
+        assert len(found) == 0
+        assert found.empty == found.candidates > 0
+
+
+def test_the_first_opaque_cell_hides_what_lies_behind_but_not_itself():
+    grid = OccupancyGrid(4, 1, step=STEP)
+    grid.density.zero_()
+    grid.density.view(4, 4, 4)[2] = 1e4  # a slab at 0 <= z < 0.5
+    rays = (
+        torch.tensor([[0.1, 0.1, 3.0]]).double(),
+        torch.tensor([[0.0, 0.0, -1.0]]).double(),
+        torch.zeros(1).double(),
+        torch.full((1,), 0.5).double(),
+    )
+    for found in (
+        march(*rays, grid, step=0.1, occlusion=0.001),
+        twin(rays, grid, step=0.1, occlusion=0.001),
+    ):
+        assert found.candidates == 20
+        assert len(found) == 6  # five in front, one in the slab
+        assert found.points[-1, 2] == pytest.approx(0.45)
+
+
+@pytest.mark.parametrize("huge", [1e8, 1e20, 1e30, 3e38, math.inf])
+def test_huge_densities_on_one_ray_do_not_disturb_the_next(huge):
+    grid, rays = grid_of(8, 1, filled=1.1, dense=3.0), rays_of(400)
+    grid.density[::7] = huge
+    ours = march(*rays, grid, step=STEP, occlusion=0.2)
+    theirs = twin(rays, grid, occlusion=0.2)
+    assert torch.equal(ours.ray, theirs.ray)
+    assert torch.equal(ours.cells, theirs.cells)
+    kept, counts = by_oracle(rays, grid, occlusion=0.2)
+    assert ours.cells.tolist() == [row[2] for row in kept]
+    assert (ours.candidates, ours.empty, ours.occluded) == counts
+
+
+def test_time_decides_which_bin_is_looked_into():
+    grid = OccupancyGrid(2, 4, step=STEP)
+    grid.occupied.view(4, 8)[:] = torch.tensor([[True], [False], [True], [False]])
+    times = torch.tensor([0.0, 0.2499, 0.25, 0.5, 0.75, 0.9999, 1.0, 1.5, -0.1])
+    rays = (
+        torch.tensor([[0.1, 0.1, 3.0]]).expand(9, 3),
+        torch.tensor([[0.0, 0.0, -1.0]]).expand(9, 3),
+        times,
+        torch.full((9,), 0.5),
+    )
+    for found in (march(*rays, grid, step=STEP), twin(rays, grid)):
+        assert sorted(set(found.ray.tolist())) == [0, 1, 3, 8]
+
+
+def test_without_the_loops_the_twin_is_used(monkeypatch):
+    grid, rays = grid_of(), rays_of(50, torch.float32)
+    monkeypatch.setenv("XPLANES_CPU_LOOPS", "0")
+    ours, theirs = march(*rays, grid, step=STEP, occlusion=0.1), twin(rays, grid, occlusion=0.1)
+    for name in ("ray", "starts", "points", "distances", "cells"):
+        assert torch.equal(getattr(ours, name), getattr(theirs, name))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    resolution=st.integers(1, 9),
+    bins=st.integers(1, 4),
+    step=st.floats(0.02, 3.0),
+    occlusion=st.sampled_from([0.0, 1e-3, 0.5, 1.0]),
+    skip=st.booleans(),
+    seed=st.integers(0, 99),
+)
+def test_any_grid_and_step(resolution, bins, step, occlusion, skip, seed):
+    grid, rays = grid_of(resolution, bins, seed=seed), rays_of(12, seed=seed)
+    kept, counts = by_oracle(rays, grid, step=step, skip_empty=skip, occlusion=occlusion)
+    for found in (
+        march(*rays, grid, step=step, skip_empty=skip, occlusion=occlusion),
+        twin(rays, grid, step=step, skip_empty=skip, occlusion=occlusion),
+    ):
+        assert found.cells.tolist() == [row[2] for row in kept]
+        assert (found.candidates, found.empty, found.occluded) == counts

@@ -1,0 +1,273 @@
+"""The occupancy grid: what it believes after looks, and what it never believes again."""
+
+import math
+
+import pytest
+import torch
+
+from xplanes.rendering.occupancy import OccupancyGrid
+
+STEP = 0.05
+
+
+def grid_of(resolution=4, bins=2, **options):
+    return OccupancyGrid(resolution, bins, step=STEP, **{"threshold": 0.01, "decay": 0.5, **options})
+
+
+def constant(density):
+    def field(points, times):
+        return torch.zeros(len(points), 3), torch.full((len(points),), float(density))
+
+    return field
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def cells_of(grid, points, times):
+    x, y, z = ((points + 1) / 2 * grid.resolution).floor().long().unbind(dim=-1)
+    time_bin = (times * grid.time_bins).floor().long()
+    return ((time_bin * grid.resolution + z) * grid.resolution + y) * grid.resolution + x
+
+
+def test_all_cells_start_as_occupied():
+    grid = grid_of()
+    assert grid.occupied.all()
+    assert grid.allowed.all()
+    assert grid.occupied_fraction == 1
+    assert len(grid.density) == 2 * 4**3
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.5, 0.95])
+def test_a_cell_empties_when_its_start_has_decayed(decay):
+    grid, cell = grid_of(decay=decay), torch.tensor([7])
+    looks = 0
+    while grid.occupied[7]:
+        grid.observe(cell, torch.zeros(1))
+        looks += 1
+    # It starts at four times what counts as empty.
+    assert looks == (1 if decay == 0 else math.ceil(math.log(0.25) / math.log(decay) - 1e-9))
+    assert grid.occupied.sum() == len(grid.occupied) - 1
+
+
+def test_a_cell_with_content_stays_and_an_empty_one_comes_back():
+    grid, cells = grid_of(), torch.tensor([3, 9])
+    for _ in range(50):
+        grid.observe(cells, torch.tensor([5.0, 0.0]))
+    assert grid.occupied[cells].tolist() == [True, False]
+    assert grid.density[3] == 5
+    grid.observe(torch.tensor([9]), torch.tensor([0.3]))
+    assert grid.occupied[9]
+    assert grid.density[9] == pytest.approx(0.3)
+
+
+def test_the_threshold_is_opacity_over_one_step():
+    grid, cells = grid_of(decay=0.0), torch.arange(3)
+    grid.observe(cells, torch.tensor([0.0099, 0.01, 0.0101]) / STEP)
+    assert grid.occupied[:3].tolist() == [False, False, True]
+
+
+def test_of_many_looks_at_one_cell_the_largest_counts():
+    for order in ([0.5, 7.0, 1.0], [7.0, 0.5, 1.0], [1.0, 0.5, 7.0]):
+        grid = grid_of()
+        grid.observe(torch.tensor([5, 5, 5]), torch.tensor(order))
+        assert grid.density[5] == 7
+
+
+def test_many_looks_at_once_decay_once():
+    grid = grid_of()
+    start = float(grid.density[5])
+    grid.observe(torch.tensor([5, 5, 5, 5]), torch.zeros(4))
+    assert grid.density[5] == pytest.approx(0.5 * start)
+
+
+def test_no_looks_change_nothing():
+    grid = grid_of()
+    grid.observe(torch.zeros(0, dtype=torch.long), torch.zeros(0))
+    assert torch.equal(grid.density, grid_of().density)
+
+
+def test_densities_in_bfloat16_are_taken():
+    grid = grid_of()
+    grid.observe(torch.tensor([1]), torch.tensor([5.0], dtype=torch.bfloat16))
+    assert grid.density[1] == 5
+    assert grid.density.dtype == torch.float32
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 3e38])
+def test_a_cell_recovers_from_an_impossible_density(bad):
+    grid, cell = grid_of(), torch.tensor([2])
+    grid.observe(cell, torch.tensor([bad]))
+    assert grid.density.isfinite().all()
+    for _ in range(60):
+        grid.observe(cell, torch.zeros(1))
+    assert not grid.occupied[2]
+    grid.observe(cell, torch.tensor([4.0]))
+    assert grid.occupied[2]
+
+
+def test_time_bins_share_out_zero_to_one():
+    grid = grid_of(bins=8)
+    times = torch.tensor([0.0, 0.124, 0.125, 0.5, 0.999, 1.0, 2.0, -1.0])
+    assert grid.bins(times).tolist() == [0, 0, 1, 4, 7, 7, 7, 0]
+
+
+def test_drawn_points_lie_in_their_cells():
+    grid = grid_of(5, 3)
+    cells = torch.arange(len(grid.density))
+    for uniform in (torch.rand(len(cells), 4, generator=generator()), torch.zeros(len(cells), 4)):
+        points, times = grid.draw(cells, uniform.clamp(0.001, 0.999))
+        assert torch.equal(cells_of(grid, points, times), cells)
+        assert torch.equal(grid.bins(times), cells // 125)
+    assert points.abs().max() <= 1
+
+
+def test_update_looks_at_random_allowed_cells_in_all_bins():
+    grid = grid_of(4, 2)
+    allowed = torch.rand(2, 4, 4, 4, generator=generator(3)) < 0.5
+    grid.allow(allowed)
+    seen = []
+
+    def field(points, times):
+        seen.append(cells_of(grid, points, times))
+        return constant(0.0)(points, times)
+
+    grid.update(field, 2000, generator())
+    looked = torch.zeros(128, dtype=torch.bool)
+    looked[seen[0]] = True
+    assert torch.equal(looked, allowed.flatten())
+
+
+def test_update_empties_an_empty_grid_and_finds_what_appears():
+    grid, draw = grid_of(), generator()
+    for _ in range(20):
+        grid.update(constant(0.0), 500, draw)
+    assert grid.occupied_fraction == 0
+    for _ in range(5):
+        grid.update(constant(3.0), 500, draw)
+    assert grid.occupied_fraction == 1
+
+
+def test_equal_generators_keep_grids_equal():
+    grids = [grid_of(), grid_of(), grid_of()]
+
+    def field(points, times):
+        return points, (points.sum(dim=-1) * 20 * times).clamp_min(0)
+
+    for grid, seed in zip(grids, (4, 4, 5), strict=True):
+        grid.update(field, 64, generator(seed))
+    assert torch.equal(grids[0].density, grids[1].density)
+    assert not torch.equal(grids[0].density, grids[2].density)
+
+
+def test_cells_that_are_ruled_out_never_fill():
+    grid = grid_of()
+    allowed = torch.rand(2, 4, 4, 4, generator=generator()) < 0.5
+    grid.allow(allowed)
+    out = ~allowed.flatten()
+    everywhere = torch.arange(len(grid.density))
+    assert torch.equal(grid.occupied, ~out)
+    for seed in range(3):
+        grid.observe(everywhere, torch.full((len(everywhere),), 1e6))
+        grid.update(constant(1e6), 300, generator(seed))
+        grid.sweep(constant(1e6), generator(seed))
+        assert not grid.occupied[out].any()
+        assert (grid.density[out] == 0).all()
+        assert grid.occupied[~out].all()
+
+
+def test_a_second_ruling_only_takes_away():
+    grid = grid_of(bins=1)
+    first = torch.rand(1, 4, 4, 4, generator=generator(1)) < 0.5
+    second = torch.rand(1, 4, 4, 4, generator=generator(2)) < 0.5
+    grid.allow(first)
+    grid.allow(second)
+    assert torch.equal(grid.allowed, (first & second).flatten())
+    assert torch.equal(grid.occupied, (first & second).flatten())
+
+
+def test_allow_takes_axes_in_the_order_z_y_x():
+    grid = grid_of(4, 2)
+    allowed = torch.zeros(2, 4, 4, 4, dtype=torch.bool)
+    allowed[1, 0, 1, 3] = True
+    grid.allow(allowed)
+    point = torch.tensor([[0.75, -0.25, -0.75]])  # x, y, z
+    assert grid.occupied.nonzero().flatten().tolist() == cells_of(
+        grid, point, torch.tensor([0.75])
+    ).tolist()
+
+
+def test_nothing_allowed_asks_the_field_nothing():
+    grid = grid_of()
+    grid.allow(torch.zeros(2, 4, 4, 4, dtype=torch.bool))
+
+    def never(points, times):
+        raise AssertionError("asked")
+
+    grid.update(never, 10, generator())
+    assert grid.occupied_fraction == 0
+
+
+def ball(points, times):
+    return torch.zeros_like(points), 50.0 * (points.norm(dim=-1) < 0.5).float()
+
+
+def test_a_sweep_keeps_a_ball_and_its_surroundings_alone():
+    grid = grid_of(16, 2)
+    grid.sweep(ball, generator())
+    cells = torch.arange(len(grid.density))
+    centres, _ = grid.draw(cells, torch.full((len(cells), 4), 0.5))
+    distance, diagonal = centres.norm(dim=-1), math.sqrt(3) / 16
+    assert grid.occupied[distance < 0.5].all()
+    assert not grid.occupied[distance > 0.5 + 3 * diagonal].any()
+
+
+def test_swept_cells_without_content_of_their_own_have_one_more_look():
+    for decay in (0.0, 0.3, 0.95, 1.0):
+        grid = grid_of(16, 1, decay=decay)
+        grid.sweep(ball, generator())
+        kept = grid.occupied.nonzero()[:, 0]
+        if decay > 0:
+            grid.observe(kept, torch.zeros(len(kept)))
+            assert grid.occupied[kept].all()
+        assert grid.density.isfinite().all()
+
+
+def test_a_sweep_does_not_bring_empty_cells_back_and_asks_only_the_occupied():
+    grid = grid_of(8, 1, decay=0.0)
+    grid.observe(torch.arange(256), torch.zeros(256))
+    asked = []
+
+    def field(points, times):
+        asked.append(len(points))
+        return constant(9.0)(points, times)
+
+    grid.sweep(field, generator(), chunk=100)
+    assert asked == [100, 100, 56]
+    assert not grid.occupied[:256].any()
+    assert grid.occupied[256:].all()
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_sweep_survives_impossible_densities(bad):
+    grid = grid_of(8, 1)
+
+    def field(points, times):
+        colour, density = ball(points, times)
+        return colour, torch.where(points[:, 0] > 0.75, bad, density)
+
+    grid.sweep(field, generator())
+    assert grid.density.isfinite().all()
+    centre = grid.density.view(8, 8, 8)[4, 4, 4]
+    assert centre == 50
+    assert grid.occupied.any()
+
+
+def test_the_state_goes_round():
+    grid, other = grid_of(), grid_of()
+    grid.allow(torch.rand(2, 4, 4, 4, generator=generator()) < 0.5)
+    grid.update(constant(2.0), 30, generator())
+    other.load_state_dict(grid.state_dict())
+    for name in ("density", "occupied", "allowed"):
+        assert torch.equal(getattr(grid, name), getattr(other, name))

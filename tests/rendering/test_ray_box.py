@@ -1,0 +1,141 @@
+"""Rays against the cube, degenerate ones included."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.oracles import ray_box as oracle
+from xplanes.rendering.box import ray_box
+
+NAN, INF = math.nan, math.inf
+
+
+def one(origin, direction, **options):
+    near, far = ray_box(
+        torch.tensor([origin], dtype=torch.float64),
+        torch.tensor([direction], dtype=torch.float64),
+        **options,
+    )
+    return float(near), float(far)
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "expected"),
+    [
+        ((0, 0, 4), (0, 0, -1), (3, 5)),
+        ((0, 0, 4), (0, 0, 1), (0, 0)),  # points away
+        ((0, 0, 0), (0, 0, 1), (0, 1)),  # from inside
+        ((0.5, 0, 0), (-1, 0, 0), (0, 1.5)),
+        ((1, 0, 0), (-1, 0, 0), (0, 2)),  # on a face, going in
+        ((1, 0, 0), (1, 0, 0), (0, 0)),  # on a face, going out
+        ((1, 0, -3), (0, 0, 1), (2, 4)),  # along a face
+        ((-1, 0, -3), (0, 0, 1), (2, 4)),
+        ((1, -1, -3), (0, 0, 1), (2, 4)),  # along an edge
+        ((1.0001, 0, -3), (0, 0, 1), (0, 0)),  # just beside a face
+        ((1, 1, 1), (-1, -1, -1), (0, 2)),  # from a corner through the middle
+        ((1, 1, 1), (1, 1, 1), (0, 0)),
+        ((2, 0, 0), (-1, 1, 0), (0, 0)),  # touches an edge in one point
+        ((0, 0, 0), (0, 0, 0), (0, 0)),  # no direction, inside
+        ((1, 1, 1), (0, 0, 0), (0, 0)),  # on a corner
+        ((3, 0, 0), (0, 0, 0), (0, 0)),  # outside
+        ((0, 0, 4), (0, 0, -2), (1.5, 2.5)),  # distances in units of the direction
+        ((0, 0, 4), (-0.0, -0.0, -1), (3, 5)),
+        ((1, 0, -3), (-0.0, 0, 1), (2, 4)),
+    ],
+)
+def test_known_rays(origin, direction, expected):
+    assert one(origin, direction) == pytest.approx(expected)
+
+
+def test_another_half_side():
+    assert one((0, 0, 4), (0, 0, -1), half=0.25) == pytest.approx((3.75, 4.25))
+    assert one((0.3, 0, 4), (0, 0, -1), half=0.25) == (0, 0)
+
+
+@pytest.mark.parametrize("bad", [NAN, INF, -INF, 3e38, -3e38])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rays_with_impossible_numbers_miss(bad, axis, dtype):
+    good = torch.tensor([[0.1, 0.2, 4.0]], dtype=dtype)
+    straight = torch.tensor([[0.0, 0.0, -1.0]], dtype=dtype)
+    origin, direction = good.clone(), straight.clone()
+    origin[0, axis] = bad
+    near, far = ray_box(origin, straight)
+    assert near == far == 0 or abs(bad) == 3e38
+    assert near.isfinite().all()
+    assert far.isfinite().all()
+    direction[0, axis] = bad
+    near, far = ray_box(good, direction)
+    assert near.isfinite().all()
+    assert far.isfinite().all()
+    if math.isnan(bad):
+        assert near == far == 0
+
+
+def test_a_bad_ray_leaves_its_neighbours_alone():
+    origins = torch.tensor([[0.0, 0, 4], [NAN, 0, 4], [0, 0, 4]])
+    directions = torch.tensor([[0.0, 0, -1]]).expand(3, 3)
+    near, far = ray_box(origins, directions)
+    assert near.tolist() == [3, 0, 3]
+    assert far.tolist() == [5, 0, 5]
+
+
+def test_no_rays():
+    near, far = ray_box(torch.zeros(0, 3), torch.zeros(0, 3))
+    assert near.shape == far.shape == (0,)
+
+
+@pytest.mark.parametrize("tiny", [1e-45, 1e-38, 1e-20, 1e-8])
+def test_nearly_parallel_rays_are_like_parallel_ones(tiny):
+    for x, hits in ((0.5, True), (1.5, False)):
+        origin = torch.tensor([[x, 0.0, 4.0]])
+        near, far = ray_box(origin, torch.tensor([[tiny, -tiny, -1.0]]))
+        assert (float(near), float(far)) == ((3, 5) if hits else (0, 0))
+
+
+def test_random_rays_are_the_oracle_s():
+    generator = np.random.default_rng(0)
+    origins = generator.uniform(-2, 2, (500, 3))
+    directions = generator.normal(size=(500, 3))
+    # Axis-parallel rays and origins on faces among them.
+    directions[::5, 0] = 0
+    directions[::10, 1] = 0
+    origins[::7, 2] = generator.choice([-1, 1], len(origins[::7]))
+    near, far = ray_box(torch.from_numpy(origins), torch.from_numpy(directions))
+    expected = np.array([oracle(o, d) for o, d in zip(origins, directions, strict=True)])
+    np.testing.assert_allclose(np.stack([near, far], axis=-1), expected, atol=1e-9)
+    assert 0.2 < (expected[:, 1] > 0).mean() < 0.95
+
+
+COORDINATE = st.floats(-3, 3, width=32) | st.sampled_from([-1.0, 0.0, 1.0, -0.0])
+VECTOR = st.tuples(COORDINATE, COORDINATE, COORDINATE)
+
+
+@settings(max_examples=60, deadline=None)
+@given(origin=VECTOR, direction=VECTOR)
+def test_flipped_and_swapped_axes_change_nothing(origin, direction):
+    origins, directions = [], []
+    for signs in itertools.product((1, -1), repeat=3):
+        for order in itertools.permutations(range(3)):
+            origins.append([signs[i] * origin[order[i]] for i in range(3)])
+            directions.append([signs[i] * direction[order[i]] for i in range(3)])
+    near, far = ray_box(torch.tensor(origins), torch.tensor(directions))
+    assert (near == near[0]).all()
+    assert (far == far[0]).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(origin=VECTOR, direction=VECTOR)
+def test_intervals_are_ordered_and_lie_in_the_cube(origin, direction):
+    near, far = one(origin, direction)
+    assert 0 <= near <= far < INF
+    if far > 0:
+        scale = max(1.0, far) * max(1e-3, max(map(abs, direction)))
+        for distance in (near, (near + far) / 2, far):
+            point = [o + distance * d for o, d in zip(origin, direction, strict=True)]
+            assert max(map(abs, point)) <= 1 + 1e-12 * scale

@@ -1,0 +1,212 @@
+"""Whole renderings against closed forms."""
+
+import math
+
+import pytest
+import torch
+
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.renderer import DIAGONAL, Renderer
+
+COLOUR = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
+WHITE = torch.ones(3, dtype=torch.float64)
+
+
+def renderer_of(samples=64, resolution=4, **options):
+    return Renderer(OccupancyGrid(resolution, 1, step=DIAGONAL / samples), samples, **options)
+
+
+def fog(density):
+    """A field of one colour and one density; a tensor density gets gradients."""
+
+    def field(points, times):
+        level = torch.as_tensor(density, dtype=points.dtype)
+        return COLOUR.to(points.dtype).expand(len(points), 3), level.expand(len(points))
+
+    return field
+
+
+def diagonal_rays(dtype=torch.float64):
+    """Rays through the cube's four diagonals: exactly as many steps as `samples` long."""
+    corner = torch.tensor([[1.0, 1, 1], [-1, 1, 1], [1, -1, 1], [-1, -1, -1]], dtype=dtype)
+    directions = -corner / math.sqrt(3)
+    return 3 * corner, directions, torch.full((4,), 0.5, dtype=dtype)
+
+
+def rays_of(count, dtype=torch.float64, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    origins = torch.randn(count, 3, generator=generator, dtype=dtype)
+    origins = 3 * origins / origins.norm(dim=-1, keepdim=True)
+    target = torch.rand(count, 3, generator=generator, dtype=dtype) * 1.6 - 0.8
+    directions = target - origins
+    directions = directions / directions.norm(dim=-1, keepdim=True)
+    return origins, directions, torch.rand(count, generator=generator, dtype=dtype)
+
+
+@pytest.mark.parametrize("density", [0.0, 1e-6, 0.1, 1.0, 10.0, 1e4, 1e8])
+@pytest.mark.parametrize("stride", [1, 2])
+def test_fog_in_the_cube_stops_the_light_of_beer_and_lambert(density, stride):
+    seen = renderer_of(occlusion=0.0).render(fog(density), *diagonal_rays(), WHITE, stride=stride)
+    opacity = -math.expm1(-density * DIAGONAL)
+    assert seen.opacity.tolist() == pytest.approx([opacity] * 4, rel=1e-9, abs=1e-15)
+    expected = opacity * COLOUR + (1 - opacity) * WHITE
+    torch.testing.assert_close(seen.colour, expected.expand(4, 3), atol=1e-9, rtol=0)
+    assert len(seen.samples) == 4 * 64 // stride
+
+
+@pytest.mark.parametrize("density", [0.5, 2.0])
+def test_depth_in_fog_is_the_mean_free_path_cut_at_the_far_side(density):
+    seen = renderer_of(2000, occlusion=0.0).render(fog(density), *diagonal_rays(), WHITE)
+    near, length = 3 * math.sqrt(3) - math.sqrt(3), DIAGONAL
+    left = math.exp(-density * length)
+    mean = 1 / density - length * left / (1 - left)
+    assert seen.depth.tolist() == pytest.approx([near + mean] * 4, rel=1e-5)
+
+
+def test_any_ray_through_fog_is_right_to_half_a_step():
+    renderer, rays = renderer_of(256, occlusion=0.0), rays_of(200)
+    seen = renderer.render(fog(1.0), *rays, WHITE)
+    from xplanes.rendering.box import ray_box
+
+    near, far = ray_box(*rays[:2])
+    wrong = (-(1 - seen.opacity).log() - (far - near)).abs()
+    assert wrong.max() <= 0.5 * renderer.step + 1e-9
+
+
+def test_the_derivative_by_density_is_that_of_the_closed_form():
+    density = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
+    seen = renderer_of(occlusion=0.0).render(fog(density), *diagonal_rays(), WHITE)
+    (slope,) = torch.autograd.grad(seen.opacity[0], density)
+    assert float(slope) == pytest.approx(DIAGONAL * math.exp(-0.7 * DIAGONAL))
+
+
+def test_dropping_what_lies_behind_costs_less_than_its_threshold():
+    rays = rays_of(300)
+    renderer = renderer_of(128, occlusion=0.0)
+    renderer.grid.density.fill_(5.0)
+    all_of_it = renderer.render(fog(5.0), *rays, WHITE)
+    for occlusion in (1e-4, 1e-2):
+        quick = Renderer(renderer.grid, 128, occlusion=occlusion)
+        less = quick.render(fog(5.0), *rays, WHITE)
+        assert less.samples.occluded > 0
+        assert ((less.colour - all_of_it.colour).abs() <= occlusion).all()
+
+
+def test_empty_cells_cost_nothing_where_there_is_nothing():
+    renderer, rays = renderer_of(128, 16), rays_of(300)
+
+    def ball(points, times):
+        inside = points.norm(dim=-1) < 0.5
+        return COLOUR.expand(len(points), 3), torch.where(inside, 20.0, 0.0).double()
+
+    whole = renderer.render(ball, *rays, WHITE)
+    centres = (torch.arange(16) + 0.5) / 8 - 1
+    grid = torch.stack(torch.meshgrid(centres, centres, centres, indexing="ij"), dim=-1)
+    renderer.grid.allow((grid.norm(dim=-1) < 0.5 + math.sqrt(3) / 16)[None])
+    less = renderer.render(ball, *rays, WHITE)
+    assert less.samples.empty > 0.5 * less.samples.candidates
+    torch.testing.assert_close(less.colour, whole.colour, atol=1e-12, rtol=0)
+    every = Renderer(renderer.grid, 128, skip_empty=False, occlusion=0.0)
+    assert every.render(ball, *rays, WHITE).samples.empty == 0
+
+
+def test_each_ray_has_its_own_time_and_background():
+    def clock(points, times):
+        return times[:, None].expand(-1, 3), torch.full_like(times, 1e4)
+
+    origins, directions, _ = diagonal_rays()
+    times = torch.tensor([0.1, 0.3, 0.6, 0.9]).double()
+    seen = renderer_of().render(clock, origins, directions, times, WHITE)
+    torch.testing.assert_close(seen.colour, times[:, None].expand(4, 3))
+    own = torch.rand(4, 3, dtype=torch.float64)
+    clear = renderer_of().render(fog(0.0), origins, directions, times, own)
+    assert torch.equal(clear.colour, own)
+    assert (clear.opacity == 0).all()
+    assert (clear.depth == 0).all()
+
+
+@pytest.mark.parametrize("density", [1e-30, 1e8, 1e20, 3e38, math.inf])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("loops", ["1", "0"])
+def test_no_density_makes_a_nan(density, dtype, loops, monkeypatch):
+    monkeypatch.setenv("XPLANES_CPU_LOOPS", loops)
+    renderer, rays = renderer_of(), rays_of(40, dtype)
+    level = torch.tensor(density, dtype=dtype, requires_grad=True)
+    for _ in range(2):
+        seen = renderer.render(fog(level), *rays, WHITE.to(dtype))
+        for value in (seen.colour, seen.opacity, seen.depth):
+            assert value.isfinite().all()
+        (slope,) = torch.autograd.grad(seen.colour.sum(), level)
+        assert slope.isfinite()
+        # The second time the grid knows of it.
+        renderer.grid.observe(seen.samples.cells, seen.density)
+
+
+@pytest.mark.parametrize("loops", ["1", "0"])
+def test_a_nan_of_the_field_stays_on_its_ray(loops, monkeypatch):
+    monkeypatch.setenv("XPLANES_CPU_LOOPS", loops)
+    rays = rays_of(10)
+
+    def field(points, times):
+        colour, density = fog(1.0)(points, times)
+        return colour, torch.where(times == rays[2][4], math.nan, density)
+
+    seen = renderer_of().render(field, *rays, WHITE)
+    assert seen.colour.isnan().any(dim=-1).nonzero().flatten().tolist() == [4]
+
+
+def test_low_precision_fields_are_merged_in_float32():
+    rays = diagonal_rays(torch.float32)
+
+    def rough(points, times):
+        colour, density = fog(1.0)(points, times)
+        return colour.bfloat16(), density.bfloat16()
+
+    seen = renderer_of(occlusion=0.0).render(rough, *rays, WHITE.float())
+    assert seen.colour.dtype == torch.float32
+    assert float(seen.opacity[0]) == pytest.approx(-math.expm1(-DIAGONAL), rel=0.01)
+
+
+def test_rays_that_miss_see_the_background():
+    origins = torch.tensor([[0.0, 0, 5], [0, 3, 0]]).double()
+    directions = torch.tensor([[0.0, 0, 1], [1, 0, 0]]).double()
+    seen = renderer_of().render(fog(9.0), origins, directions, torch.zeros(2).double(), COLOUR)
+    assert torch.equal(seen.colour, COLOUR.expand(2, 3))
+    assert len(seen.samples) == 0
+
+
+def test_an_image_does_not_depend_on_its_chunks():
+    renderer = renderer_of()
+    origins, directions, _ = rays_of(100, torch.float32)
+
+    def field(points, times):
+        return points.abs(), points.square().sum(dim=-1) * 4
+
+    whole = renderer.image(field, origins, directions, 0.3, WHITE.float())
+    parts = renderer.image(field, origins, directions, 0.3, WHITE.float(), chunk=7)
+    times = torch.full((100,), 0.3)
+    same = renderer.render(field, origins, directions, times, WHITE.float())
+    for name, value in whole.items():
+        assert torch.equal(value, parts[name]), name
+        assert torch.equal(value, getattr(same, name)), name
+        assert not value.requires_grad
+
+
+def test_an_image_without_rays_is_empty():
+    none = torch.zeros(0, 3)
+    image = renderer_of().image(fog(1.0), none, none, 0.0, WHITE.float())
+    assert {name: tuple(value.shape) for name, value in image.items()} == {
+        "colour": (0, 3),
+        "opacity": (0,),
+        "depth": (0,),
+    }
+
+
+def test_jitter_moves_samples_within_their_steps():
+    origins, directions, times = diagonal_rays()
+    renderer = renderer_of(8)
+    jitter = torch.tensor([0.0, 0.25, 0.5, 0.9]).double()
+    samples = renderer.render(fog(0.1), origins, directions, times, WHITE, jitter).samples
+    first = samples.distances[samples.starts]
+    expected = 2 * math.sqrt(3) + jitter * renderer.step
+    torch.testing.assert_close(first, expected)

@@ -1,0 +1,199 @@
+"""Ray batches: a function of seed, step and rank, and right in every pixel."""
+
+import itertools
+
+import pytest
+import torch
+
+from tests.oracles import project
+from tests.synthetic import ball_views
+from xplanes.scenes.batches import NEAR_SILHOUETTE, RayBatches, step_generator
+from xplanes.scenes.frame import Frame, cube_frame
+from xplanes.scenes.silhouettes import foreground
+
+VIEWS = ball_views(5, 0.5, size=24)
+FRAME = cube_frame(1.4, torch.zeros(3))
+
+
+def batches_of(views=VIEWS, frame=FRAME, **options):
+    defaults = {
+        "rays": 64,
+        "seed": 0,
+        "background": "white",
+        "skip_background": True,
+        "background_share": 0.1,
+    }
+    return RayBatches(views, frame, **{**defaults, **options})
+
+
+def same(first, second):
+    assert first.keys() == second.keys()
+    return all(torch.equal(first[name], second[name]) for name in first)
+
+
+@pytest.mark.parametrize("background", ["white", "random"])
+def test_a_batch_depends_on_its_step_alone(background):
+    fresh, used = batches_of(background=background), batches_of(background=background)
+    for step in (0, 17, 3, 10**9):
+        used.draw(step)
+    torch.manual_seed(5)
+    torch.rand(100)
+    for step in (0, 1, 17, 10**9):
+        assert same(fresh.draw(step), used.draw(step))
+
+
+def test_steps_ranks_and_seeds_draw_different_rays():
+    drawn = [
+        batches_of(seed=seed, rank=rank).draw(step)
+        for seed, rank, step in itertools.product((0, 1, 2), (0, 1), (0, 1, 2))
+    ]
+    for first, second in itertools.combinations(drawn, 2):
+        assert not torch.equal(first["jitter"], second["jitter"])
+        assert not torch.equal(first["directions"], second["directions"])
+
+
+def test_drawing_does_not_touch_the_global_generator():
+    torch.manual_seed(0)
+    before = torch.get_rng_state()
+    batches_of(background="random").draw(4)
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_neighbouring_generators_share_nothing():
+    keys = [
+        step_generator(seed, step, stream).initial_seed()
+        for seed in (-1, 0, 1, 2**32 - 1, 2**63)
+        for step in range(20)
+        for stream in (0, 1, 2, 1_000_003)
+    ]
+    assert len(set(keys)) == len(keys)
+    first = torch.stack([torch.rand(8, generator=step_generator(0, step)) for step in range(500)])
+    correlation = torch.corrcoef(first.T) - torch.eye(8)
+    assert correlation.abs().max() < 0.2
+    assert abs(float(first.mean()) - 0.5) < 0.02
+
+
+def pixels_of(batch, views, frame):
+    """View, row and column of each ray, found by projecting a point of it into every view."""
+    found = []
+    origins, points = (
+        frame.to_world(p) for p in (batch["origins"], batch["origins"] + batch["directions"])
+    )
+    for origin, point, time in zip(origins, points, batch["times"], strict=True):
+        (view,) = (views.times == time).nonzero().flatten().tolist()
+        pose = views.camera_to_world[view]
+        torch.testing.assert_close(origin, pose[:3, 3], atol=1e-5, rtol=0)
+        row, column, ok = project(
+            point.double().numpy(), pose.double().numpy(), views.focal, views.height, views.width
+        )
+        assert ok
+        found.append((view, row, column))
+    return torch.tensor(found).T
+
+
+@pytest.mark.parametrize("background", ["white", "random"])
+@pytest.mark.parametrize(
+    "frame",
+    [FRAME, Frame(0.3, torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), torch.ones(3))],
+)
+def test_targets_are_the_pixels_that_the_rays_go_through(background, frame):
+    colours = torch.randint(
+        0, 256, VIEWS.images.shape, generator=torch.Generator().manual_seed(0), dtype=torch.uint8
+    )
+    colours[..., :3] = torch.minimum(colours[..., :3], colours[..., 3:])  # multiplied by alpha
+    views = VIEWS.__class__(
+        colours, VIEWS.camera_to_world, VIEWS.times, VIEWS.focal, VIEWS.files
+    )
+    batch = batches_of(views, frame, background=background).draw(3)
+    view, row, column = pixels_of(batch, views, frame)
+    pixel = colours[view, row, column].double() / 255
+    expected = pixel[:, :3] + (1 - pixel[:, 3:]) * batch["background"].double()
+    torch.testing.assert_close(batch["target"].double(), expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(batch["directions"].norm(dim=-1), torch.ones(64))
+    assert torch.equal(batch["times"], views.times[view])
+    white = (batch["background"] == 1).all()
+    assert white == (background == "white")
+    for index in range(len(views)):
+        image = views.composite(index, torch.ones(3))
+        assert not white or torch.allclose(
+            batch["target"][view == index], image[row[view == index], column[view == index]]
+        )
+
+
+def test_shapes_and_ranges():
+    batch = batches_of(background="random").draw(0)
+    shapes = {name: tuple(value.shape) for name, value in batch.items()}
+    vector, number = (64, 3), (64,)
+    assert shapes == {
+        "origins": vector,
+        "directions": vector,
+        "target": vector,
+        "background": vector,
+        "times": number,
+        "jitter": number,
+    }
+    for name in ("target", "background", "jitter"):
+        assert batch[name].min() >= 0
+        assert batch[name].max() <= 1
+        assert batch[name].dtype == torch.float32
+
+
+def near_share(batches, steps=40):
+    """Share of drawn rays near the silhouettes."""
+    views = batches.views
+    margin = max(1, round(NEAR_SILHOUETTE * views.width))
+    near = foreground(views, margin)
+    found = []
+    for step in range(steps):
+        view, row, column = pixels_of(batches.draw(step), views, FRAME)
+        found.append(near[view, row, column])
+    return float(torch.cat(found).float().mean()), float(near.float().mean())
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.4])
+def test_the_share_of_background_rays_is_the_asked_one(share):
+    batches = batches_of(background_share=share)
+    drawn, natural = near_share(batches, steps=30)
+    assert drawn == pytest.approx(1 - share, abs=4 * (share * (1 - share) / (30 * 64)) ** 0.5)
+    assert batches.skipped == pytest.approx(1 - natural - share)
+
+
+@pytest.mark.parametrize("options", [{"skip_background": False}, {"background_share": 1.0}])
+def test_without_skipping_pixels_are_drawn_evenly(options):
+    batches = batches_of(rays=20_000, **options)
+    assert batches.skipped == 0
+    views = batches.views
+    counts = torch.zeros(len(views) * 24 * 24)
+    for step in range(10):
+        batch = batches.draw(step)
+        origins = FRAME.to_world(batch["origins"])
+        view = torch.cdist(origins, views.camera_to_world[:, :3, 3]).argmin(dim=1)
+        local = (batch["directions"][:, None] @ views.camera_to_world[view, :3, :3])[:, 0]
+        column = (local[:, 0] / -local[:, 2] * views.focal + 12).floor().long()
+        row = (-local[:, 1] / -local[:, 2] * views.focal + 12).floor().long()
+        counts += torch.bincount((view * 24 + row) * 24 + column, minlength=len(counts))
+    expected = counts.sum() / len(counts)
+    chi_squared = float(((counts - expected).square() / expected).sum())
+    freedom = len(counts) - 1
+    assert abs(chi_squared - freedom) < 5 * (2 * freedom) ** 0.5
+    assert counts.min() > 0
+
+
+@pytest.mark.parametrize("alpha", [0, 255])
+def test_images_that_are_all_background_or_all_content_are_drawn_evenly(alpha):
+    images = torch.full_like(VIEWS.images, alpha)
+    views = VIEWS.__class__(
+        images, VIEWS.camera_to_world, VIEWS.times, VIEWS.focal, VIEWS.files
+    )
+    batches = batches_of(views, rays=2000)
+    assert batches.skipped == 0
+    batch = batches.draw(0)
+    assert len(batch["times"].unique()) == 5
+    assert (batch["target"] == 1).all()
+    assert batch["directions"].unique(dim=0).shape[0] > 1000
+
+
+def test_jitter_is_even():
+    jitter = torch.cat([batches_of(rays=1000).draw(step)["jitter"] for step in range(10)])
+    counts = torch.histc(jitter, bins=10, min=0, max=1)
+    assert ((counts - 1000).abs() < 150).all()

@@ -1,0 +1,121 @@
+"""Cameras: pixel centres, directions and poses against hand-made numbers and projection."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.oracles import project
+from xplanes.scenes.cameras import focal_length, look_at, orbit, pixel_rays
+from xplanes.scenes.views import camera_rays
+
+EYE = torch.eye(4)
+
+
+def test_focal_length_of_a_right_angle_is_half_the_width():
+    assert focal_length(math.pi / 2, 100) == pytest.approx(50)
+    assert focal_length(0.6911112070083618, 800) == pytest.approx(1111.1110311937682)
+
+
+def test_pixel_centres_by_hand():
+    # Two rows of four pixels, focal length 1: centres at +0.5 from the corner.
+    rows, columns = torch.tensor([0.0, 0, 1, 1]), torch.tensor([0.0, 3, 0, 3])
+    origins, directions = pixel_rays(EYE, rows, columns, focal=1.0, height=2, width=4)
+    expected = torch.tensor([[-1.5, 0.5, -1], [1.5, 0.5, -1], [-1.5, -0.5, -1], [1.5, -0.5, -1]])
+    expected = expected / expected.norm(dim=-1, keepdim=True)
+    torch.testing.assert_close(directions, expected)
+    assert (origins == 0).all()
+
+
+def test_the_middle_of_the_image_looks_along_minus_z():
+    for height, width in ((5, 5), (4, 6), (1, 1)):
+        middle = torch.tensor([(height - 1) / 2]), torch.tensor([(width - 1) / 2])
+        _, directions = pixel_rays(EYE, *middle, focal=3.0, height=height, width=width)
+        assert directions[0].tolist() == pytest.approx([0, 0, -1])
+
+
+def test_outermost_pixel_edges_span_the_field_of_view():
+    focal = focal_length(1.2, 10)
+    _, directions = pixel_rays(
+        EYE, torch.tensor([4.5, 4.5]), torch.tensor([-0.5, 9.5]), focal=focal, height=10, width=10
+    )
+    angle = math.acos(float(directions[0] @ directions[1]))
+    assert angle == pytest.approx(1.2, rel=1e-5)
+
+
+def test_image_rays_run_row_by_row():
+    origins, directions = camera_rays(EYE, 2.0, 3, 4)
+    assert origins.shape == directions.shape == (12, 3)
+    grid = directions.view(3, 4, 3)
+    assert (grid[:, 1:, 0] > grid[:, :-1, 0]).all()  # right along a row
+    assert (grid[1:, :, 1] < grid[:-1, :, 1]).all()  # down along a column
+    torch.testing.assert_close(directions.norm(dim=-1), torch.ones(12))
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    place=st.tuples(*[st.floats(-4, 4, width=32)] * 3).filter(lambda p: np.linalg.norm(p) > 0.1),
+    row=st.integers(0, 8),
+    column=st.integers(0, 12),
+    distance=st.floats(0.5, 9),
+)
+def test_points_on_a_ray_project_into_its_pixel(place, row, column, distance):
+    pose = look_at(torch.tensor([place], dtype=torch.float64))[0]
+    pixel = torch.tensor([row]).double(), torch.tensor([column]).double()
+    origins, directions = pixel_rays(pose, *pixel, focal=11.0, height=9, width=13)
+    point = (origins + distance * directions)[0].numpy()
+    assert project(point, pose.numpy(), 11.0, 9, 13) == (row, column, True)
+
+
+def test_each_ray_may_have_its_own_camera():
+    poses = look_at(torch.randn(6, 3, generator=torch.Generator().manual_seed(0)))
+    rows, columns = torch.arange(6.0), torch.arange(6.0).flip(0)
+    together = pixel_rays(poses, rows, columns, focal=5.0, height=6, width=6)
+    for index in range(6):
+        one = slice(index, index + 1)
+        alone = pixel_rays(
+            poses[index], rows[one], columns[one], focal=5.0, height=6, width=6
+        )
+        for a, b in zip(together, alone, strict=True):
+            torch.testing.assert_close(a[one], b)
+
+
+PLACES = torch.tensor([[3.0, 0, 0], [0, -2, 1], [1, 1, -5], [0, 0, 4], [0, 0, -4]])
+
+
+@pytest.mark.parametrize("target", [None, torch.tensor([0.5, 0.25, -1.0])])
+def test_look_at_makes_rigid_right_handed_poses_that_see_their_target(target):
+    poses = look_at(PLACES, target)
+    aim = torch.zeros(3) if target is None else target
+    for pose, place in zip(poses, PLACES, strict=True):
+        rotation = pose[:3, :3]
+        torch.testing.assert_close(rotation.T @ rotation, torch.eye(3), atol=1e-6, rtol=0)
+        assert float(rotation.det()) == pytest.approx(1, abs=1e-5)
+        assert torch.equal(pose[:3, 3], place)
+        assert pose[3].tolist() == [0, 0, 0, 1]
+        towards = (aim - place) / (aim - place).norm()
+        torch.testing.assert_close(-rotation[:, 2], towards)
+        assert rotation[2, 0] == pytest.approx(0, abs=1e-6)  # no roll
+        assert rotation[2, 1] >= -1e-6  # up is up
+
+
+def test_straight_up_and_down_take_y_as_up():
+    poses = look_at(torch.tensor([[0.0, 0, 4], [0, 0, -4]]))
+    assert poses.isfinite().all()
+    for pose in poses:
+        torch.testing.assert_close(pose[:3, 1], torch.tensor([0.0, 1, 0]))
+
+
+def test_orbit_is_a_circle_that_starts_at_minus_y():
+    target = torch.tensor([1.0, 2, 3])
+    poses = orbit(8, radius=2.0, elevation=30.0, target=target)
+    offset = poses[:, :3, 3] - target
+    torch.testing.assert_close(offset.norm(dim=-1), torch.full((8,), 2.0))
+    torch.testing.assert_close(offset[:, 2], torch.full((8,), 1.0))
+    assert offset[0].tolist() == pytest.approx([0, -math.sqrt(3), 1], abs=1e-6)
+    assert offset[2].tolist() == pytest.approx([math.sqrt(3), 0, 1], abs=1e-6)
+    assert orbit(0, radius=1.0, elevation=0.0).shape == (0, 4, 4)
+    assert orbit(1, radius=1.0, elevation=90.0).isfinite().all()

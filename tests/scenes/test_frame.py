@@ -1,0 +1,154 @@
+"""The field's frame: similarities, the point that cameras look at, and the scene's cube."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.synthetic import ball_views, inside_ball, swinging
+from xplanes.scenes.cameras import look_at, orbit
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.frame import Frame, cube_frame, optical_centre, scene_frame
+from xplanes.scenes.views import Views
+
+
+def turned(scale=0.4):
+    """A frame turned about a slanted axis."""
+    pose = look_at(torch.tensor([[1.0, 2.0, 0.5]]))[0]
+    return Frame(scale, pose[:3, :3], torch.tensor([0.5, -1.0, 2.0]))
+
+
+def views_of(poses, *, focal=50.0, size=10):
+    count = len(poses)
+    return Views(
+        torch.full((count, size, size, 4), 255, dtype=torch.uint8),
+        poses,
+        torch.linspace(0, 1, count),
+        focal,
+        tuple(map(str, range(count))),
+    )
+
+
+@pytest.mark.parametrize("frame", [turned(), turned(3.0), cube_frame(2.0, torch.ones(3))])
+def test_points_go_round(frame):
+    points = torch.randn(5, 7, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(frame.to_world(frame.points(points)), points, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(frame.points(frame.to_world(points)), points, atol=1e-5, rtol=1e-5)
+
+
+def test_distances_scale_and_angles_stay():
+    frame, points = turned(0.4), torch.randn(10, 3, generator=torch.Generator().manual_seed(1))
+    before, after = torch.cdist(points, points), torch.cdist(*[frame.points(points)] * 2)
+    torch.testing.assert_close(after, 0.4 * before, atol=1e-5, rtol=1e-5)
+    assert torch.allclose(frame.points(frame.centre), torch.zeros(3))
+
+
+def test_a_ray_and_its_points_move_together():
+    frame, generator = turned(), torch.Generator().manual_seed(2)
+    origins, directions = torch.randn(2, 6, 3, generator=generator)
+    directions = directions / directions.norm(dim=-1, keepdim=True)
+    moved, turned_directions = frame.rays(origins, directions)
+    torch.testing.assert_close(turned_directions.norm(dim=-1), torch.ones(6))
+    point = frame.points(origins + 2.5 * directions)
+    torch.testing.assert_close(
+        moved + 2.5 * frame.scale * turned_directions, point, atol=1e-5, rtol=1e-5
+    )
+
+
+def test_a_world_cube_becomes_the_unit_cube():
+    centre = torch.tensor([1.0, -2, 3])
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1])] * 3)
+    torch.testing.assert_close(cube_frame(2.5, centre).points(centre + 2.5 * corners), corners)
+
+
+@pytest.mark.parametrize("elevation", [-20.0, 0.0, 35.0])
+def test_cameras_on_an_orbit_look_at_its_target(elevation):
+    target = torch.tensor([0.5, -1.5, 2.0])
+    poses = orbit(9, radius=3.0, elevation=elevation, target=target)
+    torch.testing.assert_close(optical_centre(views_of(poses)), target, atol=1e-4, rtol=0)
+
+
+def test_two_crossing_cameras_meet_where_they_cross():
+    target = torch.tensor([0.2, 0.3, 0.4])
+    places = torch.tensor([[3.0, 0, 0], [0.0, 4, 0]])
+    found = optical_centre(views_of(look_at(places, target)))
+    torch.testing.assert_close(found, target, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("offset", [0.0, 50.0])
+def test_parallel_cameras_leave_the_depth_to_the_origin(offset):
+    poses = torch.eye(4).repeat(3, 1, 1)
+    poses[:, 0, 3] = torch.tensor([-1.0, 0, 1]) + offset
+    poses[:, 1, 3] = offset
+    poses[:, 2, 3] = torch.tensor([4.0, 5, 6])
+    found = optical_centre(views_of(poses))
+    torch.testing.assert_close(found, torch.tensor([offset, offset, 0.0]), atol=1e-3, rtol=0)
+
+
+def test_one_camera_looks_at_the_point_of_its_axis_near_the_origin():
+    pose = look_at(torch.tensor([[2.0, 1.0, 2.0]]))
+    torch.testing.assert_close(optical_centre(views_of(pose)), torch.zeros(3), atol=1e-4, rtol=0)
+
+
+def test_a_given_half_side_is_taken():
+    views = views_of(orbit(5, radius=3.0, elevation=20.0))
+    frame = scene_frame(views, 1.25)
+    assert frame.scale == pytest.approx(0.8)
+    assert torch.equal(frame.rotation, torch.eye(3))
+
+
+@pytest.mark.parametrize("radius", [0.2, 0.5, 1.0])
+def test_a_still_scene_s_cube_holds_it_closely(radius):
+    centre = torch.tensor([0.1, -0.2, 0.15])
+    views = ball_views(30, radius, centre=lambda _: centre, size=48, times=torch.zeros(30))
+    frame = scene_frame(views)
+    points = frame.points(inside_ball(3000, radius) + centre)
+    assert points.abs().max() <= 1
+    assert 1 / frame.scale < radius + 0.35
+
+
+@pytest.mark.parametrize("turns", [0.5, 1])
+def test_a_moving_scene_s_cube_holds_it_at_all_times(turns):
+    path = swinging(0.7, turns)
+    frame = scene_frame(ball_views(40, 0.3, centre=path, size=32))
+    for time in torch.linspace(0, 1, 41).tolist():
+        assert frame.points(inside_ball(200, 0.3) + path(time)).abs().max() <= 1
+
+
+def test_without_alpha_the_cube_is_what_the_cameras_see():
+    views = views_of(orbit(12, radius=3.0, elevation=10.0), focal=10.0, size=10)
+    half = 1 / scene_frame(views).scale
+    # Half the field of view's tangent is 0.5, at a distance of 3.
+    assert 1.5 <= half < 1.5 * 1.05
+
+
+def test_the_cube_follows_the_scale_of_the_world():
+    small = ball_views(20, 0.5, size=32, times=torch.zeros(20))
+    poses = small.camera_to_world.clone()
+    poses[:, :3, 3] *= 100
+    large = replace(small, camera_to_world=poses)
+    assert scene_frame(small).scale == pytest.approx(100 * scene_frame(large).scale, rel=1e-3)
+
+
+def test_cameras_that_look_away_from_one_another_are_refused_with_a_way_out():
+    poses = orbit(6, radius=2.0, elevation=0.0)
+    poses[:, :3, 0] *= -1
+    poses[:, :3, 2] *= -1  # turned about: they look outwards
+    with pytest.raises(SceneError, match=r"data\.half_side"):
+        scene_frame(views_of(poses))
+
+
+def test_silhouettes_that_leave_nothing_are_refused_with_a_way_out():
+    views = ball_views(12, 0.2, size=32, times=torch.zeros(12))
+    images = torch.zeros_like(views.images)
+    with pytest.raises(SceneError, match=r"sampler\.silhouettes=false"):
+        scene_frame(replace(views, images=images))
+
+
+def test_the_frame_is_finite_for_every_kind_of_path():
+    for count in (1, 2, 3):
+        views = views_of(orbit(count, radius=3.0, elevation=25.0), focal=8.0)
+        frame = scene_frame(views)
+        assert math.isfinite(frame.scale)
+        assert frame.centre.isfinite().all()

@@ -1,0 +1,111 @@
+"""The visual hull over short spans of time."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.oracles import project, visual_hull
+from tests.synthetic import ball_views, inside_ball, swinging
+from xplanes.scenes.silhouettes import foreground, silhouette_hull
+
+
+def test_foreground_widens_by_whole_pixels():
+    views = ball_views(2, 0.4, size=20)
+    alpha = torch.zeros(2, 20, 20, dtype=torch.uint8)
+    alpha[0, 5, 7] = 1
+    images = views.images.clone()
+    images[..., 3] = alpha
+    for margin in (0, 1, 3):
+        found = foreground(replace(views, images=images), margin)
+        rows, columns = found[0].nonzero(as_tuple=True)
+        assert (rows.min(), rows.max()) == (5 - margin, 5 + margin)
+        assert (columns.min(), columns.max()) == (7 - margin, 7 + margin)
+        assert found[0].sum() == (2 * margin + 1) ** 2
+        assert not found[1].any()
+
+
+def grid_points(half=1.3, cells=9):
+    line = torch.linspace(-half, half, cells)
+    return torch.stack(torch.meshgrid(line, line, line, indexing="ij"), dim=-1).view(-1, 3)
+
+
+def test_without_a_radius_the_hull_is_that_of_projected_points():
+    views = ball_views(10, 0.6, size=32, times=torch.zeros(10))
+    points = grid_points()
+    found = silhouette_hull(views, points, radius=0.0)
+    expected = visual_hull(
+        views.images[..., 3].numpy(), views.camera_to_world.double().numpy(), views.focal, points
+    )
+    assert 0.01 < expected.mean() < 0.9
+    assert (found == found[0]).all()
+    assert np.array_equal(found[0].numpy(), expected)
+
+
+def test_a_moving_hull_asks_every_view_of_some_span_around():
+    views = ball_views(34, 0.5, centre=swinging(0.5, 1), size=24)  # a span is 2 of 34 views
+    points = grid_points(cells=7)
+    alpha, poses = views.images[..., 3].numpy(), views.camera_to_world.double().numpy()
+    single = np.array(
+        [visual_hull(alpha[i : i + 1], poses[i : i + 1], views.focal, points) for i in range(34)]
+    )
+    pairs = single[:-1] & single[1:]
+    expected = np.zeros_like(single)
+    expected[:-1] |= pairs
+    expected[1:] |= pairs
+    found = silhouette_hull(views, points, radius=0.0)
+    assert np.array_equal(found.numpy(), expected)
+
+
+@pytest.mark.parametrize("radius", [0.01, 0.1, 0.4])
+def test_the_radius_keeps_whatever_a_ball_around_the_point_could_hold(radius):
+    views = ball_views(12, 0.5, size=32, times=torch.zeros(12))
+    points = grid_points()
+    found = silhouette_hull(views, points, radius=radius)[0]
+    touches = (points.norm(dim=-1) - radius) < 0.5 - 0.05  # by more than a pixel
+    assert found[touches].all()
+    assert (found | ~silhouette_hull(views, points, radius=0.0)[0]).all()
+    assert not found[points.norm(dim=-1) > 1.2 + 3 * radius].any()
+
+
+def test_what_is_out_of_sight_is_not_ruled_out():
+    views = ball_views(4, 0.3, size=24, times=torch.zeros(4), angle=0.2)
+    points = grid_points(half=3.0, cells=7)
+    found = silhouette_hull(views, points, radius=0.0)[0]
+    poses = views.camera_to_world.double().numpy()
+    unseen = torch.tensor(
+        [not any(project(p, pose, views.focal, 24, 24)[2] for pose in poses) for p in points.numpy()]
+    )
+    assert unseen.any()
+    assert found[unseen].all()
+
+
+def test_points_at_and_behind_the_camera_are_not_ruled_out():
+    views = ball_views(1, 0.3, size=24)
+    place, back = views.camera_to_world[0, :3, 3], views.camera_to_world[0, :3, 2]
+    points = torch.stack([place, place + back, place - 1e-4 * back])
+    assert silhouette_hull(views, points, radius=0.01).all()
+
+
+def test_images_of_nothing_rule_out_what_they_see():
+    views = ball_views(5, 0.3, times=torch.zeros(5))
+    empty = replace(views, images=torch.zeros_like(views.images))
+    assert not silhouette_hull(empty, inside_ball(50, 0.3), radius=0.02).any()
+    full = replace(views, images=torch.full_like(views.images, 255))
+    assert silhouette_hull(full, inside_ball(50, 0.3), radius=0.02).all()
+
+
+def test_the_order_of_the_views_does_not_matter():
+    views = ball_views(40, 0.4, centre=swinging(0.6, 1), size=24)
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(1))
+    points = grid_points(cells=6)
+    straight = silhouette_hull(views, points, radius=0.05)
+    assert torch.equal(silhouette_hull(views.subset(order), points, radius=0.05), straight[order])
+
+
+def test_images_need_not_be_square():
+    views = ball_views(8, 0.5, size=30, times=torch.zeros(8))
+    cut = replace(views, images=views.images[:, 5:25])  # the middle rows: same focal length
+    points = inside_ball(300, 0.5)
+    assert silhouette_hull(cut, points, radius=0.05).all()

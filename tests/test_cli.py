@@ -1,0 +1,118 @@
+"""The command line after training: quick to ask, plain when something is wrong."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from xplanes.cli import main
+
+
+def python(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=cwd, capture_output=True, text=True, timeout=120
+    )
+
+
+def test_help_loads_nothing_heavy(tmp_path):
+    code = (
+        "import sys; from xplanes.cli import build_parser; text = build_parser().format_help();"
+        "heavy = {'torch', 'lightning', 'hydra', 'omegaconf', 'numpy'} & set(sys.modules);"
+        "print(text); sys.exit(f'loaded {heavy}' if heavy else 0)"
+    )
+    done = python("-c", code, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for verb in ("download", "evaluate", "render", "view", "table"):
+        assert verb in done.stdout
+
+
+def test_evaluate_as_a_program(trained_run: Path, tmp_path: Path):
+    done = python("-m", "xplanes", "evaluate", str(trained_run), "--lpips", "none", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0] == f"run         {trained_run}"
+    assert lines[1].startswith("checkpoint  last.ckpt, step 40")
+    scores = json.loads((trained_run / "evaluation_test.json").read_text())
+    metrics = json.loads((trained_run / "metrics.json").read_text())
+    assert scores["test"] == pytest.approx(metrics["test"], abs=1e-6)
+    assert f"{metrics['test']['psnr']:.2f}" in lines[-2]
+
+
+def test_render(trained_run: Path, tmp_path: Path, capsys):
+    out = tmp_path / "film.webp"
+    options = ["--path", "fixed", "--time", "sweep", "--frames", "2", "--size", "16"]
+    assert main(["render", str(trained_run), *options, "--out", str(out)]) == 0
+    assert out.is_file()
+    printed = capsys.readouterr().out
+    assert "last.ckpt, step 40" in printed
+    assert f"wrote {out}" in printed
+
+
+def test_table(trained_run: Path, tmp_path: Path, capsys):
+    assert main(["table", str(trained_run.parent), "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().out == (tmp_path / "table.md").read_text()
+
+
+def test_download_says_how_to_go_on(tmp_path: Path, monkeypatch, capsys):
+    from xplanes.scenes import download
+
+    monkeypatch.setattr(download, "download_dnerf", lambda root: root)
+    assert main(["download", "dnerf", "--root", str(tmp_path)]) == 0
+    assert f"data.root={tmp_path}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["evaluate", "{tmp}/missing"], "does not exist"),
+        (["evaluate", "{run}", "--split", "val", "--checkpoint", "best"], None),
+        (["render", "{run}", "--time", "7"], "--time 7: must be sweep"),
+        (["render", "{run}", "--out", "a.gif"], "films end in .webp"),
+        (["table", "{tmp}"], "no runs in it"),
+        (["view", "{run}", "--port", "70000"], "--port 70000"),
+    ],
+)
+def test_known_errors_are_one_line(arguments, words, trained_run: Path, tmp_path: Path, capsys):
+    filled = [text.format(tmp=tmp_path, run=trained_run) for text in arguments]
+    code = main(filled)
+    error = capsys.readouterr().err
+    if words is None:
+        assert code == 0
+        return
+    assert code == 1
+    assert error.startswith("error: ")
+    assert words in error
+    assert "Traceback" not in error
+
+
+def test_a_missing_extra_is_named(trained_run: Path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["view", str(trained_run)]) == 1
+    assert 'pip install "xplanes[viewer]"' in capsys.readouterr().err
+
+
+def test_other_errors_keep_their_traceback(trained_run: Path, monkeypatch):
+    from xplanes.evaluation import runs
+
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(runs, "load_run", broken)
+    with pytest.raises(ZeroDivisionError):
+        main(["evaluate", str(trained_run)])
+
+
+def test_the_view_ends_with_ctrl_c(trained_run: Path, monkeypatch, capsys):
+    pytest.importorskip("viser")
+    from xplanes.evaluation.viewer import Viewer
+
+    def interrupted(self: Viewer) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Viewer, "run", interrupted)
+    assert main(["view", str(trained_run), "--port", "18090"]) == 0
+    printed = capsys.readouterr().out
+    assert "http://localhost:18090" in printed
+    assert "ssh -L 18090:localhost:18090" in printed

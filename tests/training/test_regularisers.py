@@ -1,0 +1,77 @@
+"""Smoothness gradients written straight into ``.grad`` equal autograd's."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from tests import oracles
+from xplanes.training.regularisers import (
+    add_time_smoothness_gradient,
+    add_total_variation_gradient,
+    time_smoothness,
+    total_variation,
+)
+
+SHAPES = [(3, 5, 5, 2), (6, 4, 7, 3), (1, 2, 2, 1), (2, 1, 4, 2), (2, 4, 1, 2), (1, 1, 1, 1)]
+DIMS = [(1,), (2,), (1, 2), (2, 1), ()]
+
+
+def planes_of(shape, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("dims", DIMS)
+def test_total_variation_is_the_oracle_s(shape, dims):
+    planes = planes_of(shape)
+    expected = oracles.total_variation(planes.numpy(), dims)
+    assert float(total_variation(planes, dims)) == pytest.approx(expected, rel=1e-12, abs=1e-15)
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, (2, 3, 4, 2), (2, 2, 4, 2)])
+def test_time_smoothness_is_the_oracle_s(shape):
+    planes = planes_of(shape)
+    expected = oracles.time_smoothness(planes.numpy())
+    assert float(time_smoothness(planes)) == pytest.approx(expected, rel=1e-12, abs=1e-15)
+
+
+@pytest.mark.parametrize(("shape", "dims"), itertools.product(SHAPES, DIMS))
+def test_total_variation_gradient_is_autograd_s(shape, dims):
+    planes = planes_of(shape).requires_grad_()
+    before = planes_of(shape, seed=1)
+    gradient = before.clone()
+    add_total_variation_gradient(gradient, planes, dims, 0.7)
+    (0.7 * total_variation(planes, dims) + 0 * planes.sum()).backward()
+    torch.testing.assert_close(gradient - before, planes.grad, atol=1e-13, rtol=0)
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, (2, 3, 4, 2), (2, 2, 4, 2), (1, 9, 2, 1)])
+def test_time_smoothness_gradient_is_autograd_s(shape):
+    planes = planes_of(shape).requires_grad_()
+    before = planes_of(shape, seed=1)
+    gradient = before.clone()
+    add_time_smoothness_gradient(gradient, planes, 0.3)
+    (0.3 * time_smoothness(planes) + 0 * planes.sum()).backward()
+    torch.testing.assert_close(gradient - before, planes.grad, atol=1e-13, rtol=0)
+
+
+def test_constant_planes_and_straight_motion_cost_nothing():
+    flat = torch.full((2, 4, 5, 3), 7.0)
+    assert total_variation(flat, (1, 2)) == 0
+    line = torch.arange(6.0).view(1, 6, 1, 1).expand(2, 6, 4, 3)
+    assert time_smoothness(line) == 0
+    gradient = torch.zeros(2, 4, 5, 3)
+    add_total_variation_gradient(gradient, flat, (1, 2), 1.0)
+    assert (gradient == 0).all()
+
+
+def test_float32_planes_are_changed_in_place_without_a_graph():
+    planes = planes_of((3, 5, 5, 2)).float().requires_grad_()
+    gradient = torch.zeros_like(planes)
+    add_total_variation_gradient(gradient, planes, (1, 2), 1.0)
+    assert not gradient.requires_grad
+    assert gradient.abs().max() > 0
+    assert np.isclose(float(gradient.sum()), 0, atol=1e-6)

@@ -1,0 +1,83 @@
+"""The camera from which a Large Reconstruction Model believes that its image was taken."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+Rows = tuple[tuple[float, float, float], ...]
+
+
+@dataclass(frozen=True)
+class CanonicalView:
+    """A model's own camera and box. Camera axes are OpenGL's: x right, y up, looking along -z.
+
+    Attributes:
+        rotation: Turns camera axes into the model's frame. 3 rows of 3
+        distance: From the camera to the centre of the box, in units of the model's frame.
+        focal: Focal length as a share of the image's width.
+        half_side: Half the side of the cube in which the model's field lives.
+        background: Grey value, from 0 to 1, behind the object in the model's input.
+    """
+
+    rotation: Rows
+    distance: float
+    focal: float
+    half_side: float
+    background: float
+
+    def rotation_matrix(self) -> Tensor:
+        """`rotation` in double precision. [3, 3]"""
+        return torch.tensor(self.rotation, dtype=torch.float64)
+
+    def camera_to_world(self) -> Tensor:
+        """Pose of the camera in the model's frame, in double precision. [4, 4]"""
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = self.rotation_matrix()
+        pose[:3, 3] = self.distance * pose[:3, 2]
+        return pose
+
+
+OPENLRM_VIEW = CanonicalView(
+    rotation=((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+    distance=2.0,
+    focal=0.75,
+    half_side=1.0,
+    background=1.0,
+)
+"""On the -y side, z up. Trained with distances from 1.9 to 2.6 and this focal length only."""
+
+TRIPOSR_VIEW = CanonicalView(
+    rotation=((0, 0, 1), (1, 0, 0), (0, 1, 0)),
+    distance=1.9,
+    focal=0.5 / math.tan(math.radians(20)),
+    half_side=0.87,
+    background=0.5,
+)
+"""On the +x side, z up. Nominal: the model is not told its camera."""
+
+
+def camera_vector(
+    camera_to_world: Tensor, focal: tuple[float, float], centre: tuple[float, float] = (0.5, 0.5)
+) -> Tensor:
+    """Cameras as OpenLRM reads them: the pose's three rows, then focal lengths and centre.
+
+    Args:
+        camera_to_world: Poses in the model's frame, OpenGL camera axes. [N, 4, 4] or [N, 3, 4]
+        focal: Along x and y, as shares of the image's width and height.
+        centre: Principal point, likewise.
+
+    Returns:
+        One vector per camera. [N, 16]
+
+    Source: OpenLRM 1.1.
+    """
+    poses = camera_to_world[:, :3].flatten(1)
+    intrinsics = poses.new_tensor([*focal, *centre])
+    return torch.cat([poses, intrinsics.expand(len(poses), -1)], dim=1)
+
+
+def canonical_vector(view: CanonicalView = OPENLRM_VIEW) -> Tensor:
+    """The canonical camera as OpenLRM reads it. [16]"""
+    return camera_vector(view.camera_to_world()[None], (view.focal, view.focal))[0].float()

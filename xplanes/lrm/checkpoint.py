@@ -1,0 +1,207 @@
+"""Reading published weights, strictly."""
+
+import pickle
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from xplanes.lrm.config import LRMConfig, parse_config
+from xplanes.lrm.errors import LRMError
+from xplanes.lrm.keys import translator
+from xplanes.lrm.model import LRM
+from xplanes.lrm.openlrm import OpenLRM
+from xplanes.lrm.published import PUBLISHED, published_config
+from xplanes.lrm.triposr import TripoSR
+from xplanes.optional import require
+
+NAMED = 4
+"""Tensors named in a message at most."""
+
+
+class MismatchError(LRMError):
+    """Weights do not fit the sizes that they were loaded for.
+
+    Args:
+        message: What does not fit.
+        fits: Names of the published models that they do fit.
+    """
+
+    def __init__(self, message: str, fits: list[str]) -> None:
+        super().__init__(message)
+        self.fits = fits
+
+
+def load(config: Mapping[str, Any] | LRMConfig, weights: Path) -> LRM:
+    """Load a Large Reconstruction Model.
+
+    Args:
+        config: The checkpoint's own configuration as published (`parse_config`); or
+            ``{"architecture": NAME}`` with a name of `PUBLISHED`, in which case a configuration
+            that the file itself carries (OpenLRM 1.0) is used.
+        weights: The published file: model.safetensors, pytorch_model.bin, model.pth or model.ckpt.
+
+    Returns:
+        The model in evaluation mode, without gradients, on the CPU.
+
+    Raises:
+        LRMError: If the file is missing, damaged, holds more than tensors, or does not fit the
+            configuration; the message says which published model it fits.
+    """
+    path = Path(weights)
+    state, carried = read_weights(path)
+    name = None
+    if not isinstance(config, LRMConfig):
+        if set(config) == {"architecture"} and config["architecture"] in PUBLISHED:
+            name = str(config["architecture"])
+            config = published_config(name)
+            if carried and _same_size(config, carried):
+                config = carried
+        config = parse_config(config)
+    model = build(config)
+    try:
+        fill(model, state)
+    except MismatchError as problem:
+        message = f"{path} does not fit {name or config.architecture}: {problem}"
+        raise MismatchError(message, problem.fits) from None
+    return model
+
+
+def build(config: LRMConfig) -> LRM:
+    """A model of the given sizes whose tensors have shapes and no memory yet."""
+    with torch.device("meta"):
+        model = TripoSR(config) if config.architecture == "triposr" else OpenLRM(config)
+    return model.eval().requires_grad_(False)
+
+
+def fill(model: LRM, state: Mapping[str, Tensor]) -> None:
+    """Give a model its tensors.
+
+    Args:
+        model: As `build` makes it.
+        state: Published tensors by their published names.
+
+    Raises:
+        MismatchError: If any is missing, superfluous or of another shape.
+    """
+    problems = mismatches(model, state)
+    if problems:
+        fits = fitting(state)
+        choices = " or ".join(f"{name} ({PUBLISHED[name].choice})" for name in fits)
+        advice = f". It fits {choices or 'no published model'}"
+        raise MismatchError("; ".join(problems) + advice, fits)
+    model.load_state_dict(_translated(model, state), assign=True)
+    model.requires_grad_(False)
+
+
+def mismatches(model: LRM, state: Mapping[str, Tensor]) -> list[str]:
+    """What keeps published tensors from fitting a model, in words; nothing if they fit."""
+    translate = translator(model.config.architecture)
+    expected = {name: list(tensor.shape) for name, tensor in model.state_dict().items()}
+    unknown, shapes, found = [], [], set()
+    for published, tensor in state.items():
+        names = translate(published)
+        if names is None or any(name not in expected or name in found for name in names):
+            unknown.append(published)
+            continue
+        found.update(names)
+        for name in names:
+            rows = expected[name][0] * len(names)
+            wanted = [rows, *expected[name][1:]]
+            if list(tensor.shape) != wanted:
+                shapes.append(f"{published} is {list(tensor.shape)} and should be {wanted}")
+                break
+    missing = [name for name in expected if name not in found]
+    problems = []
+    if shapes:
+        problems.append(_some(shapes))
+    if unknown:
+        problems.append(f"it has unknown tensors: {_some(unknown)}")
+    if missing:
+        problems.append(f"it lacks tensors: {_some(missing)}")
+    return problems
+
+
+def fitting(state: Mapping[str, Tensor]) -> list[str]:
+    """Names of the published models whose tensors have the names and shapes of these."""
+    return [name for name in PUBLISHED if not mismatches(_published_model(name), state)]
+
+
+@cache
+def _published_model(name: str) -> LRM:
+    return build(parse_config(published_config(name)))
+
+
+def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors of a file by name, and the configuration that OpenLRM 1.0 stores beside them.
+
+    Files with pickles are read without running what they contain.
+
+    Raises:
+        LRMError: If the file is missing, damaged, or holds more than tensors and numbers.
+    """
+    if not path.is_file():
+        raise LRMError(f"{path} is not a file: give the downloaded weights")
+    content = _read_safetensors(path) if path.suffix == ".safetensors" else _read_pickle(path)
+    carried: Any = {}
+    if isinstance(content, dict) and "weights" in content:
+        content, carried = content["weights"], content.get("kwargs") or {}
+    if (
+        not isinstance(content, dict)
+        or not content
+        or not all(isinstance(value, Tensor) for value in content.values())
+        or not isinstance(carried, dict)
+    ):
+        raise LRMError(f"{path} holds no weights by name: is it the file published for inference?")
+    return {str(name): tensor for name, tensor in content.items()}, carried
+
+
+def _read_safetensors(path: Path) -> Any:
+    safetensors = require("safetensors", extra="lrm")
+    loader = require("safetensors.torch", extra="lrm")
+    try:
+        return loader.load_file(path)
+    except (safetensors.SafetensorError, OSError, ValueError) as problem:
+        raise LRMError(f"{path} is damaged or incomplete: {problem}") from problem
+
+
+def _read_pickle(path: Path) -> Any:
+    try:
+        try:
+            return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        except RuntimeError as problem:
+            if "mmap" not in str(problem):
+                raise
+            return torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as problem:
+        raise LRMError(
+            f"{path} is no file of weights, or holds code, which is never run: use the "
+            f".safetensors file where there is one"
+        ) from problem
+    except (RuntimeError, OSError, EOFError, ValueError, KeyError) as problem:
+        raise LRMError(f"{path} is damaged or incomplete: {problem}") from problem
+
+
+def _translated(model: LRM, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    translate = translator(model.config.architecture)
+    result = {}
+    for published, tensor in state.items():
+        names = translate(published)
+        if names:
+            result.update(zip(names, tensor.float().chunk(len(names)), strict=True))
+    return result
+
+
+def _same_size(config: Mapping[str, Any], carried: Mapping[str, Any]) -> bool:
+    """Whether a file's own configuration has the sizes of the published model asked for."""
+    model = carried.get("model", {})
+    sizes = ("transformer_dim", "transformer_layers", "triplane_dim")
+    return all(model.get(key) == config.get(key) for key in sizes)
+
+
+def _some(items: list[str]) -> str:
+    rest = len(items) - NAMED
+    return ", ".join(items[:NAMED]) + (f" and {rest} more" if rest > 0 else "")

@@ -1,0 +1,254 @@
+"""Sizes of a Large Reconstruction Model, read from the configuration published with it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from xplanes.lrm.errors import LRMError
+from xplanes.lrm.reader import Reader
+
+Architecture = Literal["openlrm-1.0", "openlrm-1.1", "triposr"]
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """Sizes of an image encoder.
+
+    Attributes:
+        width: Channels of a token.
+        depth: Number of blocks.
+        heads: Attention heads.
+        hidden: Channels inside the feed-forward layers.
+        patch: Side of a patch in pixels.
+        grid: Patches along each side of the images that the position embedding was learned for.
+        norm_epsilon: Added to variances.
+        registers: Extra tokens that are dropped at the end.
+        layer_scale: Whether each branch is scaled per channel before it is added.
+        antialias_positions: How the position embedding is resized (`interpolate_positions`).
+        mean: Subtracted from RGB; None for raw RGB.
+        std: RGB is divided by it.
+    """
+
+    width: int
+    depth: int
+    heads: int
+    hidden: int
+    patch: int
+    grid: int
+    norm_epsilon: float
+    registers: int = 0
+    layer_scale: bool = False
+    antialias_positions: bool = False
+    mean: tuple[float, ...] | None = None
+    std: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class LRMConfig:
+    """Sizes of a Large Reconstruction Model.
+
+    Attributes:
+        architecture: Family, which settles all that is not a number.
+        image_size: Side of the input image in pixels.
+        encoder: The image encoder.
+        width: Channels of the triplane's tokens.
+        layers: Transformer blocks.
+        heads: Attention heads.
+        head_width: Channels of each head.
+        channels: Channels C of each plane.
+        low_resolution: Tokens along each side of a plane; planes have twice as many texels.
+        camera_width: Channels of the camera embedding; 0 where there is none.
+        decoder_width: Neurons of the decoder's hidden layers.
+        decoder_hidden: Number of these layers.
+    """
+
+    architecture: Architecture
+    image_size: int
+    encoder: EncoderConfig
+    width: int
+    layers: int
+    heads: int
+    head_width: int
+    channels: int
+    low_resolution: int
+    camera_width: int = 0
+    decoder_width: int = 64
+    decoder_hidden: int = 3
+
+    @property
+    def resolution(self) -> int:
+        """Texels along each side of a plane."""
+        return 2 * self.low_resolution
+
+
+def parse_config(config: Mapping[str, Any]) -> LRMConfig:
+    """Sizes from a checkpoint's own configuration.
+
+    Args:
+        config: The content of the published config.json or config.yaml (OpenLRM 1.1, TripoSR) or
+            of ``kwargs`` in model.pth (OpenLRM 1.0). The key ``architecture`` may name the family:
+            openlrm-1.0, openlrm-1.1 or triposr. ``image_size``, ``image_mean`` and ``image_std``
+            may override what the published file does not say.
+
+    Raises:
+        LRMError: If a key is missing, out of range, or asks for what is not supported.
+    """
+    architecture = guess_architecture(config)
+    if architecture == "triposr":
+        return _triposr(Reader(config))
+    return _openlrm(config, architecture)
+
+
+def guess_architecture(config: Mapping[str, Any]) -> Architecture:
+    """The family that a configuration belongs to.
+
+    Raises:
+        LRMError: If it names an unknown one, or names none and its keys fit none.
+    """
+    named = str(config.get("architecture", "openlrm")).lower().replace("_", "-")
+    for known in ("openlrm-1.0", "openlrm-1.1", "triposr"):
+        if named == known:
+            return known
+    if named != "openlrm":
+        raise LRMError(
+            f"architecture={config['architecture']!r}: must be openlrm-1.0, openlrm-1.1 or "
+            f"triposr, or the name of a published model and nothing else"
+        )
+    if "cond_image_size" in config or "image_tokenizer" in config:
+        return "triposr"
+    flat = config.get("model", config)
+    if isinstance(flat, Mapping) and "transformer_dim" in flat:
+        return "openlrm-1.1" if "encoder_type" in flat else "openlrm-1.0"
+    raise LRMError(
+        "the model's configuration is neither OpenLRM's (transformer_dim, ...) nor TripoSR's "
+        "(image_tokenizer, ...): give the config.json or config.yaml published with the weights"
+    )
+
+
+DINOV2 = {"dinov2_vits14_reg": (384, 6), "dinov2_vitb14_reg": (768, 12)}
+"""Width and heads of DINOv2 by name."""
+
+SOURCE_SIZES = {512: 224, 768: 336, 1024: 448}
+"""Image side by transformer width, which OpenLRM 1.1's config.json does not hold."""
+
+
+def _openlrm(config: Mapping[str, Any], architecture: Architecture) -> LRMConfig:
+    nested = isinstance(config.get("model"), Mapping)
+    model = Reader(config).inner("model") if nested else Reader(config)
+    reduced = config.get("_reduced_encoder") or model.values.get("_reduced_encoder")
+    width, low = model.integer("transformer_dim"), model.integer("triplane_low_res")
+    if model.integer("triplane_high_res", 2 * low) != 2 * low:
+        raise LRMError(
+            f"the model's configuration has triplane_high_res="
+            f"{model.integer('triplane_high_res')}: must be twice triplane_low_res={low}"
+        )
+    name = model.values.get("encoder_model_name")
+    if architecture == "openlrm-1.1":
+        model.require("encoder_type", "dinov2")
+        encoder = _dinov2(name, reduced)
+        fallback = encoder.grid * encoder.patch if reduced else SOURCE_SIZES.get(width, 224)
+    else:
+        encoder = _dino(name, reduced, {**config, **model.values})
+        fallback = 224
+    model.require("encoder_feat_dim", encoder.width)
+    infer = config.get("infer")
+    size = infer if isinstance(infer, Mapping) else config
+    fallback = Reader(size, "infer.").integer("source_size", fallback)
+    heads = model.integer("transformer_heads")
+    if width % heads:
+        raise LRMError(f"transformer_dim={width} cannot be split into transformer_heads={heads}")
+    return LRMConfig(
+        architecture=architecture,
+        image_size=Reader(config).integer("image_size", fallback),
+        encoder=encoder,
+        width=width,
+        layers=model.integer("transformer_layers"),
+        heads=heads,
+        head_width=width // heads,
+        channels=model.integer("triplane_dim"),
+        low_resolution=low,
+        camera_width=model.integer("camera_embed_dim"),
+    )
+
+
+def _triposr(config: Reader) -> LRMConfig:
+    tokenizer, backbone = config.inner("tokenizer"), config.inner("backbone")
+    upsampler, decoder = config.inner("post_processor"), config.inner("decoder")
+    renderer = config.inner("renderer")
+    for reader, key, value in (
+        (renderer, "radius", 0.87),
+        (renderer, "feature_reduction", "concat"),
+        (renderer, "density_activation", "exp"),
+        (renderer, "density_bias", -1.0),
+        (renderer, "color_activation", "sigmoid"),
+        (decoder, "activation", "silu"),
+    ):
+        reader.require(key, value)
+    name = config.inner("image_tokenizer").values.get("pretrained_model_name_or_path")
+    encoder = _dino(name, config.values.get("_reduced_encoder"), config.values)
+    width, channels = tokenizer.integer("num_channels"), upsampler.integer("out_channels")
+    backbone.require("in_channels", width)
+    backbone.require("cross_attention_dim", encoder.width)
+    upsampler.require("in_channels", width)
+    decoder.require("in_channels", 3 * channels)
+    return LRMConfig(
+        architecture="triposr",
+        image_size=config.integer("cond_image_size"),
+        encoder=encoder,
+        width=width,
+        layers=backbone.integer("num_layers"),
+        heads=backbone.integer("num_attention_heads"),
+        head_width=backbone.integer("attention_head_dim"),
+        channels=channels,
+        low_resolution=tokenizer.integer("plane_size"),
+        decoder_width=decoder.integer("n_neurons"),
+        decoder_hidden=decoder.integer("n_hidden_layers"),
+    )
+
+
+def _dino(name: Any, reduced: Any, config: Mapping[str, Any]) -> EncoderConfig:
+    if name != "facebook/dino-vitb16":
+        raise LRMError(f"the image encoder {name!r} is not supported: only facebook/dino-vitb16")
+    sizes = Reader(reduced or {}, "_reduced_encoder.")
+    patch = sizes.integer("patch_size", 16)
+    given = Reader(config)
+    mean = given.triple("image_mean", sizes.triple("image_mean", IMAGENET_MEAN))
+    std = given.triple("image_std", sizes.triple("image_std", IMAGENET_STD))
+    return EncoderConfig(
+        width=sizes.integer("hidden_size", 768),
+        depth=sizes.integer("num_hidden_layers", 12),
+        heads=sizes.integer("num_attention_heads", 12),
+        hidden=sizes.integer("intermediate_size", 3072),
+        patch=patch,
+        grid=sizes.integer("image_size", 224) // patch,
+        norm_epsilon=sizes.number("layer_norm_eps", 1e-12),
+        mean=mean,
+        std=std,
+    )
+
+
+def _dinov2(name: Any, reduced: Any) -> EncoderConfig:
+    if name not in DINOV2:
+        raise LRMError(
+            f"the image encoder {name!r} is not supported: must be one of {', '.join(DINOV2)}"
+        )
+    width, heads = DINOV2[name]
+    sizes = Reader(reduced or {}, "_reduced_encoder.")
+    width, patch = sizes.integer("embed_dim", width), sizes.integer("patch_size", 14)
+    sizes.require("interpolate_antialias", True)
+    sizes.require("interpolate_offset", 0.0)
+    return EncoderConfig(
+        width=width,
+        depth=sizes.integer("depth", 12),
+        heads=sizes.integer("num_heads", heads),
+        hidden=sizes.integer("mlp_ratio", 4) * width,
+        patch=patch,
+        grid=sizes.integer("img_size", 518) // patch,
+        norm_epsilon=1e-6,
+        registers=sizes.integer("num_register_tokens", 4),
+        layer_scale=True,
+        antialias_positions=True,
+    )

@@ -1,0 +1,104 @@
+"""What all Large Reconstruction Models here have in common."""
+
+import copy
+
+from torch import Tensor, nn
+
+from xplanes.fields.decoder import Decoder
+from xplanes.lrm.canonical import CanonicalView
+from xplanes.lrm.config import LRMConfig
+from xplanes.lrm.errors import LRMError
+from xplanes.lrm.images import prepare
+from xplanes.lrm.vit import VisionTransformer
+
+
+class LRM(nn.Module):
+    """From one image to a triplane, and from the triplane's features to colour and density.
+
+    Args:
+        config: Sizes of the model.
+        view: The model's own camera and box.
+        decoder: From features [N, 3 C] to colour [N, 3] and density [N], the latter per unit
+            length of the model's frame.
+
+    Attributes:
+        config: As given.
+        view: As given.
+        decoder: As given.
+        encoder: The image encoder.
+    """
+
+    def __init__(self, config: LRMConfig, view: CanonicalView, decoder: Decoder) -> None:
+        super().__init__()
+        self.config = config
+        self.view = view
+        self.encoder = VisionTransformer(config.encoder)
+        self.upsample = nn.ConvTranspose2d(config.width, config.channels, kernel_size=2, stride=2)
+        self.decoder = decoder
+
+    @property
+    def image_size(self) -> int:
+        """Side in pixels of the images that the model was trained on."""
+        return self.config.image_size
+
+    @property
+    def half_side(self) -> float:
+        """Half the side of the cube in which the field lives, in the model's frame."""
+        return self.view.half_side
+
+    @property
+    def background(self) -> float:
+        """Grey value from 0 to 1 that must lie behind the object in input images."""
+        return self.view.background
+
+    def encode(self, images: Tensor, camera: Tensor | None = None) -> Tensor:
+        """Predict triplanes.
+
+        Args:
+            images: RGB from 0 to 1, composited on `background`. [N, 3, S, S]
+            camera: Cameras as OpenLRM reads them; the canonical one when None. [N, 16]
+
+        Returns:
+            Planes xy, xz, yz, first axis along the columns. [N, 3, C, H, H]
+
+        Raises:
+            LRMError: If the shapes do not fit.
+        """
+        raise NotImplementedError
+
+    def prepare(self, rgba: Tensor) -> Tensor:
+        """Pictures with alpha as the model wants to see them. [N, 4, H, W] -> [N, 3, S, S]"""
+        return prepare(rgba, self.config.architecture, self.image_size)
+
+    def field_decoder(self) -> Decoder:
+        """A trainable copy of the decoder for a field whose cube [-1, 1]^3 is the model's cube.
+
+        It differs in the unit of length that densities refer to.
+        """
+        decoder = copy.deepcopy(self.decoder).requires_grad_(True)
+        decoder.density_scale *= self.half_side
+        return decoder
+
+    def planes(self, tokens: Tensor) -> Tensor:
+        """Triplane tokens, plane by plane and row by row, as planes of twice the resolution.
+
+        Args:
+            tokens: Tokens of side R. [N, 3 R R, D]
+
+        Returns:
+            Planes in the model's own layout. [N, 3, C, 2 R, 2 R]
+        """
+        side = self.config.low_resolution
+        grid = tokens.transpose(1, 2).unflatten(2, (3, side, side)).transpose(1, 2)
+        return self.upsample(grid.flatten(0, 1)).unflatten(0, (len(tokens), 3))
+
+    def check_images(self, images: Tensor) -> None:
+        """Refuse what is no batch of square images.
+
+        Raises:
+            LRMError: Naming the shape or type.
+        """
+        if images.ndim != 4 or images.shape[1] != 3 or images.shape[2] != images.shape[3]:
+            raise LRMError(f"images have the shape {list(images.shape)}: must be [N, 3, S, S]")
+        if not images.is_floating_point():
+            raise LRMError(f"images are {images.dtype}: must be floating point, from 0 to 1")

@@ -1,0 +1,82 @@
+"""Reading settings from a configuration that somebody else has published."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from xplanes.lrm.errors import LRMError
+
+
+@dataclass(frozen=True)
+class Reader:
+    """Takes settings out of a nested configuration and names what is missing or wrong.
+
+    Attributes:
+        values: The section read from.
+        place: Keys that lead to it, for messages.
+        root: The whole configuration, for references; ``values`` where empty.
+    """
+
+    values: Mapping[str, Any]
+    place: str = ""
+    root: Mapping[str, Any] = field(default_factory=dict)
+
+    def inner(self, key: str) -> "Reader":
+        """A section of this section."""
+        value = self.values.get(key)
+        if not isinstance(value, Mapping):
+            raise LRMError(f"the model's configuration has no section {self.place}{key}")
+        return Reader(value, f"{self.place}{key}.", self.root or self.values)
+
+    def integer(self, key: str, default: int | None = None) -> int:
+        """A whole number above zero."""
+        value = self._resolve(self.values.get(key, default))
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise LRMError(
+                f"the model's configuration has {self.place}{key}={value!r}: must be a whole "
+                f"number above zero"
+            )
+        return value
+
+    def number(self, key: str, default: float) -> float:
+        """Any number."""
+        value = self._resolve(self.values.get(key, default))
+        try:
+            return float(value)  # YAML 1.1 reads 1e-12 as text
+        except (TypeError, ValueError):
+            raise LRMError(
+                f"the model's configuration has {self.place}{key}={value!r}: must be a number"
+            ) from None
+
+    def require(self, key: str, value: Any) -> None:
+        """Refuse a setting that differs from the only one that is supported."""
+        found = self._resolve(self.values.get(key, value))
+        if found != value:
+            raise LRMError(
+                f"the model's configuration has {self.place}{key}={found!r}: only {value!r} is "
+                f"supported"
+            )
+
+    def triple(self, key: str, default: tuple[float, ...]) -> tuple[float, ...]:
+        """Three numbers."""
+        values = self.values.get(key, default)
+        if not isinstance(values, list | tuple) or len(values) != 3:
+            raise LRMError(
+                f"the model's configuration has {self.place}{key}={values!r}: must be three numbers"
+            )
+        return tuple(float(value) for value in values)
+
+    def _resolve(self, value: Any) -> Any:
+        """Follow ``${a.b}``, as TripoSR's YAML uses it."""
+        for _ in range(8):
+            match = re.fullmatch(r"\$\{([\w.]+)\}", value) if isinstance(value, str) else None
+            if match is None:
+                return value
+            found: Any = self.root or self.values
+            for key in match[1].split("."):
+                if not isinstance(found, Mapping) or key not in found:
+                    raise LRMError(f"the model's configuration refers to {value}, which it lacks")
+                found = found[key]
+            value = found
+        raise LRMError(f"the model's configuration refers to {value} in a circle")

@@ -1,0 +1,160 @@
+"""Finding the weights of a published model: a local file, the hub's cache, or the hub."""
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from xplanes.lrm.checkpoint import MismatchError, load
+from xplanes.lrm.errors import LRMError
+from xplanes.lrm.model import LRM
+from xplanes.lrm.reachable import Probe
+from xplanes.optional import require
+
+CONFIG_FILES = ("config.json", "config.yaml")
+
+
+@dataclass(frozen=True)
+class WeightSource:
+    """Where the weights of a model come from.
+
+    Attributes:
+        architecture: A name of `xplanes.lrm.published.PUBLISHED`.
+        repository: On the Hugging Face hub, owner/name.
+        file: Name of the file there.
+        revision: Branch, tag or commit there.
+        licence: Of the weights.
+        megabytes: Size of the file.
+        weights: A local file to use instead; None for the hub.
+        config: A local config.json or config.yaml for weights of other sizes; None for the
+            published sizes.
+    """
+
+    architecture: str
+    repository: str
+    file: str
+    revision: str
+    licence: str
+    megabytes: int
+    weights: Path | None = None
+    config: Path | None = None
+
+    @property
+    def url(self) -> str:
+        """Address of the file on the hub."""
+        return f"https://huggingface.co/{self.repository}/resolve/{self.revision}/{self.file}"
+
+
+def load_source(
+    source: WeightSource,
+    *,
+    announce: Callable[[str], None] = print,
+    endpoint: str | None = None,
+    cache: Path | None = None,
+) -> LRM:
+    """Find the weights of a model and load them.
+
+    Weights of other than the published sizes need their configuration: the file that
+    ``source.config`` names, or one named config.json or config.yaml beside the weights.
+
+    Args:
+        source: Where the weights come from.
+        announce: Takes a line before anything is downloaded.
+        endpoint: Address of the hub; the usual one when None.
+        cache: The hub's cache; the usual one when None.
+
+    Raises:
+        LRMError: If no weights can be had, or they do not fit the architecture.
+    """
+    path = find_weights(source, announce=announce, endpoint=endpoint, cache=cache)
+    if source.config is not None:
+        return load(read_config(source.config), path)
+    try:
+        return load({"architecture": source.architecture}, path)
+    except MismatchError as problem:
+        beside = [path.parent / name for name in CONFIG_FILES if (path.parent / name).is_file()]
+        # A published model of another size is a mistake, whatever lies beside it.
+        if problem.fits or not beside or source.weights is None:
+            raise
+        announce(f"{path} has sizes of its own: using {beside[0]}")
+        return load(read_config(beside[0]), path)
+
+
+def find_weights(
+    source: WeightSource,
+    *,
+    announce: Callable[[str], None] = print,
+    endpoint: str | None = None,
+    cache: Path | None = None,
+) -> Path:
+    """The file with the weights of a model, downloaded if need be.
+
+    Args:
+        source: Where the weights come from.
+        announce: Takes a line before anything is downloaded.
+        endpoint: Address of the hub; the usual one when None.
+        cache: The hub's cache; the usual one when None.
+
+    Returns:
+        A local file, or one in the hub's cache.
+
+    Raises:
+        LRMError: If the local file is missing, or the hub cannot be reached or does not have it.
+    """
+    if source.weights is not None:
+        if not source.weights.is_file():
+            raise LRMError(f"lrm.weights={source.weights} is not a file. {_advice(source)}")
+        return source.weights
+    hub = require("huggingface_hub", extra="lrm")
+    place = {"repo_id": source.repository, "filename": source.file, "revision": source.revision}
+    cached = hub.try_to_load_from_cache(**place, cache_dir=cache)
+    if isinstance(cached, str):
+        return Path(cached)
+    if hub.constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").upper() in _YES:
+        raise LRMError(f"HF_HUB_OFFLINE forbids the download of {source.url}. {_advice(source)}")
+    server = endpoint or hub.constants.ENDPOINT
+    if not Probe(server).answers():
+        raise LRMError(f"{server} cannot be reached for {source.file}. {_advice(source)}")
+    announce(
+        f"Downloading {source.repository}/{source.file} ({source.megabytes} MB, licence "
+        f"{source.licence})"
+    )
+    try:
+        return Path(hub.hf_hub_download(**place, cache_dir=cache, endpoint=endpoint))
+    except Exception as problem:  # the hub's errors have no class in common
+        reason = " ".join(str(problem).split())[:300]
+        raise LRMError(
+            f"{source.url} cannot be downloaded ({type(problem).__name__}: {reason}). "
+            f"{_advice(source)}"
+        ) from problem
+
+
+_YES = {"1", "ON", "YES", "TRUE"}
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """A published config.json or config.yaml.
+
+    Raises:
+        LRMError: If it cannot be read.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        content = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+    except (OSError, ValueError, yaml.YAMLError) as problem:
+        raise LRMError(f"{path} cannot be read: {problem}") from problem
+    if not isinstance(content, dict):
+        raise LRMError(f"{path} is no configuration: it holds no keys")
+    return content
+
+
+def _advice(source: WeightSource) -> str:
+    return (
+        f"{source.architecture} needs weights of {source.megabytes} MB (licence {source.licence}): "
+        f"fetch {source.url} where there is a network and set lrm.weights=FILE, or start without "
+        f"them with lrm=none"
+    )

@@ -11,20 +11,12 @@ import os
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import argparse
-import json
-import platform
 import tempfile
 from pathlib import Path
 
-import torch
-from hydra import compose, initialize_config_dir
+from runner import RESULTS, Measured, lego, machine, markdown, measure
 
-from xplanes.config import register_schemas, to_plain
 from xplanes.files import write_rows, write_text
-from xplanes.launch import CONF
-from xplanes.pipeline import run
-
-RESULTS = Path(__file__).resolve().parent / "results"
 
 SWITCHES = {
     "all savings": (),
@@ -57,8 +49,8 @@ COLUMNS = (
 )
 
 
-def measure(scene: tuple[str, ...], switches: tuple[str, ...], work: Path, args) -> dict:
-    """metrics.json of one run."""
+def train(scene: list[str], switches: tuple[str, ...], work: Path, args) -> Measured:
+    """One run with equal rays at equal steps."""
     overrides = [
         *scene,
         f"data.resolution={args.resolution}",
@@ -72,12 +64,7 @@ def measure(scene: tuple[str, ...], switches: tuple[str, ...], work: Path, args)
         "trainer.accelerator=cpu",
         *switches,
     ]
-    register_schemas()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = to_plain(compose("train", overrides))
-    folder = Path(tempfile.mkdtemp(dir=work)) / "run"
-    run(config, folder, overrides, resume=False)
-    return json.loads((folder / "metrics.json").read_text())
+    return measure(overrides, work)
 
 
 def main() -> None:
@@ -87,24 +74,17 @@ def main() -> None:
     parser.add_argument("--resolution", type=int, default=100)
     args = parser.parse_args()
     scenes = {
-        "demo excavator": ("data.scene=excavator",),
-        "demo balls": ("data.scene=balls",),
+        "demo excavator": ["data.scene=excavator"],
+        "demo balls": ["data.scene=balls"],
     }
     if args.lego.is_dir():
-        scenes["lego (val)"] = (
-            "data=dnerf",
-            f"data.root={args.lego.parent}",
-            f"data.scene={args.lego.name}",
-            "data.eval_split=val",
-        )
+        scenes["lego (val)"] = lego(args.lego)
     rows = []
     with tempfile.TemporaryDirectory() as work:
-        # Compile the loops before anything is timed.
-        measure((), ("trainer.max_steps=3", "data.resolution=32"), Path(work), args)
         for name, scene in scenes.items():
             base: dict = {}
             for label, switches in SWITCHES.items():
-                metrics = measure(scene, switches, Path(work), args)
+                metrics = train(scene, switches, Path(work), args).metrics
                 base = base or metrics
                 seconds, psnr = metrics["seconds"]["train"], metrics["test"]["psnr"]
                 rows.append(
@@ -124,20 +104,16 @@ def main() -> None:
                     )
                 )
     write_rows(RESULTS / "skips.csv", COLUMNS, rows)
-    lines = [
-        "# Savings, one switched off at a time",
-        "",
-        f"{args.steps} steps of 512 rays, {args.resolution} px, six planes at random; "
-        f"{os.cpu_count()} cores, {platform.processor() or platform.machine()}, torch "
-        f"{torch.__version__}. Script: `benchmarks/skips.py`.",
-        "",
-        "empty and occluded: shares of the samples in the box; background: share of the pixels.",
-        "",
-        "| " + " | ".join(COLUMNS) + " |",
-        "|" + "---|" * len(COLUMNS),
-        *("| " + " | ".join(map(str, row)) + " |" for row in rows),
-    ]
-    write_text(RESULTS / "skips.md", "\n".join(lines) + "\n")
+    page = f"""# Savings, one switched off at a time
+
+{args.steps} steps of 512 rays, {args.resolution} px, six planes at random; {machine()}.
+Script: `benchmarks/skips.py`.
+
+empty and occluded: shares of the samples in the box; background: share of the pixels.
+
+{markdown(COLUMNS, rows)}
+"""
+    write_text(RESULTS / "skips.md", page)
 
 
 if __name__ == "__main__":

@@ -169,8 +169,15 @@ def visual_hull(alpha, poses, focal, points):
     """Which points show foreground in every view that sees them: [V, H, W], ..., [N, 3] -> [N]"""
     held = []
     for point in points:
-        seen = [project(point, pose, focal, *mask.shape) for mask, pose in zip(alpha, poses, strict=True)]
+        seen = [
+            project(point, pose, focal, *mask.shape)
+            for mask, pose in zip(alpha, poses, strict=True)
+        ]
         held.append(
-            all(mask[row, column] > 0 for mask, (row, column, ok) in zip(alpha, seen, strict=True) if ok)
+            all(
+                mask[row, column] > 0
+                for mask, (row, column, ok) in zip(alpha, seen, strict=True)
+                if ok
+            )
         )
     return np.array(held)

@@ -92,7 +92,9 @@ def test_more_views_do_not_rule_out_what_moves():
 
 
 def test_a_turned_and_moved_frame_carves_the_same_world():
-    views = ball_views(24, 0.4, centre=lambda _: torch.tensor([0.3, -0.2, 0.1]), times=torch.zeros(24))
+    views = ball_views(
+        24, 0.4, centre=lambda _: torch.tensor([0.3, -0.2, 0.1]), times=torch.zeros(24)
+    )
     turn = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     frame = Frame(0.6, turn, torch.tensor([0.2, 0.1, 0.0]))
     grid = carved(views, resolution=24, bins=1, frame=frame)

@@ -100,7 +100,10 @@ def test_in_float32_only_samples_on_borders_differ():
     grid, rays = grid_of(17, 5, filled=1.1), rays_of(3000, torch.float32)
     ours, theirs = march(*rays, grid, step=STEP), twin(rays, grid)
     numbers = [
-        {(int(r), round(float(d / STEP - j))): n for n, (r, d, j) in enumerate(zip(*x, strict=True))}
+        {
+            (int(r), round(float(d / STEP - j))): n
+            for n, (r, d, j) in enumerate(zip(*x, strict=True))
+        }
         for x in (
             (s.ray, s.distances - near_of(rays)[s.ray], rays[3][s.ray]) for s in (ours, theirs)
         )
@@ -184,7 +187,9 @@ def test_impossible_rays_have_no_samples(bad):
         assert found.points.isfinite().all()
 
 
-@pytest.mark.parametrize("rays", [rays_of(0), tuple(r + 9 for r in rays_of(3)[:1]) + rays_of(3)[1:]])
+@pytest.mark.parametrize(
+    "rays", [rays_of(0), tuple(r + 9 for r in rays_of(3)[:1]) + rays_of(3)[1:]]
+)
 def test_no_rays_or_no_hits(rays):
     for found in (march(*rays, grid_of(), step=STEP), twin(rays, grid_of())):
         assert len(found) == found.candidates == found.empty == found.occluded == 0

@@ -11,7 +11,9 @@ STEP = 0.05
 
 
 def grid_of(resolution=4, bins=2, **options):
-    return OccupancyGrid(resolution, bins, step=STEP, **{"threshold": 0.01, "decay": 0.5, **options})
+    return OccupancyGrid(
+        resolution, bins, step=STEP, **{"threshold": 0.01, "decay": 0.5, **options}
+    )
 
 
 def constant(density):
@@ -193,9 +195,10 @@ def test_allow_takes_axes_in_the_order_z_y_x():
     allowed[1, 0, 1, 3] = True
     grid.allow(allowed)
     point = torch.tensor([[0.75, -0.25, -0.75]])  # x, y, z
-    assert grid.occupied.nonzero().flatten().tolist() == cells_of(
-        grid, point, torch.tensor([0.75])
-    ).tolist()
+    assert (
+        grid.occupied.nonzero().flatten().tolist()
+        == cells_of(grid, point, torch.tensor([0.75])).tolist()
+    )
 
 
 def test_nothing_allowed_asks_the_field_nothing():

@@ -101,9 +101,7 @@ def test_targets_are_the_pixels_that_the_rays_go_through(background, frame):
         0, 256, VIEWS.images.shape, generator=torch.Generator().manual_seed(0), dtype=torch.uint8
     )
     colours[..., :3] = torch.minimum(colours[..., :3], colours[..., 3:])  # multiplied by alpha
-    views = VIEWS.__class__(
-        colours, VIEWS.camera_to_world, VIEWS.times, VIEWS.focal, VIEWS.files
-    )
+    views = VIEWS.__class__(colours, VIEWS.camera_to_world, VIEWS.times, VIEWS.focal, VIEWS.files)
     batch = batches_of(views, frame, background=background).draw(3)
     view, row, column = pixels_of(batch, views, frame)
     pixel = colours[view, row, column].double() / 255
@@ -182,9 +180,7 @@ def test_without_skipping_pixels_are_drawn_evenly(options):
 @pytest.mark.parametrize("alpha", [0, 255])
 def test_images_that_are_all_background_or_all_content_are_drawn_evenly(alpha):
     images = torch.full_like(VIEWS.images, alpha)
-    views = VIEWS.__class__(
-        images, VIEWS.camera_to_world, VIEWS.times, VIEWS.focal, VIEWS.files
-    )
+    views = VIEWS.__class__(images, VIEWS.camera_to_world, VIEWS.times, VIEWS.focal, VIEWS.files)
     batches = batches_of(views, rays=2000)
     assert batches.skipped == 0
     batch = batches.draw(0)

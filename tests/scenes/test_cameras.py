@@ -76,9 +76,7 @@ def test_each_ray_may_have_its_own_camera():
     together = pixel_rays(poses, rows, columns, focal=5.0, height=6, width=6)
     for index in range(6):
         one = slice(index, index + 1)
-        alone = pixel_rays(
-            poses[index], rows[one], columns[one], focal=5.0, height=6, width=6
-        )
+        alone = pixel_rays(poses[index], rows[one], columns[one], focal=5.0, height=6, width=6)
         for a, b in zip(together, alone, strict=True):
             torch.testing.assert_close(a[one], b)
 

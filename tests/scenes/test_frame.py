@@ -139,11 +139,18 @@ def test_cameras_that_look_away_from_one_another_are_refused_with_a_way_out():
         scene_frame(views_of(poses))
 
 
-def test_silhouettes_that_leave_nothing_are_refused_with_a_way_out():
+def test_images_of_nothing_leave_the_cameras_cube():
     views = ball_views(12, 0.2, size=32, times=torch.zeros(12))
-    images = torch.zeros_like(views.images)
-    with pytest.raises(SceneError, match=r"sampler\.silhouettes=false"):
-        scene_frame(replace(views, images=images))
+    empty = replace(views, images=torch.zeros_like(views.images))
+    opaque = replace(views, images=torch.full_like(views.images, 255))
+    assert scene_frame(empty).scale == pytest.approx(scene_frame(opaque).scale)
+
+
+def test_one_stray_pixel_widens_the_cube_to_hold_what_it_shows():
+    views = ball_views(12, 0.2, size=32, times=torch.zeros(12))
+    images = views.images.clone()
+    images[3, 2, 16, 3] = 1
+    assert scene_frame(replace(views, images=images)).scale < 0.4 * scene_frame(views).scale
 
 
 def test_the_frame_is_finite_for_every_kind_of_path():

@@ -38,7 +38,7 @@ def test_time_smoothness_is_the_oracle_s(shape):
     assert float(time_smoothness(planes)) == pytest.approx(expected, rel=1e-12, abs=1e-15)
 
 
-@pytest.mark.parametrize(("shape", "dims"), itertools.product(SHAPES, DIMS))
+@pytest.mark.parametrize(("shape", "dims"), list(itertools.product(SHAPES, DIMS)))
 def test_total_variation_gradient_is_autograd_s(shape, dims):
     planes = planes_of(shape).requires_grad_()
     before = planes_of(shape, seed=1)

@@ -123,7 +123,7 @@ class OccupancyGrid(nn.Module):
         self.observe(cells, field(points, times)[1])
 
     def _usable(self, density: Tensor) -> Tensor:
-        """Densities up to what is opaque in one step, so that a cell can empty; NaN shows nothing."""
+        """Densities up to opaque in one step, so that a cell can empty; NaN shows nothing."""
         return density.float().nan_to_num(0.0).clamp_max(self.opaque_density)
 
     def draw(self, cells: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:

@@ -42,6 +42,10 @@ class RayDataModule(LightningDataModule):
         self._batches = batches
         self._first = 0
 
+    def draw(self, step: int) -> Batch:
+        """The batch of a step, as the first process sees it."""
+        return self._batches(0).draw(step)
+
     def train_dataloader(self) -> DataLoader:
         rank = self.trainer.global_rank if self.trainer else 0
         return DataLoader(_Endless(self._batches(rank), self._first), batch_size=None)

@@ -48,22 +48,15 @@ def cube_frame(half_side: float, centre: Tensor) -> Frame:
 def optical_centre(views: Views) -> Tensor:
     """The point nearest to all optical axes, in the least-squares sense. [3]
 
-    Cameras that all look the same way leave the depth open; the point then lies where their mean
-    distance to the origin puts it.
+    Cameras that all look the same way leave the depth open: it is then that of the world's origin.
     """
     origin = views.camera_to_world[:, :3, 3].double()
     axis = -views.camera_to_world[:, :3, 2].double()
     projector = torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]
-    normal = projector.mean(dim=0)
-    eigenvalues = torch.linalg.eigvalsh(normal)
-    if eigenvalues[0] < 1e-4:
-        # One direction is free: pull weakly towards the world's origin.
-        projector = projector + 1e-3 * torch.eye(3, dtype=torch.float64)
-        normal = projector.mean(dim=0)
-        target = ((projector - 1e-3 * torch.eye(3)) @ origin[..., None])[..., 0].mean(dim=0)
-    else:
-        target = (projector @ origin[..., None])[..., 0].mean(dim=0)
-    return torch.linalg.solve(normal, target).float()
+    target = (projector @ origin[..., None])[..., 0].mean(dim=0)
+    # Of all points that solve it equally well, the pseudo-inverse takes the one nearest the origin.
+    inverse = torch.linalg.pinv(projector.mean(dim=0), atol=1e-4, hermitian=True)
+    return (inverse @ target).float()
 
 
 def scene_frame(views: Views, half_side: float | None = None) -> Frame:

@@ -28,6 +28,9 @@ class Checkpoints(Callback):
         self.folder, self.every, self.clock = folder, every, clock
         self._written = -1
 
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._save_best(trainer, pl_module)
+
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from lightning import Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 
+from xplanes.backend import cpu_loops, loops_on_disk
 from xplanes.config import TrainConfig
 from xplanes.scenes.datamodule import RayDataModule
 from xplanes.training.bar import StepBar
@@ -65,6 +66,7 @@ def fit(
         log_every_n_steps=10**9,
         use_distributed_sampler=False,
     )
+    _warm_up(module, data)
     last = run / "checkpoints" / LAST
     with interrupt.listening():
         trainer.fit(
@@ -76,6 +78,25 @@ def fit(
         scorer.finish(trainer, module)
         checkpoints.finish(trainer, module)
     return scorer
+
+
+def _warm_up(module: RadianceModule, data: RayDataModule) -> None:
+    """Run all loops once on a few rays, so that compiling them is not on the training clock."""
+    if not cpu_loops(module.field.space):
+        return
+    if not loops_on_disk():
+        print("compiling the CPU loops, once after installation: about 20 s ...", flush=True)
+    rays = {name: value[:8] for name, value in data.draw(0).items()}
+    rendering = module.renderer.render(
+        module.field,
+        rays["origins"],
+        rays["directions"],
+        rays["times"],
+        rays["background"],
+        rays["jitter"],
+    )
+    rendering.colour.sum().backward()
+    module.zero_grad(set_to_none=True)
 
 
 def quiet_lightning() -> None:

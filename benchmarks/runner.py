@@ -1,0 +1,67 @@
+"""Runs of the product for the benchmarks: composed like the command line, in this process."""
+
+import json
+import os
+import platform
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra import compose, initialize_config_dir
+
+from xplanes.config import register_schemas, to_plain
+from xplanes.files import read_rows
+from xplanes.launch import CONF
+from xplanes.pipeline import run
+
+RESULTS = Path(__file__).resolve().parent / "results"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a run left behind: metrics.json and the rows of curve.csv."""
+
+    metrics: dict[str, Any]
+    curve: list[dict[str, str]]
+
+
+def measure(overrides: list[str], work: Path) -> Measured:
+    """Train once in a fresh folder below ``work``."""
+    register_schemas()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = to_plain(compose("train", overrides))
+    folder = Path(tempfile.mkdtemp(dir=work)) / "run"
+    run(config, folder, overrides, resume=False)
+    metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    return Measured(metrics, read_rows(folder / "curve.csv"))
+
+
+def machine() -> str:
+    """The machine, in words."""
+    name = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        for line in cpuinfo.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                name = line.split(":", 1)[1].strip()
+                break
+    return f"{os.cpu_count()} cores, {name}, torch {torch.__version__}"
+
+
+def markdown(columns: tuple[str, ...], rows: list[tuple]) -> str:
+    """A table."""
+    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
+    lines += ["| " + " | ".join(map(str, row)) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def lego(folder: Path) -> list[str]:
+    """Overrides for D-NeRF's lego, scored on the val split."""
+    return [
+        "data=dnerf",
+        f"data.root={folder.parent}",
+        f"data.scene={folder.name}",
+        "data.eval_split=val",
+    ]

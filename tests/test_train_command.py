@@ -1,0 +1,130 @@
+"""`python train.py` as a user types it."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.training.runs import SMALL
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def train(*arguments: str, timeout: float = 240) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, str(ROOT / "train.py"), *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+    )
+
+
+def exact(folder: Path) -> tuple:
+    import json
+
+    content = json.loads((folder / "metrics.json").read_text())
+    return content["test"], content["views"], content["samples_per_ray"], content["skipped"]
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return f"data.root={tmp_path_factory.mktemp('scenes')}"
+
+
+def test_misspelled_key_names_its_neighbours() -> None:
+    result = train("data.resolutoin=3")
+    assert result.returncode == 1
+    assert "data.resolution" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_setting_out_of_range_stops_before_anything_is_written(tmp_path: Path) -> None:
+    result = train("trainer.rays_per_batch=0", f"hydra.run.dir={tmp_path / 'run'}")
+    assert result.returncode == 1
+    assert "trainer.rays_per_batch=0" in result.stderr
+    assert not (tmp_path / "run" / "run.json").exists()
+
+
+def test_missing_scene_says_where_to_get_one(tmp_path: Path) -> None:
+    folder = f"hydra.run.dir={tmp_path / 'run'}"
+    result = train("data=dnerf", f"data.root={tmp_path}", "data.scene=nothing", folder)
+    assert result.returncode == 1
+    assert str(tmp_path / "nothing") in result.stderr
+    assert "data=demo" in result.stderr
+
+
+def test_devices_in_a_sweep_are_refused(tmp_path: Path) -> None:
+    result = train("-m", "trainer=ddp", "seed=0,1", f"hydra.sweep.dir={tmp_path}")
+    assert result.returncode != 0
+    assert "one device per job" in (result.stdout + result.stderr)
+
+
+def test_piped_output_is_plain_and_ends_with_scores_and_paths(scenes: str, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    result = train(scenes, *SMALL, "trainer.max_steps=5", f"hydra.run.dir={run}")
+    assert result.returncode == 0, result.stderr
+    assert "\x1b" not in result.stdout
+    assert "\r" not in result.stdout
+    tail = result.stdout.split("step 5/5")[-1]
+    assert "psnr" in tail
+    assert "ssim" in tail
+    assert str(run) in tail
+
+
+def test_two_processes_share_the_rays_and_end_with_one_model(scenes: str, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    result = train(scenes, *SMALL, "trainer=ddp", "trainer.max_steps=6", f"hydra.run.dir={run}")
+    assert result.returncode == 0, result.stderr
+    state = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+    assert state["global_step"] == 6
+    assert (run / "metrics.json").is_file()
+
+
+def start(run: Path, scenes: str) -> subprocess.Popen[bytes]:
+    arguments = [scenes, *SMALL, "trainer.max_steps=400", "trainer.checkpoint_every=20"]
+    return subprocess.Popen(
+        [sys.executable, str(ROOT / "train.py"), *arguments, f"hydra.run.dir={run}"],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "OMP_WAIT_POLICY": "PASSIVE"},
+    )
+
+
+def wait_for(path: Path, process: subprocess.Popen[bytes]) -> None:
+    deadline = time.monotonic() + 120
+    while not path.is_file():
+        assert process.poll() is None, "ended before its first checkpoint"
+        assert time.monotonic() < deadline, f"no {path}"
+        time.sleep(0.05)
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(scenes: str, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    process = start(run, scenes)
+    wait_for(run / "checkpoints" / "last.ckpt", process)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(60) == 130
+    assert '"status": "interrupted"' in (run / "run.json").read_text()
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_run_ends_with_the_same_numbers(scenes: str, tmp_path: Path) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    assert start(whole, scenes).wait(240) == 0
+    process = start(killed, scenes)
+    wait_for(killed / "checkpoints" / "last.ckpt", process)
+    time.sleep(0.3)
+    process.kill()
+    process.wait()
+    assert not (killed / "metrics.json").exists()
+    result = train(f"resume={killed}")
+    assert result.returncode == 0, result.stderr
+    assert exact(killed) == exact(whole)

@@ -155,14 +155,28 @@ def _film(module: RadianceModule, frame: Frame, scene: Scene, folder: Path) -> P
 
 @contextmanager
 def _logged(path: Path) -> Iterator[None]:
-    """Send log records and warnings to a file for the time of the block."""
-    handler = logging.FileHandler(path)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    """Send log records and warnings to a file, our own warnings to the terminal too."""
+    file, terminal = logging.FileHandler(path), logging.StreamHandler()
+    file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    terminal.setFormatter(logging.Formatter("warning: %(message)s"))
+    terminal.addFilter(_own_warning)
     root = logging.getLogger()
-    root.addHandler(handler)
+    handlers = (file, terminal)
+    for handler in handlers:
+        root.addHandler(handler)
     logging.captureWarnings(True)
     try:
         yield
     finally:
-        root.removeHandler(handler)
-        handler.close()
+        logging.captureWarnings(False)
+        for handler in handlers:
+            root.removeHandler(handler)
+            handler.close()
+
+
+def _own_warning(record: logging.LogRecord) -> bool:
+    """Whether a record is a warning of this package; Python's name the file they come from."""
+    ours = record.name.startswith("xplanes") or (
+        record.name == "py.warnings" and f"{Path(__file__).parent}" in record.getMessage()
+    )
+    return ours and record.levelno == logging.WARNING

@@ -1,0 +1,424 @@
+"""Contracts between conf/, the schemas and the code, and between the packages."""
+
+import ast
+import copy
+import re
+import subprocess
+import sys
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+
+from tests.synthetic import ball_scene
+from xplanes import config as config_module
+from xplanes.config import SCHEMAS, ConfigError, parse, register_schemas, to_plain
+from xplanes.launch import CONF, check_keys, prepare
+from xplanes.scenes.frame import scene_frame
+from xplanes.training.builder import build_batches, build_module
+
+ROOT = CONF.parent
+
+OPTIONS = sorted(
+    (str(path.parent.relative_to(CONF)), path.stem)
+    for path in CONF.rglob("*.yaml")
+    if path.parent != CONF and "hydra" not in path.relative_to(CONF).parts
+)
+"""Every option of every group of conf/."""
+
+TINY = (
+    "model.resolution=6",
+    "model.channels=2",
+    "model.decoder.width=8",
+    "sampler.grid_resolution=6",
+    "sampler.samples=16",
+    "trainer.rays_per_batch=32",
+)
+
+
+def composed(*overrides):
+    register_schemas()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return to_plain(compose("train", list(overrides)))
+
+
+# conf/ and schemas
+
+
+def test_there_is_something_to_test():
+    groups = {group for group, _ in OPTIONS}
+    assert {"data", "model", "lrm", "sampler", "loss", "trainer"} <= groups
+
+
+@pytest.mark.parametrize(("group", "name"), OPTIONS)
+def test_every_option_composes_parses_and_builds(group, name):
+    plain = composed(f"{group}={name}", *TINY)
+    typed = parse(plain)
+    if group != "experiment":
+        assert getattr(typed, group) is not None
+    scene = ball_scene()
+    frame = scene_frame(scene.splits["train"], typed.data.half_side)
+    if typed.trainer.accelerator == "gpu" and not torch.cuda.is_available():
+        with pytest.raises(ConfigError, match="no GPU found"):
+            build_module(typed, scene, frame)
+        return
+    module = build_module(typed, scene, frame)
+    if typed.trainer.accelerator == "auto" and torch.cuda.is_available():
+        module = module.cuda()
+    batch = build_batches(typed, scene, frame, 0).draw(0)
+    device = module.field.space.device
+    names = ("origins", "directions", "times", "background", "jitter")
+    rays = [batch[name].to(device) for name in names]
+    colour = module.renderer.render(module.field, *rays).colour
+    assert colour.shape == (32, 3)
+    assert colour.isfinite().all()
+
+
+@pytest.mark.parametrize("moving", [True, False])
+@pytest.mark.parametrize("name", [name for group, name in OPTIONS if group == "model"])
+def test_a_still_scene_gets_no_time_planes(moving, name):
+    scene = ball_scene(moving=moving)
+    typed = parse(composed(f"model={name}", *TINY))
+    module = build_module(typed, scene, scene_frame(scene.splits["train"]))
+    assert (module.field.time is not None) == moving
+    assert module.grid.time_bins == (typed.sampler.time_bins if moving else 1)
+
+
+def test_equal_seeds_build_equal_fields_and_zero_is_a_seed():
+    scene = ball_scene()
+    frame = scene_frame(scene.splits["train"])
+    first, again, other = (
+        build_module(parse(composed(f"seed={seed}", *TINY)), scene, frame).state_dict()
+        for seed in (0, 0, 1)
+    )
+    assert all(torch.equal(first[key], again[key]) for key in first)
+    for key in ("field.space", "field.time", "field.decoder.layers.0.weight"):
+        assert not torch.equal(first[key], other[key])
+
+
+def leaves(schema, prefix=""):
+    found = set()
+    for entry in fields(schema):
+        inner = entry.type
+        if is_dataclass(inner) and isinstance(inner, type):
+            found |= leaves(inner, f"{prefix}{entry.name}.")
+        else:
+            found.add(f"{prefix}{entry.name}")
+    return found
+
+
+def yaml_leaves(node, prefix=""):
+    found = set()
+    for key, value in node.items():
+        if isinstance(value, dict):
+            found |= yaml_leaves(value, f"{prefix}{key}.")
+        else:
+            found.add(f"{prefix}{key}")
+    return found
+
+
+def keys_and_schema(group, name):
+    """Keys that a file and its parents set, and the schema that they inherit."""
+    content = yaml.safe_load((CONF / group / f"{name}.yaml").read_text())
+    keys, schema = set(), None
+    for parent in content.pop("defaults", []):
+        if parent == "_self_":
+            continue
+        if (group, parent) in SCHEMAS:
+            schema = SCHEMAS[group, parent]
+        else:
+            inherited, schema = keys_and_schema(group, parent)
+            keys |= inherited
+    return keys | yaml_leaves(content), schema
+
+
+@pytest.mark.parametrize(("group", "name"), [o for o in OPTIONS if o[0] != "experiment"])
+def test_yaml_files_set_every_field_of_their_schema_and_no_other(group, name):
+    keys, schema = keys_and_schema(group, name)
+    assert schema is not None, f"conf/{group}/{name}.yaml inherits no schema"
+    assert keys == leaves(schema)
+
+
+@pytest.mark.parametrize(("group", "name"), OPTIONS)
+def test_nothing_is_left_to_be_set(group, name):
+    plain = composed(f"{group}={name}")
+    assert "???" not in str(plain)
+    assert "hydra" not in plain
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["model.resolution=big", "trainer.media=perhaps", "trainer.max_seconds=soon", "seed=null"],
+)
+def test_values_of_another_type_are_refused(override):
+    with pytest.raises(HydraException):
+        composed(override)
+
+
+@pytest.mark.parametrize("override", ["model.colour=3", "trainer.max_step=3", "sed=1"])
+def test_unknown_keys_are_refused_by_the_schemas_too(override):
+    with pytest.raises(HydraException):
+        composed(override)
+
+
+def all_keys():
+    found = set()
+    for (group, _), schema in SCHEMAS.items():
+        if group is not None:
+            found |= leaves(schema, f"{group}.")
+        else:
+            found |= {key for key in leaves(schema) if "." not in key}
+    return found
+
+
+CHECKED = {
+    "positive": config_module._POSITIVE,
+    "not negative": config_module._NOT_NEGATIVE,
+    "share": config_module._SHARE,
+    "choice": list(config_module._CHOICES),
+}
+
+
+@pytest.mark.parametrize("kind", CHECKED)
+def test_checked_keys_exist_and_are_listed_once(kind):
+    assert set(CHECKED[kind]) <= all_keys()
+    assert len(set(CHECKED[kind])) == len(CHECKED[kind])
+    others = [key for name, keys in CHECKED.items() if name != kind for key in keys]
+    assert not set(CHECKED[kind]) & set(others)
+
+
+PLAIN = composed()
+
+REFUSED = [
+    *[(key, value) for key in CHECKED["positive"] for value in (0, -1)],
+    *[(key, -1) for key in CHECKED["not negative"]],
+    *[(key, value) for key in CHECKED["share"] for value in (-0.1, 1.1)],
+    *[(key, "bogus") for key in CHECKED["choice"]],
+    *[(key, value) for key in CHECKED["share"] for value in (float("nan"), float("inf"))],
+    ("trainer.evaluate_at", [0.5, 1.5]),
+    ("trainer.devices", 2),
+    ("sampler.grid_resolution", 4096),
+]
+
+
+def changed(key, value):
+    plain = copy.deepcopy(PLAIN)
+    *groups, last = key.split(".")
+    node = plain
+    for group in groups:
+        node = node[group]
+    assert last in node
+    node[last] = value
+    return plain
+
+
+@pytest.mark.parametrize(("key", "value"), REFUSED)
+def test_values_that_cannot_work_are_refused_by_name(key, value):
+    with pytest.raises(ConfigError) as caught:
+        parse(changed(key, value))
+    assert key in str(caught.value)
+    assert str(value) in str(caught.value)
+
+
+def test_the_composed_configuration_survives_its_file():
+    assert parse(yaml.safe_load(yaml.safe_dump(PLAIN))) == parse(PLAIN)
+
+
+# The command line
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("model.resolutoin=64", "model.resolution"),
+        ("trainer.max_step=10", "trainer.max_steps"),
+        ("modle=six_planes", "model"),
+        ("sampler.sample=3", "sampler.samples"),
+        ("max_steps=3", "trainer.max_steps"),
+        ("model.decoder.widht=3", "model.decoder.width"),
+    ],
+)
+def test_a_typing_error_names_what_was_meant(typed, meant):
+    with pytest.raises(ConfigError) as caught:
+        check_keys([typed])
+    assert typed.split("=")[0] in str(caught.value)
+    assert meant in re.split(r"Did you mean | or |\?", str(caught.value))
+
+
+def test_nonsense_is_refused_without_a_guess():
+    with pytest.raises(ConfigError, match="there is no such setting"):
+        check_keys(["qqqqqqqq=1"])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["seed=0", "model=nine_planes", "model.resolution=32"],
+        ["-m", "model=six_planes,nine_planes", "model.resolution=32,64"],
+        ["data=dnerf", "data.root=/tmp/a=b", "data.scene=lego"],
+        ["data=demo", "data.train_views=3"],
+        ["hydra.run.dir=/tmp/x", "hydra/launcher=joblib", "+extra=1", "++extra.more=2", "~resume"],
+        ["model.decoder={width: 32}", "trainer.evaluate_at=[0,1]"],
+    ],
+)
+def test_good_command_lines_pass_unchanged(arguments):
+    assert prepare(arguments) == arguments
+
+
+def test_keys_of_a_group_that_is_not_chosen_are_refused():
+    with pytest.raises(ConfigError, match=r"data\.train_views"):
+        check_keys(["data=dnerf", "data.train_views=3"])
+
+
+def test_an_unknown_option_is_left_to_hydra_which_lists_those_there_are():
+    check_keys(["model=seven_planes"])
+    with pytest.raises(HydraException, match="seven_planes") as caught:
+        composed("model=seven_planes")
+    assert "six_planes" in str(caught.value)
+    assert "nine_planes" in str(caught.value)
+
+
+# The layers of design
+
+
+LAYERS = (
+    ("backend", "files", "optional", "config", "metrics"),
+    ("scenes",),
+    ("fields",),
+    ("lrm",),
+    ("decomposition",),
+    ("rendering",),
+    ("training",),
+    ("preparation",),
+    ("evaluation",),
+    ("pipeline",),
+    ("cli",),
+    ("__main__",),
+)
+"""Rooms of the house: imports only point up this list.
+
+An LRM brings a decoder of the fields' kind, so fields stand above it.
+"""
+
+LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
+
+EDGES = {"launch": {"config", "files"}, "train": {"config", "launch", "pipeline"}}
+"""What the command line's ends may import; nothing imports them."""
+
+
+def sources():
+    paths = [*sorted((ROOT / "xplanes").rglob("*.py")), ROOT / "train.py"]
+    return {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in paths}
+
+
+def imported(path, *, functions=True):
+    """Dotted names under xplanes that a file imports; with those of functions, and by name."""
+    tree = ast.parse(path.read_text())
+    found = set()
+    inner = {
+        node
+        for outer in ast.walk(tree)
+        if isinstance(outer, ast.FunctionDef | ast.AsyncFunctionDef)
+        for node in ast.walk(outer)
+    }
+    for node in ast.walk(tree):
+        if not functions and node in inner:
+            continue
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif functions and isinstance(node, ast.Call):
+            # importlib and its helpers take the name as a string.
+            texts = [a.value for a in node.args if isinstance(a, ast.Constant)]
+            found |= {
+                t for t in texts if isinstance(t, str) and re.fullmatch(r"xplanes\.[\w.]+", t)
+            }
+    return {name for name in found if name.split(".")[0] == "xplanes"}
+
+
+def room(module):
+    """The package or module of design that a dotted name belongs to; None for the root."""
+    parts = module.split(".")
+    if parts[0] == "train":
+        return "train"
+    return parts[1] if len(parts) > 1 and parts[1] != "__init__" else None
+
+
+@pytest.mark.parametrize("module", sources())
+def test_imports_only_point_up_the_list(module):
+    own = room(module)
+    targets = {room(name) for name in imported(sources()[module])} - {None, own}
+    # `from xplanes import __version__` names no room.
+    targets = {name for name in targets if not name.startswith("__version")}
+    if own is None:
+        assert not targets, "the package's root imports nothing"
+        return
+    if own in EDGES:
+        assert targets <= EDGES[own]
+        return
+    assert own in LEVEL, f"{own} has no place in the list"
+    for target in targets:
+        assert target in LEVEL, f"{module} imports {target}, which has no place in the list"
+        assert LEVEL[target] <= LEVEL[own], f"{module} imports {target}: that points down the list"
+
+
+def test_no_module_needs_itself_to_be_imported():
+    modules = {name.removesuffix(".__init__"): path for name, path in sources().items()}
+    needs = {}
+    for name, path in modules.items():
+        found = imported(path, functions=False)
+        needs[name] = {
+            target if target in modules else target.rpartition(".")[0] for target in found
+        } - {name}
+    done, open_now = set(), []
+
+    def visit(name):
+        if name in done or name not in modules:
+            return
+        assert name not in open_now, " -> ".join([*open_now, name])
+        open_now.append(name)
+        for target in sorted(needs[name]):
+            visit(target)
+        open_now.pop()
+        done.add(name)
+
+    for name in modules:
+        visit(name)
+    assert len(done) == len(modules)
+
+
+HEAVY = {"torch", "numpy", "lightning", "hydra", "numba", "torchmetrics", "PIL"}
+
+
+@pytest.mark.parametrize(
+    ("module", "banned"),
+    [("xplanes", HEAVY), ("xplanes.launch", {"torch", "lightning", "numba"})],
+)
+def test_what_must_load_at_once_loads_nothing_heavy(module, banned):
+    script = f"import sys, {module}; print(*{{name.split('.')[0] for name in sys.modules}})"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    loaded = set(done.stdout.split())
+    assert "xplanes" in loaded
+    assert not loaded & banned
+
+
+def test_no_module_calls_anything_for_its_effect_when_imported():
+    for module, path in sources().items():
+        for node in ast.parse(path.read_text()).body:
+            loose = isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)
+            assert not loose or module in ("train", "xplanes.__main__"), (
+                f"{module}:{node.lineno} calls at import"
+            )
+
+
+def test_python_files_stay_readable():
+    assert max(len(Path(p).read_text().splitlines()) for p in sources().values()) <= 350

@@ -66,8 +66,8 @@ def test_a_still_ball_in_a_moving_scene_is_kept(count):
 @pytest.mark.parametrize("count", [50, 200])
 @pytest.mark.parametrize(("radius", "turns", "share"), [(0.4, 0.25, 0.0), (0.3, 1, 0.003)])
 def test_a_moving_ball_is_kept(count, radius, turns, share):
-    # In the span over which content is taken to stand still, the slow ball moves by an eighth of its
-    # radius with 50 views, the fast one by its whole radius.
+    # In the span over which content is taken to stand still, with 50 views, the slow ball moves by
+    # at most a fifth of its radius, the fast one by its whole radius.
     path = swinging(0.8, turns)
     grid = carved(ball_views(count, radius, centre=path, size=48), resolution=32, bins=8)
     frame, lost, tried = cube_frame(1.4, ORIGIN), 0, 0

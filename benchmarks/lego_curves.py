@@ -2,8 +2,8 @@
 
     python benchmarks/lego_curves.py [--lego FOLDER]
 
-Writes results/lego.md, lego.csv and lego.png beside this file. Seconds are the training clock of one
-process with nothing else running.
+Writes results/lego.md, lego.csv and lego.png beside this file. Seconds are the training clock of
+one process with nothing else running.
 """
 
 import os
@@ -23,7 +23,7 @@ COLUMNS = ("pixels", "planes", "budget s", "steps", "psnr", "ssim", "rays/s", "s
 
 K_PLANES = ((30, 13.0), (60, 13.7), (121, 16.6), (218, 21.0), (300, 21.6))
 """Seconds and PSNR of the public K-Planes code (batch 1024) on two such cores: lego, 200 px, TEST
-views, whose shovel differs from training; shown for orientation, not as a like-for-like comparison."""
+views, whose shovel differs from training; for orientation, not a like-for-like comparison."""
 
 
 def plot(curves: dict[str, list[tuple[float, float]]]) -> None:

@@ -2,9 +2,9 @@
 
 The three may round differently, so a sample that lies on a border may fall to either side. In
 float64 that is not seen with random rays, and they must agree exactly. In float32 the loops compute
-places in float64 and the twin in float32: cells may differ for samples within 1e-4 cells of a border
-of their cell, and samples may come or go within 1e-5 of where the ray leaves the cube; nothing else
-may differ.
+places in float64 and the twin in float32: cells may differ for samples within 1e-4 cells of a
+border of their cell, and samples may come or go within 1e-5 of where the ray leaves the cube;
+nothing else may differ.
 """
 
 import math

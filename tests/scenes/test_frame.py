@@ -116,6 +116,24 @@ def test_a_moving_scene_s_cube_holds_it_at_all_times(turns):
         assert frame.points(inside_ball(200, 0.3) + path(time)).abs().max() <= 1
 
 
+@pytest.mark.parametrize("opening", [0.0, 0.1, 0.4, 1.0])
+@pytest.mark.parametrize("depth", [-0.9, 0.9])
+def test_content_along_the_axes_of_cameras_on_one_side_is_held(opening, depth):
+    generator = torch.Generator().manual_seed(0)
+    places = torch.tensor([4.0, 0, 0]) + opening * torch.randn(12, 3, generator=generator)
+    poses = look_at(4 * places / places.norm(dim=-1, keepdim=True))
+    centre = torch.tensor([depth, 0.0, 0.0])
+    frame = scene_frame(ball_views(12, 0.2, centre=lambda _: centre, poses=poses, size=48))
+    assert frame.points(inside_ball(2000, 0.2) + centre).abs().max() <= 1
+
+
+def test_two_opposite_cameras_tell_nothing_about_depth():
+    poses = look_at(torch.tensor([[4.0, 0, 0], [-4.0, 0, 0]]))
+    views = ball_views(2, 0.2, centre=lambda _: torch.tensor([0.9, 0, 0]), poses=poses, size=48)
+    frame = scene_frame(views)
+    assert frame.points(inside_ball(500, 0.2) + torch.tensor([0.9, 0, 0])).abs().max() <= 1
+
+
 def test_without_alpha_the_cube_is_what_the_cameras_see():
     views = views_of(orbit(12, radius=3.0, elevation=10.0), focal=10.0, size=10)
     half = 1 / scene_frame(views).scale

@@ -64,7 +64,8 @@ def scene_frame(views: Views, half_side: float | None = None) -> Frame:
 
     The cameras' common view gives a first cube around the point that they look at. No ray through
     the foreground passes the centre farther away than the scene reaches, and over views from many
-    sides the farthest comes close to it: that distance, with a margin, shrinks the cube.
+    sides the farthest comes close to it: that distance, with a margin, shrinks the cube. Views from
+    one side alone tell little about depth and shrink it less.
 
     Args:
         views: Training views.
@@ -85,7 +86,22 @@ def scene_frame(views: Views, half_side: float | None = None) -> Frame:
             "the cameras look away from one another, so the scene's bounds cannot be found: set "
             "data.half_side, in world units"
         )
-    return cube_frame(min(half, MARGIN * _reach(views, centre)), centre)
+    spread = _spread(views)
+    reach = MARGIN * _reach(views, centre) / spread if spread > 0 else math.inf
+    return cube_frame(min(half, reach), centre)
+
+
+def _spread(views: Views) -> float:
+    """Share of a distance from the centre that some view shows, whichever way it points.
+
+    Views from all sides show nearly all of it; views from one side see what lies along their axes
+    foreshortened, those of one axis not at all.
+    """
+    axis = views.camera_to_world[:, :3, 2].double()
+    common = torch.linalg.eigh(axis.T @ axis).eigenvectors.T
+    cosine = torch.cat([axis, common]) @ axis.T
+    shown = (1 - cosine.square()).clamp_min(0).sqrt().amax(dim=1).min()
+    return float(shown) if shown > 1e-3 else 0.0
 
 
 def _reach(views: Views, centre: Tensor) -> float:

@@ -131,9 +131,7 @@ class LossConfig:
     total_variation: float = MISSING  # Weight of squared differences between texels.
     time_smoothness: float = MISSING  # Weight of squared second differences along time.
     time_magnitude: float = MISSING  # Weight of squared values of the time planes.
-    sparse_weight: float = (
-        MISSING  # Weight of L_r: products of time planes against the sparse part.
-    )
+    sparse_weight: float = MISSING  # Weight of L_r: time planes' products near what moves.
     sparse_frames: int = MISSING  # Random frames per application of L_r.
     every: int = MISSING  # Steps between applications of these, at as many times the weight.
 

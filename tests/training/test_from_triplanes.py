@@ -11,9 +11,11 @@ from tests.preparation.sequences import moving_sequence
 from tests.training.runs import small_config
 from xplanes.config import ConfigError
 from xplanes.decomposition import TIME_ROWS, decompose, unexplained_energy
+from xplanes.decomposition.conversion import frame_profiles
 from xplanes.evaluation.evaluate import evaluate
 from xplanes.evaluation.runs import load_run
-from xplanes.fields import Decoder
+from xplanes.fields import Decoder, XPlanes
+from xplanes.files import read_rows
 from xplanes.pipeline import run
 from xplanes.preparation import TriplaneSequence, save_triplanes
 from xplanes.preparation import stages as stages_module
@@ -240,3 +242,52 @@ def test_a_random_start_says_so_and_leaves_no_trace(
     assert "origin" not in state
     assert metrics(tmp_path / "run")["decomposition"] == {}
     assert "start    planes at random" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("model", ["six_planes", "nine_planes"])
+def test_a_trained_fields_own_triplanes_start_a_field_that_renders_as_it(
+    place: Path, tmp_path: Path, model: str
+) -> None:
+    """Ties orientation, time, decoder and frame of a file to the field's, end to end."""
+    common = (f"model={model}", "trainer.precision=32", "sampler.coarse_steps=0")
+    config = small_config(place / "scenes", *common, "trainer.max_steps=150")
+    run(config, tmp_path / "first", [], resume=False)
+    first = load_run(tmp_path / "first")
+    field, options = first.module.field, first.config.model.decoder
+    with torch.no_grad():
+        sequence = TriplaneSequence(
+            triplanes_of(field, frames=30),
+            field.decoder.state_dict(),
+            {name: getattr(options, name) for name in OPTIONS},
+            first.frame,
+        )
+    save_triplanes(tmp_path / "own.pt", sequence)
+    overrides = (
+        *common,
+        f"lrm.triplanes={tmp_path}/own.pt",
+        "data.half_side=9",  # The file's frame prevails.
+        "trainer.max_steps=1",
+        "trainer.evaluate_at=[0]",
+        "decomposition.tolerance=1e-5",
+        "decomposition.noise=0",
+    )
+    run(settings(place, *overrides), tmp_path / "second", [], resume=False)
+    rows = read_rows(tmp_path / "second" / "curve.csv")
+    trained, begun = metrics(tmp_path / "first")["test"]["psnr"], float(rows[0]["psnr"])
+    assert rows[0]["step"] == "0"
+    assert begun > trained - 1.5
+
+
+def triplanes_of(field: XPlanes, frames: int) -> torch.Tensor:
+    """What the field's features are at each moment, as triplanes. [T, 3, C, H, H]"""
+    size = field.space.shape[1]
+    ticks = torch.arange(frames)
+    profiles = frame_profiles(field.time, ticks, frames, size)
+    moments = []
+    for frame in range(frames):
+        products = [
+            torch.einsum("wc,hc->chw", profiles[first, frame], profiles[second, frame])
+            for first, second in field.rows
+        ]
+        moments.append(field.space.permute(0, 3, 1, 2) + torch.stack(products))
+    return torch.stack(moments)

@@ -1,5 +1,6 @@
 """The stages from a triplane sequence to planes, each kept in the cache."""
 
+import sys
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -109,7 +110,9 @@ def decompose_stage(
         with warnings.catch_warnings():
             # Said once for all orientations by the caller, also when the parts are cached.
             warnings.filterwarnings("ignore", message="robust PCA stopped")
-            parts = decompose(triplanes.to(device), **options)
+            # A bar needs a terminal: piped, it would fill the log.
+            shown = sys.stderr.isatty()
+            parts = decompose(triplanes.to(device), progress=shown, **options)
         report = {
             name: {key: whole[key] for key in REPORTED} for name, whole in parts.reports.items()
         }

@@ -95,6 +95,10 @@ WRONG = {
     "no frames": ({"triplanes": GOOD[:0]}, r"must be \[T, 3, C, H, H\]"),
     "nan": ({"triplanes": spoiled(2, float("nan"))}, "triplane 2 of 8 holds NaN"),
     "infinity": ({"triplanes": spoiled(5, float("inf"))}, "triplane 5 of 8 holds NaN or inf"),
+    "beyond single precision": (
+        {"triplanes": spoiled(5, 1.0).double() * 1e300},
+        "triplane 0 of 8 holds NaN or infinity",
+    ),
     "decoder alone": ({"triplanes": GOOD, "decoder": {}}, "given together"),
     "decoder options": (
         {"triplanes": GOOD, "decoder": {}, "decoder_config": {"width": 3}},

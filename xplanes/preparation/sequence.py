@@ -120,7 +120,7 @@ def check_sequence(sequence: TriplaneSequence, name: str) -> None:
             "and yz, channels, rows and as many columns"
         )
     for number, frame in enumerate(planes):
-        if not frame.isfinite().all():
+        if not frame.float().isfinite().all():  # In the type that it is computed in.
             raise ConfigError(f"{name}: triplane {number} of {len(planes)} holds NaN or infinity")
     if sequence.frame is not None:
         check_frame(sequence.frame, name)

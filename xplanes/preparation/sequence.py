@@ -76,10 +76,10 @@ def load_triplanes(path: Path) -> TriplaneSequence:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # A damaged file fails in any of a dozen ways.
-        first = (str(error).splitlines() or [""])[0]
+        # Its text advises to load the file as code.
         raise ConfigError(
-            f"{path} cannot be read ({type(error).__name__}: {first}): it is damaged, or no file "
-            "of save_triplanes"
+            f"{path} cannot be read ({type(error).__name__}): it is damaged, or no file of "
+            "save_triplanes"
         ) from error
     if not isinstance(content, dict) or "triplanes" not in content:
         found = ", ".join(map(str, content)) if isinstance(content, dict) else type(content)

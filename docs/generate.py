@@ -18,7 +18,9 @@ _FIELD = re.compile(r"^    (\w+): [^#\n]*#\s*(.+)$", re.MULTILINE)
 GROUPS: dict[str, dict[str, type]] = {
     "data": {"demo": schemas.DemoConfig, "dnerf": schemas.DataConfig},
     "model": {"six_planes": schemas.ModelConfig, "nine_planes": schemas.ModelConfig},
-    "lrm": {"none": schemas.LRMConfig},
+    "lrm": {"none": schemas.LRMConfig, "file": schemas.TriplaneFileConfig},
+    "preparation": {"default": schemas.PreparationConfig},
+    "decomposition": dict.fromkeys(("default", "paper"), schemas.DecompositionConfig),
     "sampler": {"occupancy": schemas.SamplerConfig},
     "loss": {"default": schemas.LossConfig},
     "trainer": dict.fromkeys(("default", "cpu", "gpu", "ddp", "debug"), schemas.TrainerConfig),

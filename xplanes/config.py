@@ -46,6 +46,7 @@ class DecoderConfig:
     density: str = MISSING  # Activation of the density: softplus or exp.
     density_scale: float = MISSING  # Factor on the density.
     density_start: float = MISSING  # Start of the density logit; lower is emptier.
+    colour_margin: float = MISSING  # How far colours may pass 0 and 1.
     freeze: bool = MISSING  # Keep the decoder as it starts.
 
 
@@ -56,7 +57,7 @@ class ModelConfig:
     name: str = MISSING  # Name in run directories and tables.
     plane_set: str = MISSING  # six, nine, or three (no time).
     resolution: int = MISSING  # Texels along each space axis.
-    time_resolution: int | None = MISSING  # Rows of the time planes; null: half the frames.
+    time_resolution: int | None = MISSING  # Rows of time; null: views / 2, or one per triplane.
     channels: int = MISSING  # Channels of each plane.
     space_scale: float = MISSING  # Standard deviation of the space planes at the start.
     time_scale: float = MISSING  # Standard deviation of the time planes at the start.
@@ -68,6 +69,37 @@ class LRMConfig:
     """The Large Reconstruction Model that starts the planes."""
 
     name: str = MISSING  # none starts them at random.
+
+
+@dataclass
+class TriplaneFileConfig(LRMConfig):
+    """A triplane sequence that was computed before, from a file."""
+
+    triplanes: str | None = MISSING  # File written by save_triplanes.
+
+
+@dataclass
+class DecompositionConfig:
+    """From a triplane sequence to low-rank and sparse parts, and from these to planes."""
+
+    name: str = MISSING  # Name of the settings.
+    method: str = MISSING  # adaptive, growing, admm (the paper's) or exact (slow).
+    sparsity_weight: int | float | str = MISSING  # Weight of the sparse part; auto fits the size.
+    penalty: float = MISSING  # Penalty of ADMM; where adaptive starts.
+    scale: str = MISSING  # Unit of the penalty: rms of the features, or none.
+    tolerance: float = MISSING  # Relative residual at which it stops.
+    max_iterations: int = MISSING  # Iterations at most.
+    static: str = MISSING  # Space planes from the low-rank part: median, mean or middle frame.
+    dynamic: str = MISSING  # Time planes: rank1 fits the sparse part, random starts near zero.
+    noise: float = MISSING  # Standard deviation of the time planes' noise.
+    cache: bool = MISSING  # Keep the parts in preparation.cache (twice the triplanes' size).
+
+
+@dataclass
+class PreparationConfig:
+    """What happens before training, for a start that is not random."""
+
+    cache: str | None = MISSING  # Folder for finished stages; null computes them anew.
 
 
 @dataclass
@@ -99,6 +131,8 @@ class LossConfig:
     total_variation: float = MISSING  # Weight of squared differences between texels.
     time_smoothness: float = MISSING  # Weight of squared second differences along time.
     time_magnitude: float = MISSING  # Weight of squared values of the time planes.
+    sparse_weight: float = MISSING  # Weight of L_r: time planes' products near what moves.
+    sparse_frames: int = MISSING  # Random frames per application of L_r.
     every: int = MISSING  # Steps between applications of these, at as many times the weight.
 
 
@@ -138,6 +172,8 @@ class TrainConfig:
     data: Any = MISSING
     model: Any = MISSING
     lrm: Any = MISSING
+    preparation: PreparationConfig = field(default_factory=PreparationConfig)
+    decomposition: DecompositionConfig = field(default_factory=DecompositionConfig)
     sampler: Any = MISSING
     loss: LossConfig = field(default_factory=LossConfig)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
@@ -149,6 +185,9 @@ SCHEMAS: dict[tuple[str | None, str], type] = {
     ("data", "demo_schema"): DemoConfig,
     ("model", "xplanes_schema"): ModelConfig,
     ("lrm", "lrm_schema"): LRMConfig,
+    ("lrm", "file_schema"): TriplaneFileConfig,
+    ("preparation", "preparation_schema"): PreparationConfig,
+    ("decomposition", "decomposition_schema"): DecompositionConfig,
     ("sampler", "occupancy_schema"): SamplerConfig,
     ("loss", "loss_schema"): LossConfig,
     ("trainer", "trainer_schema"): TrainerConfig,
@@ -192,12 +231,15 @@ def parse(config: dict[str, Any]) -> TrainConfig:
         ConfigError: If settings are out of range or contradict one another.
     """
     data = DemoConfig if config["data"]["name"] == "demo" else DataConfig
+    lrm = TriplaneFileConfig if config["lrm"]["name"] == "file" else LRMConfig
     typed = TrainConfig(
         seed=config["seed"],
         resume=config.get("resume"),
         data=build(data, config["data"]),
         model=build(ModelConfig, config["model"]),
-        lrm=build(LRMConfig, config["lrm"]),
+        lrm=build(lrm, config["lrm"]),
+        preparation=build(PreparationConfig, config["preparation"]),
+        decomposition=build(DecompositionConfig, config["decomposition"]),
         sampler=build(SamplerConfig, config["sampler"]),
         loss=build(LossConfig, config["loss"]),
         trainer=build(TrainerConfig, config["trainer"]),
@@ -210,18 +252,24 @@ _POSITIVE = """data.resolution data.views data.half_side data.train_views data.t
 data.val_views model.resolution model.time_resolution model.channels model.decoder.width
 model.decoder.density_scale sampler.samples sampler.grid_resolution sampler.time_bins
 sampler.threshold sampler.sweep_every sampler.update_every sampler.update_cells loss.every
+loss.sparse_frames decomposition.penalty decomposition.tolerance decomposition.max_iterations
 trainer.devices
 trainer.max_steps trainer.max_seconds trainer.rays_per_batch trainer.samples_per_batch
 trainer.accumulate trainer.plane_lr trainer.time_lr trainer.decoder_lr trainer.checkpoint_every
 trainer.evaluate_views trainer.log_every""".split()
-_NOT_NEGATIVE = """seed model.decoder.hidden model.space_scale model.time_scale loss.total_variation
-loss.time_smoothness loss.time_magnitude trainer.warmup_steps""".split()
+_NOT_NEGATIVE = """seed model.decoder.hidden model.decoder.colour_margin model.space_scale
+model.time_scale loss.total_variation loss.time_smoothness loss.time_magnitude loss.sparse_weight
+decomposition.noise trainer.warmup_steps""".split()
 _SHARE = """data.background_share sampler.decay sampler.occlusion trainer.final_lr""".split()
 _CHOICES: dict[str, tuple[str, ...]] = {
     "data.eval_split": ("test", "val"),
     "model.plane_set": ("six", "nine", "three"),
     "model.decoder.activation": ("relu", "silu"),
     "model.decoder.density": ("softplus", "exp"),
+    "decomposition.method": ("adaptive", "growing", "admm", "exact"),
+    "decomposition.scale": ("rms", "none"),
+    "decomposition.static": ("middle", "median", "mean"),
+    "decomposition.dynamic": ("random", "rank1"),
     "loss.background": ("white", "random"),
     "trainer.accelerator": ("auto", "cpu", "gpu"),
     "trainer.strategy": ("auto", "ddp"),
@@ -247,6 +295,7 @@ def check(config: TrainConfig) -> None:
     at = config.trainer.evaluate_at
     if any(not 0 <= share <= 1 for share in at):
         raise ConfigError(f"trainer.evaluate_at={at}: shares of the budget, from 0 to 1")
+    _check_decomposition(config.decomposition)
     if config.trainer.devices > 1 and config.trainer.strategy != "ddp":
         raise ConfigError(
             f"trainer.devices={config.trainer.devices} with trainer.strategy=auto: several devices "
@@ -256,6 +305,19 @@ def check(config: TrainConfig) -> None:
         raise ConfigError(
             f"sampler.grid_resolution={config.sampler.grid_resolution} with sampler.time_bins="
             f"{config.sampler.time_bins}: more than 268 million cells; lower one of them"
+        )
+
+
+def _check_decomposition(config: DecompositionConfig) -> None:
+    weight = config.sparsity_weight
+    if weight != "auto" and (isinstance(weight, str) or weight <= 0):
+        raise ConfigError(
+            f"decomposition.sparsity_weight={weight}: must be auto or a number above 0"
+        )
+    if config.dynamic == "random" and config.noise == 0:
+        raise ConfigError(
+            "decomposition.noise=0 with decomposition.dynamic=random: time planes of zeros never "
+            "learn, as products of two zeros have no gradient; set decomposition.noise=0.01"
         )
 
 

@@ -6,6 +6,7 @@ import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,9 @@ from lightning import seed_everything
 
 from xplanes.config import ConfigError, TrainConfig, parse
 from xplanes.evaluation.media import film_times, orbit_poses, render_path, write_film
-from xplanes.evaluation.report import closing, header, summary, write_hparams
+from xplanes.evaluation.report import closing, header, summary, write_hparams, write_start
 from xplanes.files import write_json, write_text
+from xplanes.preparation import check_source, prepare
 from xplanes.scenes.datamodule import RayDataModule
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, scene_frame
@@ -92,12 +94,24 @@ def train(
         The content of metrics.json; empty without a ``record``.
     """
     seed_everything(config.seed, verbose=False)
+    check_source(config.lrm)
     started = time.monotonic()
     scene = build_scene(config.data)
     frame = scene_frame(scene.splits["train"], config.data.half_side)
-    module = build_module(config, scene, frame)
-    data = RayDataModule(scene, frame, lambda rank: build_batches(config, scene, frame, rank))
     loaded = time.monotonic() - started
+    start = prepare(config, scene, frame)
+    config, frame = replace(config, model=start.model), start.frame
+    began = time.monotonic()
+    module = build_module(
+        config,
+        scene,
+        frame,
+        planes=start.planes,
+        decoder_state=start.decoder,
+        sparse=start.sparse,
+    )
+    data = RayDataModule(scene, frame, lambda rank: build_batches(config, scene, frame, rank))
+    loaded += time.monotonic() - began
     if record is not None:
         device = training_device(config.trainer.accelerator)
         record.note(
@@ -105,20 +119,22 @@ def train(
             precision=module.field.decoder.precision,
             files={name: list(views.files) for name, views in scene.splits.items()},
         )
-        text = header(config, folder, scene, frame, module, device, overrides or [])
+        text = header(config, folder, scene, frame, module, device, overrides or [], start.words)
         logger.info("\n%s", text)
         say(text + "\n")
+        write_start(folder, start.picture, log=not resume)
     scorer = fit(config, module, data, folder, resume=resume)
     if record is None:
         return {}
     seconds = {
         "load": loaded,
-        "prepare": {"fixed_view": 0.0, "lrm": 0.0, "decomposition": 0.0, "convert": 0.0},
+        "prepare": dict(start.seconds),
         "train": module.clock,
         "evaluate": scorer.seconds,
     }
     skipped = build_batches(config, scene, frame, 0).skipped
     metrics = summary(module, scorer.latest, config.data.eval_split, seconds, skipped)
+    metrics["decomposition"] = start.report
     if config.trainer.media:
         metrics["media"] = str(_film(module, frame, scene, folder).relative_to(folder))
     seconds["total"] = record.total_seconds

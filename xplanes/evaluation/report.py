@@ -4,9 +4,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from xplanes import __version__, backend
 from xplanes.config import TrainConfig
+from xplanes.rendering.pictures import write_png
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene
 from xplanes.training.module import RadianceModule
@@ -22,8 +24,9 @@ def header(
     module: RadianceModule,
     device: torch.device,
     overrides: list[str],
+    start: str,
 ) -> str:
-    """The lines printed before training: what is about to happen, on what."""
+    """The lines printed before training: what is about to happen, on what, from what ``start``."""
     counts = " / ".join(f"{len(views)} {name}" for name, views in scene.splits.items())
     train = scene.splits["train"]
     size = sum(views.nbytes for views in scene.splits.values()) / 2**20
@@ -43,7 +46,7 @@ def header(
         f"{train.width}x{train.height} px · {size:.1f} MB · cube {2 / frame.scale:.2f} wide",
         "model": f"{config.model.name} ({planes}) · {config.model.channels} channels · "
         f"{trainable:,} parameters, {frozen:,} frozen{moving}",
-        "start": "planes at random" if config.lrm.name == "none" else config.lrm.name,
+        "start": start,
         "space": f"{100 * module.grid.occupied_fraction:.0f}% of the cube may be occupied",
         "plan": budget,
         "changed": " ".join(overrides) or "(nothing)",
@@ -81,6 +84,24 @@ def summary(
         "parameters": sum(p.numel() for p in module.parameters()),
         "peak_memory_bytes": device_memory(module.device),
     }
+
+
+def write_start(run: Path, picture: Tensor | None, *, log: bool) -> None:
+    """Write the parts that a decomposition gave, if there was one.
+
+    Args:
+        run: The run directory.
+        picture: Colours from 0 to 1. [H, W, 3]
+        log: Whether it goes to TensorBoard too.
+    """
+    from torch.utils.tensorboard.writer import SummaryWriter
+
+    if picture is None:
+        return
+    write_png(run / "media" / "decomposition.png", picture)
+    if log:
+        with SummaryWriter(str(run / "tb")) as writer:
+            writer.add_image("decomposition", picture, 0, dataformats="HWC")
 
 
 def write_hparams(run: Path, config: TrainConfig, metrics: dict[str, Any]) -> None:

@@ -8,9 +8,9 @@ from typing import Any
 
 import yaml
 
-from xplanes.config import ConfigError, TrainConfig, parse
+from xplanes.config import ConfigError, ModelConfig, TrainConfig, build, parse
 from xplanes.files import read_json
-from xplanes.scenes.frame import Frame, scene_frame
+from xplanes.scenes.frame import Frame, read_frame, scene_frame
 from xplanes.scenes.views import Scene, Views
 from xplanes.training.builder import build_module, build_scene, training_device
 from xplanes.training.checkpoints import load_checkpoint
@@ -150,6 +150,9 @@ def load_run(
     scene = build_scene(config.data, ("train", name))
     _check_views(run, scene.splits["train"])
     frame = scene_frame(scene.splits["train"], config.data.half_side)
+    if (origin := state.get("origin")) is not None:
+        # Planes and decoder were shaped by a source that need not be there any more.
+        config.model, frame = _origin(origin, f"{run}/checkpoints/{checkpoint}.ckpt")
     module = build_module(config, scene, frame)
     try:
         module.load_state_dict(state["state_dict"])
@@ -170,6 +173,17 @@ def _parsed(run: Path) -> TrainConfig:
         raise ConfigError(
             f"{run}/config.yaml cannot be used ({type(error).__name__}: {error}): it is damaged, "
             "or from another version of xplanes"
+        ) from error
+
+
+def _origin(content: Any, name: str) -> tuple[ModelConfig, Frame]:
+    """The model's settings and the frame that a checkpoint carries."""
+    try:
+        return build(ModelConfig, content["model"]), read_frame(content["frame"], name)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(
+            f"{name} cannot be used ({type(error).__name__}: {error}): it is damaged, or from "
+            "another version of xplanes"
         ) from error
 
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -38,6 +39,53 @@ class Frame:
     def to_world(self, points: Tensor) -> Tensor:
         """Points of the field's frame in the world. [..., 3]"""
         return points @ self.rotation / self.scale + self.centre
+
+
+def frame_content(frame: Frame) -> dict[str, Any]:
+    """A frame as tensors and builtins, for files."""
+    return {"scale": frame.scale, "rotation": frame.rotation, "centre": frame.centre}
+
+
+def read_frame(content: Any, name: str) -> Frame:
+    """A frame from what `frame_content` gives, tensors or lists.
+
+    Raises:
+        SceneError: If it is no frame; the message calls its origin ``name``.
+    """
+    try:
+        scale = float(content["scale"])
+        rotation = torch.as_tensor(content["rotation"], dtype=torch.float32)
+        centre = torch.as_tensor(content["centre"], dtype=torch.float32)
+    except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
+        raise SceneError(
+            f"{name}: frame must be a dict of scale, rotation [3, 3] and centre [3] "
+            f"({type(error).__name__}: {error})"
+        ) from error
+    frame = Frame(scale, rotation, centre)
+    check_frame(frame, name)
+    return frame
+
+
+def check_frame(frame: Frame, name: str) -> None:
+    """Refuse what is no similarity.
+
+    Raises:
+        SceneError: For wrong shapes or numbers; the message calls its origin ``name``.
+    """
+    if frame.rotation.shape != (3, 3) or frame.centre.shape != (3,):
+        raise SceneError(
+            f"{name}: frame.rotation is {list(frame.rotation.shape)} and frame.centre "
+            f"{list(frame.centre.shape)}, but must be [3, 3] and [3]"
+        )
+    if not (math.isfinite(frame.scale) and frame.scale > 0):
+        raise SceneError(f"{name}: frame.scale={frame.scale}: must be finite and above 0")
+    if not frame.centre.isfinite().all():
+        raise SceneError(f"{name}: frame.centre={frame.centre.tolist()}: must be finite")
+    rotation = frame.rotation.double()
+    gap = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
+    # NaN compares as false.
+    if not gap < 1e-3 or torch.linalg.det(rotation) < 0:
+        raise SceneError(f"{name}: frame.rotation is no rotation (orthonormal, determinant 1)")
 
 
 def cube_frame(half_side: float, centre: Tensor) -> Frame:

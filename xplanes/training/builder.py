@@ -1,6 +1,8 @@
 """From settings to objects: the only place that turns names into classes."""
 
 import math
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -25,9 +27,10 @@ from xplanes.rendering.renderer import DIAGONAL, Renderer
 from xplanes.scenes.batches import RayBatches, step_generator
 from xplanes.scenes.demo import ensure_demo_scene
 from xplanes.scenes.dnerf import read_scene
-from xplanes.scenes.frame import Frame
+from xplanes.scenes.frame import Frame, frame_content
 from xplanes.scenes.views import Scene, Views
 from xplanes.training.module import RadianceModule
+from xplanes.training.product import SparseProduct
 
 START_STREAM = 1_000_033
 """Random stream of the start values."""
@@ -86,28 +89,37 @@ def is_still(views: Views) -> bool:
 
 
 def build_field(
-    config: ModelConfig, times: Tensor, seed: int, precision: Precision = "32"
+    config: ModelConfig,
+    times: Tensor,
+    seed: int,
+    precision: Precision = "32",
+    *,
+    planes: Mapping[str, Tensor] | None = None,
+    decoder_state: Mapping[str, Tensor] | None = None,
 ) -> XPlanes:
-    """A field with random planes and a fresh decoder.
+    """A field that starts from what it is given, the rest of it random.
 
     Args:
         config: The model group.
         times: Times of the training views; planes of time are left out where all are equal. [V]
         seed: The run's seed.
         precision: Of the decoder's products.
+        planes: Planes by name; random ones when None. [C, rows, columns] each
+        decoder_state: Weights of the decoder; a fresh one when None.
     """
     distinct = len(times.unique())
     plane_set = config.plane_set if distinct > 1 else "three"
     generator = step_generator(seed, 0, START_STREAM)
-    planes = random_planes(
-        plane_set,
-        channels=config.channels,
-        resolution=config.resolution,
-        time_resolution=config.time_resolution or max(2, math.ceil(distinct / 2)),
-        space_scale=config.space_scale,
-        time_scale=config.time_scale,
-        generator=generator,
-    )
+    if planes is None:
+        planes = random_planes(
+            plane_set,
+            channels=config.channels,
+            resolution=config.resolution,
+            time_resolution=config.time_resolution or max(2, math.ceil(distinct / 2)),
+            space_scale=config.space_scale,
+            time_scale=config.time_scale,
+            generator=generator,
+        )
     options = config.decoder
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(generator.initial_seed())
@@ -119,9 +131,13 @@ def build_field(
             density=options.density,  # type: ignore[arg-type]
             density_scale=options.density_scale,
             precision=precision,
+            colour_margin=options.colour_margin,
         )
-    with torch.no_grad():
-        decoder.layers[-1].bias[0] += options.density_start  # type: ignore[index]
+    if decoder_state is not None:
+        decoder.load_state_dict(dict(decoder_state))
+    else:
+        with torch.no_grad():
+            decoder.layers[-1].bias[0] += options.density_start  # type: ignore[index]
     decoder.requires_grad_(not options.freeze)
     return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set)
 
@@ -143,14 +159,42 @@ def build_renderer(config: SamplerConfig, *, still: bool) -> Renderer:
     )
 
 
-def build_module(config: TrainConfig, scene: Scene, frame: Frame) -> RadianceModule:
-    """Field, renderer and training in one module."""
+def build_module(
+    config: TrainConfig,
+    scene: Scene,
+    frame: Frame,
+    *,
+    planes: Mapping[str, Tensor] | None = None,
+    decoder_state: Mapping[str, Tensor] | None = None,
+    sparse: Tensor | None = None,
+) -> RadianceModule:
+    """Field, renderer and training in one module.
+
+    Args:
+        config: The run's settings, its model as it is to be built.
+        scene: The scene.
+        frame: The field's frame.
+        planes: As for `build_field`.
+        decoder_state: As for `build_field`.
+        sparse: What the products of time planes are tied to (L_r); None leaves the term out.
+            [T, 3, C, H, H]
+    """
     views = scene.splits["train"]
-    precision = decoder_precision(config.trainer)
-    field = build_field(config.model, views.times, config.seed, precision)
+    field = build_field(
+        config.model,
+        views.times,
+        config.seed,
+        decoder_precision(config.trainer),
+        planes=planes,
+        decoder_state=decoder_state,
+    )
     renderer = build_renderer(config.sampler, still=is_still(views))
     if config.sampler.silhouettes:
         carve(renderer.grid, views, frame)
+    product = None
+    if sparse is not None and field.time is not None and config.loss.sparse_weight:
+        product = SparseProduct(sparse, field.rows, config.loss.sparse_frames)
+    origin = {"model": asdict(config.model), "frame": frame_content(frame)}
     return RadianceModule(
         field,
         renderer,
@@ -158,6 +202,8 @@ def build_module(config: TrainConfig, scene: Scene, frame: Frame) -> RadianceMod
         sampler=config.sampler,
         trainer=config.trainer,
         seed=config.seed,
+        product=product,
+        origin=None if planes is None else origin,
     )
 
 

@@ -12,6 +12,7 @@ from xplanes.config import LossConfig, SamplerConfig, TrainerConfig
 from xplanes.fields import XPlanes
 from xplanes.rendering.renderer import Renderer
 from xplanes.scenes.batches import Batch, step_generator
+from xplanes.training.product import SparseProduct
 from xplanes.training.regularisers import (
     add_time_smoothness_gradient,
     add_total_variation_gradient,
@@ -19,6 +20,9 @@ from xplanes.training.regularisers import (
 
 GRID_STREAM = 1_000_003
 """Random stream of the occupancy grid, equal on all ranks so that their grids stay equal."""
+
+FRAME_STREAM = 1_000_037
+"""Random stream of the frames at which L_r is taken."""
 
 PATIENCE = 20
 """Steps in a row with a loss that is not finite after which training gives up."""
@@ -40,6 +44,9 @@ class RadianceModule(LightningModule):
         sampler: Upkeep of the grid.
         trainer: Budget and learning rates.
         seed: The run's seed.
+        product: What the products of time planes are tied to (L_r); None leaves the term out.
+        origin: What load_run needs to build this module again where its start was not random, kept
+            in checkpoints: the model's settings and the frame, tensors and builtins.
     """
 
     def __init__(
@@ -51,11 +58,14 @@ class RadianceModule(LightningModule):
         sampler: SamplerConfig,
         trainer: TrainerConfig,
         seed: int,
+        product: SparseProduct | None = None,
+        origin: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
         self.field, self.renderer, self.grid = field, renderer, renderer.grid
         self.loss, self.sampler, self.options, self.seed = loss, sampler, trainer, seed
+        self.product, self.origin = product, origin
         self.batches = 0
         self.clock = 0.0
         self.rays = min(trainer.rays_per_batch, 256)
@@ -150,6 +160,11 @@ class RadianceModule(LightningModule):
         if weight := self.loss.time_magnitude * every:
             scale = 2 * weight / field.time.numel()
             field.time.grad.add_(field.time.detach(), alpha=scale)
+        if self.product is not None:
+            weight = self.loss.sparse_weight * every
+            # The same frames on all ranks: their planes must stay equal.
+            generator = step_generator(self.seed, self.global_step, FRAME_STREAM)
+            self.product.add_gradient(field.time.grad, field.time, weight, generator)
 
     def _set_learning_rates(self) -> None:
         warm = min(1.0, (self.global_step + 1) / max(1, self.options.warmup_steps))
@@ -191,6 +206,8 @@ class RadianceModule(LightningModule):
             "counts": dict(self.counts),
             "unusable": self.unusable,
         }
+        if self.origin is not None:
+            checkpoint["origin"] = self.origin
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         progress = checkpoint["progress"]

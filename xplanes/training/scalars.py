@@ -68,4 +68,6 @@ class Scalars(Callback):
         if field.time is not None:
             values["reg/time_smoothness"] = float(time_smoothness(field.time))
             values["reg/time_magnitude"] = float(field.time.square().mean())
+            if module.product is not None:
+                values["reg/sparse_product"] = module.product.value(field.time)
         return values

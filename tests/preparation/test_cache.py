@@ -1,0 +1,160 @@
+"""Finished stages are found again, and nothing damaged is ever used."""
+
+import logging
+from pathlib import Path
+
+import pytest
+import torch
+
+from xplanes.preparation import cache as cache_module
+from xplanes.preparation.cache import StageCache, fingerprint
+
+INPUTS = [torch.arange(6.0), {"weight": "auto", "limit": 3}]
+
+
+class Maker:
+    """Counts how often it is asked."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self):
+        self.calls += 1
+        return {"planes": torch.arange(64.0).view(4, 16), "report": {"rank": 2, "x": 0.1 + 0.2}}
+
+
+def entry(folder: Path) -> Path:
+    (path,) = folder.glob("parts-*.pt")
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    StageCache(tmp_path).stage("parts", INPUTS, Maker())
+    return tmp_path
+
+
+def test_a_stage_is_made_once_and_comes_back_the_same(folder: Path):
+    make = Maker()
+    stage = StageCache(folder).stage("parts", INPUTS, make)
+    assert (make.calls, stage.cached) == (0, True)
+    fresh = make()
+    assert torch.equal(stage.content["planes"], fresh["planes"])
+    assert stage.content["report"] == fresh["report"]
+
+
+@pytest.mark.parametrize(
+    "inputs",
+    [
+        [torch.arange(6.0) + 1e-7, INPUTS[1]],
+        [torch.arange(6.0).double(), INPUTS[1]],
+        [torch.arange(6.0).view(2, 3), INPUTS[1]],
+        [INPUTS[0], {"weight": "auto", "limit": 4}],
+        [INPUTS[0], {"weight": "auto"}],
+        [INPUTS[0]],
+    ],
+)
+def test_other_inputs_are_another_stage(folder: Path, inputs):
+    make = Maker()
+    assert not StageCache(folder).stage("parts", inputs, make).cached
+    assert make.calls == 1
+
+
+def test_another_name_is_another_stage(folder: Path):
+    assert not StageCache(folder).stage("planes", INPUTS, Maker()).cached
+
+
+def damaged(path: Path, kind: str) -> None:
+    whole = path.read_bytes()
+    if kind == "truncated":
+        path.write_bytes(whole[: len(whole) // 2])
+    elif kind == "empty":
+        path.write_bytes(b"")
+    elif kind == "flipped":
+        # A byte of the tensor itself, which torch reads without a murmur.
+        place = whole.index(torch.arange(64.0).numpy().tobytes()) + 101
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+    elif kind == "foreign":
+        torch.save(torch.zeros(3), path)
+    else:
+        payload = torch.load(path, weights_only=True)
+        if kind == "version":
+            payload["version"] += 1
+        elif kind == "report":
+            payload["content"]["report"]["rank"] = 3
+        elif kind == "key":
+            payload["key"] = "0" * 64
+        else:
+            del payload[kind]
+        torch.save(payload, path)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    "truncated empty flipped foreign version report key checksum content seconds".split(),
+)
+def test_what_is_damaged_is_said_and_made_anew(folder: Path, kind: str, caplog):
+    damaged(entry(folder), kind)
+    make = Maker()
+    with caplog.at_level(logging.WARNING):
+        stage = StageCache(folder).stage("parts", INPUTS, make)
+    assert (make.calls, stage.cached) == (1, False)
+    assert str(entry(folder)) in caplog.text
+    assert torch.equal(stage.content["planes"], make()["planes"])
+    assert StageCache(folder).stage("parts", INPUTS, Maker()).cached
+
+
+def test_every_byte_of_an_entry_may_flip(folder: Path):
+    path, expected = entry(folder), Maker()()
+    whole = path.read_bytes()
+    for place in range(0, len(whole), 37):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0x10]) + whole[place + 1 :])
+        content = StageCache(folder).stage("parts", INPUTS, Maker()).content
+        assert torch.equal(content["planes"], expected["planes"])
+        assert content["report"] == expected["report"]
+
+
+def test_a_new_version_of_the_code_makes_anew(folder: Path, monkeypatch):
+    monkeypatch.setattr(cache_module, "VERSION", cache_module.VERSION + 1)
+    assert not StageCache(folder).stage("parts", INPUTS, Maker()).cached
+
+
+def test_switched_off_it_keeps_nothing(tmp_path: Path):
+    make = Maker()
+    for _ in range(2):
+        StageCache(None).stage("parts", INPUTS, make)
+        StageCache(tmp_path).stage("parts", INPUTS, make, keep=False)
+    assert make.calls == 4
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_written_costs_the_cache_alone(tmp_path: Path, caplog):
+    (tmp_path / "file").write_text("")
+    with caplog.at_level(logging.WARNING):
+        stage = StageCache(tmp_path / "file").stage("parts", INPUTS, Maker())
+    assert stage.content["report"]["rank"] == 2
+    assert "could not be written" in caplog.text
+
+
+def test_files_are_no_code(tmp_path: Path):
+    class Evil:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "executed",))
+
+    StageCache(tmp_path).stage("parts", INPUTS, Maker())
+    torch.save({"version": cache_module.VERSION, "content": Evil()}, entry(tmp_path))
+    assert not StageCache(tmp_path).stage("parts", INPUTS, Maker()).cached
+    assert not (tmp_path / "executed").exists()
+
+
+def test_fingerprints_tell_nesting_and_kinds_apart():
+    values = [1, 1.0, True, "1", None, [], [1], [[1]], [1, 1], {"a": 1}, {"a": [1]}, "a", ["a", 1]]
+    assert len({fingerprint(value) for value in values}) == len(values)
+    with pytest.raises(TypeError, match="set"):
+        fingerprint([{1, 2}])
+
+
+def test_fingerprints_do_not_depend_on_layout():
+    tensor = torch.randn(4, 6)
+    assert fingerprint(tensor.mT) == fingerprint(tensor.mT.contiguous())
+    assert fingerprint(tensor.bfloat16()) == fingerprint(tensor.bfloat16().clone())

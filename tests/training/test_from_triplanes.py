@@ -1,0 +1,293 @@
+"""Runs that start from a triplane file: what they write, how they go on, how they are loaded."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from tests.preparation.sequences import moving_sequence
+from tests.training.runs import small_config
+from xplanes.config import ConfigError
+from xplanes.decomposition import TIME_ROWS, decompose, unexplained_energy
+from xplanes.decomposition.conversion import frame_profiles
+from xplanes.evaluation.evaluate import evaluate
+from xplanes.evaluation.runs import load_run
+from xplanes.fields import Decoder, XPlanes
+from xplanes.files import read_rows
+from xplanes.pipeline import run
+from xplanes.preparation import TriplaneSequence, save_triplanes
+from xplanes.preparation import stages as stages_module
+from xplanes.scenes.frame import Frame
+from xplanes.training.clock import TrainingClock
+
+OPTIONS = {
+    "width": 16,
+    "hidden": 1,
+    "activation": "silu",
+    "density": "exp",
+    "density_scale": 20.0,
+    "colour_margin": 0.0,
+}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with scenes, a cache and triplanes.pt."""
+    folder = tmp_path_factory.mktemp("place")
+    save_triplanes(folder / "triplanes.pt", TriplaneSequence(moving_sequence()))
+    return folder
+
+
+def settings(place: Path, *overrides: str) -> dict:
+    return small_config(
+        place / "scenes",
+        "lrm=file",
+        f"lrm.triplanes={place}/triplanes.pt",
+        f"preparation.cache={place}/cache",
+        "loss.sparse_weight=0.5",
+        "trainer.log_every=10",
+        *overrides,
+    )
+
+
+def metrics(folder: Path) -> dict:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    return state["state_dict"]
+
+
+@pytest.fixture(scope="module")
+def trained(place: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    run(settings(place), folder, [], resume=False)
+    return folder
+
+
+def test_the_run_tells_how_it_started(trained: Path, place: Path) -> None:
+    content = metrics(trained)
+    assert set(content["decomposition"]) == {"xy", "xz", "yz", "unexplained"}
+    wanted = "rank iterations residual converged sparsity drift low_rank_energy sparse_energy"
+    for name in ("xy", "xz", "yz"):
+        assert set(content["decomposition"][name]) >= set(wanted.split())
+    unexplained = content["decomposition"]["unexplained"]
+    assert unexplained["after"] < 0.3 < 0.9 < unexplained["before"]
+    prepare = content["seconds"]["prepare"]
+    assert set(prepare) == {"fixed_view", "lrm", "decomposition", "convert"}
+    assert prepare["decomposition"] > 0
+    assert prepare["convert"] > 0
+
+
+def test_the_parts_are_a_picture_and_the_loss_a_curve(trained: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    with Image.open(trained / "media" / "decomposition.png") as picture:
+        assert picture.size == (8 * 132, 3 * 132)
+        assert len(picture.convert("RGB").getcolors(2**20)) > 100
+    events = EventAccumulator(str(trained / "tb"))
+    events.Reload()
+    assert "decomposition" in events.Tags()["images"]
+    points = events.Scalars("reg/sparse_product")
+    assert [point.step for point in points] == [10, 20, 30, 40]
+    assert all(point.value > 0 for point in points)
+
+
+def test_the_sparse_part_is_in_no_checkpoint(trained: Path, place: Path) -> None:
+    state = torch.load(trained / "checkpoints" / "last.ckpt", weights_only=True)
+    elements = 8 * 3 * 8 * 16 * 16
+    assert all(value.numel() != elements for value in state["state_dict"].values())
+    assert not [key for key in state["state_dict"] if "sparse" in key or "product" in key]
+    assert set(state["origin"]) == {"model", "frame"}
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one(
+    trained: Path, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = TrainingClock.on_train_batch_end
+
+    def break_down(self, trainer, module, *rest) -> None:
+        original(self, trainer, module, *rest)
+        if trainer.global_step == 13:
+            raise OSError("power cut")
+
+    folder = tmp_path / "broken"
+    monkeypatch.setattr(TrainingClock, "on_train_batch_end", break_down)
+    with pytest.raises(OSError, match="power cut"):
+        run(settings(place), folder, [], resume=False)
+    monkeypatch.undo()
+
+    def refuse(*_args, **_options):
+        raise AssertionError("decomposed again")
+
+    # The parts come from the cache.
+    monkeypatch.setattr(stages_module, "decompose", refuse)
+    run(settings(place), folder, [], resume=True)
+    ours, theirs = weights(folder), weights(trained)
+    assert set(ours) == set(theirs)
+    assert all(torch.equal(ours[key], theirs[key]) for key in ours)
+    for key in ("test", "views", "step", "skipped", "samples_per_ray", "decomposition"):
+        assert metrics(folder)[key] == metrics(trained)[key]
+
+
+def test_the_loss_changes_the_run(trained: Path, place: Path, tmp_path: Path) -> None:
+    run(settings(place, "loss.sparse_weight=0"), tmp_path / "without", [], resume=False)
+    assert not torch.equal(
+        weights(tmp_path / "without")["field.time"], weights(trained)["field.time"]
+    )
+
+
+@pytest.mark.parametrize("model", ["six_planes", "nine_planes"])
+def test_the_loss_pulls_random_planes_towards_the_sparse_part(
+    place: Path, tmp_path: Path, model: str
+) -> None:
+    """Colours are taken out of the loss as far as they go, so that L_r alone is seen."""
+    left = {}
+    for weight in (0, 100):
+        folder = tmp_path / f"{weight}"
+        overrides = (
+            f"model={model}",
+            "decomposition.dynamic=random",
+            "decomposition.noise=0.1",
+            f"loss.sparse_weight={weight}",
+            "loss.every=1",
+            "trainer.time_lr=0.03",
+            "trainer.max_steps=150",
+            "trainer.evaluate_at=[]",
+            "trainer.warmup_steps=1",
+        )
+        run(settings(place, *overrides), folder, [], resume=False)
+        sparse = decompose(moving_sequence(), sparsity_weight="auto").sparse
+        rows = TIME_ROWS[model.removesuffix("_planes")]
+        left[weight] = unexplained_energy(weights(folder)["field.time"], sparse, rows=rows)
+    start = metrics(tmp_path / "100")["decomposition"]["unexplained"]["after"]
+    assert start == pytest.approx(1, abs=0.1)
+    assert left[100] < 0.6 * start
+    assert left[100] < 0.6 * left[0]
+
+
+def test_a_run_is_loaded_without_its_source(tmp_path: Path) -> None:
+    """Planes, decoder, frame and channels are the file's; the file is gone afterwards."""
+    decoder = Decoder(4, **OPTIONS)
+    frame = Frame(0.55, torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), torch.zeros(3))
+    sequence = TriplaneSequence(
+        moving_sequence(channels=4), decoder.state_dict(), dict(OPTIONS), frame
+    )
+    save_triplanes(tmp_path / "triplanes.pt", sequence)
+    folder = tmp_path / "run"
+    run(settings(tmp_path, "model=nine_planes"), folder, [], resume=False)
+    (tmp_path / "triplanes.pt").unlink()
+    for path in (tmp_path / "cache").iterdir():
+        path.unlink()
+    loaded = load_run(folder)
+    assert loaded.frame.scale == 0.55
+    assert loaded.config.model.channels == 4
+    assert loaded.module.field.decoder.density_activation == "exp"
+    scores = evaluate(loaded, network="none")
+    assert scores["test"]["psnr"] == pytest.approx(metrics(folder)["test"]["psnr"], abs=1e-6)
+    with pytest.raises(ConfigError, match="there is no such file"):
+        run(settings(tmp_path, "model=nine_planes"), folder, [], resume=True)
+
+
+def test_a_run_from_one_triplane_is_loaded_too(place: Path, tmp_path: Path) -> None:
+    sequence = TriplaneSequence(moving_sequence(frames=1))
+    save_triplanes(tmp_path / "one.pt", sequence)
+    config = settings(
+        place, f"lrm.triplanes={tmp_path}/one.pt", "trainer.max_steps=2", "trainer.evaluate_at=[]"
+    )
+    run(config, tmp_path / "run", [], resume=False)
+    assert metrics(tmp_path / "run")["decomposition"] == {}
+    assert not (tmp_path / "run" / "media" / "decomposition.png").exists()
+    assert load_run(tmp_path / "run").is_still
+
+
+def test_a_damaged_origin_is_named(trained: Path, tmp_path: Path) -> None:
+    import shutil
+
+    folder = Path(shutil.copytree(trained, tmp_path / "run"))
+    path = folder / "checkpoints" / "last.ckpt"
+    state = torch.load(path, weights_only=True)
+    del state["origin"]["model"]["channels"]
+    torch.save(state, path)
+    with pytest.raises(ConfigError, match=r"last\.ckpt cannot be used"):
+        load_run(folder)
+
+
+def test_a_decomposition_that_did_not_converge_is_said_once(
+    place: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    config = settings(
+        place,
+        "decomposition.max_iterations=3",
+        "trainer.max_steps=2",
+        "trainer.evaluate_at=[]",
+    )
+    run(config, tmp_path / "run", [], resume=False)
+    said = capfd.readouterr()
+    assert said.err.count("did not converge") == 1
+    assert f"start    8 triplanes of {place}/triplanes.pt" in said.out
+    assert "time planes rank1" in said.out
+    assert not metrics(tmp_path / "run")["decomposition"]["xy"]["converged"]
+
+
+def test_a_random_start_says_so_and_leaves_no_trace(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = small_config(place / "scenes", "trainer.max_steps=2", "trainer.evaluate_at=[]")
+    run(config, tmp_path / "run", [], resume=False)
+    state = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
+    assert "origin" not in state
+    assert metrics(tmp_path / "run")["decomposition"] == {}
+    assert "start    planes at random" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("model", ["six_planes", "nine_planes"])
+def test_a_trained_fields_own_triplanes_start_a_field_that_renders_as_it(
+    place: Path, tmp_path: Path, model: str
+) -> None:
+    """Ties orientation, time, decoder and frame of a file to the field's, end to end."""
+    common = (f"model={model}", "trainer.precision=32", "sampler.coarse_steps=0")
+    config = small_config(place / "scenes", *common, "trainer.max_steps=150")
+    run(config, tmp_path / "first", [], resume=False)
+    first = load_run(tmp_path / "first")
+    field, options = first.module.field, first.config.model.decoder
+    with torch.no_grad():
+        sequence = TriplaneSequence(
+            triplanes_of(field, frames=30),
+            field.decoder.state_dict(),
+            {name: getattr(options, name) for name in OPTIONS},
+            first.frame,
+        )
+    save_triplanes(tmp_path / "own.pt", sequence)
+    overrides = (
+        *common,
+        f"lrm.triplanes={tmp_path}/own.pt",
+        "data.half_side=9",  # The file's frame prevails.
+        "trainer.max_steps=1",
+        "trainer.evaluate_at=[0]",
+        "decomposition.tolerance=1e-5",
+        "decomposition.noise=0",
+    )
+    run(settings(place, *overrides), tmp_path / "second", [], resume=False)
+    rows = read_rows(tmp_path / "second" / "curve.csv")
+    trained, begun = metrics(tmp_path / "first")["test"]["psnr"], float(rows[0]["psnr"])
+    assert rows[0]["step"] == "0"
+    assert begun > trained - 1.5
+
+
+def triplanes_of(field: XPlanes, frames: int) -> torch.Tensor:
+    """What the field's features are at each moment, as triplanes. [T, 3, C, H, H]"""
+    size = field.space.shape[1]
+    ticks = torch.arange(frames)
+    profiles = frame_profiles(field.time, ticks, frames, size)
+    moments = []
+    for frame in range(frames):
+        products = [
+            torch.einsum("wc,hc->chw", profiles[first, frame], profiles[second, frame])
+            for first, second in field.rows
+        ]
+        moments.append(field.space.permute(0, 3, 1, 2) + torch.stack(products))
+    return torch.stack(moments)

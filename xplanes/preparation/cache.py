@@ -1,0 +1,152 @@
+"""Finished stages on disk, found by what went into them and never trusted unseen.
+
+An entry is one file of tensors and builtins. Its name is a hash of the stage's inputs, and it
+carries a checksum of its content: what is truncated, changed or of another version is made anew.
+"""
+
+import hashlib
+import json
+import logging
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from xplanes.files import replacing
+
+logger = logging.getLogger(__name__)
+
+VERSION = 1
+"""Raised when a stage would come out differently from the same inputs."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """The outcome of a stage.
+
+    Attributes:
+        content: Tensors and builtins.
+        seconds: How long it took to make, also where it came from the cache.
+        cached: Whether it came from the cache.
+        key: Hash of what went into it; empty where nothing is kept.
+    """
+
+    content: dict[str, Any]
+    seconds: float
+    cached: bool
+    key: str
+
+
+class StageCache:
+    """A folder of finished stages.
+
+    Args:
+        folder: Where they are kept; None keeps nothing and finds nothing.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self.folder = folder
+
+    def stage(
+        self, name: str, inputs: Any, make: Callable[[], dict[str, Any]], *, keep: bool = True
+    ) -> Stage:
+        """Fetch a stage, or make and keep it.
+
+        Args:
+            name: Name of the stage, part of the file's name.
+            inputs: All that the outcome depends on: tensors, numbers, strings, lists, dicts.
+            make: Makes it: tensors and builtins in a dict.
+            keep: Whether this stage may be fetched and kept.
+        """
+        key = fingerprint([VERSION, name, inputs]) if self.folder else ""
+        path = self.folder / f"{name}-{key[:32]}.pt" if self.folder and keep else None
+        if path is not None and path.exists():
+            try:
+                content, seconds = _read(path, key)
+                return Stage(content, seconds, True, key)
+            except _UnusableError as reason:
+                logger.warning("%s is %s: making it anew", path, reason)
+        began = time.perf_counter()
+        content = make()
+        seconds = time.perf_counter() - began
+        if path is not None:
+            _write(path, key, content, seconds)
+        return Stage(content, seconds, False, key)
+
+
+class _UnusableError(Exception):
+    """An entry that cannot be used; the message completes "the file is ..."."""
+
+
+def _read(path: Path, key: str) -> tuple[dict[str, Any], float]:
+    try:
+        payload = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # A damaged file fails in any of a dozen ways.
+        raise _UnusableError(f"damaged ({type(error).__name__})") from error
+    if not isinstance(payload, dict):
+        raise _UnusableError("no entry of this cache")
+    if payload.get("version") != VERSION:
+        raise _UnusableError(f"of version {payload.get('version')}, not {VERSION}")
+    content, seconds = payload.get("content"), payload.get("seconds")
+    if payload.get("key") != key:
+        raise _UnusableError("that of other inputs")
+    try:
+        same = payload.get("checksum") == fingerprint([content, seconds])
+    except TypeError:
+        same = False
+    if not same or not isinstance(content, dict) or not isinstance(seconds, float):
+        raise _UnusableError("damaged (wrong checksum)")
+    return content, seconds
+
+
+def _write(path: Path, key: str, content: dict[str, Any], seconds: float) -> None:
+    """Keep an entry; failing to is no reason to stop a run."""
+    payload = {
+        "version": VERSION,
+        "key": key,
+        "checksum": fingerprint([content, seconds]),
+        "seconds": seconds,
+        "content": content,
+    }
+    try:
+        with replacing(path) as temporary:
+            torch.save(payload, temporary)
+    except (OSError, RuntimeError) as error:
+        logger.warning("%s could not be written (%s): it is not kept", path, error)
+
+
+def fingerprint(value: Any) -> str:
+    """A hash of tensors (type, shape and bytes) and builtins, in any nesting.
+
+    Raises:
+        TypeError: For a value of any other kind.
+    """
+    digest = hashlib.sha256()
+    _feed(digest, value)
+    return digest.hexdigest()
+
+
+def _feed(digest: Any, value: Any) -> None:
+    # Lengths and kinds come first, so that no two values give the same bytes.
+    if isinstance(value, Tensor):
+        digest.update(f"tensor {value.dtype} {tuple(value.shape)}:".encode())
+        for part in value.detach().reshape(-1).split(1 << 24):
+            digest.update(part.cpu().contiguous().view(torch.uint8).numpy())
+    elif isinstance(value, Mapping):
+        digest.update(f"dict {len(value)}:".encode())
+        for name in sorted(value):
+            _feed(digest, name)
+            _feed(digest, value[name])
+    elif isinstance(value, list | tuple):
+        digest.update(f"list {len(value)}:".encode())
+        for item in value:
+            _feed(digest, item)
+    elif value is None or isinstance(value, bool | int | float | str):
+        text = json.dumps(value)
+        digest.update(f"{len(text)} {text}:".encode())
+    else:
+        raise TypeError(f"{type(value).__name__} cannot be hashed here")

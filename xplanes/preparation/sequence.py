@@ -1,0 +1,163 @@
+"""Triplane sequences: what every source of a start supplies, and their files."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from xplanes.config import ConfigError
+from xplanes.fields import Decoder
+from xplanes.files import replacing
+from xplanes.scenes.frame import Frame, check_frame, frame_content, read_frame
+
+DECODER_OPTIONS: dict[str, tuple[type, ...]] = {
+    "width": (int,),
+    "hidden": (int,),
+    "activation": (str,),
+    "density": (str,),
+    "density_scale": (int, float),
+    "colour_margin": (int, float),
+}
+"""Options that a decoder's weights need to mean anything, as in the group ``model.decoder``."""
+
+_KEYS = {"triplanes", "decoder", "decoder_config", "frame"}
+
+
+@dataclass(frozen=True)
+class TriplaneSequence:
+    """One triplane per moment of a scene, and what is needed to read it.
+
+    Attributes:
+        triplanes: Planes xy, xz, yz of moments that fill [0, 1] evenly; plane "ab" has axis a along
+            the columns, b along the rows, texels as in the field. Any floating type.
+            [T, 3, C, H, H]
+        decoder: Weights of the decoder that reads them, ``Decoder.state_dict()``; None for none.
+        decoder_config: Its options, the keys of ``DECODER_OPTIONS``; given with ``decoder``.
+        frame: How the world maps into the triplanes' cube; None for the scene's own frame.
+    """
+
+    triplanes: Tensor
+    decoder: Mapping[str, Tensor] | None = None
+    decoder_config: Mapping[str, Any] | None = None
+    frame: Frame | None = None
+
+
+def save_triplanes(path: Path, sequence: TriplaneSequence) -> None:
+    """Write a sequence for ``lrm=file lrm.triplanes=PATH``, whole or not at all.
+
+    The file is torch.save's, of tensors and builtins: ``triplanes``, and where they are given
+    ``decoder``, ``decoder_config`` and ``frame`` {scale, rotation [3, 3], centre [3]}.
+
+    Raises:
+        ConfigError, SceneError: If the sequence could not be loaded again.
+    """
+    check_sequence(sequence, str(path))
+    content: dict[str, Any] = {"triplanes": sequence.triplanes.detach().cpu().clone()}
+    if sequence.decoder is not None:
+        content["decoder"] = {k: v.detach().cpu().clone() for k, v in sequence.decoder.items()}
+        content["decoder_config"] = dict(sequence.decoder_config or {})
+    if sequence.frame is not None:
+        content["frame"] = frame_content(sequence.frame)
+    with replacing(Path(path)) as temporary:
+        torch.save(content, temporary)
+
+
+def load_triplanes(path: Path) -> TriplaneSequence:
+    """Read a file of `save_triplanes`.
+
+    Raises:
+        ConfigError, SceneError: If it is missing or damaged, or holds what cannot be used.
+    """
+    if not path.is_file():
+        raise ConfigError(f"{path}: there is no such file; save_triplanes writes one")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # A damaged file fails in any of a dozen ways.
+        # Its text advises to load the file as code.
+        raise ConfigError(
+            f"{path} cannot be read ({type(error).__name__}): it is damaged, or no file of "
+            "save_triplanes"
+        ) from error
+    if not isinstance(content, dict) or "triplanes" not in content:
+        found = ", ".join(map(str, content)) if isinstance(content, dict) else type(content)
+        raise ConfigError(f"{path} holds {found}: there must be a dict with the key triplanes")
+    if unknown := set(content) - _KEYS:
+        names = ", ".join(sorted(map(str, unknown)))
+        raise ConfigError(f"{path}: unknown keys {names}; allowed are {', '.join(sorted(_KEYS))}")
+    frame = content.get("frame")
+    sequence = TriplaneSequence(
+        triplanes=content["triplanes"],
+        decoder=content.get("decoder"),
+        decoder_config=content.get("decoder_config"),
+        frame=None if frame is None else read_frame(frame, str(path)),
+    )
+    check_sequence(sequence, str(path))
+    return sequence
+
+
+def check_sequence(sequence: TriplaneSequence, name: str) -> None:
+    """Refuse a sequence that no field can start from.
+
+    Args:
+        sequence: The sequence.
+        name: What messages call it.
+
+    Raises:
+        ConfigError, SceneError: For wrong types or shapes, numbers that are not finite, a decoder
+            that does not fit, or a frame that is none.
+    """
+    planes = sequence.triplanes
+    if not isinstance(planes, Tensor) or not planes.is_floating_point():
+        kind = planes.dtype if isinstance(planes, Tensor) else type(planes).__name__
+        raise ConfigError(f"{name}: triplanes are {kind}, but must be a floating-point tensor")
+    shape = list(planes.shape)
+    if len(shape) != 5 or shape[1] != 3 or 0 in shape or shape[3] != shape[4]:
+        raise ConfigError(
+            f"{name}: triplanes are {shape}, but must be [T, 3, C, H, H]: moments, planes xy, xz "
+            "and yz, channels, rows and as many columns"
+        )
+    for number, frame in enumerate(planes):
+        if not frame.float().isfinite().all():  # In the type that it is computed in.
+            raise ConfigError(f"{name}: triplane {number} of {len(planes)} holds NaN or infinity")
+    if sequence.frame is not None:
+        check_frame(sequence.frame, name)
+    _check_decoder(sequence, name)
+
+
+def _check_decoder(sequence: TriplaneSequence, name: str) -> None:
+    state, options = sequence.decoder, sequence.decoder_config
+    if state is None and options is None:
+        return
+    if not isinstance(state, Mapping) or not isinstance(options, Mapping):
+        raise ConfigError(f"{name}: decoder and decoder_config must be dicts, given together")
+    if set(options) != set(DECODER_OPTIONS):
+        raise ConfigError(
+            f"{name}: decoder_config has the keys {', '.join(map(str, options)) or '(none)'}, but "
+            f"must have {', '.join(DECODER_OPTIONS)}"
+        )
+    for key, kinds in DECODER_OPTIONS.items():
+        value = options[key]
+        if isinstance(value, bool) or not isinstance(value, kinds):
+            raise ConfigError(f"{name}: decoder_config.{key} is {value!r}: wrong type")
+    # What else the options must be is checked with the settings they replace.
+    if not (1 <= options["width"] <= 65536 and 0 <= options["hidden"] <= 256):
+        raise ConfigError(
+            f"{name}: decoder_config.width={options['width']}, hidden={options['hidden']}: out of "
+            "range"
+        )
+    try:
+        decoder = Decoder(
+            sequence.triplanes.shape[2], width=options["width"], hidden=options["hidden"]
+        )
+        decoder.load_state_dict(dict(state))
+    except (RuntimeError, TypeError, AttributeError) as error:
+        raise ConfigError(
+            f"{name}: decoder does not fit decoder_config and {sequence.triplanes.shape[2]} "
+            f"channels: {error}"
+        ) from error
+    broken = [key for key, value in state.items() if not value.isfinite().all()]
+    if broken:
+        raise ConfigError(f"{name}: decoder.{broken[0]} holds NaN or infinity")

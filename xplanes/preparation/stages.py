@@ -1,0 +1,204 @@
+"""The stages from a triplane sequence to planes, each kept in the cache."""
+
+import sys
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from xplanes.config import DecompositionConfig, ModelConfig
+from xplanes.decomposition import (
+    TIME_ROWS,
+    decompose,
+    space_planes,
+    time_planes,
+    unexplained_energy,
+)
+from xplanes.fields.xplanes import SPACE_PLANES, TIME_PLANES
+from xplanes.preparation.cache import StageCache
+from xplanes.preparation.pictures import parts_sheet
+from xplanes.scenes.batches import step_generator
+
+NOISE_STREAM = 1_000_039
+"""Random stream of the time planes' noise."""
+
+REPORTED = (
+    "rank",
+    "iterations",
+    "residual",
+    "converged",
+    "sparsity",
+    "drift",
+    "low_rank_energy",
+    "sparse_energy",
+    "sparsity_weight",
+    "unit",
+)
+"""What metrics.json tells of each orientation."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """A sequence in two parts.
+
+    Attributes:
+        low_rank: What stands still, on the CPU. [T, 3, C, H, H]
+        sparse: What moves, on the CPU. [T, 3, C, H, H]
+        report: For "xy", "xz" and "yz" the entries of `REPORTED`; empty where there was nothing to
+            take apart.
+        picture: Both parts at a few moments; None where there was nothing to take apart.
+        seconds: Time that it took.
+        cached: Whether they came from the cache.
+        key: Hash of what they depend on.
+    """
+
+    low_rank: Tensor
+    sparse: Tensor | None
+    report: dict[str, dict[str, Any]]
+    picture: Tensor | None
+    seconds: float
+    cached: bool
+    key: str
+
+
+@dataclass(frozen=True)
+class Planes:
+    """The start of the planes.
+
+    Attributes:
+        planes: By name. [C, rows, columns] each
+        unexplained: Share of the sparse part's energy that their products leave, ``before`` with
+            random planes and ``after`` with these; empty without planes of time.
+        seconds: Time that it took.
+    """
+
+    planes: Mapping[str, Tensor]
+    unexplained: dict[str, float]
+    seconds: float
+
+
+def decompose_stage(
+    triplanes: Tensor, config: DecompositionConfig, cache: StageCache, device: torch.device
+) -> Parts:
+    """Robust PCA of a sequence; a single triplane is all low rank.
+
+    Args:
+        triplanes: The sequence. [T, 3, C, H, H]
+        config: Its settings.
+        cache: Where the parts are kept.
+        device: Where they are computed.
+    """
+    triplanes = triplanes.float()
+    options = {
+        name: getattr(config, name)
+        for name in (
+            "method",
+            "sparsity_weight",
+            "penalty",
+            "scale",
+            "tolerance",
+            "max_iterations",
+        )
+    }
+
+    def make() -> dict[str, Any]:
+        if len(triplanes) == 1:
+            return {"low_rank": triplanes, "sparse": None, "report": {}}
+        with warnings.catch_warnings():
+            # Said once for all orientations by the caller, also when the parts are cached.
+            warnings.filterwarnings("ignore", message="robust PCA stopped")
+            # A bar needs a terminal: piped, it would fill the log.
+            shown = sys.stderr.isatty()
+            parts = decompose(triplanes.to(device), progress=shown, **options)
+        report = {
+            name: {key: whole[key] for key in REPORTED} for name, whole in parts.reports.items()
+        }
+        return {
+            "low_rank": parts.low_rank.cpu(),
+            "sparse": parts.sparse.cpu(),
+            "report": report,
+        }
+
+    keep = config.cache and len(triplanes) > 1
+    stage = cache.stage("decomposition", [triplanes, options], make, keep=keep)
+    content = stage.content
+    sparse = content["sparse"]
+    picture = None if sparse is None else parts_sheet(content["low_rank"], sparse)
+    return Parts(
+        content["low_rank"],
+        sparse,
+        content["report"],
+        picture,
+        stage.seconds if sparse is not None else 0.0,
+        stage.cached,
+        stage.key,
+    )
+
+
+def convert_stage(
+    parts: Parts,
+    model: ModelConfig,
+    config: DecompositionConfig,
+    seed: int,
+    cache: StageCache,
+    device: torch.device,
+) -> Planes:
+    """Space planes from the low-rank part, time planes from the sparse one.
+
+    Args:
+        parts: The two parts.
+        model: The model's settings, as the field is to be built.
+        config: Which planes to choose.
+        seed: The run's seed, for the noise.
+        cache: Where the planes are kept.
+        device: Where they are computed.
+    """
+    moving = model.plane_set != "three"
+    sparse = parts.sparse if moving else None
+
+    def begin(dynamic: str, moved: Tensor) -> Tensor:
+        return time_planes(
+            moved,
+            plane_set=model.plane_set,
+            dynamic=dynamic,
+            resolution=model.resolution,
+            time_resolution=model.time_resolution,
+            noise=config.noise,
+            generator=step_generator(seed, 0, NOISE_STREAM),
+        )
+
+    def make() -> dict[str, Any]:
+        low_rank = parts.low_rank.to(device)
+        space = space_planes(low_rank, static=config.static, resolution=model.resolution)
+        content: dict[str, Any] = {"space": space.cpu(), "time": None, "unexplained": {}}
+        if sparse is not None:
+            moved, rows = sparse.to(device), TIME_ROWS[model.plane_set]
+            begun = begin(config.dynamic, moved)
+            content["time"] = begun.cpu()
+            content["unexplained"] = {
+                "before": unexplained_energy(begin("random", moved), moved, rows=rows),
+                "after": unexplained_energy(begun, moved, rows=rows),
+            }
+        return content
+
+    inputs = [
+        parts.key,
+        config.static,
+        model.resolution,
+        [config.dynamic, config.noise, model.plane_set, model.time_resolution, seed]
+        if moving
+        else [],
+    ]
+    stage = cache.stage("planes", inputs, make)
+    planes = _named(stage.content["space"], SPACE_PLANES)
+    if stage.content["time"] is not None:
+        planes |= _named(stage.content["time"], TIME_PLANES[model.plane_set])
+    return Planes(planes, stage.content["unexplained"], stage.seconds)
+
+
+def _named(stack: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
+    """Planes by name, channels first. [P, rows, columns, C] -> [C, rows, columns] each"""
+    return {name: plane.permute(2, 0, 1) for name, plane in zip(names, stack, strict=True)}

@@ -1,0 +1,213 @@
+"""The start of a field: planes, decoder and frame from a source, or nothing."""
+
+import logging
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from xplanes.config import (
+    ConfigError,
+    LRMConfig,
+    ModelConfig,
+    TrainConfig,
+    TriplaneFileConfig,
+    build,
+    check,
+)
+from xplanes.preparation.cache import StageCache
+from xplanes.preparation.sequence import TriplaneSequence, load_triplanes
+from xplanes.preparation.stages import Parts, convert_stage, decompose_stage
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.views import Scene
+from xplanes.training.builder import is_still, training_device
+
+logger = logging.getLogger(__name__)
+
+STAGES = ("fixed_view", "lrm", "decomposition", "convert")
+
+
+def _no_time() -> dict[str, float]:
+    return dict.fromkeys(STAGES, 0.0)
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a field starts from.
+
+    Attributes:
+        model: The model's settings as the field is to be built: the source decides about channels,
+            decoder and whether there are planes of time.
+        frame: The field's frame: the source's own, or the scene's.
+        planes: Planes by name; None for random ones. [C, rows, columns] each
+        decoder: Weights of the decoder; None for a fresh one.
+        sparse: What the products of time planes are tied to (L_r). [T, 3, C, H, H]
+        report: The decomposition for metrics.json: per orientation, and as ``unexplained`` the
+            share of the sparse part's energy that the time planes leave, ``before`` (at random) and
+            ``after`` (as they start).
+        seconds: Seconds of each stage; of one from the cache those that it took to make.
+        words: The start in one line.
+        picture: The two parts at a few moments, colours from 0 to 1. [H, W, 3]
+    """
+
+    model: ModelConfig
+    frame: Frame
+    planes: Mapping[str, Tensor] | None = None
+    decoder: Mapping[str, Tensor] | None = None
+    sparse: Tensor | None = None
+    report: dict[str, Any] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=_no_time)
+    words: str = "planes at random"
+    picture: Tensor | None = None
+
+
+def check_source(config: LRMConfig) -> None:
+    """Refuse a source that is not there, before anything slow begins.
+
+    Raises:
+        ConfigError: If the file is missing or not named.
+    """
+    if not isinstance(config, TriplaneFileConfig):
+        return
+    if config.triplanes is None:
+        raise ConfigError("lrm=file needs lrm.triplanes=FILE, a file written by save_triplanes")
+    if not Path(config.triplanes).is_file():
+        raise ConfigError(f"lrm.triplanes={config.triplanes}: there is no such file")
+
+
+def prepare(config: TrainConfig, scene: Scene, frame: Frame) -> Start:
+    """Make the start that the settings ask for; ``lrm=none`` is random and costs nothing.
+
+    Args:
+        config: The run's settings.
+        scene: The scene.
+        frame: The frame of the scene, for sources that bring none.
+
+    Raises:
+        ConfigError, SceneError: If the source is missing, damaged or does not fit the settings.
+    """
+    if not isinstance(config.lrm, TriplaneFileConfig):
+        return Start(config.model, frame)
+    check_source(config.lrm)
+    began = time.perf_counter()
+    path = Path(str(config.lrm.triplanes))
+    sequence = load_triplanes(path)
+    seconds = {"lrm": time.perf_counter() - began}
+    return start_from(sequence, config, scene, frame, source=str(path), seconds=seconds)
+
+
+def start_from(
+    sequence: TriplaneSequence,
+    config: TrainConfig,
+    scene: Scene,
+    frame: Frame,
+    *,
+    source: str,
+    seconds: Mapping[str, float],
+) -> Start:
+    """From a triplane sequence of any source to a start.
+
+    Args:
+        sequence: The sequence, checked.
+        config: The run's settings.
+        scene: The scene.
+        frame: The frame of the scene, for a sequence that brings none.
+        source: What messages call the sequence.
+        seconds: Seconds of the stages that made it.
+    """
+    still = is_still(scene.splits["train"])
+    model = _settled(config, sequence, moving=not still, source=source)
+    if len(sequence.triplanes) == 1 and not still:
+        logger.warning(
+            "%s holds one triplane, but the scene moves: the field gets no planes of time and "
+            "stands still",
+            source,
+        )
+    cache = StageCache(None if config.preparation.cache is None else Path(config.preparation.cache))
+    device = training_device(config.trainer.accelerator)
+    parts = decompose_stage(sequence.triplanes, config.decomposition, cache, device)
+    _warn(parts, config)
+    planes = convert_stage(parts, model, config.decomposition, config.seed, cache, device)
+    tied = model.plane_set != "three" and config.loss.sparse_weight > 0
+    return Start(
+        model=model,
+        frame=sequence.frame or frame,
+        planes=planes.planes,
+        decoder=sequence.decoder,
+        sparse=parts.sparse if tied else None,
+        report=parts.report | ({"unexplained": planes.unexplained} if planes.unexplained else {}),
+        seconds=_no_time()
+        | dict(seconds)
+        | {"decomposition": parts.seconds, "convert": planes.seconds},
+        words=_words(sequence, config, parts, planes.unexplained, source),
+        picture=parts.picture,
+    )
+
+
+def _settled(
+    config: TrainConfig, sequence: TriplaneSequence, *, moving: bool, source: str
+) -> ModelConfig:
+    """The model's settings with what the sequence decides."""
+    frames, _, channels = sequence.triplanes.shape[:3]
+    model = replace(config.model, channels=channels)
+    if not moving or frames == 1:
+        model = replace(model, plane_set="three")
+    if model.plane_set != "three":
+        model = replace(model, time_resolution=model.time_resolution or frames)
+    if sequence.decoder_config is not None:
+        decoder = asdict(model.decoder) | dict(sequence.decoder_config)
+        model = replace(model, decoder=build(type(model.decoder), decoder))
+    try:
+        check(replace(config, model=model))
+    except ConfigError as error:
+        raise ConfigError(f"{source} does not fit: {error}") from error
+    return model
+
+
+def _warn(parts: Parts, config: TrainConfig) -> None:
+    """Say once which orientations did not converge."""
+    open_ones = [
+        f"{name} (residual {report['residual']:.1e})"
+        for name, report in parts.report.items()
+        if not report["converged"]
+    ]
+    if open_ones:
+        logger.warning(
+            "the decomposition of %s did not converge within decomposition.max_iterations=%d to "
+            "decomposition.tolerance=%g: raise one of them",
+            ", ".join(open_ones),
+            config.decomposition.max_iterations,
+            config.decomposition.tolerance,
+        )
+
+
+def _words(
+    sequence: TriplaneSequence,
+    config: TrainConfig,
+    parts: Parts,
+    unexplained: Mapping[str, float],
+    source: str,
+) -> str:
+    frames, _, channels, size = sequence.triplanes.shape[:4]
+    words = [f"{frames} triplanes of {source}, {size} x {size} with {channels} channels"]
+    if channels != config.model.channels:
+        words[0] += f" (not model.channels={config.model.channels})"
+    if parts.report:
+        ranks = "/".join(str(report["rank"]) for report in parts.report.values())
+        share = max(report["sparsity"] for report in parts.report.values())
+        words.append(
+            f"rank {ranks}, up to {100 * share:.0f}% sparse" + (", cached" if parts.cached else "")
+        )
+    if unexplained:
+        words.append(
+            f"time planes {config.decomposition.dynamic}, {100 * unexplained['after']:.0f}% of the "
+            f"sparse part unexplained ({100 * unexplained['before']:.0f}% at random)"
+        )
+    else:
+        words.append("no planes of time")
+    words.append("its decoder" if sequence.decoder is not None else "a fresh decoder")
+    words.append("its frame" if sequence.frame is not None else "the scene's frame")
+    return " · ".join(words)

@@ -176,6 +176,7 @@ def _logged(path: Path) -> Iterator[None]:
     file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     terminal.setFormatter(logging.Formatter("warning: %(message)s"))
     terminal.addFilter(_own_warning)
+    logging.getLogger("xplanes").setLevel(logging.INFO)
     root = logging.getLogger()
     handlers = (file, terminal)
     for handler in handlers:

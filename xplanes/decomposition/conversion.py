@@ -13,6 +13,7 @@ from torch import Tensor
 from xplanes.decomposition.decompose import check_triplanes
 from xplanes.decomposition.interpolation import space_weights, time_weights
 from xplanes.decomposition.rank1 import rank1_factors, shared_factors
+from xplanes.fields.xplanes import PLANE_SETS
 
 STATIC = ("middle", "median", "mean")
 DYNAMIC = ("random", "rank1")
@@ -23,10 +24,7 @@ TIME_PLANES = {
 }
 """Time planes of each plane set, in storage order."""
 
-TIME_ROWS = {
-    "six": ((0, 1), (0, 2), (1, 2)),
-    "nine": ((0, 1), (2, 3), (4, 5)),
-}
+TIME_ROWS = {name: PLANE_SETS[name] for name in TIME_PLANES}
 """For xy, xz and yz the time planes of its first and second axis, by position in storage."""
 
 

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from xplanes.scenes.views import Views
 
-WINDOW = 0.02
+WINDOW = 0.06
 """Share of the time span over which content is taken to stand still when silhouettes are joined."""
 
 MOST_VIEWS = 5

@@ -8,7 +8,7 @@ import torch
 
 from tests.oracles import project, visual_hull
 from tests.synthetic import ball_views, inside_ball, swinging
-from xplanes.scenes.silhouettes import foreground, silhouette_hull
+from xplanes.scenes.silhouettes import MOST_VIEWS, WINDOW, foreground, silhouette_hull
 
 
 def test_foreground_widens_by_whole_pixels():
@@ -45,17 +45,19 @@ def test_without_a_radius_the_hull_is_that_of_projected_points():
     assert np.array_equal(found[0].numpy(), expected)
 
 
-def test_a_moving_hull_asks_every_view_of_some_span_around():
-    views = ball_views(34, 0.5, centre=swinging(0.5, 1), size=24)  # a span is 2 of 34 views
-    points = grid_points(cells=7)
+@pytest.mark.parametrize("count", [12, 34, 90])
+def test_a_moving_hull_asks_every_view_of_some_span_around(count):
+    views = ball_views(count, 0.5, centre=swinging(0.5, 1), size=24)
+    points = grid_points(cells=5)
     alpha, poses = views.images[..., 3].numpy(), views.camera_to_world.double().numpy()
-    single = np.array(
-        [visual_hull(alpha[i : i + 1], poses[i : i + 1], views.focal, points) for i in range(34)]
-    )
-    pairs = single[:-1] & single[1:]
-    expected = np.zeros_like(single)
-    expected[:-1] |= pairs
-    expected[1:] |= pairs
+    single = [
+        visual_hull(alpha[i : i + 1], poses[i : i + 1], views.focal, points) for i in range(count)
+    ]
+    span = max(1, min(MOST_VIEWS, round(WINDOW * count)))
+    expected = np.zeros((count, len(points)), dtype=bool)
+    for first in range(count - span + 1):
+        run = np.all(single[first : first + span], axis=0)
+        expected[first : first + span] |= run
     found = silhouette_hull(views, points, radius=0.0)
     assert np.array_equal(found.numpy(), expected)
 

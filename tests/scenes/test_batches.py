@@ -1,6 +1,7 @@
 """Ray batches: a function of seed, step and rank, and right in every pixel."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,7 +12,8 @@ from xplanes.scenes.batches import NEAR_SILHOUETTE, RayBatches, step_generator
 from xplanes.scenes.frame import Frame, cube_frame
 from xplanes.scenes.silhouettes import foreground
 
-VIEWS = ball_views(5, 0.5, size=24)
+SQUARE = ball_views(5, 0.5, size=24)
+VIEWS = replace(SQUARE, images=SQUARE.images[:, 4:20].contiguous())  # 16 rows, 24 columns
 FRAME = cube_frame(1.4, torch.zeros(3))
 
 
@@ -161,15 +163,17 @@ def test_without_skipping_pixels_are_drawn_evenly(options):
     batches = batches_of(rays=20_000, **options)
     assert batches.skipped == 0
     views = batches.views
-    counts = torch.zeros(len(views) * 24 * 24)
+    height, width = views.height, views.width
+    counts = torch.zeros(len(views) * height * width)
     for step in range(10):
         batch = batches.draw(step)
         origins = FRAME.to_world(batch["origins"])
         view = torch.cdist(origins, views.camera_to_world[:, :3, 3]).argmin(dim=1)
         local = (batch["directions"][:, None] @ views.camera_to_world[view, :3, :3])[:, 0]
-        column = (local[:, 0] / -local[:, 2] * views.focal + 12).floor().long()
-        row = (-local[:, 1] / -local[:, 2] * views.focal + 12).floor().long()
-        counts += torch.bincount((view * 24 + row) * 24 + column, minlength=len(counts))
+        column = (local[:, 0] / -local[:, 2] * views.focal + width / 2).floor().long()
+        row = (-local[:, 1] / -local[:, 2] * views.focal + height / 2).floor().long()
+        pixel = (view * height + row) * width + column
+        counts += torch.bincount(pixel, minlength=len(counts))
     expected = counts.sum() / len(counts)
     chi_squared = float(((counts - expected).square() / expected).sum())
     freedom = len(counts) - 1

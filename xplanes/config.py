@@ -22,7 +22,7 @@ class DataConfig:
     views: int | None = MISSING  # Training views kept, spread over time; null keeps all.
     eval_split: str = MISSING  # Split that is scored: test or val.
     half_side: float | None = MISSING  # Half the side of the scene's cube; null finds it.
-    background_share: float = MISSING  # Share of rays drawn far from the silhouettes; null-rays.
+    background_share: float = MISSING  # Share of rays drawn far from the silhouettes.
     skip_background: bool = MISSING  # Draw rays near the silhouettes more often than elsewhere.
 
 

@@ -283,6 +283,11 @@ def test_an_unknown_option_is_left_to_hydra_which_lists_those_there_are():
     assert "nine_planes" in str(caught.value)
 
 
+def test_an_occlusion_that_hides_everything_is_refused():
+    with pytest.raises(ConfigError, match=r"sampler\.occlusion=1\.0.*below 1"):
+        parse(composed("sampler.occlusion=1"))
+
+
 # The layers of design
 
 

@@ -292,6 +292,11 @@ def check(config: TrainConfig) -> None:
             raise ConfigError(f"{key}={value}: must lie between 0 and 1")
         if key in _CHOICES and value not in _CHOICES[key]:
             raise ConfigError(f"{key}={value}: must be one of {', '.join(_CHOICES[key])}")
+    if config.sampler.occlusion >= 1:
+        raise ConfigError(
+            f"sampler.occlusion={config.sampler.occlusion}: must be below 1, or no light counts as "
+            "seen; 1e-5 is the default, sampler.skip_occluded=false skips nothing"
+        )
     at = config.trainer.evaluate_at
     if any(not 0 <= share <= 1 for share in at):
         raise ConfigError(f"trainer.evaluate_at={at}: shares of the budget, from 0 to 1")

@@ -18,7 +18,11 @@ _FIELD = re.compile(r"^    (\w+): [^#\n]*#\s*(.+)$", re.MULTILINE)
 GROUPS: dict[str, dict[str, type]] = {
     "data": {"demo": schemas.DemoConfig, "dnerf": schemas.DataConfig},
     "model": {"six_planes": schemas.ModelConfig, "nine_planes": schemas.ModelConfig},
-    "lrm": {"none": schemas.LRMConfig, "file": schemas.TriplaneFileConfig},
+    "lrm": {
+        "none": schemas.LRMConfig,
+        "file": schemas.TriplaneFileConfig,
+        **dict.fromkeys(("small", "base", "large", "xlarge"), schemas.PretrainedLRMConfig),
+    },
     "preparation": {"default": schemas.PreparationConfig},
     "decomposition": dict.fromkeys(("default", "paper"), schemas.DecompositionConfig),
     "sampler": {"occupancy": schemas.SamplerConfig},

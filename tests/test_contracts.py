@@ -191,7 +191,7 @@ def test_checked_keys_exist_and_are_listed_once(kind):
     assert not set(CHECKED[kind]) & set(others)
 
 
-PLAIN = composed()
+PLAIN = composed("lrm=small")
 
 REFUSED = [
     *[(key, value) for key in CHECKED["positive"] for value in (0, -1)],
@@ -202,6 +202,7 @@ REFUSED = [
     ("trainer.evaluate_at", [0.5, 1.5]),
     ("trainer.devices", 2),
     ("sampler.grid_resolution", 4096),
+    ("preparation.elevation", 91),
 ]
 
 
@@ -222,6 +223,18 @@ def test_values_that_cannot_work_are_refused_by_name(key, value):
         parse(changed(key, value))
     assert key in str(caught.value)
     assert str(value) in str(caught.value)
+
+
+def test_a_crop_and_padding_exclude_each_other():
+    with pytest.raises(ConfigError, match=r"lrm\.crop=true with lrm\.matching=pad"):
+        parse(composed("lrm=large", "lrm.matching=pad"))
+
+
+def test_several_processes_need_a_cache_for_their_start():
+    overrides = ["lrm=small", "trainer=ddp", "trainer.devices=2"]
+    parse(composed(*overrides))
+    with pytest.raises(ConfigError, match=r"preparation\.cache=null .* trainer\.devices=2"):
+        parse(composed(*overrides, "preparation.cache=null"))
 
 
 def test_the_composed_configuration_survives_its_file():

@@ -79,6 +79,23 @@ class TriplaneFileConfig(LRMConfig):
 
 
 @dataclass
+class PretrainedLRMConfig(LRMConfig):
+    """A published model: its weights, and how it meets the scene's pictures."""
+
+    architecture: str = MISSING  # One of openlrm-{small,base,large}-{1.0,1.1} and triposr.
+    repository: str = MISSING  # On the Hugging Face hub.
+    file: str = MISSING  # Name of the weights there.
+    revision: str = MISSING  # Branch, tag or commit there.
+    licence: str = MISSING  # Of the weights.
+    megabytes: int = MISSING  # Size of the file.
+    weights: str | None = MISSING  # A local file instead.
+    config: str | None = MISSING  # A config.json or config.yaml for weights of other sizes.
+    matching: str = MISSING  # Where focal lengths differ: scale, or pad the pictures (exact).
+    crop: bool = MISSING  # Show the model the object at the size that it was trained with.
+    batch: int = MISSING  # Pictures at a time.
+
+
+@dataclass
 class DecompositionConfig:
     """From a triplane sequence to low-rank and sparse parts, and from these to planes."""
 
@@ -100,6 +117,11 @@ class PreparationConfig:
     """What happens before training, for a start that is not random."""
 
     cache: str | None = MISSING  # Folder for finished stages; null computes them anew.
+    frames: int = MISSING  # Moments of the fixed view.
+    fixed_view: str = MISSING  # The scene's video, train (a field films it), or auto.
+    fixed_view_seconds: float = MISSING  # Training clock of the field that films it.
+    azimuth: float | None = MISSING  # Degrees from x towards y; null: a training view's.
+    elevation: float = MISSING  # Its height angle in degrees.
 
 
 @dataclass
@@ -186,6 +208,7 @@ SCHEMAS: dict[tuple[str | None, str], type] = {
     ("model", "xplanes_schema"): ModelConfig,
     ("lrm", "lrm_schema"): LRMConfig,
     ("lrm", "file_schema"): TriplaneFileConfig,
+    ("lrm", "pretrained_lrm_schema"): PretrainedLRMConfig,
     ("preparation", "preparation_schema"): PreparationConfig,
     ("decomposition", "decomposition_schema"): DecompositionConfig,
     ("sampler", "occupancy_schema"): SamplerConfig,
@@ -231,7 +254,11 @@ def parse(config: dict[str, Any]) -> TrainConfig:
         ConfigError: If settings are out of range or contradict one another.
     """
     data = DemoConfig if config["data"]["name"] == "demo" else DataConfig
-    lrm = TriplaneFileConfig if config["lrm"]["name"] == "file" else LRMConfig
+    lrm = LRMConfig
+    if "triplanes" in config["lrm"]:
+        lrm = TriplaneFileConfig
+    elif "architecture" in config["lrm"]:
+        lrm = PretrainedLRMConfig
     typed = TrainConfig(
         seed=config["seed"],
         resume=config.get("resume"),
@@ -253,7 +280,7 @@ data.val_views model.resolution model.time_resolution model.channels model.decod
 model.decoder.density_scale sampler.samples sampler.grid_resolution sampler.time_bins
 sampler.threshold sampler.sweep_every sampler.update_every sampler.update_cells loss.every
 loss.sparse_frames decomposition.penalty decomposition.tolerance decomposition.max_iterations
-trainer.devices
+preparation.frames preparation.fixed_view_seconds lrm.megabytes lrm.batch trainer.devices
 trainer.max_steps trainer.max_seconds trainer.rays_per_batch trainer.samples_per_batch
 trainer.accumulate trainer.plane_lr trainer.time_lr trainer.decoder_lr trainer.checkpoint_every
 trainer.evaluate_views trainer.log_every""".split()
@@ -266,6 +293,8 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "model.plane_set": ("six", "nine", "three"),
     "model.decoder.activation": ("relu", "silu"),
     "model.decoder.density": ("softplus", "exp"),
+    "lrm.matching": ("scale", "pad"),
+    "preparation.fixed_view": ("auto", "video", "train"),
     "decomposition.method": ("adaptive", "growing", "admm", "exact"),
     "decomposition.scale": ("rms", "none"),
     "decomposition.static": ("middle", "median", "mean"),
@@ -301,6 +330,7 @@ def check(config: TrainConfig) -> None:
     if any(not 0 <= share <= 1 for share in at):
         raise ConfigError(f"trainer.evaluate_at={at}: shares of the budget, from 0 to 1")
     _check_decomposition(config.decomposition)
+    _check_preparation(config)
     if config.trainer.devices > 1 and config.trainer.strategy != "ddp":
         raise ConfigError(
             f"trainer.devices={config.trainer.devices} with trainer.strategy=auto: several devices "
@@ -310,6 +340,26 @@ def check(config: TrainConfig) -> None:
         raise ConfigError(
             f"sampler.grid_resolution={config.sampler.grid_resolution} with sampler.time_bins="
             f"{config.sampler.time_bins}: more than 268 million cells; lower one of them"
+        )
+
+
+def _check_preparation(config: TrainConfig) -> None:
+    elevation = config.preparation.elevation
+    if not -90 <= elevation <= 90:
+        raise ConfigError(f"preparation.elevation={elevation}: must lie between -90 and 90")
+    lrm = config.lrm
+    if not isinstance(lrm, PretrainedLRMConfig):
+        return
+    if lrm.crop and lrm.matching == "pad":
+        raise ConfigError(
+            "lrm.crop=true with lrm.matching=pad: a crop settles the size already; set one of "
+            "lrm.crop=false and lrm.matching=scale"
+        )
+    if config.trainer.devices > 1 and config.preparation.cache is None:
+        raise ConfigError(
+            f"preparation.cache=null with lrm={lrm.name} and trainer.devices="
+            f"{config.trainer.devices}: the processes share the start through the cache; name a "
+            "folder"
         )
 
 

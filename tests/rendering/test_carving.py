@@ -65,7 +65,7 @@ def test_a_still_ball_in_a_moving_scene_is_kept(count):
 
 @pytest.mark.parametrize("count", [50, 200])
 @pytest.mark.parametrize(("radius", "turns", "share"), [(0.4, 0.25, 0.0), (0.3, 1, 0.0005)])
-def test_a_moving_ball_is_never_ruled_out_and_most_of_the_rest_is_empty(count, radius, turns, share):
+def test_a_moving_ball_is_never_ruled_out_and_most_else_is_empty(count, radius, turns, share):
     # In the span over which content is taken to stand still, with 50 views, the slow ball moves by
     # at most a fifth of its radius, the fast one by its whole radius.
     path = swinging(0.8, turns)

@@ -46,10 +46,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _known_errors() -> tuple[type[Exception], ...]:
     """Errors whose message says all."""
     from xplanes.config import ConfigError
+    from xplanes.lrm.errors import LRMError
     from xplanes.optional import MissingExtraError
     from xplanes.scenes.errors import SceneError
 
-    return ConfigError, SceneError, MissingExtraError, PermissionError
+    return ConfigError, SceneError, LRMError, MissingExtraError, PermissionError
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -60,7 +61,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"xplanes {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (_add_download, _add_evaluate, _add_render, _add_view, _add_table):
+    for add in (_add_download, _add_triplanes, _add_evaluate, _add_render, _add_view, _add_table):
         add(commands)
     return parser
 
@@ -79,6 +80,23 @@ def _download(options: argparse.Namespace) -> None:
 
     root = download_dnerf(options.root)
     print(f"train with: python train.py data=dnerf data.root={root} data.scene=lego")
+
+
+def _add_triplanes(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser("triplanes", help="turn pictures into triplanes with an LRM")
+    parser.add_argument(
+        "arguments",
+        nargs="+",
+        metavar="IMAGES lrm=NAME lrm.weights=FILE out=FILE.safetensors",
+        help="pictures (with transparency) or folders of them, and settings of train.py",
+    )
+    parser.set_defaults(command=_triplanes)
+
+
+def _triplanes(options: argparse.Namespace) -> None:
+    from xplanes.evaluation.turntable import write_triplanes
+
+    write_triplanes(options.arguments, say=_say)
 
 
 def _add_run(parser: argparse.ArgumentParser) -> None:

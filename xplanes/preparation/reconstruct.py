@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from xplanes.config import PretrainedLRMConfig, TrainConfig
@@ -22,8 +23,11 @@ from xplanes.preparation.fixed_view import FixedView, fixed_view
 from xplanes.preparation.pictures import film_sheet
 from xplanes.preparation.sequence import TriplaneSequence
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.views import Scene, Views
+from xplanes.scenes.views import Scene
 from xplanes.training.builder import training_device
+
+SOLID = 128
+"""Alpha from which a pixel belongs to the object that is cropped."""
 
 
 @dataclass(frozen=True)
@@ -168,16 +172,26 @@ def place(film: FixedView, model: LRM, config: PretrainedLRMConfig) -> Alignment
         target=film.target,
         view=model.view,
         matching="pad" if config.matching == "pad" else "scale",
-        crop=_crop(views) if config.crop else None,
+        crop=picture_crop(views.images, crop=True) if config.crop else None,
     )
 
 
-def _crop(views: Views) -> Crop:
-    """One crop for all frames; none where nothing stands out from the background."""
-    alpha = views.images[..., 3].amax(dim=0)
-    if bool((alpha > 0).all()):
-        return square_crop(views.height, views.width)
+def picture_crop(frames: Tensor, *, crop: bool) -> Crop:
+    """One crop for all frames: around what is opaque in any, or around the whole pictures.
+
+    Args:
+        frames: Premultiplied RGBA. uint8 [T, H, W, 4]
+        crop: Whether the model wants to see the object at a size of its own.
+
+    Raises:
+        LRMError: If nothing is opaque.
+    """
+    alpha = frames[..., 3].amax(dim=0)
+    if not crop or bool((alpha > 0).all()):
+        return square_crop(*alpha.shape)
+    # What is hardly there, such as specks of a field that films, is not the object.
+    solid = torch.where(alpha >= SOLID, alpha, 0)
     try:
-        return foreground_crop(alpha)
+        return foreground_crop(solid)
     except LRMError as problem:
-        raise LRMError(f"the video of the fixed camera: {problem}; set lrm.crop=false") from None
+        raise LRMError(f"{problem}; set lrm.crop=false to show it whole") from None

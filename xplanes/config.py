@@ -138,6 +138,7 @@ class SamplerConfig:
     skip_occluded: bool = MISSING  # Skip samples behind opaque surfaces.
     occlusion: float = MISSING  # Light left behind a surface below which it is opaque.
     silhouettes: bool = MISSING  # Rule out cells that the images' alpha shows to be empty.
+    fill: bool = MISSING  # Empty cells where a start that is not random shows nothing.
     coarse_steps: int = MISSING  # First steps, in which samples lie twice as far apart.
     sweep_at: list[int] = MISSING  # Steps at which all occupied cells are looked at.
     sweep_every: int = MISSING  # Steps between such sweeps later on.

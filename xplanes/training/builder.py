@@ -22,6 +22,7 @@ from xplanes.fields import Decoder, XPlanes
 from xplanes.fields.decoder import Precision
 from xplanes.fields.xplanes import random_planes
 from xplanes.rendering.carving import carve
+from xplanes.rendering.filling import fill
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.renderer import DIAGONAL, Renderer
 from xplanes.scenes.batches import RayBatches, step_generator
@@ -34,6 +35,9 @@ from xplanes.training.product import SparseProduct
 
 START_STREAM = 1_000_033
 """Random stream of the start values."""
+
+FILL_STREAM = 1_000_081
+"""Random stream of the points at which the grid of a field that has begun is filled."""
 
 
 def build_scene(config: DataConfig, splits: tuple[str, ...] | None = None) -> Scene:
@@ -191,6 +195,9 @@ def build_module(
     renderer = build_renderer(config.sampler, still=is_still(views))
     if config.sampler.silhouettes:
         carve(renderer.grid, views, frame)
+    if planes is not None and config.sampler.fill:
+        generator = step_generator(config.seed, 0, FILL_STREAM)
+        fill(renderer.grid, field, views, frame, step=renderer.step, generator=generator)
     product = None
     if sparse is not None and field.time is not None and config.loss.sparse_weight:
         product = SparseProduct(sparse, field.rows, config.loss.sparse_frames)

@@ -94,9 +94,17 @@ def _add_triplanes(commands: "argparse._SubParsersAction") -> None:
 
 
 def _triplanes(options: argparse.Namespace) -> None:
+    from xplanes.launch import settings
+
+    changed = [text for text in options.arguments if "=" in text and not Path(text).exists()]
+    paths = [Path(text) for text in options.arguments if text not in changed]
+    outs = [text for text in changed if text.startswith("out=")]
+    config = settings([text for text in changed if text not in outs])
+    out = outs[-1].removeprefix("out=") if outs else "triplanes.safetensors"
+
     from xplanes.evaluation.turntable import write_triplanes
 
-    write_triplanes(options.arguments, say=_say)
+    write_triplanes(paths, Path(out), config, say=_say)
 
 
 def _add_run(parser: argparse.ArgumentParser) -> None:

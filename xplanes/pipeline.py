@@ -14,7 +14,8 @@ import torch
 import yaml
 from lightning import seed_everything
 
-from xplanes.config import ConfigError, TrainConfig, parse
+from xplanes.checks import parse
+from xplanes.config import ConfigError, TrainConfig
 from xplanes.evaluation.media import film_times, orbit_poses, render_path, write_film
 from xplanes.evaluation.report import closing, header, summary, write_hparams, write_start
 from xplanes.files import write_json, write_text

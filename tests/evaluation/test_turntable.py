@@ -13,6 +13,7 @@ from xplanes.cli import main
 from xplanes.config import ConfigError
 from xplanes.evaluation import turntable as module
 from xplanes.evaluation.turntable import find_pictures, turntable, write_triplanes
+from xplanes.launch import settings
 from xplanes.lrm import LRMError
 from xplanes.preparation import load_triplanes
 from xplanes.preparation.encode import straight_alpha
@@ -80,13 +81,14 @@ def test_the_film_begins_at_the_models_camera_and_goes_round(few):
 
 
 def test_settings_that_make_no_triplanes_are_refused(tmp_path: Path, pictures):
-    def make(*arguments):
-        write_triplanes([str(pictures), *arguments], say=lambda _: None)
+    def make(*arguments, out="made.pt"):
+        config = settings(list(arguments))
+        write_triplanes([pictures], Path(out), config, say=lambda _: None)
 
     with pytest.raises(ConfigError, match=r"lrm=none makes no triplanes.*lrm=small"):
         make("lrm=none")
     with pytest.raises(ConfigError, match=r"out=made\.zip: must end in"):
-        make("lrm=small", "out=made.zip")
+        make("lrm=small", out="made.zip")
     with pytest.raises(ConfigError, match=r"Did you mean lrm\.weights"):
         make("lrm=small", "lrm.weight=a")
     with pytest.raises(LRMError, match=r"lrm\.weights=absent\.pt is not a file"):
@@ -106,14 +108,7 @@ def test_opaque_pictures_are_remarked_upon(tmp_path: Path, few):
     picture = tmp_path / "opaque.png"
     Image.fromarray(np.full((30, 30, 3), 90, np.uint8)).save(picture)
     said: list[str] = []
-    write_triplanes(
-        [
-            str(picture),
-            "lrm=small",
-            f"lrm.weights={publish(tmp_path, 'openlrm-1.1')}",
-            "preparation.cache=null",
-            f"out={tmp_path}/a.pt",
-        ],
-        say=said.append,
-    )
+    weights = publish(tmp_path, "openlrm-1.1")
+    config = settings(["lrm=small", f"lrm.weights={weights}", "preparation.cache=null"])
+    write_triplanes([picture], tmp_path / "a.pt", config, say=said.append)
     assert any("no transparency" in line for line in said)

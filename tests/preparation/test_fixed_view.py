@@ -9,7 +9,7 @@ import torch
 
 from tests.synthetic import ball_scene, ball_views, inside_ball
 from tests.training.runs import small_config
-from xplanes.config import parse
+from xplanes.checks import parse
 from xplanes.lrm.alignment import align
 from xplanes.lrm.canonical import OPENLRM_VIEW, TRIPOSR_VIEW
 from xplanes.preparation import fixed_view as module

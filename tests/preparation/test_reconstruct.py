@@ -10,7 +10,8 @@ import torch
 from tests.lrm.reduced import SIDES, reduced
 from tests.synthetic import ball_scene, ball_views, inside_ball, surrounding
 from tests.training.runs import small_config
-from xplanes.config import ConfigError, parse
+from xplanes.checks import parse
+from xplanes.config import ConfigError
 from xplanes.fields import Decoder, XPlanes
 from xplanes.lrm import LRMError
 from xplanes.lrm.triposr import CHORD

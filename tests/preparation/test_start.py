@@ -11,8 +11,9 @@ from tests.preparation.sequences import blob, moving_sequence, still_features
 from tests.synthetic import ball_scene
 from tests.training.runs import small_config
 from xplanes import decomposition
-from xplanes.config import _CHOICES as CHOICES
-from xplanes.config import ConfigError, parse
+from xplanes.checks import _CHOICES as CHOICES
+from xplanes.checks import parse
+from xplanes.config import ConfigError
 from xplanes.decomposition import TIME_ROWS, unexplained_energy
 from xplanes.decomposition.conversion import DYNAMIC, STATIC
 from xplanes.decomposition.rpca import METHODS, SCALES

@@ -7,11 +7,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from xplanes.config import ConfigError, PretrainedLRMConfig, parse, register_schemas, to_plain
+from xplanes.config import ConfigError, PretrainedLRMConfig, TrainConfig
 from xplanes.evaluation.media import render_path, write_film
 from xplanes.fields import XPlanes
 from xplanes.fields.xplanes import SPACE_PLANES
-from xplanes.launch import CONF, check_keys
 from xplanes.lrm.model import LRM
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.encode import encode
@@ -32,36 +31,33 @@ GRID_STREAM = 1_000_061
 """Random stream of the points at which the preview's grid is filled."""
 
 
-def write_triplanes(arguments: Sequence[str], *, say: Callable[[str], None]) -> Path:
+def write_triplanes(
+    paths: Sequence[Path], out: Path, config: TrainConfig, *, say: Callable[[str], None]
+) -> Path:
     """Turn pictures into triplanes, and write them and a film that goes round them.
 
     Args:
-        arguments: Pictures or folders of them, and settings ``key=value`` of train.py; ``out=FILE``
-            names the file to write, ``triplanes.safetensors`` if it is left out.
+        paths: Pictures, or folders of them.
+        out: File to write, .safetensors or .pt; the film lies beside it.
+        config: Settings, of which the model's, the cache and the device count.
         say: Takes lines about what happens.
 
     Returns:
-        The file; the film lies beside it.
+        The film.
 
     Raises:
         ConfigError, LRMError, SceneError: If a setting, the weights or a picture cannot be used.
     """
-    settings = [text for text in arguments if "=" in text and not Path(text).exists()]
-    paths = find_pictures([Path(text) for text in arguments if text not in settings])
-    out = Path("triplanes.safetensors")
-    for text in [text for text in settings if text.startswith("out=")]:
-        out = Path(text.removeprefix("out="))
-        settings.remove(text)
+    pictures = find_pictures(paths)
     if out.suffix not in (".safetensors", ".pt"):
         raise ConfigError(f"out={out}: must end in .safetensors or .pt")
-    config = _config(settings)
     options = config.lrm
     if not isinstance(options, PretrainedLRMConfig):
         raise ConfigError(
             f"lrm={options.name} makes no triplanes of pictures: choose a model, such as lrm=small"
         )
     lrm = load_lrm(options, say=say)
-    frames = load_images(paths, None)
+    frames = load_images(pictures, None)
     if bool((frames[..., 3] == 255).all()):
         say("the pictures have no transparency: the model takes the background for a thing")
     folder = config.preparation.cache
@@ -86,7 +82,7 @@ def write_triplanes(arguments: Sequence[str], *, say: Callable[[str], None]) -> 
     film = out.with_suffix(".webp")
     write_film(film, turntable(encoded.triplanes, lrm.model, device), fps=FPS)
     say(f"wrote {film}")
-    return out
+    return film
 
 
 def find_pictures(paths: Sequence[Path]) -> list[Path]:
@@ -153,16 +149,3 @@ def turntable(triplanes: Tensor, model: LRM, device: torch.device) -> Iterator[T
             size=SIDE,
             background=torch.ones(3),
         )
-
-
-def _config(settings: list[str]):
-    from hydra import compose, initialize_config_dir
-    from hydra.errors import HydraException
-
-    check_keys(settings)
-    register_schemas()
-    try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            return parse(to_plain(compose("train", settings)))
-    except HydraException as error:
-        raise ConfigError(str(error)) from error

@@ -9,6 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
+from xplanes.checks import check
 from xplanes.config import (
     ConfigError,
     LRMConfig,
@@ -17,7 +18,6 @@ from xplanes.config import (
     TrainConfig,
     TriplaneFileConfig,
     build,
-    check,
 )
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.reconstruct import LoadedLRM, load_lrm, reconstruct

@@ -42,12 +42,13 @@ def fill(
     for index in range(len(views)):
         solid = (views.images[index, ..., 3] >= SOLID).flatten()
         origins, directions = (ray[solid] for ray in views.image_rays(index))
-        rays = [ray.to(kept.device) for ray in frame.rays(origins, directions)]
+        origins, directions = frame.rays(origins, directions)
+        origins, directions = origins.to(kept.device), directions.to(kept.device)
         time = views.times[index].to(kept.device)
         met = torch.zeros(len(origins), dtype=torch.bool, device=kept.device)
-        met[_samples(grid, *rays, time, step).ray] = True
+        met[_samples(grid, origins, directions, time, step).ray] = True
         grid.occupied.copy_(occupied)
-        missing[_samples(grid, *(ray[~met] for ray in rays), time, step).cells] = True
+        missing[_samples(grid, origins[~met], directions[~met], time, step).cells] = True
         grid.occupied.copy_(kept)
     missing &= ~kept
     grid.density[missing] = density[missing]

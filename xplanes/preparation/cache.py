@@ -28,7 +28,7 @@ except ImportError:  # Not on Windows; two processes may then do the same work.
 
 logger = logging.getLogger(__name__)
 
-VERSION = 1
+VERSION = 2
 """Raised when a stage would come out differently from the same inputs."""
 
 

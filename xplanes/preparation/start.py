@@ -208,14 +208,14 @@ def _settled(
 def _warn(parts: Parts, config: TrainConfig) -> None:
     """Say once which orientations did not converge."""
     open_ones = [
-        f"{name} (residual {report['residual']:.1e})"
+        f"{name} (residual {report['residual']:.1e}, last step {report['change']:.1e})"
         for name, report in parts.report.items()
         if not report["converged"]
     ]
     if open_ones:
         logger.warning(
             "the decomposition of %s did not converge within decomposition.max_iterations=%d to "
-            "decomposition.tolerance=%g: raise one of them",
+            "decomposition.tolerance=%g (ten times that for the last step): raise one of them",
             ", ".join(open_ones),
             config.decomposition.max_iterations,
             config.decomposition.tolerance,

@@ -55,7 +55,8 @@ data.val_views model.resolution model.time_resolution model.channels model.decod
 model.decoder.density_scale sampler.samples sampler.grid_resolution sampler.time_bins
 sampler.threshold sampler.sweep_every sampler.update_every sampler.update_cells loss.every
 loss.sparse_frames decomposition.penalty decomposition.tolerance decomposition.max_iterations
-preparation.frames preparation.fixed_view_seconds lrm.megabytes lrm.batch trainer.devices
+preparation.frames preparation.fixed_view_seconds
+preparation.fixed_view_steps lrm.megabytes lrm.batch trainer.devices
 trainer.max_steps trainer.max_seconds trainer.rays_per_batch trainer.samples_per_batch
 trainer.accumulate trainer.plane_lr trainer.time_lr trainer.decoder_lr trainer.checkpoint_every
 trainer.evaluate_views trainer.log_every""".split()

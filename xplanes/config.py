@@ -119,6 +119,7 @@ class PreparationConfig:
     frames: int = MISSING  # Moments of the fixed view.
     fixed_view: str = MISSING  # The scene's video, train (a field films it), or auto.
     fixed_view_seconds: float = MISSING  # Training clock of the field that films it.
+    fixed_view_steps: int = MISSING  # Its steps at most.
     azimuth: float | None = MISSING  # Degrees from x towards y; null: a training view's.
     elevation: float = MISSING  # Its height angle in degrees.
 

@@ -27,7 +27,7 @@ def settings(folder: Path, *overrides: str):
             folder,
             "preparation.frames=4",
             "preparation.fixed_view_seconds=1000",
-            "trainer.max_steps=60",
+            "preparation.fixed_view_steps=60",
             *overrides,
         )
     )
@@ -145,13 +145,15 @@ def test_a_field_films_the_scene_and_the_film_is_kept(tmp_path: Path, monkeypatc
 
 
 def test_a_still_scene_is_filmed_once(tmp_path: Path):
-    made, _ = film(settings(tmp_path, "trainer.max_steps=5"), ball_scene(moving=False), tmp_path)
+    made, _ = film(
+        settings(tmp_path, "preparation.fixed_view_steps=5"), ball_scene(moving=False), tmp_path
+    )
     assert len(made.views) == 1
 
 
 def test_an_interrupted_field_goes_on_where_it_stopped(tmp_path: Path, monkeypatch):
     scene, cache = ball_scene(count=12, size=24), tmp_path / "cache"
-    config = settings(tmp_path, "trainer.max_steps=20")
+    config = settings(tmp_path, "preparation.fixed_view_steps=20")
 
     def stop(*_):
         raise KeyboardInterrupt

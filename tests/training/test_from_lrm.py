@@ -24,6 +24,7 @@ def settings(place: Path, name: str, *overrides: str) -> dict:
         f"preparation.cache={place}/cache",
         "preparation.frames=3",
         "preparation.fixed_view_seconds=1000",
+        "preparation.fixed_view_steps=12",
         "trainer.max_steps=12",
         *overrides,
     )

@@ -188,6 +188,7 @@ def _rendered(
             devices=1,
             strategy="auto",
             max_seconds=options.fixed_view_seconds,
+            max_steps=options.fixed_view_steps,
             checkpoint_every=CHECKPOINT_EVERY,
             evaluate_at=[],
             media=False,

@@ -5,10 +5,12 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 from xplanes.config import (
+    BundledLRMConfig,
     ConfigError,
     DataConfig,
     DecompositionConfig,
     DemoConfig,
+    ImageLRMConfig,
     LossConfig,
     LRMConfig,
     ModelConfig,
@@ -32,6 +34,8 @@ def parse(config: dict[str, Any]) -> TrainConfig:
     lrm = LRMConfig
     if "triplanes" in config["lrm"]:
         lrm = TriplaneFileConfig
+    elif "bundled" in config["lrm"]:
+        lrm = BundledLRMConfig
     elif "architecture" in config["lrm"]:
         lrm = PretrainedLRMConfig
     typed = TrainConfig(
@@ -124,7 +128,7 @@ def _check_preparation(config: TrainConfig) -> None:
     if not -90 <= elevation <= 90:
         raise ConfigError(f"preparation.elevation={elevation}: must lie between -90 and 90")
     lrm = config.lrm
-    if not isinstance(lrm, PretrainedLRMConfig):
+    if not isinstance(lrm, ImageLRMConfig):
         return
     if lrm.crop and lrm.matching == "pad":
         raise ConfigError(

@@ -19,6 +19,7 @@ class DataConfig:
     scene: str = MISSING  # Folder of the scene, or name of the demo scene.
     resolution: int | None = MISSING  # Pixels per side; null keeps the native size.
     views: int | None = MISSING  # Training views kept, spread over time; null keeps all.
+    train_on_video: bool = MISSING  # Train on the frames of the scene's fixed camera too.
     eval_split: str = MISSING  # Split that is scored: test or val.
     half_side: float | None = MISSING  # Half the side of the scene's cube; null finds it.
     background_share: float = MISSING  # Share of rays drawn far from the silhouettes.
@@ -78,8 +79,25 @@ class TriplaneFileConfig(LRMConfig):
 
 
 @dataclass
-class PretrainedLRMConfig(LRMConfig):
-    """A published model: its weights, and how it meets the scene's pictures."""
+class ImageLRMConfig(LRMConfig):
+    """A model, and how it meets the scene's pictures."""
+
+    weights: str | None = MISSING  # A local file instead.
+    matching: str = MISSING  # Where focal lengths differ: scale, or pad the pictures (exact).
+    crop: bool = MISSING  # Show the model the object at the size that it was trained with.
+    batch: int = MISSING  # Pictures at a time.
+
+
+@dataclass
+class BundledLRMConfig(ImageLRMConfig):
+    """A model of the package, or with `weights` one of the same form."""
+
+    bundled: str = MISSING  # Name of its files in the package.
+
+
+@dataclass
+class PretrainedLRMConfig(ImageLRMConfig):
+    """A published model."""
 
     architecture: str = MISSING  # One of openlrm-{small,base,large}-{1.0,1.1} and triposr.
     repository: str = MISSING  # On the Hugging Face hub.
@@ -87,11 +105,7 @@ class PretrainedLRMConfig(LRMConfig):
     revision: str = MISSING  # Branch, tag or commit there.
     licence: str = MISSING  # Of the weights.
     megabytes: int = MISSING  # Size of the file.
-    weights: str | None = MISSING  # A local file instead.
     config: str | None = MISSING  # A config.json or config.yaml for weights of other sizes.
-    matching: str = MISSING  # Where focal lengths differ: scale, or pad the pictures (exact).
-    crop: bool = MISSING  # Show the model the object at the size that it was trained with.
-    batch: int = MISSING  # Pictures at a time.
 
 
 @dataclass
@@ -209,6 +223,7 @@ SCHEMAS: dict[tuple[str | None, str], type] = {
     ("model", "xplanes_schema"): ModelConfig,
     ("lrm", "lrm_schema"): LRMConfig,
     ("lrm", "file_schema"): TriplaneFileConfig,
+    ("lrm", "bundled_lrm_schema"): BundledLRMConfig,
     ("lrm", "pretrained_lrm_schema"): PretrainedLRMConfig,
     ("preparation", "preparation_schema"): PreparationConfig,
     ("decomposition", "decomposition_schema"): DecompositionConfig,

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from xplanes.config import ConfigError, PretrainedLRMConfig, TrainConfig
+from xplanes.config import ConfigError, ImageLRMConfig, TrainConfig
 from xplanes.evaluation.media import render_path, write_film
 from xplanes.fields import XPlanes
 from xplanes.fields.xplanes import SPACE_PLANES
@@ -52,7 +52,7 @@ def write_triplanes(
     if out.suffix not in (".safetensors", ".pt"):
         raise ConfigError(f"out={out}: must end in .safetensors or .pt")
     options = config.lrm
-    if not isinstance(options, PretrainedLRMConfig):
+    if not isinstance(options, ImageLRMConfig):
         raise ConfigError(
             f"lrm={options.name} makes no triplanes of pictures: choose a model, such as lrm=small"
         )

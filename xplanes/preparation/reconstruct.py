@@ -10,8 +10,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from xplanes.config import PretrainedLRMConfig, TrainConfig
+from xplanes.config import (
+    BundledLRMConfig,
+    ImageLRMConfig,
+    PretrainedLRMConfig,
+    TrainConfig,
+)
 from xplanes.lrm.alignment import Alignment, align
+from xplanes.lrm.bundled import load_bundled
 from xplanes.lrm.cube import fit_cube
 from xplanes.lrm.errors import LRMError
 from xplanes.lrm.images import Crop, foreground_crop, square_crop
@@ -78,16 +84,25 @@ def weight_source(config: PretrainedLRMConfig) -> WeightSource:
     )
 
 
-def load_lrm(config: PretrainedLRMConfig, *, say: Callable[[str], None]) -> LoadedLRM:
+def load_lrm(config: ImageLRMConfig, *, say: Callable[[str], None]) -> LoadedLRM:
     """Find the weights, downloading them if need be, and load them.
 
     Raises:
         LRMError: If no weights can be had, or they do not fit.
     """
-    source = weight_source(config)
-    path = find_weights(source, announce=say)
     began = time.perf_counter()
-    model = load_weights(source, path, announce=say)
+    if isinstance(config, BundledLRMConfig):
+        own = None if config.weights is None else Path(config.weights)
+        model, path = (
+            load_bundled(config.bundled) if own is None else load_bundled(own.stem, own.parent)
+        )
+    elif isinstance(config, PretrainedLRMConfig):
+        source = weight_source(config)
+        path = find_weights(source, announce=say)
+        began = time.perf_counter()
+        model = load_weights(source, path, announce=say)
+    else:
+        raise TypeError(f"{type(config).__name__} names no weights")
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     key = fingerprint([digest, repr(model.config), repr(model.view)])
@@ -140,7 +155,7 @@ def reconstruct(
         "mismatch_pixels": {"largest": apart.largest, "mean": apart.mean},
     }
     words = (
-        f"{options.name} ({options.architecture}) on {film.words}, pictures and field up to "
+        f"{options.name} ({model.config.architecture}) on {film.words}, pictures and field up to "
         f"{apart.largest:.1f} px apart"
     )
     return Reconstruction(
@@ -157,7 +172,7 @@ def reconstruct(
     )
 
 
-def place(film: FixedView, model: LRM, config: PretrainedLRMConfig) -> Alignment:
+def place(film: FixedView, model: LRM, config: ImageLRMConfig) -> Alignment:
     """Where the model's field lies in the world.
 
     Raises:

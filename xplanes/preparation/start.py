@@ -12,9 +12,9 @@ from torch import Tensor
 from xplanes.checks import check
 from xplanes.config import (
     ConfigError,
+    ImageLRMConfig,
     LRMConfig,
     ModelConfig,
-    PretrainedLRMConfig,
     TrainConfig,
     TriplaneFileConfig,
     build,
@@ -84,7 +84,7 @@ def find_source(config: LRMConfig, *, say: Callable[[str], None] = print) -> Sou
         ConfigError: If a file is missing or not named.
         LRMError: If the weights of a model cannot be had, or do not fit.
     """
-    if isinstance(config, PretrainedLRMConfig):
+    if isinstance(config, ImageLRMConfig):
         return load_lrm(config, say=say)
     if not isinstance(config, TriplaneFileConfig):
         return None

@@ -28,8 +28,9 @@ from xplanes.rendering.renderer import DIAGONAL, Renderer
 from xplanes.scenes.batches import RayBatches, step_generator
 from xplanes.scenes.demo import ensure_demo_scene
 from xplanes.scenes.dnerf import read_scene
+from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, frame_content
-from xplanes.scenes.views import Scene, Views
+from xplanes.scenes.views import Scene, Views, joined
 from xplanes.training.module import RadianceModule
 from xplanes.training.product import SparseProduct
 
@@ -64,7 +65,15 @@ def build_scene(config: DataConfig, splits: tuple[str, ...] | None = None) -> Sc
         splits=splits or ("train", config.eval_split),
         views=config.views,
     )
-    return Scene(config.scene, scene.splits, scene.video, scene.background)
+    parts = dict(scene.splits)
+    if config.train_on_video and "train" in parts:
+        if scene.video is None:
+            raise SceneError(
+                f"data.train_on_video=true: {folder} has no video of a fixed camera "
+                "(transforms_video.json); set it to false"
+            )
+        parts["train"] = joined(parts["train"], scene.video)
+    return Scene(config.scene, parts, scene.video, scene.background)
 
 
 def training_device(name: str) -> torch.device:

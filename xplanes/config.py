@@ -134,7 +134,7 @@ class PreparationConfig:
     fixed_view: str = MISSING  # The scene's video, train (a field films it), or auto.
     fixed_view_seconds: float = MISSING  # Training clock of the field that films it.
     fixed_view_steps: int = MISSING  # Its steps at most.
-    azimuth: float | None = MISSING  # Degrees from x towards y; null: a training view's.
+    azimuth: float | None = MISSING  # Degrees from x towards y; null: along an axis.
     elevation: float = MISSING  # Its height angle in degrees.
 
 

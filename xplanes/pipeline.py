@@ -120,7 +120,7 @@ def train(
         device = training_device(config.trainer.accelerator)
         record.note(
             device=torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
-            precision=module.field.decoder.precision,
+            precision=module.field.precision,
             files={name: list(views.files) for name, views in scene.splits.items()},
         )
         text = header(config, folder, scene, frame, module, device, overrides or [], start.words)

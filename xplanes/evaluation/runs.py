@@ -54,7 +54,7 @@ class TrainedRun:
     @property
     def is_still(self) -> bool:
         """Whether the field has no time."""
-        return self.module.field.time is None
+        return not self.module.field.moves
 
 
 def find_run(path: Path, outputs: Path = OUTPUTS) -> Path:

@@ -31,8 +31,10 @@ from xplanes.scenes.dnerf import read_scene
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, frame_content
 from xplanes.scenes.views import Scene, Views, joined
+from xplanes.training.methods.xplanes import XPlanesMethod
 from xplanes.training.module import RadianceModule
 from xplanes.training.product import SparseProduct
+from xplanes.training.sampling.occupancy import OccupancySampling
 
 START_STREAM = 1_000_033
 """Random stream of the start values."""
@@ -217,13 +219,10 @@ def build_module(
         product = SparseProduct(sparse, field.rows, config.loss.sparse_frames)
     origin = {"model": asdict(config.model), "frame": frame_content(frame)}
     return RadianceModule(
-        field,
-        renderer,
-        loss=config.loss,
-        sampler=config.sampler,
+        XPlanesMethod(field, loss=config.loss, trainer=config.trainer, product=product),
+        OccupancySampling(renderer, config.sampler),
         trainer=config.trainer,
         seed=config.seed,
-        product=product,
         origin=None if planes is None else origin,
     )
 

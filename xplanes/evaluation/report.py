@@ -115,7 +115,7 @@ def write_hparams(run: Path, config: TrainConfig, metrics: dict[str, Any]) -> No
         "channels": config.model.channels,
         "lrm": config.lrm.name,
         "seed": config.seed,
-        "plane_lr": config.trainer.plane_lr,
+        "learning_rate": getattr(config.model, "learning_rate", config.trainer.plane_lr),
     }
     scores = {f"test/{name}": value for name, value in metrics["test"].items()}
     scores["time/train_s"] = metrics["seconds"]["train"]

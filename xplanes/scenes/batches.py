@@ -39,7 +39,8 @@ class RayBatches:
         frame: The field's frame, in which rays are served.
         rays: Rays per batch.
         seed: The run's seed.
-        background: "white", or "random": another colour behind each ray, in the target too.
+        background: Behind rays, in the target too: "white", "random" (another colour for each ray)
+            or "one" (one random colour for the batch).
         skip_background: Whether rays far from the silhouettes are drawn at ``background_share``
             instead of at their share of the pixels. They show nothing but background, and teach
             only while the grid of occupied cells is wrong.
@@ -98,11 +99,12 @@ class RayBatches:
         origins, directions = self.frame.rays(origins, directions)
         colour = self.views.images.view(-1, 4)[pixel].float() / 255
         shape = (self.rays, 3)
-        background = (
-            torch.rand(shape, generator=generator)
-            if self.background == "random"
-            else torch.ones(shape)
-        )
+        if self.background == "random":
+            background = torch.rand(shape, generator=generator)
+        elif self.background == "one":
+            background = torch.rand(3, generator=generator).expand(shape)
+        else:
+            background = torch.ones(shape)
         return {
             "origins": origins,
             "directions": directions,

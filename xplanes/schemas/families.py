@@ -1,0 +1,109 @@
+"""Which settings go together: families of models, their losses and samplers."""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from xplanes.schemas.kplanes import KPlanesConfig, KPlanesLossConfig
+from xplanes.schemas.samplers import (
+    ProposalConfig,
+    SamplerConfig,
+    occupancy_conflict,
+    proposal_conflict,
+)
+
+
+@dataclass(frozen=True)
+class Family:
+    """What goes with a family of models.
+
+    Attributes:
+        model: Schema of the model group.
+        loss: Schema of the loss group.
+        samplers: Names of the samplers that can place its samples.
+    """
+
+    model: type
+    loss: type
+    samplers: tuple[str, ...]
+
+
+FAMILIES = {
+    "kplanes": Family(KPlanesConfig, KPlanesLossConfig, ("proposal", "occupancy")),
+}
+"""By ``model.family``; models without that key are X-Planes."""
+
+SAMPLERS: dict[str, type] = {"proposal": ProposalConfig}
+"""By ``sampler.name``; all others are settings of the occupancy grid."""
+
+SCHEMAS: dict[tuple[str, str], type] = {
+    ("model", "kplanes_schema"): KPlanesConfig,
+    ("loss", "kplanes_schema"): KPlanesLossConfig,
+    ("sampler", "proposal_schema"): ProposalConfig,
+}
+
+POSITIVE = """model.half_side model.width model.learning_rate sampler.far
+sampler.time_resolution sampler.channels sampler.width sampler.anneal_steps
+sampler.anneal_slope sampler.update_warmup sampler.learning_rate""".split()
+NOT_NEGATIVE = """model.warmup_steps loss.time_identity sampler.near
+sampler.padding sampler.histogram sampler.total_variation sampler.time_smoothness
+sampler.time_identity""".split()
+CHOICES: dict[str, tuple[str, ...]] = {
+    "model.variant": ("hybrid", "explicit"),
+    "loss.variation": ("coded", "corrected"),
+    "sampler.variation": ("coded", "corrected"),
+}
+
+LISTS = ("scales", "proposal_samples", "resolutions")
+"""Keys that hold one or more numbers above 0."""
+
+XPLANES_RATES = """trainer.plane_lr trainer.time_lr trainer.decoder_lr trainer.warmup_steps
+trainer.final_lr""".split()
+"""Keys that only X-Planes use; baselines bring learning rates of their own."""
+
+
+_CONFLICTS = {SamplerConfig: occupancy_conflict, ProposalConfig: proposal_conflict}
+
+
+def misfit(config: dict[str, Any], family: Family, losses: str) -> str | None:
+    """What is wrong between the groups of a plain configuration, in words; None for nothing.
+
+    Args:
+        config: The configuration.
+        family: The family of its model.
+        losses: The option of the loss group that fits it.
+    """
+    model, sampler, lrm = (config[group]["name"] for group in ("model", "sampler", "lrm"))
+    known = {entry.name for entry in fields(family.loss)}
+    if strange := sorted(set(config["loss"]) - known):
+        return f"loss.{strange[0]} with model={model}: it has no such term; set loss={losses}"
+    kind = sampler if sampler in SAMPLERS else "occupancy"
+    if kind not in family.samplers:
+        return f"sampler={sampler} with model={model}: must be one of {', '.join(family.samplers)}"
+    if family in FAMILIES.values() and lrm != "none":
+        return (
+            f"lrm={lrm} with model={model}: triplanes start X-Planes alone; set lrm=none, "
+            "or model=six_planes or model=nine_planes"
+        )
+    return None
+
+
+def conflict(config: Any) -> str | None:
+    """What is wrong between settings that each are allowed, in words; None for nothing."""
+    for group in ("model", "sampler"):
+        settings = getattr(config, group)
+        if hasattr(settings, "space_low") and settings.space_low > settings.space_high:
+            return (
+                f"{group}.space_low={settings.space_low}: must not be above "
+                f"{group}.space_high={settings.space_high}"
+            )
+        for name in LISTS:
+            values = getattr(settings, name, [1])
+            if not values or min(values) < 1:
+                return f"{group}.{name}={values}: must be one or more numbers above 0"
+    baseline = any(isinstance(config.model, family.model) for family in FAMILIES.values())
+    if config.trainer.devices > 1 and (baseline or isinstance(config.sampler, ProposalConfig)):
+        return (
+            f"trainer.devices={config.trainer.devices} with model={config.model.name} and "
+            f"sampler={config.sampler.name}: they train on one device; set trainer.devices=1"
+        )
+    return _CONFLICTS[type(config.sampler)](config.sampler)

@@ -1,0 +1,158 @@
+"""The published baselines and their samplers from settings: names to classes, for the builder."""
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from xplanes.config import ConfigError, TrainConfig
+from xplanes.fields.base import RadianceField
+from xplanes.fields.kplanes import DensityField, ExplicitDecoder, HybridDecoder, KPlanes
+from xplanes.fields.products import PlaneProducts
+from xplanes.rendering.proposal import ProposalRenderer
+from xplanes.scenes.batches import step_generator
+from xplanes.scenes.frame import Frame, cube_frame, scene_frame
+from xplanes.scenes.views import Views
+from xplanes.schemas.kplanes import KPlanesConfig
+from xplanes.schemas.samplers import ProposalConfig
+from xplanes.training.methods.base import Method
+from xplanes.training.methods.kplanes import KPlanesMethod
+from xplanes.training.sampling.base import Sampling
+from xplanes.training.sampling.proposal import ProposalSampling
+
+FIELD_STREAM, SAMPLER_STREAM = 1_000_099, 1_000_117
+"""Random streams of the start values."""
+
+
+@dataclass(frozen=True)
+class Site:
+    """What a field is built for.
+
+    Attributes:
+        views: Training views.
+        frame: The field's frame.
+        precision: Of matrix products: "32" or "bf16".
+        begun: Whether the field starts from something that it shows.
+    """
+
+    views: Views
+    frame: Frame
+    precision: str
+    begun: bool = False
+
+    @property
+    def unit(self) -> float:
+        """World units per unit of the frame."""
+        return 1 / self.frame.scale
+
+    @property
+    def moments(self) -> int:
+        """Number of distinct times; 1 for a scene that stands still."""
+        return len(self.views.times.unique())
+
+
+@contextmanager
+def start_values(seed: int, stream: int) -> Iterator[None]:
+    """Draw random start values from a stream of the run's seed, and leave other streams alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(step_generator(seed, 0, stream).initial_seed())
+        yield
+
+
+def kplanes_frame(config: TrainConfig, views: Views) -> Frame:
+    """A cube around the world's origin, or the scene's."""
+    if config.model.half_side is None:
+        return scene_frame(views, config.data.half_side)
+    return cube_frame(config.model.half_side, torch.zeros(3))
+
+
+def kplanes_method(config: TrainConfig, site: Site) -> Method:
+    """K-Planes, hybrid or explicit."""
+    model: KPlanesConfig = config.model
+    rows = model.time_resolution or max(2, math.ceil(site.moments / 2))
+    decoder = {"hybrid": HybridDecoder, "explicit": ExplicitDecoder}[model.variant]
+    with start_values(config.seed, FIELD_STREAM):
+        products = PlaneProducts(
+            model.channels,
+            model.resolution,
+            model.scales,
+            rows if site.moments > 1 else None,
+            low=model.space_low,
+            high=model.space_high,
+        )
+        decode = decoder(products.features, model.width, precision=site.precision)
+    return KPlanesMethod(KPlanes(products, decode, site.unit), model, config.loss)
+
+
+def proposal_sampling(config: TrainConfig, site: Site, field: RadianceField) -> Sampling:
+    """Density fields that train along, for any field."""
+    sampler: ProposalConfig = config.sampler
+    bounds = {}
+    if sampler.near is not None and sampler.far is not None:
+        check_range(site, sampler.near, sampler.far)
+        bounds = {"near": sampler.near * site.frame.scale, "far": sampler.far * site.frame.scale}
+    proposals = nn.ModuleList()
+    with start_values(config.seed, SAMPLER_STREAM):
+        for resolution in sampler.resolutions:
+            products = PlaneProducts(
+                sampler.channels,
+                resolution,
+                [1],
+                sampler.time_resolution if site.moments > 1 else None,
+                low=sampler.space_low,
+                high=sampler.space_high,
+            )
+            proposals.append(
+                DensityField(
+                    products,
+                    sampler.width,
+                    linear=sampler.linear,
+                    unit=site.unit,
+                    precision=site.precision,
+                )
+            )
+    renderer = ProposalRenderer(
+        proposals, sampler.proposal_samples, sampler.samples, padding=sampler.padding, **bounds
+    )
+    return ProposalSampling(renderer, sampler)
+
+
+def check_range(site: Site, near: float, far: float) -> None:
+    """Refuse distances between which the cameras do not see the centre of the field's cube.
+
+    Raises:
+        ConfigError: With the cameras' distances.
+    """
+    away = (site.views.camera_to_world[:, :3, 3] - site.frame.centre).norm(dim=-1)
+    nearest, farthest = float(away.min()), float(away.max())
+    if nearest <= near or farthest >= far:
+        raise ConfigError(
+            f"sampler.near={near} with sampler.far={far}: the cameras stand {nearest:.3g} to "
+            f"{farthest:.3g} world units from the centre of the field's cube; set both to numbers "
+            "around these"
+        )
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a family of models is built.
+
+    Attributes:
+        frame: Its frame, for training views.
+        method: Its field and training.
+    """
+
+    frame: Callable[[TrainConfig, Views], Frame]
+    method: Callable[[TrainConfig, Site], Method]
+
+
+PLANS: dict[type, Plan] = {KPlanesConfig: Plan(kplanes_frame, kplanes_method)}
+"""By the schema of the model group."""
+
+SAMPLINGS: dict[type, Callable[[TrainConfig, Site, RadianceField], Sampling]] = {
+    ProposalConfig: proposal_sampling,
+}
+"""By the schema of the sampler group."""

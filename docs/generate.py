@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from xplanes import config as schemas
-from xplanes.schemas import kplanes, samplers
+from xplanes.schemas import kplanes, samplers, tineuvox
 
 ROOT = Path(__file__).resolve().parent.parent
 TARGET = ROOT / "docs" / "configuration.md"
@@ -21,6 +21,7 @@ GROUPS: dict[str, dict[str, type]] = {
     "model": {
         **dict.fromkeys(("six_planes", "nine_planes"), schemas.ModelConfig),
         **dict.fromkeys(("kplanes", "kplanes_explicit"), kplanes.KPlanesConfig),
+        **dict.fromkeys(("tineuvox_s", "tineuvox_b"), tineuvox.TiNeuVoxConfig),
     },
     "lrm": {
         "none": schemas.LRMConfig,
@@ -32,8 +33,13 @@ GROUPS: dict[str, dict[str, type]] = {
     "sampler": {
         "occupancy": samplers.SamplerConfig,
         **dict.fromkeys(("proposal", "kplanes", "kplanes_explicit"), samplers.ProposalConfig),
+        "fixed_step": samplers.FixedStepConfig,
     },
-    "loss": {"default": schemas.LossConfig, "kplanes": kplanes.KPlanesLossConfig},
+    "loss": {
+        "default": schemas.LossConfig,
+        "kplanes": kplanes.KPlanesLossConfig,
+        "tineuvox": tineuvox.TiNeuVoxLossConfig,
+    },
     "trainer": dict.fromkeys(("default", "cpu", "gpu", "ddp", "debug"), schemas.TrainerConfig),
 }
 

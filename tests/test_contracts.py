@@ -34,12 +34,19 @@ OPTIONS = sorted(
 FILES_OF_KEYS = [o for o in OPTIONS if o[0] not in ("experiment", "recipe")]
 """Options that set one group; the others set keys of several."""
 
-COMPANIONS = {("loss", "kplanes"): ["model=kplanes"], ("recipe", "kplanes"): ["model=kplanes"]}
+COMPANIONS = {
+    ("loss", "kplanes"): ["model=kplanes"],
+    ("loss", "tineuvox"): ["model=tineuvox_s"],
+    ("sampler", "fixed_step"): ["model=tineuvox_s"],
+    ("recipe", "kplanes"): ["model=kplanes"],
+    ("recipe", "tineuvox"): ["model=tineuvox_s"],
+}
 """What an option that only goes with some models is tried with."""
 
 TINY_MODELS = {
     None: ("model.resolution=6", "model.channels=2", "model.decoder.width=8"),
     "kplanes": ("model.resolution=4", "model.scales=[1,2]", "model.channels=2", "model.width=16"),
+    "tineuvox": ("model.resolution=12", "model.channels=2", "model.width=8"),
 }
 TINY_SAMPLERS = {
     "occupancy": ("sampler.grid_resolution=6", "sampler.samples=16"),
@@ -49,6 +56,7 @@ TINY_SAMPLERS = {
         "sampler.resolutions=[4,6]",
         "sampler.time_resolution=3",
     ),
+    "fixed_step": (),
 }
 
 
@@ -213,7 +221,7 @@ def test_checked_keys_exist_and_are_listed_once(kind):
 
 PLAIN = composed("lrm=small")
 
-PLAINS = [PLAIN, *(composed(f"model={name}") for name in ("kplanes",))]
+PLAINS = [PLAIN, *(composed(f"model={name}") for name in ("kplanes", "tineuvox_s"))]
 """Configurations that hold all keys between them."""
 
 REFUSED = [

@@ -54,3 +54,12 @@ def baseline_config(root: Path, *overrides: str) -> dict[str, Any]:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("train", [f"data.root={root}", *SCENE, *overrides])
     return to_plain(config)
+
+
+TINEUVOX = (
+    "model.resolution=20",
+    "model.width=16",
+    "model.grow_at=[8,30]",
+    "sampler.step=1.0",
+    "trainer.rays_per_batch=128",
+)

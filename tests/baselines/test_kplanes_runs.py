@@ -13,7 +13,7 @@ from xplanes.config import ConfigError
 from xplanes.launch import check_keys
 from xplanes.training.assembly import Site, check_range, kplanes_frame
 
-LONGER = ("model.channels=8", "trainer.max_steps=150")
+LONGER = ("model.channels=8", "trainer.max_steps=200")
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_hybrid_run_learns_goes_on_and_is_loaded(scenes, tmp_path, monkeypatch):
-    config = baseline_config(scenes, "model=kplanes", *KPLANES, *PROPOSAL, "trainer.max_steps=60")
+    config = baseline_config(scenes, "model=kplanes", *KPLANES, *PROPOSAL, "trainer.max_steps=120")
     folder = check_learns(config, tmp_path / "whole", gain=3)
     check_resume(config, folder, tmp_path / "broken", monkeypatch, stop=23)
     trained = check_reload(folder)
@@ -44,7 +44,7 @@ def test_hybrid_run_learns_goes_on_and_is_loaded(scenes, tmp_path, monkeypatch):
     ],
 )
 def test_others_learn(scenes, tmp_path, overrides):
-    config = baseline_config(scenes, "trainer.max_steps=60", *overrides)
+    config = baseline_config(scenes, "trainer.max_steps=120", *overrides)
     check_learns(config, tmp_path / "run", gain=2)
 
 

@@ -79,3 +79,11 @@ def truncated_exponential(logits: Tensor) -> Tensor:
     Source: Instant-NGP; K-Planes.
     """
     return _TruncatedExponential.apply(logits)  # type: ignore[return-value]
+
+
+def layers(widths: Sequence[int]) -> nn.Sequential:
+    """Linear layers with biases and ReLUs between them."""
+    found: list[nn.Module] = []
+    for columns, rows in zip(widths, widths[1:], strict=False):
+        found += [nn.Linear(columns, rows), nn.ReLU()]
+    return nn.Sequential(*found[:-1])

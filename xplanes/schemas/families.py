@@ -5,11 +5,14 @@ from typing import Any
 
 from xplanes.schemas.kplanes import KPlanesConfig, KPlanesLossConfig
 from xplanes.schemas.samplers import (
+    FixedStepConfig,
     ProposalConfig,
     SamplerConfig,
+    fixed_step_conflict,
     occupancy_conflict,
     proposal_conflict,
 )
+from xplanes.schemas.tineuvox import TiNeuVoxConfig, TiNeuVoxLossConfig
 
 
 @dataclass(frozen=True)
@@ -29,22 +32,30 @@ class Family:
 
 FAMILIES = {
     "kplanes": Family(KPlanesConfig, KPlanesLossConfig, ("proposal", "occupancy")),
+    "tineuvox": Family(TiNeuVoxConfig, TiNeuVoxLossConfig, ("fixed_step", "occupancy", "proposal")),
 }
 """By ``model.family``; models without that key are X-Planes."""
 
-SAMPLERS: dict[str, type] = {"proposal": ProposalConfig}
+SAMPLERS: dict[str, type] = {"proposal": ProposalConfig, "fixed_step": FixedStepConfig}
 """By ``sampler.name``; all others are settings of the occupancy grid."""
 
 SCHEMAS: dict[tuple[str, str], type] = {
     ("model", "kplanes_schema"): KPlanesConfig,
     ("loss", "kplanes_schema"): KPlanesLossConfig,
+    ("model", "tineuvox_schema"): TiNeuVoxConfig,
+    ("loss", "tineuvox_schema"): TiNeuVoxLossConfig,
     ("sampler", "proposal_schema"): ProposalConfig,
+    ("sampler", "fixed_step_schema"): FixedStepConfig,
 }
 
-POSITIVE = """model.half_side model.width model.learning_rate sampler.far
+POSITIVE = """model.half_side model.width model.learning_rate model.far model.margin
+model.grid_learning_rate model.deformation_learning_rate model.network_learning_rate
+model.decay_steps sampler.far sampler.step
 sampler.time_resolution sampler.channels sampler.width sampler.anneal_steps
 sampler.anneal_slope sampler.update_warmup sampler.learning_rate""".split()
-NOT_NEGATIVE = """model.warmup_steps loss.time_identity sampler.near
+NOT_NEGATIVE = """model.warmup_steps model.near model.point_octaves model.time_octaves
+model.direction_octaves model.feature_octaves loss.time_identity loss.entropy
+loss.sample_colour sampler.near
 sampler.padding sampler.histogram sampler.total_variation sampler.time_smoothness
 sampler.time_identity""".split()
 CHOICES: dict[str, tuple[str, ...]] = {
@@ -61,7 +72,11 @@ trainer.final_lr""".split()
 """Keys that only X-Planes use; baselines bring learning rates of their own."""
 
 
-_CONFLICTS = {SamplerConfig: occupancy_conflict, ProposalConfig: proposal_conflict}
+_CONFLICTS = {
+    SamplerConfig: occupancy_conflict,
+    ProposalConfig: proposal_conflict,
+    FixedStepConfig: fixed_step_conflict,
+}
 
 
 def misfit(config: dict[str, Any], family: Family, losses: str) -> str | None:
@@ -100,6 +115,8 @@ def conflict(config: Any) -> str | None:
             values = getattr(settings, name, [1])
             if not values or min(values) < 1:
                 return f"{group}.{name}={values}: must be one or more numbers above 0"
+    if isinstance(config.model, TiNeuVoxConfig) and config.model.near >= config.model.far:
+        return f"model.near={config.model.near}: must be below model.far={config.model.far}"
     baseline = any(isinstance(config.model, family.model) for family in FAMILIES.values())
     if config.trainer.devices > 1 and (baseline or isinstance(config.sampler, ProposalConfig)):
         return (

@@ -56,6 +56,17 @@ class ProposalConfig:
     learning_rate: float = MISSING  # Of the density fields.
 
 
+@dataclass
+class FixedStepConfig:
+    """Equal steps through a field's box; samples that add nothing get no colour."""
+
+    name: str = MISSING  # fixed_step: chooses the settings' type.
+    near: float = MISSING  # First sample's distance in world units.
+    far: float = MISSING  # Last sample's distance in world units.
+    step: float = MISSING  # Distance between samples, in cells of the field.
+    threshold: float = MISSING  # Opacity, and weight, at which samples are dropped.
+
+
 def occupancy_conflict(sampler: SamplerConfig) -> str | None:
     """What is wrong with an occupancy grid's settings, in words; None for nothing."""
     if sampler.occlusion >= 1:
@@ -68,6 +79,15 @@ def occupancy_conflict(sampler: SamplerConfig) -> str | None:
             f"sampler.grid_resolution={sampler.grid_resolution} with sampler.time_bins="
             f"{sampler.time_bins}: more than 268 million cells; lower one of them"
         )
+    return None
+
+
+def fixed_step_conflict(sampler: FixedStepConfig) -> str | None:
+    """What is wrong with a fixed-step sampler's settings, in words; None for nothing."""
+    if sampler.near >= sampler.far:
+        return f"sampler.near={sampler.near}: must be below sampler.far={sampler.far}"
+    if sampler.threshold >= 1:
+        return f"sampler.threshold={sampler.threshold}: must be below 1, or nothing is seen"
     return None
 
 

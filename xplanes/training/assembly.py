@@ -6,21 +6,26 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from xplanes.config import ConfigError, TrainConfig
 from xplanes.fields.base import RadianceField
 from xplanes.fields.kplanes import DensityField, ExplicitDecoder, HybridDecoder, KPlanes
 from xplanes.fields.products import PlaneProducts
+from xplanes.fields.tineuvox import TiNeuVox
+from xplanes.rendering.fixed_step import FixedStepRenderer
 from xplanes.rendering.proposal import ProposalRenderer
 from xplanes.scenes.batches import step_generator
 from xplanes.scenes.frame import Frame, cube_frame, scene_frame
 from xplanes.scenes.views import Views
 from xplanes.schemas.kplanes import KPlanesConfig
-from xplanes.schemas.samplers import ProposalConfig
+from xplanes.schemas.samplers import FixedStepConfig, ProposalConfig
+from xplanes.schemas.tineuvox import TiNeuVoxConfig
 from xplanes.training.methods.base import Method
 from xplanes.training.methods.kplanes import KPlanesMethod
+from xplanes.training.methods.tineuvox import TiNeuVoxMethod
 from xplanes.training.sampling.base import Sampling
+from xplanes.training.sampling.fixed_step import FixedStepSampling
 from xplanes.training.sampling.proposal import ProposalSampling
 
 FIELD_STREAM, SAMPLER_STREAM = 1_000_099, 1_000_117
@@ -87,6 +92,69 @@ def kplanes_method(config: TrainConfig, site: Site) -> Method:
     return KPlanesMethod(KPlanes(products, decode, site.unit), model, config.loss)
 
 
+def frusta_box(views: Views, near: float, far: float, margin: float) -> Tensor:
+    """The box of all that cameras see between two distances, ``margin`` times as large. [2, 3]"""
+    low, high = torch.full((3,), torch.inf), torch.full((3,), -torch.inf)
+    for index in range(len(views)):
+        origins, directions = views.image_rays(index)
+        for distance in (near, far):
+            ends = origins + distance * directions
+            low, high = torch.minimum(low, ends.amin(dim=0)), torch.maximum(high, ends.amax(dim=0))
+    room = (margin - 1) / 2 * (high - low)
+    return torch.stack([low - room, high + room])
+
+
+def tineuvox_box(config: TrainConfig, views: Views) -> Tensor:
+    """The box of TiNeuVox' grid, in world units. [2, 3]"""
+    model: TiNeuVoxConfig = config.model
+    if model.half_side is None:
+        return frusta_box(views, model.near, model.far, model.margin)
+    return torch.tensor([[-1.0] * 3, [1.0] * 3]) * model.half_side
+
+
+def tineuvox_frame(config: TrainConfig, views: Views) -> Frame:
+    """The smallest cube around the world's origin that holds the grid's box."""
+    return cube_frame(float(tineuvox_box(config, views).abs().max()), torch.zeros(3))
+
+
+def tineuvox_method(config: TrainConfig, site: Site) -> Method:
+    """TiNeuVox, of any size."""
+    model: TiNeuVoxConfig = config.model
+    with start_values(config.seed, FIELD_STREAM):
+        field = TiNeuVox(
+            tineuvox_box(config, site.views),
+            model.resolution,
+            model.channels,
+            model.width,
+            octaves=(
+                model.point_octaves,
+                model.time_octaves,
+                model.direction_octaves,
+                model.feature_octaves,
+            ),
+            alpha=model.alpha_start,
+            halvings=len(model.grow_at),
+            moves=site.moments > 1,
+            unit=site.unit,
+            precision=site.precision,
+        )
+    return TiNeuVoxMethod(field, model, config.loss)
+
+
+def fixed_step_sampling(config: TrainConfig, site: Site, field: RadianceField) -> Sampling:
+    """Equal steps through the field's box."""
+    sampler: FixedStepConfig = config.sampler
+    check_range(site, sampler.near, sampler.far)
+    renderer = FixedStepRenderer(
+        field,
+        near=sampler.near * site.frame.scale,
+        far=sampler.far * site.frame.scale,
+        step=sampler.step,
+        threshold=sampler.threshold,
+    )
+    return FixedStepSampling(renderer)
+
+
 def proposal_sampling(config: TrainConfig, site: Site, field: RadianceField) -> Sampling:
     """Density fields that train along, for any field."""
     sampler: ProposalConfig = config.sampler
@@ -149,10 +217,14 @@ class Plan:
     method: Callable[[TrainConfig, Site], Method]
 
 
-PLANS: dict[type, Plan] = {KPlanesConfig: Plan(kplanes_frame, kplanes_method)}
+PLANS: dict[type, Plan] = {
+    KPlanesConfig: Plan(kplanes_frame, kplanes_method),
+    TiNeuVoxConfig: Plan(tineuvox_frame, tineuvox_method),
+}
 """By the schema of the model group."""
 
 SAMPLINGS: dict[type, Callable[[TrainConfig, Site, RadianceField], Sampling]] = {
     ProposalConfig: proposal_sampling,
+    FixedStepConfig: fixed_step_sampling,
 }
 """By the schema of the sampler group."""

@@ -11,6 +11,9 @@ from xplanes.rendering.resampling import covering_weights
 SMALLEST = 1e-7
 """Keeps the histogram term finite where the field sees nothing."""
 
+LEAST_LIGHT = 1e-6
+"""Shares of light closer than this to 0 and 1 are taken as that close."""
+
 
 def histogram_loss(levels: Sequence[Level]) -> Tensor:
     """How far the field's weights rise above what each density field allows.
@@ -34,3 +37,27 @@ def histogram_loss(levels: Sequence[Level]) -> Tensor:
         for level in coarse
     ]
     return torch.stack([term.mean() for term in terms]).sum()
+
+
+def light_entropy(opacity: Tensor) -> Tensor:
+    """Entropy of whether a ray is stopped or passes, in nats, mean over rays. [R] -> []
+
+    Source: TiNeuVox, released code; DirectVoxGO, Section 5.2.
+    """
+    light = (1 - opacity).clamp(LEAST_LIGHT, 1 - LEAST_LIGHT)
+    return -(light * light.log() + (1 - light) * (1 - light).log()).mean()
+
+
+def sample_colour_error(colours: Tensor, target: Tensor, weights: Tensor, ray: Tensor) -> Tensor:
+    """Squared error of each sample's own colour, weighted and summed along rays, mean over rays.
+
+    Args:
+        colours: Colour of each sample. [M, 3]
+        target: True colour of each ray. [R, 3]
+        weights: Share of its ray's light that each sample sends, without gradient. [M]
+        ray: Ray of each sample. [M]
+
+    Source: TiNeuVox, released code; DirectVoxGO, Section 5.2.
+    """
+    error = (colours - target[ray]).square().sum(dim=1)
+    return (error * weights).sum() / len(target)

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from xplanes import config as schemas
-from xplanes.schemas import kplanes, samplers, tineuvox
+from xplanes.schemas import kplanes, samplers, tensor4d, tineuvox
 
 ROOT = Path(__file__).resolve().parent.parent
 TARGET = ROOT / "docs" / "configuration.md"
@@ -22,6 +22,8 @@ GROUPS: dict[str, dict[str, type]] = {
         **dict.fromkeys(("six_planes", "nine_planes"), schemas.ModelConfig),
         **dict.fromkeys(("kplanes", "kplanes_explicit"), kplanes.KPlanesConfig),
         **dict.fromkeys(("tineuvox_s", "tineuvox_b"), tineuvox.TiNeuVoxConfig),
+        "tensor4d": tensor4d.Tensor4DConfig,
+        "tensor4d_density": tensor4d.Tensor4DDensityConfig,
     },
     "lrm": {
         "none": schemas.LRMConfig,
@@ -34,11 +36,14 @@ GROUPS: dict[str, dict[str, type]] = {
         "occupancy": samplers.SamplerConfig,
         **dict.fromkeys(("proposal", "kplanes", "kplanes_explicit"), samplers.ProposalConfig),
         "fixed_step": samplers.FixedStepConfig,
+        "neus": samplers.NeusConfig,
     },
     "loss": {
         "default": schemas.LossConfig,
         "kplanes": kplanes.KPlanesLossConfig,
         "tineuvox": tineuvox.TiNeuVoxLossConfig,
+        "tensor4d": tensor4d.Tensor4DLossConfig,
+        "tensor4d_density": tensor4d.Tensor4DDensityLossConfig,
     },
     "trainer": dict.fromkeys(("default", "cpu", "gpu", "ddp", "debug"), schemas.TrainerConfig),
 }

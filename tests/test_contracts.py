@@ -40,6 +40,10 @@ COMPANIONS = {
     ("sampler", "fixed_step"): ["model=tineuvox_s"],
     ("recipe", "kplanes"): ["model=kplanes"],
     ("recipe", "tineuvox"): ["model=tineuvox_s"],
+    ("loss", "tensor4d"): ["model=tensor4d"],
+    ("loss", "tensor4d_density"): ["model=tensor4d_density"],
+    ("sampler", "neus"): ["model=tensor4d"],
+    ("recipe", "tensor4d"): ["model=tensor4d"],
 }
 """What an option that only goes with some models is tried with."""
 
@@ -47,6 +51,10 @@ TINY_MODELS = {
     None: ("model.resolution=6", "model.channels=2", "model.decoder.width=8"),
     "kplanes": ("model.resolution=4", "model.scales=[1,2]", "model.channels=2", "model.width=16"),
     "tineuvox": ("model.resolution=12", "model.channels=2", "model.width=8"),
+    **dict.fromkeys(
+        ("tensor4d", "tensor4d_density"),
+        ("model.resolution=6", "model.fine_resolution=8", "model.channels=2", "model.width=8"),
+    ),
 }
 TINY_SAMPLERS = {
     "occupancy": ("sampler.grid_resolution=6", "sampler.samples=16"),
@@ -57,6 +65,7 @@ TINY_SAMPLERS = {
         "sampler.time_resolution=3",
     ),
     "fixed_step": (),
+    "neus": ("sampler.samples=8", "sampler.more_samples=5"),
 }
 
 
@@ -221,7 +230,7 @@ def test_checked_keys_exist_and_are_listed_once(kind):
 
 PLAIN = composed("lrm=small")
 
-PLAINS = [PLAIN, *(composed(f"model={name}") for name in ("kplanes", "tineuvox_s"))]
+PLAINS = [PLAIN, *(composed(f"model={name}") for name in ("kplanes", "tineuvox_s", "tensor4d"))]
 """Configurations that hold all keys between them."""
 
 REFUSED = [

@@ -167,3 +167,28 @@ def trilinear(grid, box, point):
             value += weights[0][x] * weights[1][y] * weights[2][z] * coarse[:, x, y, z]
         found.append(value)
     return np.concatenate(found)
+
+
+def plane_value(plane, columns, rows):
+    """A plane [H, W, C] between its texels' centres, the border's value beyond."""
+    across, down = (
+        tent(min(max((place + 1) / 2, 0), 1) * (size - 1), size)
+        for place, size in ((columns, plane.shape[1]), (rows, plane.shape[0]))
+    )
+    return np.einsum("r,c,rck->k", down, across, plane)
+
+
+def surface_ray(distances, changes, lengths, sharpness, inside):
+    """Opacities and weights of the sections of one ray, by NeuS' Eq. 13."""
+
+    def logistic(value):
+        return 1 / (1 + math.exp(-value * sharpness))
+
+    opacities, light, weights = [], 1.0, []
+    for d, c, length, ok in zip(distances, changes, lengths, inside, strict=True):
+        before, after = logistic(d - c * length / 2), logistic(d + c * length / 2)
+        opacity = min(max((before - after + 1e-5) / (before + 1e-5), 0), 1) * ok
+        opacities.append(opacity)
+        weights.append(light * opacity)
+        light *= 1 - opacity + 1e-7
+    return opacities, weights

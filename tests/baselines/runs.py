@@ -63,3 +63,21 @@ TINEUVOX = (
     "sampler.step=1.0",
     "trainer.rays_per_batch=128",
 )
+
+TENSOR4D = (
+    "model.resolution=12",
+    "model.fine_resolution=16",
+    "model.time_resolution=6",
+    "model.channels=4",
+    "model.fine_channels=4",
+    "model.width=24",
+    "model.point_octaves=3",
+    "model.fine_from=15",
+    "model.blur_until=30",
+    "model.blur_resolution=8",
+    "model.warmup_steps=10",
+    "model.learning_rate=0.003",
+    "model.plane_learning_rate=0.02",
+)
+
+NEUS = ("trainer.rays_per_batch=64", "sampler.samples=16", "sampler.more_samples=9")

@@ -77,7 +77,8 @@ class RayBatches:
 
         Returns:
             ``origins`` and unit ``directions`` in the field's frame [R, 3], ``times`` [R],
-            ``target`` colour before ``background`` [R, 3] each, and ``jitter`` from 0 to 1 [R].
+            ``target`` colour before ``background`` [R, 3] each, its ``alpha`` [R], and ``jitter``
+            from 0 to 1 [R].
         """
         generator = step_generator(self.seed, step, self.rank)
         uniform = torch.rand(self.rays, 3, generator=generator, dtype=torch.float64)
@@ -111,6 +112,7 @@ class RayBatches:
             "times": self.views.times[view],
             "target": colour[:, :3] + (1 - colour[:, 3:]) * background,
             "background": background,
+            "alpha": colour[:, 3],
             "jitter": uniform[:, 2].float(),
         }
 

@@ -1,16 +1,24 @@
 """Which settings go together: families of models, their losses and samplers."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
 from xplanes.schemas.kplanes import KPlanesConfig, KPlanesLossConfig
 from xplanes.schemas.samplers import (
     FixedStepConfig,
+    NeusConfig,
     ProposalConfig,
     SamplerConfig,
     fixed_step_conflict,
     occupancy_conflict,
     proposal_conflict,
+)
+from xplanes.schemas.tensor4d import (
+    Tensor4DConfig,
+    Tensor4DDensityConfig,
+    Tensor4DDensityLossConfig,
+    Tensor4DLossConfig,
 )
 from xplanes.schemas.tineuvox import TiNeuVoxConfig, TiNeuVoxLossConfig
 
@@ -33,10 +41,18 @@ class Family:
 FAMILIES = {
     "kplanes": Family(KPlanesConfig, KPlanesLossConfig, ("proposal", "occupancy")),
     "tineuvox": Family(TiNeuVoxConfig, TiNeuVoxLossConfig, ("fixed_step", "occupancy", "proposal")),
+    "tensor4d": Family(Tensor4DConfig, Tensor4DLossConfig, ("neus",)),
+    "tensor4d_density": Family(
+        Tensor4DDensityConfig, Tensor4DDensityLossConfig, ("occupancy", "proposal")
+    ),
 }
 """By ``model.family``; models without that key are X-Planes."""
 
-SAMPLERS: dict[str, type] = {"proposal": ProposalConfig, "fixed_step": FixedStepConfig}
+SAMPLERS: dict[str, type] = {
+    "proposal": ProposalConfig,
+    "fixed_step": FixedStepConfig,
+    "neus": NeusConfig,
+}
 """By ``sampler.name``; all others are settings of the occupancy grid."""
 
 SCHEMAS: dict[tuple[str, str], type] = {
@@ -44,18 +60,26 @@ SCHEMAS: dict[tuple[str, str], type] = {
     ("loss", "kplanes_schema"): KPlanesLossConfig,
     ("model", "tineuvox_schema"): TiNeuVoxConfig,
     ("loss", "tineuvox_schema"): TiNeuVoxLossConfig,
+    ("model", "tensor4d_schema"): Tensor4DConfig,
+    ("model", "tensor4d_density_schema"): Tensor4DDensityConfig,
+    ("loss", "tensor4d_schema"): Tensor4DLossConfig,
+    ("loss", "tensor4d_density_schema"): Tensor4DDensityLossConfig,
     ("sampler", "proposal_schema"): ProposalConfig,
+    ("sampler", "neus_schema"): NeusConfig,
     ("sampler", "fixed_step_schema"): FixedStepConfig,
 }
 
 POSITIVE = """model.half_side model.width model.learning_rate model.far model.margin
 model.grid_learning_rate model.deformation_learning_rate model.network_learning_rate
-model.decay_steps sampler.far sampler.step
+model.decay_steps model.fine_resolution model.fine_channels model.blur_resolution
+model.plane_learning_rate model.radius model.sharpness loss.smoothness_distance
+sampler.more_samples sampler.coarse_sharpness sampler.far sampler.step
 sampler.time_resolution sampler.channels sampler.width sampler.anneal_steps
 sampler.anneal_slope sampler.update_warmup sampler.learning_rate""".split()
 NOT_NEGATIVE = """model.warmup_steps model.near model.point_octaves model.time_octaves
 model.direction_octaves model.feature_octaves loss.time_identity loss.entropy
-loss.sample_colour sampler.near
+loss.sample_colour model.fine_from model.blur_until loss.eikonal loss.opacity
+loss.smoothness sampler.near
 sampler.padding sampler.histogram sampler.total_variation sampler.time_smoothness
 sampler.time_identity""".split()
 CHOICES: dict[str, tuple[str, ...]] = {
@@ -72,7 +96,7 @@ trainer.final_lr""".split()
 """Keys that only X-Planes use; baselines bring learning rates of their own."""
 
 
-_CONFLICTS = {
+_CONFLICTS: dict[type, Callable[[Any], str | None]] = {
     SamplerConfig: occupancy_conflict,
     ProposalConfig: proposal_conflict,
     FixedStepConfig: fixed_step_conflict,
@@ -123,4 +147,5 @@ def conflict(config: Any) -> str | None:
             f"trainer.devices={config.trainer.devices} with model={config.model.name} and "
             f"sampler={config.sampler.name}: they train on one device; set trainer.devices=1"
         )
-    return _CONFLICTS[type(config.sampler)](config.sampler)
+    check = _CONFLICTS.get(type(config.sampler))
+    return None if check is None else check(config.sampler)

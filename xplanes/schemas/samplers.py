@@ -67,6 +67,16 @@ class FixedStepConfig:
     threshold: float = MISSING  # Opacity, and weight, at which samples are dropped.
 
 
+@dataclass
+class NeusConfig:
+    """Samples near a surface, which a coarse round finds."""
+
+    name: str = MISSING  # neus: chooses the settings' type.
+    samples: int = MISSING  # Equal steps of the coarse round.
+    more_samples: int = MISSING  # Samples that it adds near the surface.
+    coarse_sharpness: float = MISSING  # Sharpness at which it looks for the surface.
+
+
 def occupancy_conflict(sampler: SamplerConfig) -> str | None:
     """What is wrong with an occupancy grid's settings, in words; None for nothing."""
     if sampler.occlusion >= 1:

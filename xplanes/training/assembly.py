@@ -10,22 +10,30 @@ from torch import Tensor, nn
 
 from xplanes.config import ConfigError, TrainConfig
 from xplanes.fields.base import RadianceField
+from xplanes.fields.hierarchy import MOVING as MOVING_GROUPS
+from xplanes.fields.hierarchy import STILL as STILL_GROUPS
+from xplanes.fields.hierarchy import Groups, HierarchicalPlanes, Level
 from xplanes.fields.kplanes import DensityField, ExplicitDecoder, HybridDecoder, KPlanes
 from xplanes.fields.products import PlaneProducts
+from xplanes.fields.tensor4d import Tensor4D, Tensor4DDensity
 from xplanes.fields.tineuvox import TiNeuVox
 from xplanes.rendering.fixed_step import FixedStepRenderer
+from xplanes.rendering.neus import NeusRenderer
 from xplanes.rendering.proposal import ProposalRenderer
 from xplanes.scenes.batches import step_generator
 from xplanes.scenes.frame import Frame, cube_frame, scene_frame
 from xplanes.scenes.views import Views
 from xplanes.schemas.kplanes import KPlanesConfig
-from xplanes.schemas.samplers import FixedStepConfig, ProposalConfig
+from xplanes.schemas.samplers import FixedStepConfig, NeusConfig, ProposalConfig
+from xplanes.schemas.tensor4d import Tensor4DConfig, Tensor4DDensityConfig
 from xplanes.schemas.tineuvox import TiNeuVoxConfig
 from xplanes.training.methods.base import Method
 from xplanes.training.methods.kplanes import KPlanesMethod
+from xplanes.training.methods.tensor4d import Tensor4DDensityMethod, Tensor4DMethod
 from xplanes.training.methods.tineuvox import TiNeuVoxMethod
 from xplanes.training.sampling.base import Sampling
 from xplanes.training.sampling.fixed_step import FixedStepSampling
+from xplanes.training.sampling.neus import NeusSampling
 from xplanes.training.sampling.proposal import ProposalSampling
 
 FIELD_STREAM, SAMPLER_STREAM = 1_000_099, 1_000_117
@@ -204,6 +212,63 @@ def check_range(site: Site, near: float, far: float) -> None:
         )
 
 
+def hierarchical_planes(
+    model: Tensor4DDensityConfig, groups: Groups, *, fine: bool
+) -> HierarchicalPlanes:
+    """Planes of the coarse level, and of the fine one."""
+    rows = model.time_resolution
+    levels = [Level(model.resolution, rows, model.channels)]
+    if fine:
+        levels.append(Level(model.fine_resolution, rows, model.fine_channels))
+    return HierarchicalPlanes(groups, levels, blur=model.blur_resolution)
+
+
+def tensor4d_method(config: TrainConfig, site: Site) -> Method:
+    """Tensor4D as published: a surface and a flow."""
+    model: Tensor4DConfig = config.model
+    moves = site.moments > 1
+    with start_values(config.seed, FIELD_STREAM):
+        field = Tensor4D(
+            hierarchical_planes(model, STILL_GROUPS, fine=True),
+            hierarchical_planes(model, MOVING_GROUPS, fine=False) if moves else None,
+            model.width,
+            octaves=(model.point_octaves, model.time_octaves, model.direction_octaves),
+            radius=model.radius,
+            sharpness=model.sharpness,
+        )
+    return Tensor4DMethod(field, model, config.loss)
+
+
+def tensor4d_density_method(config: TrainConfig, site: Site) -> Method:
+    """The nine planes of Tensor4D with a density."""
+    model: Tensor4DDensityConfig = config.model
+    groups = MOVING_GROUPS if site.moments > 1 else STILL_GROUPS
+    with start_values(config.seed, FIELD_STREAM):
+        field = Tensor4DDensity(
+            hierarchical_planes(model, groups, fine=True),
+            model.width,
+            octaves=(model.point_octaves, model.time_octaves, model.direction_octaves),
+        )
+    return Tensor4DDensityMethod(field, model)
+
+
+def neus_sampling(config: TrainConfig, site: Site, field: RadianceField) -> Sampling:
+    """Samples near the field's surface."""
+    sampler: NeusConfig = config.sampler
+    renderer = NeusRenderer(
+        field,
+        samples=sampler.samples,
+        more=sampler.more_samples,
+        coarse_sharpness=sampler.coarse_sharpness,
+    )
+    return NeusSampling(renderer)
+
+
+def scene_cube(config: TrainConfig, views: Views) -> Frame:
+    """The scene's own cube."""
+    return scene_frame(views, config.data.half_side)
+
+
 @dataclass(frozen=True)
 class Plan:
     """How a family of models is built.
@@ -220,11 +285,14 @@ class Plan:
 PLANS: dict[type, Plan] = {
     KPlanesConfig: Plan(kplanes_frame, kplanes_method),
     TiNeuVoxConfig: Plan(tineuvox_frame, tineuvox_method),
+    Tensor4DConfig: Plan(scene_cube, tensor4d_method),
+    Tensor4DDensityConfig: Plan(scene_cube, tensor4d_density_method),
 }
 """By the schema of the model group."""
 
 SAMPLINGS: dict[type, Callable[[TrainConfig, Site, RadianceField], Sampling]] = {
     ProposalConfig: proposal_sampling,
     FixedStepConfig: fixed_step_sampling,
+    NeusConfig: neus_sampling,
 }
 """By the schema of the sampler group."""

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from xplanes.rendering.proposal import Level
@@ -61,3 +62,44 @@ def sample_colour_error(colours: Tensor, target: Tensor, weights: Tensor, ray: T
     """
     error = (colours - target[ray]).square().sum(dim=1)
     return (error * weights).sum() / len(target)
+
+
+def masked_colour_error(colour: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+    """Absolute errors summed over channels, mean over the rays in a mask. [R, 3] x 2, [R] -> []
+
+    Source: NeuS and Tensor4D, released code.
+    """
+    error = (colour - target).abs().sum(dim=1)
+    return (error * mask).sum() / (mask.sum() + 1e-5)
+
+
+def silhouette_error(opacity: Tensor, mask: Tensor) -> Tensor:
+    """Cross entropy between opacities, kept from 0 and 1 by 0.001, and a mask. [R], [R] -> []
+
+    Source: NeuS, Eq. 16; Tensor4D, released code.
+    """
+    return F.binary_cross_entropy(opacity.clamp(1e-3, 1 - 1e-3), mask)
+
+
+def eikonal_error(slopes: Tensor, inside: Tensor) -> Tensor:
+    """Mean squared distance of gradients from length 1, over samples in the cube. [N, 3], [N] -> []
+
+    Source: NeuS, Eq. 15; IGR, Eq. 2.
+    """
+    # A gradient of zero has no direction in which its length could grow.
+    lengths = (slopes.square().sum(dim=1) + 1e-12).sqrt()
+    return ((lengths - 1).square() * inside).sum() / (inside.sum() + 1e-5)
+
+
+def feature_change(here: Tensor, nearby: Tensor, weights: Tensor, rays: int) -> Tensor:
+    """Squared change of features over a small distance: weighted sum along rays, mean over them.
+
+    Args:
+        here: Features at samples. [N, F]
+        nearby: Features close by. [N, F]
+        weights: Share of its ray's light that each sample sends, without gradient. [N]
+        rays: Number of rays.
+
+    Source: Tensor4D, released code.
+    """
+    return ((nearby - here).square().mean(dim=1) * weights).sum() / rays

@@ -33,9 +33,9 @@ class Moment:
     batch: int
     rank: int
 
-    def generator(self, device: torch.device) -> torch.Generator:
-        """Random numbers of this batch and rank, and of nothing else."""
-        key = step_generator(self.seed, self.batch, JITTER_STREAM + self.rank).initial_seed()
+    def generator(self, device: torch.device, stream: int = JITTER_STREAM) -> torch.Generator:
+        """Random numbers of this batch, rank and stream, and of nothing else."""
+        key = step_generator(self.seed, self.batch, stream + self.rank).initial_seed()
         return torch.Generator(device).manual_seed(key)
 
 

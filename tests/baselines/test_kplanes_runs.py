@@ -7,11 +7,12 @@ import torch
 
 from tests.baselines.checks import check_learns, check_reload, check_resume
 from tests.baselines.runs import KPLANES, OCCUPANCY, PROPOSAL, baseline_config
-from tests.synthetic import ball_views
+from tests.synthetic import ball_scene, ball_views
 from xplanes.checks import parse
 from xplanes.config import ConfigError
 from xplanes.launch import check_keys
 from xplanes.training.assembly import Site, check_range, kplanes_frame
+from xplanes.training.builder import build_frame, build_module
 
 LONGER = ("model.channels=8", "trainer.max_steps=200")
 
@@ -101,3 +102,14 @@ def test_cube_is_the_published_one_or_the_scenes(scenes):
     assert torch.equal(frame.centre, torch.zeros(3))
     config.model.half_side = None
     assert kplanes_frame(config, views).scale > 1
+
+
+@pytest.mark.parametrize(
+    ("model", "count"), [("kplanes", 36_467_008), ("kplanes_explicit", 36_551_936)]
+)
+def test_published_settings_have_the_published_number_of_parameters(scenes, model, count):
+    config = parse(baseline_config(scenes, f"model={model}"))
+    scene = ball_scene(50)
+    frame = build_frame(config, scene.splits["train"])
+    module = build_module(config, scene, frame)
+    assert sum(p.numel() for p in module.parameters() if p.requires_grad) == count

@@ -1,13 +1,19 @@
 """Products of feature planes at several scales: what K-Planes reads from."""
 
-import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from xplanes.backend import compiled, cpu_loops
 
 AXES = "xyzt"
+
+BLOCK = 2048
+"""Points whose intermediate gradients lie in the cache together."""
 
 MOVING = ("xy", "xz", "xt", "yz", "yt", "zt")
 STILL = ("xy", "xz", "yz")
@@ -52,7 +58,9 @@ class PlaneProducts(nn.Module):
                 size = resolution * scale
                 rows = time_resolution if "t" in name else size
                 plane = torch.ones(1, channels, rows or 0, size)
-                planes[name] = nn.Parameter(plane if "t" in name else plane.uniform_(low, high))
+                plane = plane if "t" in name else plane.uniform_(low, high)
+                # The channels of a texel side by side: one read of memory brings them all.
+                planes[name] = nn.Parameter(plane.contiguous(memory_format=torch.channels_last))
             self.scales.append(planes)
 
     @property
@@ -74,19 +82,77 @@ class PlaneProducts(nn.Module):
         Returns:
             The scales side by side. [N, channels * scales]
         """
-        place = torch.cat([points, 2 * times[:, None] - 1], dim=1)
-        # Grids of a pair of axes are the same at all scales.
-        grids = {n: place[:, [AXES.index(n[0]), AXES.index(n[1])]][None, None] for n in self.names}
-        found = []
-        for scale in self.scales:
-            factors = (
-                F.grid_sample(
-                    scale[name],  # type: ignore[index]
-                    grids[name],
-                    padding_mode="border",
-                    align_corners=True,
-                )
-                for name in self.names
-            )
-            found.append(math.prod(factors, start=torch.ones((), device=points.device)))
-        return torch.cat(found, dim=1)[0, :, 0].T
+        places = torch.cat([points, 2 * times[:, None] - 1], dim=1)
+        found = [
+            plane_product([scale[name] for name in self.names], places, self.names)  # type: ignore[index]
+            for scale in self.scales
+        ]
+        return torch.cat(found, dim=1)
+
+
+def plane_product(planes: Sequence[Tensor], places: Tensor, names: Sequence[str]) -> Tensor:
+    """What planes hold at places, multiplied channel by channel.
+
+    Gradients reach the planes only. On the CPU compiled loops do the work, elsewhere
+    `plane_product_reference`.
+
+    Args:
+        planes: Plane "ab" has axis a along its columns. [1, C, rows, columns] each
+        places: Coordinates x, y, z, t, from -1 to 1 between the outermost texels. [N, 4]
+        names: Axes of the planes.
+
+    Returns:
+        [N, C]
+
+    Source: K-Planes, Eq. 2.
+    """
+    if cpu_loops(planes[0]):
+        axes = torch.tensor([[AXES.index(axis) for axis in name] for name in names])
+        places = places.detach().to(planes[0].dtype).contiguous()
+        return _Product.apply(places, axes, *planes)  # type: ignore[return-value]
+    return plane_product_reference(planes, places, names)
+
+
+def plane_product_reference(
+    planes: Sequence[Tensor], places: Tensor, names: Sequence[str]
+) -> Tensor:
+    """The same as `plane_product`, written for reading: one ``grid_sample`` per plane."""
+    product = torch.ones((), device=places.device)
+    for plane, (column, row) in zip(planes, names, strict=True):
+        grid = places[:, [AXES.index(column), AXES.index(row)]][None, None].to(plane.dtype)
+        product = product * F.grid_sample(plane, grid, padding_mode="border", align_corners=True)
+    return product[0, :, 0].T
+
+
+class _Product(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, places: Tensor, axes: Tensor, *planes: Tensor) -> Tensor:
+        product = places.new_empty(len(places), planes[0].shape[1])
+        arrays = tuple(_array(plane) for plane in planes)
+        cpu = compiled("xplanes.fields.cpu")
+        cpu.multiply(arrays, places.numpy(), axes.numpy(), product.numpy())
+        ctx.save_for_backward(places, axes, *planes)
+        return product
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        places, axes, *planes = ctx.saved_tensors
+        found = [torch.zeros_like(plane, memory_format=torch.channels_last) for plane in planes]
+        spread = places.new_empty(BLOCK, len(planes), planes[0].shape[1])
+        compiled("xplanes.fields.cpu").multiply_backward(
+            tuple(_array(plane) for plane in planes),
+            places.numpy(),
+            axes.numpy(),
+            gradients[0].to(places.dtype).contiguous().numpy(),
+            spread.numpy(),
+            tuple(_array(plane) for plane in found),
+        )
+        return None, None, *found
+
+
+def _array(plane: Tensor) -> Any:
+    """A plane with its channels last, for loops. [1, C, rows, columns] -> [rows, columns, C]"""
+    return plane.detach()[0].permute(1, 2, 0).contiguous().numpy()

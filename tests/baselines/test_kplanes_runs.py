@@ -11,7 +11,8 @@ from tests.synthetic import ball_scene, ball_views
 from xplanes.checks import parse
 from xplanes.config import ConfigError
 from xplanes.launch import check_keys
-from xplanes.training.assembly import Site, check_range, kplanes_frame
+from xplanes.training.assembly.kplanes import kplanes_frame
+from xplanes.training.assembly.site import Site, check_range
 from xplanes.training.builder import build_frame, build_module
 
 LONGER = ("model.channels=8", "trainer.max_steps=200")
@@ -102,6 +103,20 @@ def test_cube_is_the_published_one_or_the_scenes(scenes):
     assert torch.equal(frame.centre, torch.zeros(3))
     config.model.half_side = None
     assert kplanes_frame(config, views).scale > 1
+
+
+def test_a_cube_of_the_wrong_size_is_said(scenes, caplog):
+    config = parse(baseline_config(scenes, "model=kplanes"))
+    kplanes_frame(config, ball_views(6, 0.6))
+    assert not caplog.records
+    kplanes_frame(config, ball_views(6, 3.0, distance=12.0))
+    assert "model.half_side=1.3: the scene reaches 3." in caplog.text
+
+
+def test_two_cubes_are_refused(scenes):
+    with pytest.raises(ConfigError, match=r"data\.half_side=1\.5 with model\.half_side=1\.3"):
+        parse(baseline_config(scenes, "model=kplanes", "data.half_side=1.5"))
+    parse(baseline_config(scenes, "model=kplanes", "data.half_side=1.5", "model.half_side=null"))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ from tests.baselines.runs import NEUS, OCCUPANCY, TENSOR4D, baseline_config
 from tests.synthetic import ball_views
 from xplanes.checks import parse
 from xplanes.config import ConfigError
-from xplanes.training.assembly import Site, scene_cube, tensor4d_method
+from xplanes.training.assembly.site import Site, scene_cube
+from xplanes.training.assembly.tensor4d import tensor4d_method
 from xplanes.training.sampling.base import Moment
 
 

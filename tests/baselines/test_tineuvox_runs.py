@@ -8,7 +8,8 @@ from tests.baselines.runs import OCCUPANCY, TINEUVOX, baseline_config
 from tests.synthetic import ball_views
 from xplanes.checks import parse
 from xplanes.config import ConfigError
-from xplanes.training.assembly import Site, frusta_box, tineuvox_frame, tineuvox_method
+from xplanes.training.assembly.site import Site
+from xplanes.training.assembly.tineuvox import frusta_box, tineuvox_frame, tineuvox_method
 
 
 @pytest.fixture(scope="module")

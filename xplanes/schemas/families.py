@@ -141,6 +141,12 @@ def conflict(config: Any) -> str | None:
                 return f"{group}.{name}={values}: must be one or more numbers above 0"
     if isinstance(config.model, TiNeuVoxConfig) and config.model.near >= config.model.far:
         return f"model.near={config.model.near}: must be below model.far={config.model.far}"
+    own, given = getattr(config.model, "half_side", None), config.data.half_side
+    if own is not None and given is not None:
+        return (
+            f"data.half_side={given} with model.half_side={own}: two cubes; set "
+            "model.half_side=null to use the former, or leave data.half_side out"
+        )
     baseline = any(isinstance(config.model, family.model) for family in FAMILIES.values())
     if config.trainer.devices > 1 and (baseline or isinstance(config.sampler, ProposalConfig)):
         return (

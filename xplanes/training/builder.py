@@ -30,9 +30,9 @@ from xplanes.scenes.batches import RayBatches, step_generator
 from xplanes.scenes.demo import ensure_demo_scene
 from xplanes.scenes.dnerf import read_scene
 from xplanes.scenes.errors import SceneError
-from xplanes.scenes.frame import Frame, frame_content, scene_frame
+from xplanes.scenes.frame import Frame, frame_content
 from xplanes.scenes.views import Scene, Views, joined
-from xplanes.training.assembly import PLANS, SAMPLINGS, Site
+from xplanes.training.assembly import PLANS, SAMPLINGS, Site, scene_cube
 from xplanes.training.methods.xplanes import XPlanesMethod
 from xplanes.training.module import RadianceModule
 from xplanes.training.product import SparseProduct
@@ -167,7 +167,7 @@ def build_field(
 def build_frame(config: TrainConfig, views: Views) -> Frame:
     """The frame in which a model's field lives: the scene's cube, or the model's own."""
     plan = PLANS.get(type(config.model))
-    return scene_frame(views, config.data.half_side) if plan is None else plan.frame(config, views)
+    return (scene_cube if plan is None else plan.frame)(config, views)
 
 
 def build_renderer(config: SamplerConfig, *, still: bool) -> Renderer:

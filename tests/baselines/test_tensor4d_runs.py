@@ -30,7 +30,13 @@ def test_surface_run_learns_goes_on_and_is_loaded(scenes, tmp_path, monkeypatch)
 
 def test_density_run_learns_and_is_loaded(scenes, tmp_path):
     config = baseline_config(
-        scenes, "model=tensor4d_density", *TENSOR4D, *OCCUPANCY, "trainer.max_steps=60"
+        scenes,
+        "model=tensor4d_density",
+        *TENSOR4D,
+        *OCCUPANCY,
+        "trainer.rays_per_batch=256",
+        "trainer.samples_per_batch=2048",
+        "trainer.max_steps=60",
     )
     check_reload(check_learns(config, tmp_path / "run", gain=1.5))
 

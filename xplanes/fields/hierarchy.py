@@ -76,7 +76,7 @@ class HierarchicalPlanes(nn.Module):
         fine: Whether levels beyond the first are read; zeros stand in for them otherwise.
         blurred: Whether planes are averaged down.
 
-    Source: Tensor4D, Section 3.2 and 3.3, and released code.
+    Source: Tensor4D, released code.
     """
 
     fine: Tensor

@@ -22,7 +22,7 @@ class HybridDecoder(nn.Module):
         width: Neurons of the hidden layers, one for density and two for colour.
         precision: Of the matrix products.
 
-    Source: K-Planes, Section 3.3.
+    Source: K-Planes, hybrid decoder.
     """
 
     def __init__(self, features: int, width: int = 64, *, precision: str = "32") -> None:
@@ -48,7 +48,7 @@ class ExplicitDecoder(nn.Module):
         width: Neurons of the hidden layers of the network from direction to colour basis.
         precision: Of the matrix products.
 
-    Source: K-Planes, Section 3.3, Eq. 4.
+    Source: K-Planes, explicit decoder.
     """
 
     HIDDEN = 4
@@ -126,7 +126,7 @@ class DensityField(nn.Module):
         unit: World units per unit of the field's frame.
         precision: Of the matrix products.
 
-    Source: K-Planes, Section 3.4 and released code; Mip-NeRF 360, Section 3.
+    Source: K-Planes, released code; Mip-NeRF 360, Section 3.
     """
 
     def __init__(

@@ -35,7 +35,7 @@ class PlaneProducts(nn.Module):
         low: Space planes start uniform between this
         high: and this; time planes start at 1.
 
-    Source: K-Planes, Eq. 2 and Section 3.1.
+    Source: K-Planes, Section 3.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ def plane_product(planes: Sequence[Tensor], places: Tensor, names: Sequence[str]
     Returns:
         [N, C]
 
-    Source: K-Planes, Eq. 2.
+    Source: K-Planes, Section 3.
     """
     if cpu_loops(planes[0]):
         axes = torch.tensor([[AXES.index(axis) for axis in name] for name in names])

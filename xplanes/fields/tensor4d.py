@@ -30,7 +30,7 @@ class SkipNetwork(nn.Module):
         radius: The first output starts as the distance from a sphere of this radius around the
             origin; None starts at random.
 
-    Source: Tensor4D, released code; NeuS; IGR, Section 4 (start).
+    Source: Tensor4D, released code; NeuS; IGR (start).
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Tensor4D(RadianceField):
         radius: Of the sphere at the start.
         sharpness: The surface's width at the start is exp(-10 times this).
 
-    Source: Tensor4D, Section 3, and released code.
+    Source: Tensor4D, released code.
     """
 
     COMPRESSED = 32
@@ -193,7 +193,7 @@ class Tensor4DDensity(ViewDependentField):
         width: Neurons of the hidden layers.
         octaves: Frequencies for positions, times and directions.
 
-    Source: Tensor4D, Section 3.2 (planes) and released code (networks).
+    Source: Tensor4D, released code.
     """
 
     COMPRESSED = 48

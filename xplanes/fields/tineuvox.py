@@ -28,13 +28,13 @@ class TiNeuVox(ViewDependentField):
         channels: Channels of a cell.
         width: Neurons of the hidden layers.
         octaves: Frequencies for positions, times, directions and features.
-        alpha: Opacity of half a cell at the start.
+        alpha: Opacity of one cell of the finished grid at the start.
         halvings: How often the number of cells is halved at the start.
         moves: Whether points are moved to canonical space; a still scene needs none of it.
         unit: World units per unit of the field's frame.
         precision: Of the matrix products.
 
-    Source: TiNeuVox, Section 3, and released code.
+    Source: TiNeuVox, released code.
     """
 
     box: Tensor

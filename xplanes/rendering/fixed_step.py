@@ -38,7 +38,7 @@ class FixedStepRenderer(RayRenderer):
         step: Distance between samples, in cells.
         threshold: Opacity and weight up to which a sample is dropped.
 
-    Source: TiNeuVox, released code; DirectVoxGO, Section 5.
+    Source: TiNeuVox, released code; DirectVoxGO.
     """
 
     rays_at_once = 2048

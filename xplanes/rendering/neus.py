@@ -68,7 +68,7 @@ class NeusRenderer(RayRenderer):
         more: Samples added.
         coarse_sharpness: Sharpness at which they are placed.
 
-    Source: NeuS, Section 3.2 and released code; Tensor4D, released code.
+    Source: NeuS and Tensor4D, released code.
     """
 
     rays_at_once = 512

@@ -49,7 +49,7 @@ class ProposalRenderer(RayRenderer):
         far: Distance at which they end; None where rays leave the cube.
         padding: As for `resample`.
 
-    Source: K-Planes, Section 3.4 and released code; Mip-NeRF 360, Section 3.
+    Source: K-Planes, released code; Mip-NeRF 360, Section 3.
     """
 
     rays_at_once = 2048

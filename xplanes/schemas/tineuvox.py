@@ -18,7 +18,7 @@ class TiNeuVoxConfig:
     resolution: int = MISSING  # Cube root of the number of cells in the end.
     channels: int = MISSING  # Channels of a cell.
     width: int = MISSING  # Neurons of the hidden layers.
-    alpha_start: float = MISSING  # Opacity of half a cell at the start.
+    alpha_start: float = MISSING  # Opacity of one cell at the start.
     point_octaves: int = MISSING  # Frequencies of the positions' encoding.
     time_octaves: int = MISSING  # Frequencies of the time's encoding.
     direction_octaves: int = MISSING  # Frequencies of the directions' encoding.

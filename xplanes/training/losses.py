@@ -28,7 +28,7 @@ def histogram_loss(levels: Sequence[Level]) -> Tensor:
     Returns:
         The sum over density fields. []
 
-    Source: Mip-NeRF 360, Eq. 13; K-Planes, Section 3.4.
+    Source: Mip-NeRF 360, Eq. 13; K-Planes.
     """
     *coarse, fine = levels
     weights = fine.weights.detach()
@@ -43,7 +43,7 @@ def histogram_loss(levels: Sequence[Level]) -> Tensor:
 def light_entropy(opacity: Tensor) -> Tensor:
     """Entropy of whether a ray is stopped or passes, in nats, mean over rays. [R] -> []
 
-    Source: TiNeuVox, released code; DirectVoxGO, Section 5.2.
+    Source: TiNeuVox, released code; DirectVoxGO.
     """
     light = (1 - opacity).clamp(LEAST_LIGHT, 1 - LEAST_LIGHT)
     return -(light * light.log() + (1 - light) * (1 - light).log()).mean()
@@ -58,7 +58,7 @@ def sample_colour_error(colours: Tensor, target: Tensor, weights: Tensor, ray: T
         weights: Share of its ray's light that each sample sends, without gradient. [M]
         ray: Ray of each sample. [M]
 
-    Source: TiNeuVox, released code; DirectVoxGO, Section 5.2.
+    Source: TiNeuVox, released code; DirectVoxGO.
     """
     error = (colours - target[ray]).square().sum(dim=1)
     return (error * weights).sum() / len(target)
@@ -76,7 +76,7 @@ def masked_colour_error(colour: Tensor, target: Tensor, mask: Tensor) -> Tensor:
 def silhouette_error(opacity: Tensor, mask: Tensor) -> Tensor:
     """Cross entropy between opacities, kept from 0 and 1 by 0.001, and a mask. [R], [R] -> []
 
-    Source: NeuS, Eq. 16; Tensor4D, released code.
+    Source: NeuS and Tensor4D, released code.
     """
     return F.binary_cross_entropy(opacity.clamp(1e-3, 1 - 1e-3), mask)
 
@@ -84,7 +84,7 @@ def silhouette_error(opacity: Tensor, mask: Tensor) -> Tensor:
 def eikonal_error(slopes: Tensor, inside: Tensor) -> Tensor:
     """Mean squared distance of gradients from length 1, over samples in the cube. [N, 3], [N] -> []
 
-    Source: NeuS, Eq. 15; IGR, Eq. 2.
+    Source: NeuS; IGR.
     """
     # A gradient of zero has no direction in which its length could grow.
     lengths = (slopes.square().sum(dim=1) + 1e-12).sqrt()

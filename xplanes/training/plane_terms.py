@@ -32,7 +32,7 @@ class PlaneTerms:
         time_smoothness: Of squared second differences along time, summed over planes.
         time_identity: Of the time planes' mean distance from 1, summed over planes.
 
-    Source: K-Planes, Eq. 5 to 7, and released code.
+    Source: K-Planes, released code.
     """
 
     total_variation: float

@@ -17,7 +17,7 @@ class KPlanesMethod(Method):
         config: Learning rate.
         loss: Weights.
 
-    Source: K-Planes, Section 3.2 and released code.
+    Source: K-Planes, released code.
     """
 
     def __init__(self, field: KPlanes, config: KPlanesConfig, loss: KPlanesLossConfig) -> None:

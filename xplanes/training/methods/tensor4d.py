@@ -33,7 +33,7 @@ class Tensor4DDensityMethod(Method):
         field: The field.
         config: Learning rates and schedule.
 
-    Source: Tensor4D, Section 3.4 (coarse to fine) and released code.
+    Source: Tensor4D, released code.
     """
 
     def __init__(self, field: Tensor4D | Tensor4DDensity, config: Tensor4DDensityConfig) -> None:
@@ -81,7 +81,7 @@ class Tensor4DMethod(Tensor4DDensityMethod):
         config: Learning rates and schedule.
         loss: Weights.
 
-    Source: Tensor4D, Section 3.4 and released code.
+    Source: Tensor4D, released code.
     """
 
     def __init__(self, field: Tensor4D, config: Tensor4DConfig, loss: Tensor4DLossConfig) -> None:

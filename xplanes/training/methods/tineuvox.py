@@ -24,7 +24,7 @@ class TiNeuVoxMethod(Method):
         config: Learning rates and growth.
         loss: Weights.
 
-    Source: TiNeuVox, Section 3.4 and released code.
+    Source: TiNeuVox, released code.
     """
 
     def __init__(self, field: TiNeuVox, config: TiNeuVoxConfig, loss: TiNeuVoxLossConfig) -> None:

@@ -23,7 +23,7 @@ class ProposalSampling(Sampling):
         renderer: Holds the density fields.
         config: Schedule, weights and learning rate.
 
-    Source: K-Planes, Section 3.4 and released code.
+    Source: K-Planes, released code.
     """
 
     def __init__(self, renderer: ProposalRenderer, config: ProposalConfig) -> None:

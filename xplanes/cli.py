@@ -60,7 +60,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"xplanes {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (_add_download, _add_evaluate, _add_render, _add_view, _add_table):
+    verbs = (_add_download, _add_evaluate, _add_render, _add_view, _add_table, _add_pretrain)
+    for add in verbs:
         add(commands)
     return parser
 
@@ -217,3 +218,17 @@ def _table(options: argparse.Namespace) -> None:
     from xplanes.evaluation.table import write_tables
 
     print(write_tables(options.folder, options.out), end="")
+
+
+def _add_pretrain(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser("pretrain-lrm", help="train a small LRM on procedural objects")
+    parser.add_argument(
+        "overrides", nargs="*", metavar="key=value", help="settings of conf/pretrain_lrm.yaml"
+    )
+    parser.set_defaults(command=_pretrain)
+
+
+def _pretrain(options: argparse.Namespace) -> None:
+    from xplanes.pretraining.command import run_pretraining
+
+    _say(f"wrote {run_pretraining(options.overrides, _say)}")

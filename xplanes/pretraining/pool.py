@@ -68,7 +68,7 @@ def ensure_pool(
     shards = []
     for number in range(len(seeds) // SHARD):
         path = folder / f"{number:05d}.npy"
-        if record["sha256"].get(path.name) != _digest(path):
+        if path.name not in record["sha256"] or record["sha256"][path.name] != _digest(path):
             first = seeds[number * SHARD]
             drawn = [draw_sample(seed, views, side) for seed in range(first, first + SHARD)]
             with replacing(path) as temporary:

@@ -17,6 +17,10 @@ DITHER = 0.01
 """Standard deviation of the distance to the surface at which its colour is asked for."""
 
 
+TRIES = 3
+"""Points near the surface of which one is kept."""
+
+
 class PretrainingBatch(NamedTuple):
     """Input pictures and what is known of the objects, all in the model's frame.
 
@@ -96,10 +100,8 @@ class PretrainingBatches:
         views = len(record["poses"])
         source = int(random.integers(views))
         turn = self._turn(record["poses"][source])
-        chosen = np.concatenate(
-            [random.integers(SURFACE, size=self.near),
-             SURFACE + random.integers(VOLUME, size=self.volume)]
-        )  # fmt: skip
+        near = self._near(record, random)
+        chosen = np.concatenate([near, SURFACE + random.integers(VOLUME, size=self.volume)])
         points, inside = record["points"][chosen] @ turn.T, record["inside"][chosen]
         free = self._free_points(record, source, turn, random)
         at = random.integers(SURFACE, size=self.colour)
@@ -123,6 +125,16 @@ class PretrainingBatches:
             pixels[:, 3] / np.float32(255),
             hits,
         )
+
+    def _near(self, record: NDArray, random: np.random.Generator) -> NDArray:
+        """Numbers of points near the surface: of `TRIES` each, the one farthest from it. [N]
+
+        Those that lie closer than the planes' texels can tell teach little.
+        """
+        tries = random.integers(SURFACE, size=(TRIES, self.near))
+        apart = record["points"][tries].astype(np.float32) - record["surface"][tries]
+        best = np.square(apart).sum(axis=-1).argmax(axis=0)
+        return tries[best, np.arange(self.near)]
 
     def _turn(self, pose: NDArray) -> NDArray:
         """From the object's world to the model's frame, about the origin. [3, 3]"""

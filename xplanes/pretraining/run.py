@@ -13,7 +13,9 @@ from torch.utils.data import DataLoader, IterableDataset
 from xplanes.backend import fast_bf16
 from xplanes.config import ConfigError
 from xplanes.files import read_json, write_json
+from xplanes.lrm import LRMConfig, load
 from xplanes.lrm.config import parse_config
+from xplanes.lrm.openlrm import OpenLRM
 from xplanes.pretraining.batches import PretrainingBatch, PretrainingBatches
 from xplanes.pretraining.export import export
 from xplanes.pretraining.module import PretrainingModule
@@ -22,7 +24,7 @@ from xplanes.pretraining.observe import FOCAL
 from xplanes.pretraining.pool import SHARD, ensure_pool
 from xplanes.pretraining.quick import QuickLook
 from xplanes.pretraining.settings import PretrainConfig, published_sizes
-from xplanes.pretraining.start import start_model
+from xplanes.pretraining.start import grow_model, start_model
 from xplanes.pretraining.upkeep import Upkeep
 from xplanes.training.fit import quiet_lightning
 
@@ -104,7 +106,8 @@ def assemble(
         side=side,
         announce=announce,
     )
-    model = start_model(parse_config(published_sizes(config.model, FOCAL)), config.seed)
+    sizes = parse_config(published_sizes(config.model, FOCAL))
+    model = start_model(sizes, config.seed) if config.start is None else _grown(config.start, sizes)
     module = PretrainingModule(
         model, batch, config.schedule, config.seed, bf16=fast_bf16(torch.device("cpu"))
     )
@@ -120,6 +123,16 @@ def assemble(
         rays=batch.rays,
     )
     return module, data, QuickLook(held_out, config.schedule.score_objects)
+
+
+def _grown(start: str, sizes: LRMConfig) -> OpenLRM:
+    weights = Path(start)
+    try:
+        earlier = load(read_json(weights.with_suffix(".json")), weights)
+        assert isinstance(earlier, OpenLRM)
+        return grow_model(earlier, sizes).requires_grad_(True)
+    except (OSError, ValueError, RuntimeError) as problem:
+        raise ConfigError(f"start={start}: not the weights of such a model: {problem}") from problem
 
 
 def _settle(run: Path, plain: dict) -> None:

@@ -1,6 +1,7 @@
 """A model before its first step: places of picture and planes speak one language."""
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from xplanes.lrm.config import LRMConfig
@@ -43,16 +44,20 @@ def start_model(config: LRMConfig, seed: int) -> OpenLRM:
     with torch.no_grad():
         for block in [*model.encoder.blocks, *model.blocks]:
             for name, child in block.named_modules():  # branches start small
-                if name.endswith((".out", "mlp.2")):
+                if name.endswith(("attention.out", "mlp.2")) and "image" not in name:
                     child.weight.mul_(0.2)  # type: ignore[operator]
+        patch = model.encoder.patch
+        assert patch.bias is not None
+        patch.bias.copy_(-patch.weight.sum(dim=(1, 2, 3)))  # nothing to say of white
         for block in model.blocks:
             _compare(block.image_attention, SHARPNESS)  # type: ignore[arg-type]
             _compare(block.self_attention, SELF_SHARPNESS)  # type: ignore[arg-type]
             for norm in (block.norm1, block.norm2, block.norm3):
                 nn.init.zeros_(norm.modulation[1].weight)  # type: ignore[index]
         model.encoder.position[0, 1:] = _patch_places(config, places)
-        model.position[0] = _plane_places(config, places)
-        model.decoder.layers[-1].bias[0] = -2.0  # type: ignore[index]
+        model.position[0] = 0.5 * _plane_places(config, places)
+        for layer in model.decoder.layers[:-1]:  # half of what rectifiers get is lost
+            layer.weight.mul_(2**0.5)  # type: ignore[operator]
     return model
 
 
@@ -100,3 +105,23 @@ def _plane_places(config: LRMConfig, places: tuple[range, int]) -> Tensor:
             for column, row in ((0, 1), (0, 2), (2, 1))
         ]
     )
+
+
+def grow_model(earlier: OpenLRM, config: LRMConfig) -> OpenLRM:
+    """A model with planes of another resolution that goes on from one that was trained.
+
+    Everything is taken over; what places have learned is interpolated, their waves are drawn anew.
+
+    Args:
+        earlier: A model that differs in its low resolution at most.
+        config: Sizes of the new one.
+    """
+    model, places = OpenLRM(config), _places(config)
+    old = earlier.config.low_resolution
+    learned = earlier.position[0] - 0.5 * _plane_places(earlier.config, places)
+    planes = learned.unflatten(0, (3, old, old)).permute(0, 3, 1, 2)
+    size = (config.low_resolution, config.low_resolution)
+    wider = F.interpolate(planes, size=size, mode="bilinear").flatten(2).transpose(1, 2).flatten(0, 1)
+    state = {**earlier.state_dict(), "position": (wider + 0.5 * _plane_places(config, places))[None]}
+    model.load_state_dict(state)
+    return model

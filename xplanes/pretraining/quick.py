@@ -13,6 +13,9 @@ from xplanes.pretraining.render import render_view
 from xplanes.scenes.demo.film import CAMERA_DISTANCE
 
 
+_USED = ("pictures", "poses", "points", "inside")
+
+
 class QuickLook:
     """Scores of the first objects of a held-out pool, seen from their first view.
 
@@ -30,7 +33,7 @@ class QuickLook:
         found: dict[str, list[float]] = {"iou": [], "psnr_input": [], "psnr_novel": []}
         camera = canonical_vector(model.view)[None]
         for number in range(self.count):
-            record = self.pool[number]
+            record = {name: self.pool[number][name].copy() for name in _USED}
             pictures = torch.from_numpy(record["pictures"][..., :3] / 255).float()
             planes = model.triplanes(pictures[:1].permute(0, 3, 1, 2), camera)
             turn = world_to_model(torch.from_numpy(record["poses"][0]), model)

@@ -27,6 +27,7 @@ from xplanes.pretraining.settings import PretrainConfig, published_sizes
 from xplanes.pretraining.start import grow_model, start_model
 from xplanes.pretraining.upkeep import Upkeep
 from xplanes.training.fit import quiet_lightning
+from xplanes.training.interrupt import Interrupt
 
 CHECKPOINT = "last.ckpt"
 
@@ -68,11 +69,12 @@ def pretrain(plain: dict, config: PretrainConfig, announce: Callable[[str], None
     module, data, look = assemble(config, announce)
     if last.is_file():
         announce(f"going on from {last}")
+    interrupt = Interrupt()
     trainer = Trainer(
         accelerator="cpu",
         max_steps=-1,
         max_epochs=-1,
-        callbacks=[Upkeep(last, config.schedule, look, announce)],
+        callbacks=[Upkeep(last, config.schedule, look, announce), interrupt],
         logger=TensorBoardLogger(run, name="", version="tb"),
         enable_checkpointing=False,
         enable_progress_bar=False,
@@ -82,7 +84,8 @@ def pretrain(plain: dict, config: PretrainConfig, announce: Callable[[str], None
     )
     loader = DataLoader(Steps(data, lambda: module.steps), batch_size=None)
     checkpoint = str(last) if last.is_file() else None
-    trainer.fit(module, loader, ckpt_path=checkpoint, weights_only=True)
+    with interrupt.listening():
+        trainer.fit(module, loader, ckpt_path=checkpoint, weights_only=True)
     return export(module.average, published_sizes(config.model, FOCAL), run, config.model.name)
 
 

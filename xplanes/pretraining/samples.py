@@ -44,9 +44,8 @@ def draw_sample(seed: int, views: int, side: int) -> NDArray:
     """The record of an object, the same for the same seed. [1]"""
     solids, random = procedural_object(seed), np.random.default_rng([STREAM, seed])
     record = np.zeros(1, sample_type(views, side))
-    for view in range(views):
-        elevation = random.uniform(3, 50) if random.random() < 0.85 else random.uniform(50, 85)
-        pose = camera(random.uniform(0, 360), elevation)
+    for view, (azimuth, elevation) in enumerate(_cameras(random, views)):
+        pose = camera(azimuth, elevation)
         colour, alpha, depth = film_solids(solids, pose, side)
         record["pictures"][0, view, ..., :3] = np.rint(255 * colour)
         record["pictures"][0, view, ..., 3] = np.rint(255 * alpha)
@@ -62,6 +61,20 @@ def draw_sample(seed: int, views: int, side: int) -> NDArray:
     # Occupancy is that of the rounded points.
     record["inside"][0] = inside(solids, record["points"][0].astype(np.float64))
     return record
+
+
+def view_cameras(seed: int, views: int) -> list[tuple[float, float]]:
+    """Azimuth and elevation of the cameras that see an object, in degrees."""
+    return _cameras(np.random.default_rng([STREAM, seed]), views)
+
+
+def _cameras(random: np.random.Generator, views: int) -> list[tuple[float, float]]:
+    """Mostly from the side, at times from above."""
+    found = []
+    for _ in range(views):
+        elevation = random.uniform(3, 50) if random.random() < 0.85 else random.uniform(50, 85)
+        found.append((random.uniform(0, 360), elevation))
+    return found
 
 
 def surface_points(

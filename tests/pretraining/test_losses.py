@@ -69,7 +69,9 @@ def test_compositing_of_a_wall():
     density, lengths = torch.tensor([0.0, 50, 50, 50]), torch.tensor([1.0, 0.1, 0.1, 0.1])
     colours = torch.tensor([[0.1] * 3, [0.2] * 3, [0.3] * 3, [0.4] * 3])
     rendered, alpha = composite(density, colours, lengths)
-    first, second, third = (1 - torch.exp(torch.tensor(-5.0))) * torch.exp(torch.tensor([0.0, -5, -10]))
+    first, second, third = (1 - torch.exp(torch.tensor(-5.0))) * torch.exp(
+        torch.tensor([0.0, -5, -10])
+    )
     wanted = 0.2 * first + 0.3 * second + 0.4 * third + 1 - alpha
     torch.testing.assert_close(alpha, first + second + third)
     torch.testing.assert_close(rendered, wanted.expand(3))

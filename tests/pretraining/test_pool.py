@@ -145,7 +145,10 @@ def test_pictures_points_and_rays_lie_in_one_frame():
 
 
 def test_free_points_are_empty_and_in_the_box():
-    solids, data = procedural_object(0), batches(small_pool(1), objects=1, near=0, volume=0, free=400)
+    solids, data = (
+        procedural_object(0),
+        batches(small_pool(1), objects=1, near=0, volume=0, free=400),
+    )
     record = data.pool[0]
     turn = data._turn(record["poses"][1])
     points = data._free_points(record, 1, turn, np.random.default_rng(0))

@@ -119,7 +119,12 @@ def test_pictures_agree_with_the_demo_films():
     line = torch.arange(48, dtype=torch.float64) - 0.25
     rows, columns = torch.meshgrid(line, line, indexing="ij")
     origins, directions = pixel_rays(
-        torch.from_numpy(pose), rows.flatten(), columns.flatten(), focal=48 * FOCAL, height=48, width=48
+        torch.from_numpy(pose),
+        rows.flatten(),
+        columns.flatten(),
+        focal=48 * FOCAL,
+        height=48,
+        width=48,
     )
     distance = cast(solids, origins.numpy().copy(), directions.numpy())[0]
     seen = np.isfinite(distance)

@@ -123,7 +123,9 @@ def test_the_camera_and_scale_have_the_published_defaults(key):
 
 def test_encoder_sizes_go_by_either_name():
     sizes = {k: v for k, v in SIZES.items() if k != "encoder_sizes"}
-    assert parse_config({**sizes, "_reduced_encoder": SIZES["encoder_sizes"]}) == parse_config(SIZES)
+    assert parse_config({**sizes, "_reduced_encoder": SIZES["encoder_sizes"]}) == parse_config(
+        SIZES
+    )
 
 
 @pytest.mark.parametrize(

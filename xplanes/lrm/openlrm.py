@@ -75,9 +75,7 @@ class OpenLRM(LRM):
             density_scale=config.density_scale,
             colour_margin=0.001,
         )
-        view = replace(
-            OPENLRM_VIEW, distance=config.source_distance, focal=config.source_focal
-        )
+        view = replace(OPENLRM_VIEW, distance=config.source_distance, focal=config.source_focal)
         super().__init__(config, view, decoder)
         self.camera = nn.Sequential(
             nn.Linear(16, config.camera_width),

@@ -45,14 +45,17 @@ def published_state(model: OpenLRM) -> dict[str, Tensor]:
     result: dict[str, Tensor] = {}
     for published, names in NAMES[config.architecture].items():
         templates = () if names is None else (names,) if isinstance(names, str) else names
-        if ".cross_attn." in published and "out_proj" not in published:
-            if packed != ("in_proj" in published):
-                continue
+        # Query, key and value of attention to the picture are stacked where widths are equal.
+        of_picture = ".cross_attn." in published and "out_proj" not in published
+        if of_picture and packed != ("in_proj" in published):
+            continue
         for layer in range(layers):
             for part in ("weight", "bias"):
                 values = {"i": layer, "p": part, "h": layer, "e": 2 * layer}
                 found = [ours.get(template.format(**values)) for template in templates]
                 tensors = [tensor for tensor in found if tensor is not None]
                 if tensors and len(tensors) == len(templates):
-                    result[published.format(**values)] = torch.cat(tensors) if len(tensors) > 1 else tensors[0]
+                    result[published.format(**values)] = (
+                        torch.cat(tensors) if len(tensors) > 1 else tensors[0]
+                    )
     return result

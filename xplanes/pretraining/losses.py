@@ -66,7 +66,11 @@ def ray_samples(
     share = torch.where(steps < even, steps, steps - even) + jitter
     through = near[..., None] + (far - near)[..., None] * share / even
     around = 0.1 * (2 * share / (jitter.shape[-1] - even) - 1) + hits[..., None]
-    around = torch.where(hits.isfinite()[..., None], around, near[..., None] + (far - near)[..., None] * (share + 0.5) / (even + 1))
+    around = torch.where(
+        hits.isfinite()[..., None],
+        around,
+        near[..., None] + (far - near)[..., None] * (share + 0.5) / (even + 1),
+    )
     distances = torch.where(steps < even, through, around)
     distances = torch.minimum(torch.maximum(distances, near[..., None]), far[..., None])
     distances = distances.sort(dim=-1).values

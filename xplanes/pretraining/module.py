@@ -104,9 +104,8 @@ class PretrainingModule(LightningModule):
         self.steps += 1
         keep = min(self.schedule.average, (1 + self.steps) / (10 + self.steps))
         with torch.no_grad():
-            torch._foreach_lerp_(
-                list(self.average.parameters()), list(self.model.parameters()), 1 - keep
-            )
+            for mean, value in zip(self.average.parameters(), self.model.parameters(), strict=True):
+                mean.lerp_(value, 1 - keep)
         self.last = {**parts, "gradient": float(norm), "rate": self.rate}
 
     def losses(self, batch: PretrainingBatch) -> tuple[Tensor, dict[str, float]]:

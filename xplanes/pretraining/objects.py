@@ -19,7 +19,7 @@ STREAM = 70_203
 
 
 def procedural_object(seed: int) -> Solids:
-    """The object of a seed: centred near the origin, no farther than about 1.2 along any axis, z up.
+    """The object of a seed: near the origin, within about 1.2 of it along each axis, z up.
 
     Args:
         seed: One of `TRAINING_SEEDS` or `HELD_OUT_SEEDS`.
@@ -69,7 +69,9 @@ def _prop(b: Builder, reach: float) -> None:
         heap(b, place(spot, scale=b.uniform(0.1, 0.35)))
     else:
         size = (b.uniform(0.03, 0.3), b.uniform(0.03, 0.3), b.uniform(0.03, 0.3))
-        b.add(place((spot[0], spot[1], size[2]), (0, 0, b.uniform(0, 90))), BOX, size, b.pattern(0.2))
+        b.add(
+            place((spot[0], spot[1], size[2]), (0, 0, b.uniform(0, 90))), BOX, size, b.pattern(0.2)
+        )
 
 
 def _light(b: Builder) -> Array:

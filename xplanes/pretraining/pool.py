@@ -88,7 +88,9 @@ def _read(folder: Path, kind: dict[str, int]) -> dict[str, Any]:
     record = read_json(path)
     found = {key: record.get(key) for key in kind}
     if found != kind:
-        raise ConfigError(f"pool.root={folder} holds a pool of {found}, wanted is {kind}: name another folder")
+        raise ConfigError(
+            f"pool.root={folder} holds a pool of {found}, wanted is {kind}: name another folder"
+        )
     return record
 
 

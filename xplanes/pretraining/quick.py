@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from xplanes.lrm import LRM
 from xplanes.lrm.canonical import canonical_vector
 from xplanes.lrm.openlrm import OpenLRM
 from xplanes.metrics import psnr
@@ -11,7 +12,6 @@ from xplanes.pretraining.observe import FOCAL
 from xplanes.pretraining.pool import Pool
 from xplanes.pretraining.render import render_view
 from xplanes.scenes.demo.film import CAMERA_DISTANCE
-
 
 _USED = ("pictures", "poses", "points", "inside")
 
@@ -49,7 +49,7 @@ class QuickLook:
         return {name: sum(values) / len(values) for name, values in found.items()}
 
 
-def world_to_model(source: Tensor, model: OpenLRM) -> Tensor:
+def world_to_model(source: Tensor, model: LRM) -> Tensor:
     """Scale and turn that take the source camera to the model's own. [4, 4] -> [3, 3]"""
     scale = model.view.distance / CAMERA_DISTANCE
     return (scale * model.view.rotation_matrix() @ source[:3, :3].T.double()).float()
@@ -68,5 +68,3 @@ def overlap(found: Tensor, truth: Tensor) -> float:
     """Intersection over union; 1 where both are empty. bool [N], bool [N]"""
     union = int((found | truth).sum())
     return int((found & truth).sum()) / union if union else 1.0
-
-

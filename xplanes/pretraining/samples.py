@@ -77,9 +77,7 @@ def _cameras(random: np.random.Generator, views: int) -> list[tuple[float, float
     return found
 
 
-def surface_points(
-    solids: Solids, random: np.random.Generator, count: int
-) -> tuple[Array, Array]:
+def surface_points(solids: Solids, random: np.random.Generator, count: int) -> tuple[Array, Array]:
     """Points on the surface, as random lines from above and the sides first meet it.
 
     Returns:

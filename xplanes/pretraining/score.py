@@ -12,11 +12,11 @@ from torch import Tensor
 from xplanes.files import replacing, write_json
 from xplanes.lrm import LRM
 from xplanes.metrics import psnr, ssim
+from xplanes.pretraining.losses import triplane_logits
 from xplanes.pretraining.objects import HELD_OUT_SEEDS, procedural_object
 from xplanes.pretraining.observe import FOCAL, camera, film_solids, inside
 from xplanes.pretraining.quick import model_pose, overlap, world_to_model
 from xplanes.pretraining.render import render_view
-from xplanes.pretraining.losses import triplane_logits
 from xplanes.pretraining.samples import view_cameras
 from xplanes.scenes.demo.film import camera_at, film
 from xplanes.scenes.demo.scenes import DEMO_SCENES, build_demo_scene
@@ -95,7 +95,10 @@ def score(model: LRM, subject: Subject) -> Score:
     line = model.half_side * (2 * (torch.arange(GRID) + 0.5) / GRID - 1)
     grid = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), dim=-1).flatten(0, 2)
     solid = torch.cat(
-        [triplane_logits(planes, model.decoder, part[None])[0, :, 0] > 1 for part in grid.split(2**15)]
+        [
+            triplane_logits(planes, model.decoder, part[None])[0, :, 0] > 1
+            for part in grid.split(2**15)
+        ]
     )
     world = grid @ torch.linalg.inv(turn).T
     rendered = [
@@ -131,14 +134,14 @@ def score_all(
     """
     found = [score(model, subject) for subject in held_out(objects)]
     scenes = [score(model, subject) for subject in demo_subjects()]
-    means = {
-        key: sum(s.values[key] for s in found) / len(found) for key in found[0].values
-    }
+    means = {key: sum(s.values[key] for s in found) / len(found) for key in found[0].values}
     table = {f"{objects} held-out objects": means, **{s.name: s.values for s in scenes}}
     announce(f"{'':24}" + "".join(f"{key:>12}" for key in means))
     for name, values in table.items():
         announce(f"{name:24}" + "".join(f"{value:12.3f}" for value in values.values()))
-    write_json(folder / "scores.json", {"mean": table, "objects": {s.name: s.values for s in found}})
+    write_json(
+        folder / "scores.json", {"mean": table, "objects": {s.name: s.values for s in found}}
+    )
     by_overlap = sorted(found, key=lambda s: s.values["iou"])
     write_sheet(folder / "objects.png", [s.strip for s in found[:16]], 2)
     write_sheet(folder / "demo.png", [s.strip for s in scenes], 1)

@@ -83,9 +83,8 @@ class Solids:
     def moved(self, scale: float, shift: Array) -> "Solids":
         """The whole scaled about the origin, patterns too, and then shifted."""
         numbers = self.numbers.copy()
-        for kind, columns in ((PLAIN, [1]), (STRIPES, [1]), (CHECKER, [0, 1, 2])):
-            chosen = np.flatnonzero(self.patterns == kind)
-            numbers[np.ix_(chosen, columns)] *= scale
+        for kind, columns in ((PLAIN, slice(1, 2)), (STRIPES, slice(1, 2)), (CHECKER, slice(3))):
+            numbers[self.patterns == kind, columns] *= scale
         numbers[self.patterns == BRICKS, :3] *= scale
         return Solids(
             self.kinds, self.sizes * scale, self.rotations, self.centres * scale + shift,

@@ -121,7 +121,12 @@ def grow_model(earlier: OpenLRM, config: LRMConfig) -> OpenLRM:
     learned = earlier.position[0] - 0.5 * _plane_places(earlier.config, places)
     planes = learned.unflatten(0, (3, old, old)).permute(0, 3, 1, 2)
     size = (config.low_resolution, config.low_resolution)
-    wider = F.interpolate(planes, size=size, mode="bilinear").flatten(2).transpose(1, 2).flatten(0, 1)
-    state = {**earlier.state_dict(), "position": (wider + 0.5 * _plane_places(config, places))[None]}
+    wider = (
+        F.interpolate(planes, size=size, mode="bilinear").flatten(2).transpose(1, 2).flatten(0, 1)
+    )
+    state = {
+        **earlier.state_dict(),
+        "position": (wider + 0.5 * _plane_places(config, places))[None],
+    }
     model.load_state_dict(state)
     return model

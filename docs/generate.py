@@ -9,6 +9,7 @@ from typing import Any
 import yaml
 
 from xplanes import config as schemas
+from xplanes.pretraining.settings import PretrainConfig
 
 ROOT = Path(__file__).resolve().parent.parent
 TARGET = ROOT / "docs" / "configuration.md"
@@ -18,7 +19,11 @@ _FIELD = re.compile(r"^    (\w+): [^#\n]*#\s*(.+)$", re.MULTILINE)
 GROUPS: dict[str, dict[str, type]] = {
     "data": {"demo": schemas.DemoConfig, "dnerf": schemas.DataConfig},
     "model": {"six_planes": schemas.ModelConfig, "nine_planes": schemas.ModelConfig},
-    "lrm": {"none": schemas.LRMConfig, "file": schemas.TriplaneFileConfig},
+    "lrm": {
+        "none": schemas.LRMConfig,
+        "file": schemas.TriplaneFileConfig,
+        **dict.fromkeys(("small", "base", "large", "xlarge"), schemas.PretrainedLRMConfig),
+    },
     "preparation": {"default": schemas.PreparationConfig},
     "decomposition": dict.fromkeys(("default", "paper"), schemas.DecompositionConfig),
     "sampler": {"occupancy": schemas.SamplerConfig},
@@ -85,7 +90,24 @@ def document() -> str:
             parts += ["", f"## {names}", "", (schema.__doc__ or "").split("\n")[0], ""]
             parts += ["| key | meaning | value |", "|---|---|---|"]
             parts += rows(schema, named, f"{group}.")
-    return "\n".join(parts) + "\n"
+    return "\n".join([*parts, *pretraining()]) + "\n"
+
+
+def pretraining() -> list[str]:
+    """The settings of the other program."""
+    shared = yaml.safe_load((ROOT / "conf" / "pretrain_lrm.yaml").read_text())
+    shared.pop("defaults")
+    options = {name: {**shared, "model": values("pretrain", name)} for name in ("tiny", "mini")}
+    return [
+        "",
+        "## `python -m xplanes pretrain-lrm`, with `pretrain=tiny`, `pretrain=mini`",
+        "",
+        "Training of a small LRM on procedural objects, [its card](lrm_tiny.md).",
+        "",
+        "| key | meaning | value |",
+        "|---|---|---|",
+        *rows(PretrainConfig, options, ""),
+    ]
 
 
 if __name__ == "__main__":

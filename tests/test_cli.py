@@ -24,7 +24,7 @@ def test_help_loads_nothing_heavy(tmp_path):
     )
     done = python("-c", code, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    for verb in ("download", "evaluate", "render", "view", "table"):
+    for verb in ("download", "triplanes", "evaluate", "render", "view", "table"):
         assert verb in done.stdout
 
 

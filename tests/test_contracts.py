@@ -15,8 +15,9 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 
 from tests.synthetic import ball_scene
-from xplanes import config as config_module
-from xplanes.config import SCHEMAS, ConfigError, parse, register_schemas, to_plain
+from xplanes import checks
+from xplanes.checks import parse
+from xplanes.config import SCHEMAS, ConfigError, register_schemas, to_plain
 from xplanes.launch import CONF, check_keys, prepare
 from xplanes.scenes.frame import scene_frame
 from xplanes.training.builder import build_batches, build_module
@@ -26,9 +27,9 @@ ROOT = CONF.parent
 OPTIONS = sorted(
     (str(path.parent.relative_to(CONF)), path.stem)
     for path in CONF.rglob("*.yaml")
-    if path.parent != CONF and "hydra" not in path.relative_to(CONF).parts
+    if path.parent != CONF and not {"hydra", "pretrain"} & set(path.relative_to(CONF).parts)
 )
-"""Every option of every group of conf/."""
+"""Every option of every group that train.py knows; tests/pretraining looks after the other."""
 
 TINY = (
     "model.resolution=6",
@@ -176,10 +177,10 @@ def all_keys():
 
 
 CHECKED = {
-    "positive": config_module._POSITIVE,
-    "not negative": config_module._NOT_NEGATIVE,
-    "share": config_module._SHARE,
-    "choice": list(config_module._CHOICES),
+    "positive": checks._POSITIVE,
+    "not negative": checks._NOT_NEGATIVE,
+    "share": checks._SHARE,
+    "choice": list(checks._CHOICES),
 }
 
 
@@ -191,7 +192,7 @@ def test_checked_keys_exist_and_are_listed_once(kind):
     assert not set(CHECKED[kind]) & set(others)
 
 
-PLAIN = composed()
+PLAIN = composed("lrm=small")
 
 REFUSED = [
     *[(key, value) for key in CHECKED["positive"] for value in (0, -1)],
@@ -202,6 +203,7 @@ REFUSED = [
     ("trainer.evaluate_at", [0.5, 1.5]),
     ("trainer.devices", 2),
     ("sampler.grid_resolution", 4096),
+    ("preparation.elevation", 91),
 ]
 
 
@@ -222,6 +224,18 @@ def test_values_that_cannot_work_are_refused_by_name(key, value):
         parse(changed(key, value))
     assert key in str(caught.value)
     assert str(value) in str(caught.value)
+
+
+def test_a_crop_and_padding_exclude_each_other():
+    with pytest.raises(ConfigError, match=r"lrm\.crop=true with lrm\.matching=pad"):
+        parse(composed("lrm=large", "lrm.matching=pad"))
+
+
+def test_several_processes_need_a_cache_for_their_start():
+    overrides = ["lrm=small", "trainer=ddp", "trainer.devices=2"]
+    parse(composed(*overrides))
+    with pytest.raises(ConfigError, match=r"preparation\.cache=null .* trainer\.devices=2"):
+        parse(composed(*overrides, "preparation.cache=null"))
 
 
 def test_the_composed_configuration_survives_its_file():
@@ -292,7 +306,7 @@ def test_an_occlusion_that_hides_everything_is_refused():
 
 
 LAYERS = (
-    ("backend", "files", "optional", "config", "metrics"),
+    ("backend", "files", "optional", "config", "checks", "metrics"),
     ("scenes",),
     ("fields",),
     ("lrm",),
@@ -301,7 +315,8 @@ LAYERS = (
     ("training",),
     ("preparation",),
     ("evaluation",),
-    ("pipeline",),
+    ("pretraining",),
+    ("pipeline", "launch"),
     ("cli",),
     ("__main__",),
 )
@@ -312,8 +327,8 @@ An LRM brings a decoder of the fields' kind, so fields stand above it.
 
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 
-EDGES = {"launch": {"config", "files"}, "train": {"config", "launch", "pipeline"}}
-"""What the command line's ends may import; nothing imports them."""
+EDGES = {"launch": {"checks", "config", "files"}, "train": {"config", "launch", "pipeline"}}
+"""What the ends of the command line may import, which must be quick to start."""
 
 
 def sources():

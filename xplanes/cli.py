@@ -46,10 +46,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _known_errors() -> tuple[type[Exception], ...]:
     """Errors whose message says all."""
     from xplanes.config import ConfigError
+    from xplanes.lrm.errors import LRMError
     from xplanes.optional import MissingExtraError
     from xplanes.scenes.errors import SceneError
 
-    return ConfigError, SceneError, MissingExtraError, PermissionError
+    return ConfigError, SceneError, LRMError, MissingExtraError, PermissionError
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -60,8 +61,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"xplanes {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    verbs = (_add_download, _add_evaluate, _add_render, _add_view, _add_table, _add_pretrain)
-    for add in verbs:
+    verbs = (_add_download, _add_triplanes, _add_evaluate, _add_render, _add_view, _add_table)
+    for add in (*verbs, _add_pretrain, _add_score):
         add(commands)
     return parser
 
@@ -80,6 +81,31 @@ def _download(options: argparse.Namespace) -> None:
 
     root = download_dnerf(options.root)
     print(f"train with: python train.py data=dnerf data.root={root} data.scene=lego")
+
+
+def _add_triplanes(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser("triplanes", help="turn pictures into triplanes with an LRM")
+    parser.add_argument(
+        "arguments",
+        nargs="+",
+        metavar="IMAGES lrm=NAME lrm.weights=FILE out=FILE.safetensors",
+        help="pictures (with transparency) or folders of them, and settings of train.py",
+    )
+    parser.set_defaults(command=_triplanes)
+
+
+def _triplanes(options: argparse.Namespace) -> None:
+    from xplanes.launch import settings
+
+    changed = [text for text in options.arguments if "=" in text and not Path(text).exists()]
+    paths = [Path(text) for text in options.arguments if text not in changed]
+    outs = [text for text in changed if text.startswith("out=")]
+    config = settings([text for text in changed if text not in outs])
+    out = outs[-1].removeprefix("out=") if outs else "triplanes.safetensors"
+
+    from xplanes.evaluation.turntable import write_triplanes
+
+    write_triplanes(paths, Path(out), config, say=_say)
 
 
 def _add_run(parser: argparse.ArgumentParser) -> None:
@@ -232,3 +258,27 @@ def _pretrain(options: argparse.Namespace) -> None:
     from xplanes.pretraining.command import run_pretraining
 
     _say(f"wrote {run_pretraining(options.overrides, _say)}")
+
+
+def _add_score(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser("score-lrm", help="judge a small LRM by held-out objects")
+    parser.add_argument("model", help="tiny, or the weights of a run, FOLDER/NAME.safetensors")
+    parser.add_argument("--objects", type=int, default=64, help="default: %(default)s")
+    parser.add_argument(
+        "--out", type=Path, default=Path("outputs/score-lrm"), help="default: %(default)s"
+    )
+    parser.set_defaults(command=_score)
+
+
+def _score(options: argparse.Namespace) -> None:
+    from xplanes.config import ConfigError
+    from xplanes.lrm.bundled import FOLDER, load_bundled
+    from xplanes.pretraining.score import score_all
+
+    if options.objects < 1:
+        raise ConfigError(f"--objects {options.objects}: must be at least 1")
+    path = Path(options.model)
+    own = path.suffix == ".safetensors"
+    model, _ = load_bundled(path.stem if own else options.model, path.parent if own else FOLDER)
+    score_all(model, options.out, objects=options.objects, announce=_say)
+    _say(f"wrote {options.out}/scores.json, objects.png, failures.png and demo.png")

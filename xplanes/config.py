@@ -1,6 +1,5 @@
 """Every setting, typed. The values live in conf/, one YAML group per thing a user varies."""
 
-import math
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
@@ -20,6 +19,7 @@ class DataConfig:
     scene: str = MISSING  # Folder of the scene, or name of the demo scene.
     resolution: int | None = MISSING  # Pixels per side; null keeps the native size.
     views: int | None = MISSING  # Training views kept, spread over time; null keeps all.
+    train_on_video: bool = MISSING  # Train on the frames of the scene's fixed camera too.
     eval_split: str = MISSING  # Split that is scored: test or val.
     half_side: float | None = MISSING  # Half the side of the scene's cube; null finds it.
     background_share: float = MISSING  # Share of rays drawn far from the silhouettes.
@@ -79,6 +79,36 @@ class TriplaneFileConfig(LRMConfig):
 
 
 @dataclass
+class ImageLRMConfig(LRMConfig):
+    """A model, and how it meets the scene's pictures."""
+
+    weights: str | None = MISSING  # A local file instead.
+    matching: str = MISSING  # Where focal lengths differ: scale, or pad the pictures (exact).
+    crop: bool = MISSING  # Show the model the object at the size that it was trained with.
+    batch: int = MISSING  # Pictures at a time.
+
+
+@dataclass
+class BundledLRMConfig(ImageLRMConfig):
+    """A model of the package, or with `weights` one of the same form."""
+
+    bundled: str = MISSING  # Name of its files in the package.
+
+
+@dataclass
+class PretrainedLRMConfig(ImageLRMConfig):
+    """A published model."""
+
+    architecture: str = MISSING  # One of openlrm-{small,base,large}-{1.0,1.1} and triposr.
+    repository: str = MISSING  # On the Hugging Face hub.
+    file: str = MISSING  # Name of the weights there.
+    revision: str = MISSING  # Branch, tag or commit there.
+    licence: str = MISSING  # Of the weights.
+    megabytes: int = MISSING  # Size of the file.
+    config: str | None = MISSING  # A config.json or config.yaml for weights of other sizes.
+
+
+@dataclass
 class DecompositionConfig:
     """From a triplane sequence to low-rank and sparse parts, and from these to planes."""
 
@@ -100,6 +130,12 @@ class PreparationConfig:
     """What happens before training, for a start that is not random."""
 
     cache: str | None = MISSING  # Folder for finished stages; null computes them anew.
+    frames: int = MISSING  # Moments of the fixed view.
+    fixed_view: str = MISSING  # The scene's video, train (a field films it), or auto.
+    fixed_view_seconds: float = MISSING  # Training clock of the field that films it.
+    fixed_view_steps: int = MISSING  # Its steps at most.
+    azimuth: float | None = MISSING  # Degrees from x towards y; null: a training view's.
+    elevation: float = MISSING  # Its height angle in degrees.
 
 
 @dataclass
@@ -116,6 +152,7 @@ class SamplerConfig:
     skip_occluded: bool = MISSING  # Skip samples behind opaque surfaces.
     occlusion: float = MISSING  # Light left behind a surface below which it is opaque.
     silhouettes: bool = MISSING  # Rule out cells that the images' alpha shows to be empty.
+    fill: bool = MISSING  # Empty cells where a start that is not random shows nothing.
     coarse_steps: int = MISSING  # First steps, in which samples lie twice as far apart.
     sweep_at: list[int] = MISSING  # Steps at which all occupied cells are looked at.
     sweep_every: int = MISSING  # Steps between such sweeps later on.
@@ -186,6 +223,8 @@ SCHEMAS: dict[tuple[str | None, str], type] = {
     ("model", "xplanes_schema"): ModelConfig,
     ("lrm", "lrm_schema"): LRMConfig,
     ("lrm", "file_schema"): TriplaneFileConfig,
+    ("lrm", "bundled_lrm_schema"): BundledLRMConfig,
+    ("lrm", "pretrained_lrm_schema"): PretrainedLRMConfig,
     ("preparation", "preparation_schema"): PreparationConfig,
     ("decomposition", "decomposition_schema"): DecompositionConfig,
     ("sampler", "occupancy_schema"): SamplerConfig,
@@ -222,114 +261,3 @@ def build(schema: type, values: dict[str, Any]) -> Any:
             build(inner, value) if is_dataclass(inner) and isinstance(inner, type) else value
         )
     return schema(**arguments)
-
-
-def parse(config: dict[str, Any]) -> TrainConfig:
-    """A plain configuration, as saved in a run directory, as typed settings.
-
-    Raises:
-        ConfigError: If settings are out of range or contradict one another.
-    """
-    data = DemoConfig if config["data"]["name"] == "demo" else DataConfig
-    lrm = TriplaneFileConfig if config["lrm"]["name"] == "file" else LRMConfig
-    typed = TrainConfig(
-        seed=config["seed"],
-        resume=config.get("resume"),
-        data=build(data, config["data"]),
-        model=build(ModelConfig, config["model"]),
-        lrm=build(lrm, config["lrm"]),
-        preparation=build(PreparationConfig, config["preparation"]),
-        decomposition=build(DecompositionConfig, config["decomposition"]),
-        sampler=build(SamplerConfig, config["sampler"]),
-        loss=build(LossConfig, config["loss"]),
-        trainer=build(TrainerConfig, config["trainer"]),
-    )
-    check(typed)
-    return typed
-
-
-_POSITIVE = """data.resolution data.views data.half_side data.train_views data.test_views
-data.val_views model.resolution model.time_resolution model.channels model.decoder.width
-model.decoder.density_scale sampler.samples sampler.grid_resolution sampler.time_bins
-sampler.threshold sampler.sweep_every sampler.update_every sampler.update_cells loss.every
-loss.sparse_frames decomposition.penalty decomposition.tolerance decomposition.max_iterations
-trainer.devices
-trainer.max_steps trainer.max_seconds trainer.rays_per_batch trainer.samples_per_batch
-trainer.accumulate trainer.plane_lr trainer.time_lr trainer.decoder_lr trainer.checkpoint_every
-trainer.evaluate_views trainer.log_every""".split()
-_NOT_NEGATIVE = """seed model.decoder.hidden model.decoder.colour_margin model.space_scale
-model.time_scale loss.total_variation loss.time_smoothness loss.time_magnitude loss.sparse_weight
-decomposition.noise trainer.warmup_steps""".split()
-_SHARE = """data.background_share sampler.decay sampler.occlusion trainer.final_lr""".split()
-_CHOICES: dict[str, tuple[str, ...]] = {
-    "data.eval_split": ("test", "val"),
-    "model.plane_set": ("six", "nine", "three"),
-    "model.decoder.activation": ("relu", "silu"),
-    "model.decoder.density": ("softplus", "exp"),
-    "decomposition.method": ("adaptive", "growing", "admm", "exact"),
-    "decomposition.scale": ("rms", "none"),
-    "decomposition.static": ("middle", "median", "mean"),
-    "decomposition.dynamic": ("random", "rank1"),
-    "loss.background": ("white", "random"),
-    "trainer.accelerator": ("auto", "cpu", "gpu"),
-    "trainer.strategy": ("auto", "ddp"),
-    "trainer.precision": ("auto", "32", "bf16"),
-}
-
-
-def check(config: TrainConfig) -> None:
-    """Refuse settings that cannot work, each with the key, the value and what is allowed."""
-    for key, value in _leaves(config):
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ConfigError(f"{key}={value}: must be a finite number")
-        if value is None:
-            continue
-        if key in _POSITIVE and value <= 0:
-            raise ConfigError(f"{key}={value}: must be above 0")
-        if key in _NOT_NEGATIVE and value < 0:
-            raise ConfigError(f"{key}={value}: must not be negative")
-        if key in _SHARE and not 0 <= value <= 1:
-            raise ConfigError(f"{key}={value}: must lie between 0 and 1")
-        if key in _CHOICES and value not in _CHOICES[key]:
-            raise ConfigError(f"{key}={value}: must be one of {', '.join(_CHOICES[key])}")
-    if config.sampler.occlusion >= 1:
-        raise ConfigError(
-            f"sampler.occlusion={config.sampler.occlusion}: must be below 1, or no light counts as "
-            "seen; 1e-5 is the default, sampler.skip_occluded=false skips nothing"
-        )
-    at = config.trainer.evaluate_at
-    if any(not 0 <= share <= 1 for share in at):
-        raise ConfigError(f"trainer.evaluate_at={at}: shares of the budget, from 0 to 1")
-    _check_decomposition(config.decomposition)
-    if config.trainer.devices > 1 and config.trainer.strategy != "ddp":
-        raise ConfigError(
-            f"trainer.devices={config.trainer.devices} with trainer.strategy=auto: several devices "
-            "need trainer=ddp"
-        )
-    if config.sampler.grid_resolution**3 * config.sampler.time_bins > 2**28:
-        raise ConfigError(
-            f"sampler.grid_resolution={config.sampler.grid_resolution} with sampler.time_bins="
-            f"{config.sampler.time_bins}: more than 268 million cells; lower one of them"
-        )
-
-
-def _check_decomposition(config: DecompositionConfig) -> None:
-    weight = config.sparsity_weight
-    if weight != "auto" and (isinstance(weight, str) or weight <= 0):
-        raise ConfigError(
-            f"decomposition.sparsity_weight={weight}: must be auto or a number above 0"
-        )
-    if config.dynamic == "random" and config.noise == 0:
-        raise ConfigError(
-            "decomposition.noise=0 with decomposition.dynamic=random: time planes of zeros never "
-            "learn, as products of two zeros have no gradient; set decomposition.noise=0.01"
-        )
-
-
-def _leaves(node: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    found = []
-    for entry in fields(node):
-        value = getattr(node, entry.name)
-        key = f"{prefix}{entry.name}"
-        found += _leaves(value, f"{key}.") if is_dataclass(value) else [(key, value)]
-    return found

@@ -8,7 +8,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from xplanes.config import ConfigError, register_schemas
+from xplanes.checks import parse
+from xplanes.config import ConfigError, TrainConfig, register_schemas, to_plain
 from xplanes.files import read_json
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
@@ -85,6 +86,24 @@ def _latest(outputs: Path, overrides: list[str]) -> Path | None:
 
 def _mtime(path: Path) -> float:
     return path.stat().st_mtime
+
+
+def settings(overrides: list[str], conf: Path = CONF) -> TrainConfig:
+    """The settings of train.py with some of them changed.
+
+    Raises:
+        ConfigError: If a setting does not exist or cannot work.
+    """
+    from hydra import compose, initialize_config_dir
+    from hydra.errors import HydraException
+
+    check_keys(overrides, conf)
+    register_schemas()
+    try:
+        with initialize_config_dir(str(conf), version_base="1.3"):
+            return parse(to_plain(compose("train", overrides)))
+    except HydraException as error:
+        raise ConfigError(str(error)) from error
 
 
 def check_keys(arguments: list[str], conf: Path = CONF) -> None:

@@ -14,11 +14,14 @@ import torch
 import yaml
 from lightning import seed_everything
 
-from xplanes.config import ConfigError, TrainConfig, parse
+from xplanes.checks import parse
+from xplanes.config import ConfigError, TrainConfig
 from xplanes.evaluation.media import film_times, orbit_poses, render_path, write_film
 from xplanes.evaluation.report import closing, header, summary, write_hparams, write_start
 from xplanes.files import write_json, write_text
-from xplanes.preparation import check_source, prepare
+from xplanes.lrm import LRMError
+from xplanes.optional import MissingExtraError
+from xplanes.preparation import find_source, prepare
 from xplanes.scenes.datamodule import RayDataModule
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, scene_frame
@@ -35,7 +38,7 @@ from xplanes.training.record import RunRecord, claim
 
 logger = logging.getLogger(__name__)
 
-KNOWN_ERRORS = (ConfigError, SceneError, TrainingError)
+KNOWN_ERRORS = (ConfigError, SceneError, LRMError, TrainingError, MissingExtraError)
 """Errors whose message says all; their traceback goes to train.log alone."""
 
 FILM_FRAMES, FILM_FPS, FILM_SIZE = 48, 16, 200
@@ -54,7 +57,7 @@ def run(config: dict[str, Any], folder: Path, overrides: list[str], *, resume: b
         PSNR of the scored split in dB; NaN in helper processes of a distributed run.
 
     Raises:
-        ConfigError, SceneError, TrainingError: With a message that says what to do.
+        ConfigError, SceneError, LRMError, TrainingError: With a message that says what to do.
         KeyboardInterrupt: If the user stopped it; the state is saved.
     """
     typed = parse(config)
@@ -94,12 +97,13 @@ def train(
         The content of metrics.json; empty without a ``record``.
     """
     seed_everything(config.seed, verbose=False)
-    check_source(config.lrm)
+    source = find_source(config.lrm, say=say)
     started = time.monotonic()
     scene = build_scene(config.data)
     frame = scene_frame(scene.splits["train"], config.data.half_side)
     loaded = time.monotonic() - started
-    start = prepare(config, scene, frame)
+    start = prepare(config, scene, frame, source, say=say)
+    del source
     config, frame = replace(config, model=start.model), start.frame
     began = time.monotonic()
     module = build_module(
@@ -122,7 +126,7 @@ def train(
         text = header(config, folder, scene, frame, module, device, overrides or [], start.words)
         logger.info("\n%s", text)
         say(text + "\n")
-        write_start(folder, start.picture, log=not resume)
+        write_start(folder, start.pictures, log=not resume)
     scorer = fit(config, module, data, folder, resume=resume)
     if record is None:
         return {}
@@ -135,6 +139,7 @@ def train(
     skipped = build_batches(config, scene, frame, 0).skipped
     metrics = summary(module, scorer.latest, config.data.eval_split, seconds, skipped)
     metrics["decomposition"] = start.report
+    metrics["lrm"] = start.lrm
     if config.trainer.media:
         metrics["media"] = str(_film(module, frame, scene, folder).relative_to(folder))
     seconds["total"] = record.total_seconds

@@ -8,9 +8,11 @@ from typing import Any
 
 import pytest
 import yaml
+from PIL import Image
 
 from xplanes.config import ConfigError
-from xplanes.evaluation.sweep import read_rows
+from xplanes.evaluation.curves import _mean_curve
+from xplanes.evaluation.sweep import Point, read_rows
 from xplanes.evaluation.table import write_tables
 
 
@@ -62,17 +64,65 @@ def test_columns_are_the_settings_that_differ(tmp_path):
     text = write_tables(tmp_path)
     header = [cell.strip() for cell in text.splitlines()[4].strip("|").split("|")]
     assert header == [
-        *("run", "model", "psnr", "ssim", "steps"),
+        *("run", "model", "psnr", "ssim", "step 0", "s to 20 dB", "steps"),
         *("prepare s", "train s", "samples/ray", "params", "status"),
     ]
     row = [cell.strip() for cell in text.splitlines()[6].strip("|").split("|")]
     assert row == [
-        *("0_a", "six_planes", "20.00", "0.5000", "300"),
+        *("0_a", "six_planes", "20.00", "0.5000", "", "", "300"),
         *("2.0", "60.2", "12.5", "1,234,567", "finished"),
     ]
     assert "2 runs: 2 finished. Scores of the test split." in text
     assert (tmp_path / "table.md").read_text() == text
     assert table(tmp_path)[1]["psnr"] == "21.0"
+
+
+CURVE = "seconds,step,split,psnr,ssim\n"
+
+
+@pytest.mark.parametrize(
+    ("rows", "start", "reached"),
+    [
+        ("0,0,test,8,0.1\n10,50,test,16,0.2\n20,90,test,24,0.3\n", 8.0, 2 + 15.0),
+        ("0,0,test,21,0.1\n10,50,test,25,0.2\n", 21.0, 2.0),
+        ("0,0,test,8,0.1\n10,50,test,19,0.2\n", 8.0, None),
+        ("10,50,test,19,0.2\n20,90,test,21,0.2\n", None, 2 + 15.0),
+    ],
+)
+def test_the_curve_tells_the_start_and_the_time_to_20(tmp_path, rows, start, reached):
+    (make(tmp_path / "0") / "curve.csv").write_text(CURVE + rows)
+    (row,) = table(tmp_path)
+    assert row["start_psnr"] == ("" if start is None else repr(start))
+    # Two seconds of preparation come first.
+    assert row["seconds_to_20"] == ("" if reached is None else repr(reached))
+
+
+def test_a_damaged_curve_is_a_status(tmp_path):
+    (make(tmp_path / "0") / "curve.csv").write_text(CURVE + "0,zero,test,8,0.1\n")
+    assert table(tmp_path)[0]["status"] == "damaged; curve.csv is damaged"
+
+
+def test_several_runs_are_plotted(tmp_path):
+    pytest.importorskip("matplotlib", reason="needs the extra plots")
+    for number, (model, seed) in enumerate([("a", 0), ("a", 1), ("b", 0)]):
+        run = make(tmp_path / f"{number}", model=model, seed=seed)
+        rows = f"0,0,test,{8 + seed},0.1\n10,50,test,16,0.2\n"
+        (run / "curve.csv").write_text(CURVE + rows)
+    assert "![PSNR against seconds and steps](curves.png)" in write_tables(tmp_path)
+    with Image.open(tmp_path / "curves.png") as picture:
+        assert min(picture.size) > 300
+
+
+def test_curves_of_seeds_are_averaged_over_what_they_share():
+    runs = [
+        (Point(0, 0, 10.0), Point(10, 100, 20.0)),
+        (Point(2, 0, 10.0), Point(6, 50, 14.0), Point(12, 100, 20.0)),
+    ]
+    places, values = _mean_curve(runs, "seconds")
+    assert (places[0], places[-1]) == (2, 10)
+    assert values[0] == pytest.approx((12 + 10) / 2)
+    assert values[-1] == pytest.approx((20 + 18) / 2)
+    assert _mean_curve(runs[:1], "step") == ([0, 100], [10.0, 20.0])
 
 
 def test_a_setting_that_was_swept_is_shown_even_if_the_model_decides_it(tmp_path):

@@ -33,10 +33,11 @@ def whole(channels: int = 4) -> TriplaneSequence:
 
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float16, torch.bfloat16, torch.float64])
-def test_a_sequence_comes_back_as_it_was(tmp_path: Path, kind):
+@pytest.mark.parametrize("name", ["a.pt", "a.safetensors"])
+def test_a_sequence_comes_back_as_it_was(tmp_path: Path, kind, name):
     sequence = replace(whole(), triplanes=whole().triplanes.to(kind))
-    save_triplanes(tmp_path / "a.pt", sequence)
-    back = load_triplanes(tmp_path / "a.pt")
+    save_triplanes(tmp_path / name, sequence)
+    back = load_triplanes(tmp_path / name)
     assert back.triplanes.dtype == kind
     assert torch.equal(back.triplanes, sequence.triplanes)
     assert all(torch.equal(back.decoder[key], value) for key, value in sequence.decoder.items())
@@ -46,9 +47,10 @@ def test_a_sequence_comes_back_as_it_was(tmp_path: Path, kind):
     assert torch.equal(back.frame.centre, sequence.frame.centre)
 
 
-def test_triplanes_alone_are_enough(tmp_path: Path):
-    save_triplanes(tmp_path / "a.pt", TriplaneSequence(moving_sequence()))
-    back = load_triplanes(tmp_path / "a.pt")
+@pytest.mark.parametrize("name", ["a.pt", "a.safetensors"])
+def test_triplanes_alone_are_enough(tmp_path: Path, name):
+    save_triplanes(tmp_path / name, TriplaneSequence(moving_sequence()))
+    back = load_triplanes(tmp_path / name)
     assert (back.decoder, back.decoder_config, back.frame) == (None, None, None)
 
 
@@ -63,6 +65,13 @@ def refusal(path: Path) -> str:
         load_triplanes(path)
     assert str(path) in str(caught.value)
     return str(caught.value)
+
+
+def test_a_damaged_safetensors_file_is_named(tmp_path: Path):
+    save_triplanes(tmp_path / "a.safetensors", whole())
+    content = (tmp_path / "a.safetensors").read_bytes()
+    (tmp_path / "a.safetensors").write_bytes(content[: len(content) // 2])
+    assert "damaged" in refusal(tmp_path / "a.safetensors")
 
 
 def test_a_missing_file_is_named(tmp_path: Path):

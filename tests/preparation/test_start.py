@@ -11,13 +11,14 @@ from tests.preparation.sequences import blob, moving_sequence, still_features
 from tests.synthetic import ball_scene
 from tests.training.runs import small_config
 from xplanes import decomposition
-from xplanes.config import _CHOICES as CHOICES
-from xplanes.config import ConfigError, parse
+from xplanes.checks import _CHOICES as CHOICES
+from xplanes.checks import parse
+from xplanes.config import ConfigError
 from xplanes.decomposition import TIME_ROWS, unexplained_energy
 from xplanes.decomposition.conversion import DYNAMIC, STATIC
 from xplanes.decomposition.rpca import METHODS, SCALES
 from xplanes.fields import Decoder
-from xplanes.preparation import Start, TriplaneSequence, check_source, prepare, save_triplanes
+from xplanes.preparation import Start, TriplaneSequence, find_source, prepare, save_triplanes
 from xplanes.preparation import stages as stages_module
 from xplanes.preparation.start import STAGES
 from xplanes.scenes.frame import Frame, cube_frame
@@ -46,7 +47,7 @@ def start(
     save_triplanes(path, sequence)
     config = settings(folder, f"lrm.triplanes={path}", *overrides)
     scene = ball_scene(moving=moving)
-    begun = prepare(config, scene, FRAME)
+    begun = prepare(config, scene, FRAME, find_source(config.lrm))
     module = build_module(
         replace(config, model=begun.model),
         scene,
@@ -63,7 +64,7 @@ SEQUENCE = TriplaneSequence(moving_sequence())
 
 def test_no_source_is_a_random_start_that_touches_nothing(tmp_path: Path):
     config = parse(small_config(tmp_path, f"preparation.cache={tmp_path}/cache"))
-    begun = prepare(config, ball_scene(), FRAME)
+    begun = prepare(config, ball_scene(), FRAME, find_source(config.lrm))
     assert begun == Start(config.model, FRAME)
     assert (begun.planes, begun.sparse, begun.report) == (None, None, {})
     assert begun.seconds == dict.fromkeys(STAGES, 0.0)
@@ -120,9 +121,9 @@ def test_reports_and_seconds_are_whole(tmp_path: Path):
     assert set(begun.seconds) == set(STAGES)
     assert begun.seconds["fixed_view"] == 0
     assert all(begun.seconds[name] > 0 for name in STAGES[1:])
-    assert begun.picture.shape == (3 * 132, 8 * 132, 3)
-    assert begun.picture.min() >= 0
-    assert begun.picture.max() <= 1
+    assert begun.pictures["decomposition"].shape == (3 * 132, 8 * 132, 3)
+    assert begun.pictures["decomposition"].min() >= 0
+    assert begun.pictures["decomposition"].max() <= 1
 
 
 def test_a_second_start_comes_from_the_cache(tmp_path: Path, monkeypatch):
@@ -203,7 +204,7 @@ def test_one_triplane_is_the_space_planes(tmp_path: Path, caplog, moving):
         begun, module = start(tmp_path, sequence, "model.resolution=16", moving=moving)
     assert ("the scene moves" in caplog.text) == moving
     assert module.field.time is None
-    assert (begun.report, begun.picture, begun.sparse) == ({}, None, None)
+    assert (begun.report, begun.pictures, begun.sparse) == ({}, {}, None)
     for index, name in enumerate(("xy", "xz", "yz")):
         assert torch.equal(begun.planes[name], sequence.triplanes[0, index])
 
@@ -262,7 +263,7 @@ def test_the_papers_choices_run(tmp_path: Path):
 )
 def test_a_source_that_is_not_there_is_refused_first(tmp_path: Path, overrides, words):
     with pytest.raises(ConfigError, match=words):
-        check_source(settings(tmp_path, *overrides).lrm)
+        find_source(settings(tmp_path, *overrides).lrm)
 
 
 @pytest.mark.parametrize(

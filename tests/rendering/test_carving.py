@@ -60,12 +60,12 @@ def test_a_still_ball_in_a_moving_scene_is_kept(count):
     points = cube_frame(1.4, ORIGIN).points(inside_ball(2000, 0.5))
     for time in torch.linspace(0, 1, 17).tolist():
         assert allowed_at(grid, points, time).all()
-    assert grid.allowed.float().mean() < 0.8
+    assert grid.occupied_fraction < 0.8
 
 
 @pytest.mark.parametrize("count", [50, 200])
-@pytest.mark.parametrize(("radius", "turns", "share"), [(0.4, 0.25, 0.0), (0.3, 1, 0.003)])
-def test_a_moving_ball_is_kept(count, radius, turns, share):
+@pytest.mark.parametrize(("radius", "turns", "share"), [(0.4, 0.25, 0.0), (0.3, 1, 0.0005)])
+def test_a_moving_ball_is_never_ruled_out_and_most_else_is_empty(count, radius, turns, share):
     # In the span over which content is taken to stand still, with 50 views, the slow ball moves by
     # at most a fifth of its radius, the fast one by its whole radius.
     path = swinging(0.8, turns)
@@ -77,7 +77,23 @@ def test_a_moving_ball_is_kept(count, radius, turns, share):
         lost += int((~allowed_at(grid, points, time)).sum())
         tried += len(points)
     assert lost <= share * tried
-    assert grid.allowed.float().mean() < 0.4
+    assert grid.occupied_fraction < 0.4
+
+
+def test_what_only_joined_views_rule_out_fills_again():
+    views = ball_views(50, 0.3, centre=swinging(0.8, 1), size=48)
+    grid = carved(views, resolution=16, bins=8)
+    presumed = grid.allowed & ~grid.occupied
+    assert presumed.float().mean() > 0.05
+    cells = presumed.nonzero()[:3, 0]
+    grid.observe(cells, torch.full((3,), 100.0))
+    assert grid.occupied[cells].all()
+
+
+def test_a_still_scene_rules_out_for_good_what_any_view_shows_empty():
+    grid = carved(ball_views(24, 0.5, size=24, times=torch.zeros(24)), bins=1)
+    assert torch.equal(grid.allowed, grid.occupied)
+    assert not grid.allowed.all()
 
 
 def test_more_views_do_not_rule_out_what_moves():
@@ -88,7 +104,7 @@ def test_more_views_do_not_rule_out_what_moves():
         time = (number + 0.5) / 120
         points = frame.points(inside_ball(100, 0.15, seed=number) + path(time))
         lost += int((~allowed_at(grid, points, time)).sum())
-    assert lost < 0.01 * 12_000
+    assert lost < 0.001 * 12_000
 
 
 def test_a_turned_and_moved_frame_carves_the_same_world():
@@ -135,3 +151,4 @@ def test_one_view_and_views_out_of_order_work():
     views = ball_views(20, 0.4, centre=swinging(0.6, 1))
     shuffled = views.subset(torch.randperm(20, generator=torch.Generator().manual_seed(0)))
     assert torch.equal(carved(views).allowed, carved(shuffled).allowed)
+    assert torch.equal(carved(views).occupied, carved(shuffled).occupied)

@@ -41,6 +41,17 @@ def test_all_cells_start_as_occupied():
     assert len(grid.density) == 2 * 4**3
 
 
+def test_presumed_cells_are_empty_until_something_shows():
+    grid = grid_of()
+    occupied = torch.zeros(128, dtype=torch.bool)
+    occupied[5] = True
+    grid.presume(occupied.view(2, 4, 4, 4))
+    assert grid.occupied.nonzero().tolist() == [[5]]
+    assert grid.allowed.all()
+    grid.observe(torch.tensor([7]), torch.tensor([100.0]))
+    assert grid.occupied.nonzero()[:, 0].tolist() == [5, 7]
+
+
 @pytest.mark.parametrize("decay", [0.0, 0.5, 0.95])
 def test_a_cell_empties_when_its_start_has_decayed(decay):
     grid, cell = grid_of(decay=decay), torch.tensor([7])

@@ -8,7 +8,11 @@ import torch
 
 from tests.oracles import project, visual_hull
 from tests.synthetic import ball_views, inside_ball, swinging
-from xplanes.scenes.silhouettes import MOST_VIEWS, WINDOW, foreground, silhouette_hull
+from xplanes.scenes.silhouettes import MOST_VIEWS, WINDOW, foreground, join_in_time, may_hold
+
+
+def silhouette_hull(views, points, *, radius):
+    return join_in_time(may_hold(views, points, radius=radius), views.times)
 
 
 def test_foreground_widens_by_whole_pixels():

@@ -1,5 +1,6 @@
 """What a run says of itself: its first lines, metrics.json, TensorBoard, its last lines."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -86,22 +87,21 @@ def summary(
     }
 
 
-def write_start(run: Path, picture: Tensor | None, *, log: bool) -> None:
-    """Write the parts that a decomposition gave, if there was one.
+def write_start(run: Path, pictures: Mapping[str, Tensor], *, log: bool) -> None:
+    """Write the pictures of what happened before training, if anything did.
 
     Args:
         run: The run directory.
-        picture: Colours from 0 to 1. [H, W, 3]
-        log: Whether it goes to TensorBoard too.
+        pictures: By name, colours from 0 to 1. [H, W, 3] each
+        log: Whether they go to TensorBoard too.
     """
     from torch.utils.tensorboard.writer import SummaryWriter
 
-    if picture is None:
-        return
-    write_png(run / "media" / "decomposition.png", picture)
-    if log:
-        with SummaryWriter(str(run / "tb")) as writer:
-            writer.add_image("decomposition", picture, 0, dataformats="HWC")
+    for name, picture in pictures.items():
+        write_png(run / "media" / f"{name}.png", picture)
+        if log:
+            with SummaryWriter(str(run / "tb")) as writer:
+                writer.add_image(name, picture, 0, dataformats="HWC")
 
 
 def write_hparams(run: Path, config: TrainConfig, metrics: dict[str, Any]) -> None:

@@ -8,7 +8,8 @@ from typing import Any
 
 import yaml
 
-from xplanes.config import ConfigError, ModelConfig, TrainConfig, build, parse
+from xplanes.checks import parse
+from xplanes.config import ConfigError, ModelConfig, TrainConfig, build
 from xplanes.files import read_json
 from xplanes.scenes.frame import Frame, read_frame, scene_frame
 from xplanes.scenes.views import Scene, Views

@@ -14,6 +14,7 @@ from typing import Any
 import yaml
 
 from xplanes.files import read_json
+from xplanes.files import read_rows as read_csv
 
 SCORES = {
     "psnr": ("test", "psnr"),
@@ -26,7 +27,38 @@ SCORES = {
 }
 """Where metrics.json holds each column's number."""
 
+MEASURES = (
+    "psnr",
+    "ssim",
+    "start_psnr",
+    "seconds_to_20",
+    "steps",
+    "prepare_seconds",
+    "train_seconds",
+    "samples_per_ray",
+    "parameters",
+)
+"""Columns of a table; the third and fourth come from curve.csv."""
+
+GOAL = 20.0
+"""PSNR that ``seconds_to_20`` stands for."""
+
 STATES = ("running", "finished", "failed", "interrupted")
+
+
+@dataclass(frozen=True)
+class Point:
+    """A line of curve.csv.
+
+    Attributes:
+        seconds: Preparation and training clock.
+        step: Optimiser steps.
+        psnr: Mean over the scored views.
+    """
+
+    seconds: float
+    step: int
+    psnr: float
 
 
 @dataclass(frozen=True)
@@ -37,8 +69,9 @@ class RunRow:
         name: Folder of the run relative to the sweep's.
         settings: Settings by dotted name.
         overridden: Names of those that the command line set.
-        scores: Numbers by the names of `SCORES`, as far as they are known.
+        scores: Numbers by the names of `MEASURES`, as far as they are known.
         status: How it ended, with the reason where it is not ``finished``.
+        curve: PSNR on the way.
     """
 
     name: str
@@ -46,6 +79,7 @@ class RunRow:
     overridden: frozenset[str] = frozenset()
     scores: dict[str, float] = field(default_factory=dict)
     status: str = "finished"
+    curve: tuple[Point, ...] = ()
 
 
 def read_rows(folder: Path) -> list[RunRow]:
@@ -95,6 +129,8 @@ def read_run(run: Path, name: str) -> RunRow:
     record = _read_json(run / "run.json", problems)
     metrics = _read_json(run / "metrics.json", problems)
     scores = _scores(metrics) if metrics else {}
+    curve = _curve(run, scores.get("prepare_seconds", 0.0), problems) if metrics else ()
+    scores |= _curve_scores(curve)
     if metrics and not {"psnr", "ssim"} <= scores.keys():
         problems.append("metrics.json lacks scores")
     if not isinstance(config, dict) and (run / "config.yaml").is_file() and not problems:
@@ -112,7 +148,34 @@ def read_run(run: Path, name: str) -> RunRow:
         overridden=frozenset(_key(line) for line in run_overrides(run)),
         scores=scores,
         status=status,
+        curve=curve,
     )
+
+
+def _curve(run: Path, prepare: float, problems: list[str]) -> tuple[Point, ...]:
+    try:
+        return tuple(
+            Point(prepare + float(line["seconds"]), int(line["step"]), float(line["psnr"]))
+            for line in read_csv(run / "curve.csv")
+        )
+    except (KeyError, TypeError, ValueError):
+        problems.append("curve.csv is damaged")
+        return ()
+
+
+def _curve_scores(curve: tuple[Point, ...]) -> dict[str, float]:
+    """PSNR before the first step, and seconds until it reaches `GOAL`."""
+    found = {}
+    if curve and curve[0].step == 0:
+        found["start_psnr"] = curve[0].psnr
+    if curve and curve[0].psnr >= GOAL:
+        return found | {"seconds_to_20": curve[0].seconds}
+    for before, after in zip(curve, curve[1:], strict=False):
+        if before.psnr < GOAL <= after.psnr:
+            share = (GOAL - before.psnr) / (after.psnr - before.psnr)
+            found["seconds_to_20"] = before.seconds + share * (after.seconds - before.seconds)
+            break
+    return found
 
 
 def _status(record: dict[str, Any] | None, metrics: dict[str, Any] | None) -> str:

@@ -13,6 +13,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from xplanes.config import ConfigError
+from xplanes.evaluation.curves import plot_curves
 from xplanes.evaluation.sweep import RunRow, read_rows
 from xplanes.evaluation.tabulate import (
     SEED,
@@ -31,8 +32,8 @@ def write_tables(folder: Path, out: Path | None = None) -> str:
 
     Args:
         folder: A sweep, or any folder of runs.
-        out: Where table.md, table.csv and, with several seeds, table_seeds.csv go; ``folder`` when
-            None.
+        out: Where table.md, table.csv, with several seeds table_seeds.csv, and with several runs
+            and the extra ``plots`` curves.png go; ``folder`` when None.
 
     Returns:
         What table.md holds.
@@ -56,6 +57,8 @@ def write_tables(folder: Path, out: Path | None = None) -> str:
         write_rows(out / "table_seeds.csv", *seed_table(seeds, over, exact=True))
     else:
         (out / "table_seeds.csv").unlink(missing_ok=True)
+    if len(rows) > 1 and plot_curves(rows, names, out / "curves.png"):
+        text.append("![PSNR against seconds and steps](curves.png)")
     whole = "\n\n".join(text) + "\n"
     write_text(out / "table.md", whole)
     return whole

@@ -6,19 +6,21 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from xplanes.evaluation.sweep import SCORES, RunRow
+from xplanes.evaluation.sweep import MEASURES, RunRow
 
 SEED = "seed"
 UNLISTED = ("resume",)
 """Settings that say nothing about a result."""
 
 LABELS = {
+    "start_psnr": "step 0",
+    "seconds_to_20": "s to 20 dB",
     "prepare_seconds": "prepare s",
     "train_seconds": "train s",
     "samples_per_ray": "samples/ray",
     "parameters": "params",
 }
-FORMATS = {"psnr": ".2f", "ssim": ".4f", "steps": ".0f", "parameters": ",.0f"}
+FORMATS = {"psnr": ".2f", "start_psnr": ".2f", "ssim": ".4f", "steps": ".0f", "parameters": ",.0f"}
 LONGEST = 120
 """Letters of a status in markdown; the CSV has all of it."""
 
@@ -70,12 +72,12 @@ def run_table(
     rows: Sequence[RunRow], names: Sequence[str], *, exact: bool = False
 ) -> tuple[list[str], list[list[str]]]:
     """Header and one line per run; ``exact`` keeps all digits, for CSV."""
-    header = ["run", *(_label(n, exact) for n in names), *(_label(n, exact) for n in SCORES)]
+    header = ["run", *(_label(n, exact) for n in names), *(_label(n, exact) for n in MEASURES)]
     lines = [
         [
             row.name,
             *(_text(row.settings[n]) if n in row.settings else "" for n in names),
-            *(_number(row.scores.get(n), n, exact) for n in SCORES),
+            *(_number(row.scores.get(n), n, exact) for n in MEASURES),
             row.status,
         ]
         for row in rows
@@ -99,7 +101,7 @@ def seed_table(
 ) -> tuple[list[str], list[list[str]]]:
     """Header and one line per setting; quality with its standard deviation, the rest as means."""
     header = [*(_label(n, exact) for n in names), "seeds"]
-    for name in SCORES:
+    for name in MEASURES:
         label = _label(name, exact)
         spread = name in ("psnr", "ssim")
         header += [label, f"{name}_std"] if spread and exact else [label]
@@ -107,7 +109,7 @@ def seed_table(
     for group in groups:
         settings = group[0].settings
         line = [_text(settings[n]) if n in settings else "" for n in names] + [str(len(group))]
-        for name in SCORES:
+        for name in MEASURES:
             values = [row.scores[name] for row in group if name in row.scores]
             mean = math.fsum(values) / len(values) if values else None
             shown = _number(mean, name, exact)

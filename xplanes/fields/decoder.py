@@ -1,7 +1,7 @@
 """The MLP that turns plane features into colour and density."""
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -52,11 +52,25 @@ class Decoder(nn.Module):
         super().__init__()
         sizes = [3 * channels, *[width] * hidden, 4]
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
+        self.width, self.hidden = width, hidden
+        self.activation_name: Activation = activation
         self.activation = _ACTIVATIONS[activation]
         self.density_activation: DensityActivation = density
         self.density_scale = density_scale
         self.precision: Precision = precision
         self.colour_margin = colour_margin
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What its weights need to mean anything: arguments but for channels and precision."""
+        return {
+            "width": self.width,
+            "hidden": self.hidden,
+            "activation": self.activation_name,
+            "density": self.density_activation,
+            "density_scale": self.density_scale,
+            "colour_margin": self.colour_margin,
+        }
 
     def logits(self, features: Tensor) -> Tensor:
         """The last layer's output before the activations. [N, 3 C] -> [N, 4]"""

@@ -70,13 +70,16 @@ class LRM(nn.Module):
         """Pictures with alpha as the model wants to see them. [N, 4, H, W] -> [N, 3, S, S]"""
         return prepare(rgba, self.config.architecture, self.image_size)
 
-    def field_decoder(self) -> Decoder:
-        """A trainable copy of the decoder for a field whose cube [-1, 1]^3 is the model's cube.
+    def field_decoder(self, half_side: float | None = None) -> Decoder:
+        """A trainable copy of the decoder for a field in a cube [-1, 1]^3 of its own.
 
         It differs in the unit of length that densities refer to.
+
+        Args:
+            half_side: Half the side of that cube in the model's frame; the model's own when None.
         """
         decoder = copy.deepcopy(self.decoder).requires_grad_(True)
-        decoder.density_scale *= self.half_side
+        decoder.density_scale *= self.half_side if half_side is None else half_side
         return decoder
 
     def planes(self, tokens: Tensor) -> Tensor:

@@ -71,6 +71,17 @@ def load_source(
         LRMError: If no weights can be had, or they do not fit the architecture.
     """
     path = find_weights(source, announce=announce, endpoint=endpoint, cache=cache)
+    return load_weights(source, path, announce=announce)
+
+
+def load_weights(
+    source: WeightSource, path: Path, *, announce: Callable[[str], None] = print
+) -> LRM:
+    """Load the weights of a model from a file that `find_weights` found.
+
+    Raises:
+        LRMError: If they do not fit the architecture.
+    """
     if source.config is not None:
         return load(read_config(source.config), path)
     try:

@@ -2,13 +2,13 @@
 
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.sequence import TriplaneSequence, load_triplanes, save_triplanes
-from xplanes.preparation.start import Start, check_source, prepare
+from xplanes.preparation.start import Start, find_source, prepare
 
 __all__ = [
     "StageCache",
     "Start",
     "TriplaneSequence",
-    "check_source",
+    "find_source",
     "load_triplanes",
     "prepare",
     "save_triplanes",

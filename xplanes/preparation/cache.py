@@ -7,8 +7,11 @@ carries a checksum of its content: what is truncated, changed or of another vers
 import hashlib
 import json
 import logging
+import shutil
+import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,9 +21,14 @@ from torch import Tensor
 
 from xplanes.files import replacing
 
+try:
+    import fcntl
+except ImportError:  # Not on Windows; two processes may then do the same work.
+    fcntl = None
+
 logger = logging.getLogger(__name__)
 
-VERSION = 1
+VERSION = 2
 """Raised when a stage would come out differently from the same inputs."""
 
 
@@ -52,7 +60,13 @@ class StageCache:
         self.folder = folder
 
     def stage(
-        self, name: str, inputs: Any, make: Callable[[], dict[str, Any]], *, keep: bool = True
+        self,
+        name: str,
+        inputs: Any,
+        make: Callable[[], dict[str, Any]],
+        *,
+        keep: bool = True,
+        alone: bool = False,
     ) -> Stage:
         """Fetch a stage, or make and keep it.
 
@@ -61,21 +75,83 @@ class StageCache:
             inputs: All that the outcome depends on: tensors, numbers, strings, lists, dicts.
             make: Makes it: tensors and builtins in a dict.
             keep: Whether this stage may be fetched and kept.
+            alone: Whether a second process that wants the same stage waits for the first one.
         """
-        key = fingerprint([VERSION, name, inputs]) if self.folder else ""
-        path = self.folder / f"{name}-{key[:32]}.pt" if self.folder and keep else None
-        if path is not None and path.exists():
-            try:
-                content, seconds = _read(path, key)
-                return Stage(content, seconds, True, key)
-            except _UnusableError as reason:
-                logger.warning("%s is %s: making it anew", path, reason)
-        began = time.perf_counter()
-        content = make()
-        seconds = time.perf_counter() - began
+        path, key = self._path(name, inputs)
+        path = path if keep else None
+        if (found := _find(path, key)) is not None:
+            return found
+        with _lock(path if alone else None) as waited:
+            if waited and (found := _find(path, key)) is not None:
+                return found
+            began = time.perf_counter()
+            content = make()
+            seconds = time.perf_counter() - began
+            if path is not None:
+                _write(path, key, content, seconds)
+        return Stage(content, seconds, False, key)
+
+    def find(self, name: str, inputs: Any) -> Stage | None:
+        """A stage that was kept, or None where it is not there or cannot be used."""
+        return _find(*self._path(name, inputs))
+
+    def keep(self, name: str, inputs: Any, content: dict[str, Any], seconds: float) -> None:
+        """Keep a stage that was just made."""
+        path, key = self._path(name, inputs)
         if path is not None:
             _write(path, key, content, seconds)
-        return Stage(content, seconds, False, key)
+
+    @contextmanager
+    def workshop(self, name: str, inputs: Any) -> Iterator[Path]:
+        """A folder for the unfinished work of a stage, found again after an interruption.
+
+        It is removed when the block ends well.
+        """
+        path, _ = self._path(name, inputs)
+        if path is None:
+            with tempfile.TemporaryDirectory(prefix="xplanes_") as folder:
+                yield Path(folder)
+            return
+        yield path.with_suffix("")
+        shutil.rmtree(path.with_suffix(""), ignore_errors=True)
+
+    def _path(self, name: str, inputs: Any) -> tuple[Path | None, str]:
+        if self.folder is None:
+            return None, ""
+        key = fingerprint([VERSION, name, inputs])
+        return self.folder / f"{name}-{key[:32]}.pt", key
+
+
+def _find(path: Path | None, key: str) -> Stage | None:
+    if path is None or not path.exists():
+        return None
+    try:
+        content, seconds = _read(path, key)
+    except _UnusableError as reason:
+        logger.warning("%s is %s: making it anew", path, reason)
+        return None
+    return Stage(content, seconds, True, key)
+
+
+@contextmanager
+def _lock(path: Path | None) -> Iterator[bool]:
+    """Hold what other processes wait for; gives whether this one had to wait.
+
+    The system frees it when a process ends, however it ends.
+    """
+    if path is None or fcntl is None:
+        yield False
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.with_suffix(".lock").open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            waited = False
+        except BlockingIOError:
+            logger.warning("%s: another process is making it; waiting", path)
+            fcntl.flock(file, fcntl.LOCK_EX)
+            waited = True
+        yield waited
 
 
 class _UnusableError(Exception):

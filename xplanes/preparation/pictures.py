@@ -1,9 +1,12 @@
-"""The two parts of a triplane sequence as a picture."""
+"""Pictures of what preparation did: the frames shown to a model, the parts of its triplanes."""
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from xplanes.lrm.images import Crop
+from xplanes.lrm.model import LRM
+from xplanes.preparation.encode import straight_alpha
 from xplanes.training.scoring import spread
 
 
@@ -42,3 +45,22 @@ def _colours(planes: Tensor) -> Tensor:
     shown = planes[:, :, :3].detach().float().cpu()
     missing = 3 - shown.shape[2]
     return torch.cat([shown, shown[:, :, :1].expand(-1, -1, missing, -1, -1)], dim=2)
+
+
+def film_sheet(frames: Tensor, crop: Crop, model: LRM, moments: int = 6, side: int = 160) -> Tensor:
+    """A few frames as the model is shown them.
+
+    Args:
+        frames: Premultiplied RGBA. uint8 [T, H, W, 4]
+        crop: What the model is shown of them.
+        model: The model.
+        moments: Frames shown, spread evenly.
+        side: Pixels per frame.
+
+    Returns:
+        Colours from 0 to 1, the frames side by side. [side, M side, 3]
+    """
+    chosen = torch.tensor(spread(moments, len(frames)))
+    shown = model.prepare(crop.apply(straight_alpha(frames[chosen])))
+    shown = F.interpolate(shown, size=(side, side), mode="bilinear", antialias=True)
+    return shown.permute(2, 0, 3, 1).flatten(1, 2).clamp(0, 1)

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from xplanes.config import ConfigError
 from xplanes.fields import Decoder
-from xplanes.files import replacing
+from xplanes.optional import MissingExtraError
+from xplanes.preparation.tensor_file import read_content, write_content
 from xplanes.scenes.frame import Frame, check_frame, frame_content, read_frame
 
 DECODER_OPTIONS: dict[str, tuple[type, ...]] = {
@@ -48,8 +48,9 @@ class TriplaneSequence:
 def save_triplanes(path: Path, sequence: TriplaneSequence) -> None:
     """Write a sequence for ``lrm=file lrm.triplanes=PATH``, whole or not at all.
 
-    The file is torch.save's, of tensors and builtins: ``triplanes``, and where they are given
-    ``decoder``, ``decoder_config`` and ``frame`` {scale, rotation [3, 3], centre [3]}.
+    The file is safetensors where its name ends so, else torch.save's, of tensors and builtins:
+    ``triplanes``, and where they are given ``decoder``, ``decoder_config`` and ``frame`` {scale,
+    rotation [3, 3], centre [3]}.
 
     Raises:
         ConfigError, SceneError: If the sequence could not be loaded again.
@@ -61,8 +62,7 @@ def save_triplanes(path: Path, sequence: TriplaneSequence) -> None:
         content["decoder_config"] = dict(sequence.decoder_config or {})
     if sequence.frame is not None:
         content["frame"] = frame_content(sequence.frame)
-    with replacing(Path(path)) as temporary:
-        torch.save(content, temporary)
+    write_content(Path(path), content)
 
 
 def load_triplanes(path: Path) -> TriplaneSequence:
@@ -74,7 +74,9 @@ def load_triplanes(path: Path) -> TriplaneSequence:
     if not path.is_file():
         raise ConfigError(f"{path}: there is no such file; save_triplanes writes one")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = read_content(path)
+    except MissingExtraError:
+        raise
     except Exception as error:  # A damaged file fails in any of a dozen ways.
         # Its text advises to load the file as code.
         raise ConfigError(

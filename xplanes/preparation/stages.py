@@ -29,6 +29,7 @@ REPORTED = (
     "rank",
     "iterations",
     "residual",
+    "change",
     "converged",
     "sparsity",
     "drift",

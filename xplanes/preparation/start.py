@@ -2,23 +2,25 @@
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
+from xplanes.checks import check
 from xplanes.config import (
     ConfigError,
+    ImageLRMConfig,
     LRMConfig,
     ModelConfig,
     TrainConfig,
     TriplaneFileConfig,
     build,
-    check,
 )
 from xplanes.preparation.cache import StageCache
+from xplanes.preparation.reconstruct import LoadedLRM, load_lrm, reconstruct
 from xplanes.preparation.sequence import TriplaneSequence, load_triplanes
 from xplanes.preparation.stages import Parts, convert_stage, decompose_stage
 from xplanes.scenes.frame import Frame
@@ -50,7 +52,9 @@ class Start:
             ``after`` (as they start).
         seconds: Seconds of each stage; of one from the cache those that it took to make.
         words: The start in one line.
-        picture: The two parts at a few moments, colours from 0 to 1. [H, W, 3]
+        pictures: By name, colours from 0 to 1: the two parts at a few moments, and what the model
+            was shown. [H, W, 3] each
+        lrm: What the model made of the scene, for metrics.json.
     """
 
     model: ModelConfig
@@ -61,42 +65,76 @@ class Start:
     report: dict[str, Any] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=_no_time)
     words: str = "planes at random"
-    picture: Tensor | None = None
+    pictures: dict[str, Tensor] = field(default_factory=dict)
+    lrm: dict[str, Any] = field(default_factory=dict)
 
 
-def check_source(config: LRMConfig) -> None:
-    """Refuse a source that is not there, before anything slow begins.
+Source = Path | LoadedLRM | None
+"""Where a start comes from: a file, a model, or nothing."""
+
+
+def find_source(config: LRMConfig, *, say: Callable[[str], None] = print) -> Source:
+    """Find what a start is to come from, before anything slow begins.
+
+    Args:
+        config: The settings of the Large Reconstruction Model.
+        say: Takes a line before anything is downloaded.
 
     Raises:
-        ConfigError: If the file is missing or not named.
+        ConfigError: If a file is missing or not named.
+        LRMError: If the weights of a model cannot be had, or do not fit.
     """
+    if isinstance(config, ImageLRMConfig):
+        return load_lrm(config, say=say)
     if not isinstance(config, TriplaneFileConfig):
-        return
+        return None
     if config.triplanes is None:
         raise ConfigError("lrm=file needs lrm.triplanes=FILE, a file written by save_triplanes")
     if not Path(config.triplanes).is_file():
         raise ConfigError(f"lrm.triplanes={config.triplanes}: there is no such file")
+    return Path(config.triplanes)
 
 
-def prepare(config: TrainConfig, scene: Scene, frame: Frame) -> Start:
+def prepare(
+    config: TrainConfig,
+    scene: Scene,
+    frame: Frame,
+    source: Source,
+    *,
+    say: Callable[[str], None] = print,
+) -> Start:
     """Make the start that the settings ask for; ``lrm=none`` is random and costs nothing.
 
     Args:
         config: The run's settings.
         scene: The scene.
         frame: The frame of the scene, for sources that bring none.
+        source: Outcome of `find_source`.
+        say: Takes a line before something slow begins.
 
     Raises:
-        ConfigError, SceneError: If the source is missing, damaged or does not fit the settings.
+        ConfigError, SceneError, LRMError: If the source is damaged or does not fit the settings or
+            the scene.
     """
-    if not isinstance(config.lrm, TriplaneFileConfig):
+    if source is None:
         return Start(config.model, frame)
-    check_source(config.lrm)
+    if isinstance(source, LoadedLRM):
+        cache = _cache(config)
+        made = reconstruct(config, scene, frame, source, cache, say=say)
+        start = start_from(
+            made.sequence, config, scene, frame, source=made.words, seconds=made.seconds
+        )
+        shown = {} if made.picture is None else {"fixed_view": made.picture}
+        return replace(start, pictures=shown | start.pictures, lrm=made.report)
     began = time.perf_counter()
-    path = Path(str(config.lrm.triplanes))
-    sequence = load_triplanes(path)
+    sequence = load_triplanes(source)
     seconds = {"lrm": time.perf_counter() - began}
-    return start_from(sequence, config, scene, frame, source=str(path), seconds=seconds)
+    return start_from(sequence, config, scene, frame, source=str(source), seconds=seconds)
+
+
+def _cache(config: TrainConfig) -> StageCache:
+    folder = config.preparation.cache
+    return StageCache(None if folder is None else Path(folder))
 
 
 def start_from(
@@ -126,7 +164,7 @@ def start_from(
             "stands still",
             source,
         )
-    cache = StageCache(None if config.preparation.cache is None else Path(config.preparation.cache))
+    cache = _cache(config)
     device = training_device(config.trainer.accelerator)
     parts = decompose_stage(sequence.triplanes, config.decomposition, cache, device)
     _warn(parts, config)
@@ -143,7 +181,7 @@ def start_from(
         | dict(seconds)
         | {"decomposition": parts.seconds, "convert": planes.seconds},
         words=_words(sequence, config, parts, planes.unexplained, source),
-        picture=parts.picture,
+        pictures={} if parts.picture is None else {"decomposition": parts.picture},
     )
 
 
@@ -170,14 +208,14 @@ def _settled(
 def _warn(parts: Parts, config: TrainConfig) -> None:
     """Say once which orientations did not converge."""
     open_ones = [
-        f"{name} (residual {report['residual']:.1e})"
+        f"{name} (residual {report['residual']:.1e}, last step {report['change']:.1e})"
         for name, report in parts.report.items()
         if not report["converged"]
     ]
     if open_ones:
         logger.warning(
             "the decomposition of %s did not converge within decomposition.max_iterations=%d to "
-            "decomposition.tolerance=%g: raise one of them",
+            "decomposition.tolerance=%g (ten times that for the last step): raise one of them",
             ", ".join(open_ones),
             config.decomposition.max_iterations,
             config.decomposition.tolerance,

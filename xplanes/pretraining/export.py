@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import save_file
 from torch import Tensor
 
 from xplanes.files import replacing, write_json
 from xplanes.lrm.config import LRMConfig
 from xplanes.lrm.keys import NAMES
 from xplanes.lrm.openlrm import OpenLRM
-from xplanes.optional import require
 
 
 def export(model: OpenLRM, config: dict[str, Any], folder: Path, name: str) -> Path:
@@ -26,11 +26,10 @@ def export(model: OpenLRM, config: dict[str, Any], folder: Path, name: str) -> P
     Returns:
         The weights. Their SHA-256 stands in the configuration as ``weights_sha256``.
     """
-    writer = require("safetensors.torch", extra="lrm")
     path = folder / f"{name}.safetensors"
     state = {key: value.half().contiguous() for key, value in published_state(model).items()}
     with replacing(path) as temporary:
-        writer.save_file(state, temporary)
+        save_file(state, temporary)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     write_json(folder / f"{name}.json", {**config, "weights_sha256": digest})
     return path

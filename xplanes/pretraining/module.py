@@ -8,6 +8,7 @@ import torch
 from lightning import LightningModule
 from torch import Tensor, nn
 
+from xplanes.config import ConfigError
 from xplanes.lrm.canonical import canonical_vector
 from xplanes.lrm.openlrm import OpenLRM
 from xplanes.pretraining.batches import PretrainingBatch
@@ -28,7 +29,7 @@ PATIENCE = 20
 """Steps in a row with a loss that is not finite after which training gives up."""
 
 
-class PretrainingError(RuntimeError):
+class PretrainingError(ConfigError):
     """Pretraining cannot go on; the message says what was seen and what to change."""
 
 

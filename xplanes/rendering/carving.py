@@ -5,18 +5,22 @@ from torch import Tensor
 
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.silhouettes import silhouette_hull
+from xplanes.scenes.silhouettes import join_in_time, may_hold
 from xplanes.scenes.views import Views
 
 CHUNK = 2**17
 
 
 def carve(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
-    """Rule out the grid's cells that the silhouettes of the training views show to be empty.
+    """Empty the grid's cells that the silhouettes of the training views show to be empty.
+
+    What one view shows empty at its time is ruled out for good. What only views of neighbouring
+    times show together is presumed empty: it may have moved in between, so the grid may fill it
+    again.
 
     Args:
         grid: Changed in place.
-        views: Training views; without alpha nothing is ruled out.
+        views: Training views; without alpha nothing is emptied.
         frame: The field's frame.
     """
     if bool((views.images[..., 3] > 0).all()):
@@ -27,13 +31,18 @@ def carve(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
     points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).flip(-1)
     world = frame.to_world(points.reshape(-1, 3))
     radius = 3**0.5 / size / frame.scale
+    still = bool((views.times == views.times[0]).all())
     allowed = torch.empty(bins, size**3, dtype=torch.bool)
+    likely = torch.empty_like(allowed)
     for start in range(0, size**3, CHUNK):
         part = slice(start, start + CHUNK)
-        held = silhouette_hull(views, world[part], radius=radius)
+        alone = may_hold(views, world[part], radius=radius)
+        joined = join_in_time(alone, views.times)
         for index, cover in enumerate(covers):
-            allowed[index, part] = held[cover].any(dim=0)
+            likely[index, part] = joined[cover].any(dim=0)
+            allowed[index, part] = (joined if still else alone)[cover].any(dim=0)
     grid.allow(allowed)
+    grid.presume(likely)
 
 
 def _views_of_bins(times: Tensor, bins: int) -> list[Tensor]:

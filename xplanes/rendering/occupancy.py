@@ -59,6 +59,11 @@ class OccupancyGrid(nn.Module):
         self.density.mul_(self.allowed)
         torch.gt(self.density, self.empty_density, out=self.occupied)
 
+    def presume(self, occupied: Tensor) -> None:
+        """Empty all other cells; they fill again where the field shows something. Like `allow`."""
+        self.density.mul_(occupied.reshape(-1))
+        torch.gt(self.density, self.empty_density, out=self.occupied)
+
     @property
     def occupied_fraction(self) -> float:
         """Share of all cells that are occupied."""

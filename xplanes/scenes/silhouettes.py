@@ -19,13 +19,10 @@ def foreground(views: Views, margin: int) -> Tensor:
     return F.max_pool2d(alpha, 2 * margin + 1, stride=1, padding=margin)[:, 0] > 0
 
 
-def silhouette_hull(views: Views, points: Tensor, *, radius: float) -> Tensor:
-    """Where and when something may be: the visual hull over short spans of time.
+def may_hold(views: Views, points: Tensor, *, radius: float) -> Tensor:
+    """Which points may hold something at each view's time, as far as that view alone can tell.
 
-    A point holds something at a view's time only if every view of some span of time around it
-    shows foreground where the point projects to. The span is short (`WINDOW`), so that motion
-    stays inside the hull; where all views have one time, all must agree. Points out of a view's
-    sight are not ruled out by it, and images without alpha rule out nothing.
+    Points out of a view's sight are not ruled out by it, and images without alpha rule out nothing.
 
     Args:
         views: Images with alpha.
@@ -33,7 +30,7 @@ def silhouette_hull(views: Views, points: Tensor, *, radius: float) -> Tensor:
         radius: Distance around each point that counts as the point, in world units.
 
     Returns:
-        For each view's time and point, whether something may be there. bool [V, N]
+        Whether something may be there. bool [V, N]
     """
     inside = torch.ones(len(views), len(points), dtype=torch.bool)
     for index, pose in enumerate(views.camera_to_world):
@@ -50,9 +47,27 @@ def silhouette_hull(views: Views, points: Tensor, *, radius: float) -> Tensor:
         margin = (views.focal * radius * slant / (depth * (depth - radius))).ceil()[seen]
         steps = _steps_to_foreground(views.images[index, ..., 3] > 0, int(margin.max()))
         inside[index, seen] = steps[row[seen].long(), column[seen].long()] <= margin
-    still = bool((views.times == views.times[0]).all())
-    span = len(views) if still else max(1, min(MOST_VIEWS, round(WINDOW * len(views))))
-    order = views.times.argsort(stable=True)
+    return inside
+
+
+def join_in_time(inside: Tensor, times: Tensor) -> Tensor:
+    """The visual hull over short spans of time, from what each view alone can tell.
+
+    A point holds something at a view's time only if every view of some span of time around it
+    allows that. The span is short (`WINDOW`), so that slow motion stays inside the hull; what moves
+    fast can lose its edges. Where all views have one time all must agree, and nothing is lost.
+
+    Args:
+        inside: Outcome of `may_hold`. bool [V, N]
+        times: Times of the views. [V]
+
+    Returns:
+        For each view's time and point, whether something may be there. bool [V, N]
+    """
+    span = max(1, min(MOST_VIEWS, round(WINDOW * len(times))))
+    if bool((times == times[0]).all()):
+        span = len(times)
+    order = times.argsort(stable=True)
     runs = inside[order].unfold(0, span, 1).all(dim=-1)
     held = torch.zeros_like(inside)
     for shift in range(span):

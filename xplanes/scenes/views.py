@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from xplanes.scenes.cameras import pixel_rays
+from xplanes.scenes.errors import SceneError
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,28 @@ class Views:
     def image_rays(self, index: int) -> tuple[Tensor, Tensor]:
         """Rays through every pixel of image ``index``, row by row. [H W, 3], [H W, 3]"""
         return camera_rays(self.camera_to_world[index], self.focal, self.height, self.width)
+
+
+def joined(first: Views, second: Views) -> Views:
+    """The views of both.
+
+    Raises:
+        SceneError: If their sizes or focal lengths differ.
+    """
+    for what in ("height", "width", "focal"):
+        one, other = getattr(first, what), getattr(second, what)
+        if abs(one - other) > 1e-4 * one:
+            raise SceneError(
+                f"{first.files[0]} and {second.files[0]} cannot be trained on together: {what} "
+                f"{one:g} and {other:g} pixels; set data.train_on_video=false"
+            )
+    return Views(
+        torch.cat([first.images, second.images]),
+        torch.cat([first.camera_to_world, second.camera_to_world]),
+        torch.cat([first.times, second.times]),
+        first.focal,
+        first.files + second.files,
+    )
 
 
 @dataclass(frozen=True)

@@ -22,18 +22,23 @@ from xplanes.fields import Decoder, XPlanes
 from xplanes.fields.decoder import Precision
 from xplanes.fields.xplanes import random_planes
 from xplanes.rendering.carving import carve
+from xplanes.rendering.filling import fill
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.renderer import DIAGONAL, Renderer
 from xplanes.scenes.batches import RayBatches, step_generator
 from xplanes.scenes.demo import ensure_demo_scene
 from xplanes.scenes.dnerf import read_scene
+from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, frame_content
-from xplanes.scenes.views import Scene, Views
+from xplanes.scenes.views import Scene, Views, joined
 from xplanes.training.module import RadianceModule
 from xplanes.training.product import SparseProduct
 
 START_STREAM = 1_000_033
 """Random stream of the start values."""
+
+FILL_STREAM = 1_000_081
+"""Random stream of the points at which the grid of a field that has begun is filled."""
 
 
 def build_scene(config: DataConfig, splits: tuple[str, ...] | None = None) -> Scene:
@@ -60,7 +65,15 @@ def build_scene(config: DataConfig, splits: tuple[str, ...] | None = None) -> Sc
         splits=splits or ("train", config.eval_split),
         views=config.views,
     )
-    return Scene(config.scene, scene.splits, scene.video, scene.background)
+    parts = dict(scene.splits)
+    if config.train_on_video and "train" in parts:
+        if scene.video is None:
+            raise SceneError(
+                f"data.train_on_video=true: {folder} has no video of a fixed camera "
+                "(transforms_video.json); set it to false"
+            )
+        parts["train"] = joined(parts["train"], scene.video)
+    return Scene(config.scene, parts, scene.video, scene.background)
 
 
 def training_device(name: str) -> torch.device:
@@ -191,6 +204,9 @@ def build_module(
     renderer = build_renderer(config.sampler, still=is_still(views))
     if config.sampler.silhouettes:
         carve(renderer.grid, views, frame)
+    if planes is not None and config.sampler.fill:
+        generator = step_generator(config.seed, 0, FILL_STREAM)
+        fill(renderer.grid, field, views, frame, step=renderer.step, generator=generator)
     product = None
     if sparse is not None and field.time is not None and config.loss.sparse_weight:
         product = SparseProduct(sparse, field.rows, config.loss.sparse_frames)

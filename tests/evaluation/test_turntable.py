@@ -1,0 +1,114 @@
+"""Pictures in, triplanes and a film out."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.preparation.test_encode import frames_of, model_of
+from tests.preparation.test_reconstruct import publish
+from xplanes.cli import main
+from xplanes.config import ConfigError
+from xplanes.evaluation import turntable as module
+from xplanes.evaluation.turntable import find_pictures, turntable, write_triplanes
+from xplanes.launch import settings
+from xplanes.lrm import LRMError
+from xplanes.preparation import load_triplanes
+from xplanes.preparation.encode import straight_alpha
+from xplanes.scenes.errors import SceneError
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    """A folder of three pictures, two of them equal."""
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for number, frame in enumerate(straight_alpha(frames_of(2))[[0, 1, 0]]):
+        pixels = (frame.permute(1, 2, 0) * 255).round().to(torch.uint8).numpy()
+        Image.fromarray(pixels).save(folder / f"{number}.png")
+    return folder
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """A short film of small pictures."""
+    monkeypatch.setattr(module, "FRAMES", 6)
+    monkeypatch.setattr(module, "SIDE", 24)
+
+
+@pytest.mark.parametrize("ending", [".safetensors", ".pt"])
+def test_pictures_become_triplanes_and_a_film(tmp_path: Path, pictures, few, capsys, ending):
+    weights, out = publish(tmp_path, "openlrm-1.1"), tmp_path / f"made{ending}"
+    arguments = ["lrm=small", f"lrm.weights={weights}", f"preparation.cache={tmp_path}/cache"]
+    assert main(["triplanes", str(pictures), *arguments, f"out={out}"]) == 0
+    assert f"wrote {out}: 3 triplanes of 8 x 8 texels and 6 channels" in capsys.readouterr().out
+    sequence = load_triplanes(out)
+    assert sequence.triplanes.shape == (3, 3, 6, 8, 8)
+    assert torch.equal(sequence.triplanes[0], sequence.triplanes[2])
+    assert not torch.equal(sequence.triplanes[0], sequence.triplanes[1])
+    model = model_of()
+    for name, tensor in model.decoder.state_dict().items():
+        assert torch.equal(sequence.decoder[name], tensor)
+    assert sequence.decoder_config == model.decoder.options
+    with Image.open(out.with_suffix(".webp")) as film:
+        assert film.size == (24, 24)
+
+
+def test_the_film_begins_at_the_models_camera_and_goes_round(few):
+    model = model_of()
+    with torch.no_grad():
+        # Dense where the features of plane xz are positive: on the side x > 0.
+        for layer in model.decoder.layers:
+            layer.weight.zero_()
+            layer.bias.zero_()
+            layer.weight[0, 0] = 1
+        model.decoder.layers[0].weight[0] = 0
+        model.decoder.layers[0].weight[0, 6] = 1
+        model.decoder.layers[-1].bias[0] = -5
+    triplane = torch.zeros(1, 3, 6, 8, 8)
+    triplane[0, 1, 0, :, 4:] = 100.0
+    frames = [frame.float() for frame in turntable(triplane, model, torch.device("cpu"))]
+    assert len(frames) == 6
+    left, right = (frames[0][:, part].mean() for part in (slice(0, 10), slice(14, 24)))
+    assert left > 250
+    assert right < 200
+    # Half a turn later the sides are exchanged.
+    left, right = (frames[3][:, part].mean() for part in (slice(0, 10), slice(14, 24)))
+    assert left < 200
+    assert right > 250
+
+
+def test_settings_that_make_no_triplanes_are_refused(tmp_path: Path, pictures):
+    def make(*arguments, out="made.pt"):
+        config = settings(list(arguments))
+        write_triplanes([pictures], Path(out), config, say=lambda _: None)
+
+    with pytest.raises(ConfigError, match=r"lrm=none makes no triplanes.*lrm=small"):
+        make("lrm=none")
+    with pytest.raises(ConfigError, match=r"out=made\.zip: must end in"):
+        make("lrm=small", out="made.zip")
+    with pytest.raises(ConfigError, match=r"Did you mean lrm\.weights"):
+        make("lrm=small", "lrm.weight=a")
+    with pytest.raises(LRMError, match=r"lrm\.weights=absent\.pt is not a file"):
+        make("lrm=small", "lrm.weights=absent.pt")
+
+
+def test_pictures_that_are_not_there_are_named(tmp_path: Path):
+    with pytest.raises(SceneError, match="absent"):
+        find_pictures([tmp_path / "absent.png"])
+    with pytest.raises(SceneError, match="holds no pictures"):
+        find_pictures([tmp_path])
+    with pytest.raises(SceneError, match="at least one"):
+        find_pictures([])
+
+
+def test_opaque_pictures_are_remarked_upon(tmp_path: Path, few):
+    picture = tmp_path / "opaque.png"
+    Image.fromarray(np.full((30, 30, 3), 90, np.uint8)).save(picture)
+    said: list[str] = []
+    weights = publish(tmp_path, "openlrm-1.1")
+    config = settings(["lrm=small", f"lrm.weights={weights}", "preparation.cache=null"])
+    write_triplanes([picture], tmp_path / "a.pt", config, say=said.append)
+    assert any("no transparency" in line for line in said)

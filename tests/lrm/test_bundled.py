@@ -1,0 +1,64 @@
+"""Models in the package: whole, or refused by their checksum."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.lrm.reduced import reduced
+from xplanes.lrm import LRMError
+from xplanes.lrm.bundled import CHECKSUM, bundled_models, load_bundled
+
+
+def ship(folder: Path, name: str, seed: int = 0) -> Path:
+    """A reduced model in the form in which the package carries its own."""
+    from safetensors.torch import save_file
+
+    config, state = reduced("openlrm-1.1")
+    state = {key: (tensor + seed).half() for key, tensor in state.items()}
+    path = folder / f"{name}.safetensors"
+    save_file(state, path)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    (folder / f"{name}.json").write_text(json.dumps({**config, CHECKSUM: digest}))
+    return path
+
+
+def test_a_model_is_loaded_from_half_precision(tmp_path: Path):
+    path = ship(tmp_path, "tiny")
+    assert bundled_models(tmp_path) == ["tiny"]
+    model, found = load_bundled("tiny", tmp_path)
+    assert found == path
+    expected = reduced("openlrm-1.1")[1]["pos_embed"]
+    assert model.position.dtype == torch.float32
+    torch.testing.assert_close(model.position, expected, atol=2e-3, rtol=1e-3)
+    assert model.encode(torch.rand(1, 3, 56, 56)).isfinite().all()
+
+
+def test_changed_weights_are_refused(tmp_path: Path):
+    path = ship(tmp_path, "tiny")
+    content = bytearray(path.read_bytes())
+    content[-5] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(LRMError, match=r"tiny\.safetensors is damaged.*SHA-256"):
+        load_bundled("tiny", tmp_path)
+    path.write_bytes(content[:-100])
+    with pytest.raises(LRMError, match=r"tiny\.safetensors is damaged"):
+        load_bundled("tiny", tmp_path)
+
+
+def test_swapped_weights_are_refused(tmp_path: Path):
+    tiny, mini = ship(tmp_path, "tiny"), ship(tmp_path, "mini", seed=1)
+    content = tiny.read_bytes()
+    tiny.write_bytes(mini.read_bytes())
+    mini.write_bytes(content)
+    for name in ("tiny", "mini"):
+        with pytest.raises(LRMError, match="belongs to another model"):
+            load_bundled(name, tmp_path)
+
+
+def test_a_model_that_is_not_there_is_named_with_those_that_are(tmp_path: Path):
+    ship(tmp_path, "tiny")
+    with pytest.raises(LRMError, match=r"huge\.safetensors.*no such model.*there is tiny"):
+        load_bundled("huge", tmp_path)

@@ -1,0 +1,96 @@
+"""Frames to triplanes: each distinct frame once, nothing lost when it stops."""
+
+import pytest
+import torch
+
+from tests.lrm.reduced import SIDES, reduced
+from xplanes.lrm.checkpoint import build, fill
+from xplanes.lrm.config import parse_config
+from xplanes.lrm.images import square_crop
+from xplanes.preparation.cache import StageCache
+from xplanes.preparation.encode import encode, straight_alpha
+
+CPU = torch.device("cpu")
+
+
+def model_of(name="openlrm-1.1"):
+    config, state = reduced(name)
+    model = build(parse_config(config))
+    fill(model, state)
+    return model
+
+
+def frames_of(count, size=20, seed=0):
+    """Random pictures whose colours are multiplied by alpha. uint8 [T, H, W, 4]"""
+    generator = torch.Generator().manual_seed(seed)
+    whole = torch.rand(count, size, size, 4, generator=generator)
+    whole[..., :3] *= whole[..., 3:]
+    return (whole * 255).to(torch.uint8)
+
+
+def run(model, frames, cache, batch=2, key="weights"):
+    crop = square_crop(*frames.shape[1:3])
+    return encode(model, key, frames, crop, cache, CPU, batch=batch)
+
+
+@pytest.mark.parametrize("name", SIDES)
+@pytest.mark.parametrize("batch", [1, 3, 8])
+def test_every_frame_gets_the_triplane_of_its_own_picture(name, batch, tmp_path):
+    model, frames = model_of(name), frames_of(4)[[0, 1, 0, 2, 3, 1]]
+    encoded = run(model, frames, StageCache(tmp_path), batch)
+    assert (encoded.distinct, encoded.cached) == (4, 0)
+    assert encoded.seconds > 0
+    for frame, triplane in zip(frames, encoded.triplanes, strict=True):
+        alone = model.encode(model.prepare(straight_alpha(frame[None])))[0]
+        torch.testing.assert_close(triplane, alone, atol=2e-5, rtol=1e-4)
+
+
+def test_each_distinct_frame_is_encoded_once(tmp_path, monkeypatch):
+    model, seen = model_of(), []
+    original = model.encode
+    monkeypatch.setattr(
+        model, "encode", lambda images, *rest: seen.append(len(images)) or original(images, *rest)
+    )
+    frames, cache = frames_of(3)[[0, 0, 1, 1, 2, 0]], StageCache(tmp_path)
+    first = run(model, frames, cache)
+    assert sum(seen) == 3
+    again = run(model, frames, cache)
+    assert sum(seen) == 3
+    assert (again.distinct, again.cached) == (3, 3)
+    assert again.seconds == pytest.approx(first.seconds)
+    assert torch.equal(again.triplanes, first.triplanes)
+    run(model, frames, cache, key="other weights")
+    assert sum(seen) == 6
+    run(model, frames, StageCache(None))
+    assert sum(seen) == 9
+
+
+def test_an_interrupted_video_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    model, frames, cache = model_of(), frames_of(5), StageCache(tmp_path)
+    expected = run(model, frames, StageCache(None)).triplanes
+    original, seen = model.encode, []
+
+    def stop_at_third(images, *rest):
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        seen.append(len(images))
+        return original(images, *rest)
+
+    monkeypatch.setattr(model, "encode", stop_at_third)
+    with pytest.raises(KeyboardInterrupt):
+        run(model, frames, cache)
+    monkeypatch.setattr(model, "encode", original)
+    finished = run(model, frames, cache)
+    assert finished.cached == 4
+    torch.testing.assert_close(finished.triplanes, expected, atol=2e-5, rtol=1e-4)
+
+
+def test_alpha_is_taken_out_of_colours():
+    straight = torch.rand(2, 4, 6, 6, generator=torch.Generator().manual_seed(1))
+    straight[:, 3] = 0.5 + 0.5 * straight[:, 3]
+    straight[0, 3, 0, 0] = 0
+    premultiplied = torch.cat([straight[:, :3] * straight[:, 3:], straight[:, 3:]], dim=1)
+    found = straight_alpha((premultiplied * 255).round().to(torch.uint8).movedim(1, -1))
+    assert found[0, :, 0, 0].tolist() == [0, 0, 0, 0]
+    straight[0, :3, 0, 0] = 0
+    torch.testing.assert_close(found, straight, atol=0.01, rtol=0)

@@ -1,0 +1,86 @@
+"""Runs that start from a Large Reconstruction Model: stages, files, going on after a stop."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.preparation.test_reconstruct import CHOICES, publish
+from tests.training.runs import small_config
+from xplanes.evaluation.evaluate import evaluate
+from xplanes.evaluation.runs import load_run
+from xplanes.pipeline import run
+from xplanes.preparation import reconstruct as reconstruct_module
+from xplanes.preparation import start as start_module
+
+STAGES = ("fixed_view", "lrm", "decomposition", "convert")
+
+
+def settings(place: Path, name: str, *overrides: str) -> dict:
+    return small_config(
+        place / "scenes",
+        *CHOICES[name],
+        f"lrm.weights={publish(place / name, name)}",
+        f"preparation.cache={place}/cache",
+        "preparation.frames=3",
+        "preparation.fixed_view_seconds=1000",
+        "preparation.fixed_view_steps=12",
+        "trainer.max_steps=12",
+        *overrides,
+    )
+
+
+def metrics(folder: Path) -> dict:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [("openlrm-1.0", "six_planes"), ("openlrm-1.1", "nine_planes"), ("triposr", "six_planes")],
+)
+def test_a_run_from_the_scenes_video(tmp_path: Path, name, model):
+    folder = tmp_path / "run"
+    run(settings(tmp_path, name, f"model={model}"), folder, [], resume=False)
+    told = metrics(folder)
+    seconds = told["seconds"]["prepare"]
+    assert set(seconds) == set(STAGES)
+    assert seconds["fixed_view"] == 0
+    assert all(seconds[stage] > 0 for stage in STAGES[1:])
+    assert told["lrm"]["frames"] == 3
+    assert set(told["decomposition"]) == {"xy", "xz", "yz", "unexplained"}
+    for picture in ("fixed_view.png", "decomposition.png"):
+        assert (folder / "media" / picture).is_file()
+    assert list((folder / "media" / "step000000").glob("*.png"))
+    loaded = load_run(folder)
+    again = evaluate(loaded, "none")
+    assert again["test"]["psnr"] == pytest.approx(told["test"]["psnr"], abs=1e-4)
+
+
+@pytest.mark.parametrize("stopped", ["encode", "start_from"])
+def test_a_stopped_preparation_goes_on_from_the_last_finished_stage(
+    tmp_path: Path, monkeypatch, stopped
+):
+    folder = tmp_path / "run"
+    config = settings(tmp_path, "openlrm-1.1", "preparation.fixed_view=train")
+    owner = start_module if stopped == "start_from" else reconstruct_module
+
+    def stop(*_args, **_options):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, stopped, stop)
+        with pytest.raises(KeyboardInterrupt):
+            run(config, folder, [], resume=False)
+    assert json.loads((folder / "run.json").read_text())["status"] == "interrupted"
+    kept = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "cache").glob("*.pt")}
+    assert any(name.startswith("fixed_view") for name in kept)
+    assert any(name.startswith("triplane") for name in kept) == (stopped == "start_from")
+    run(config, folder, [], resume=True)
+    for name, written in kept.items():
+        assert (tmp_path / "cache" / name).stat().st_mtime_ns == written
+    told = metrics(folder)
+    assert told["seconds"]["prepare"]["fixed_view"] > 0
+    assert "filmed by a field" in told["lrm"]["fixed_view"]
+    uninterrupted = tmp_path / "other"
+    run(config, uninterrupted, [], resume=False)
+    assert told["test"] == metrics(uninterrupted)["test"]

@@ -1,0 +1,113 @@
+"""A plot of the runs of a sweep: PSNR against seconds and steps."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from xplanes.evaluation.sweep import Point, RunRow
+from xplanes.evaluation.tabulate import SEED
+from xplanes.files import replacing
+
+SCENE = "data.scene"
+PLACES = 60
+"""Places along an axis at which curves of several seeds are averaged."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a plot: runs that differ in nothing but their seed.
+
+    Attributes:
+        scene: Panel that it belongs to.
+        label: Settings in which it differs from the others.
+        runs: Curves of its runs.
+    """
+
+    scene: str
+    label: str
+    runs: list[tuple[Point, ...]]
+
+
+def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bool:
+    """Draw PSNR against seconds, preparation included, and against steps, a column per scene.
+
+    Args:
+        rows: Runs.
+        names: Settings in which they differ.
+        path: Picture to write, PNG.
+
+    Returns:
+        Whether there was something to draw, and matplotlib (extra ``plots``) to draw it with.
+    """
+    lines = _lines(rows, names)
+    if not lines:
+        return False
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        return False
+    scenes = list(dict.fromkeys(line.scene for line in lines))
+    labels = list(dict.fromkeys(line.label for line in lines))
+    figure = Figure(figsize=(1 + 4.2 * len(scenes), 7), layout="constrained")
+    panels = figure.subplots(2, len(scenes), squeeze=False)
+    for line in lines:
+        column = scenes.index(line.scene)
+        for row, (axis, title) in enumerate((("seconds", "seconds"), ("step", "steps"))):
+            panel = panels[row][column]
+            places, values = _mean_curve(line.runs, axis)
+            panel.plot(
+                places, values, label=line.label, color=f"C{labels.index(line.label)}", marker="."
+            )
+            panel.set_xlabel(f"{title} (preparation included)" if row == 0 else title)
+            panel.set_ylabel("PSNR, dB")
+            panel.set_title(line.scene)
+            panel.grid(alpha=0.3)
+    panels[0][0].legend(fontsize="small")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
+    return True
+
+
+def _lines(rows: Sequence[RunRow], names: Sequence[str]) -> list[Line]:
+    over = [name for name in names if name not in (SEED, SCENE)]
+    found: dict[tuple[str, str], Line] = {}
+    for row in rows:
+        if len(row.curve) < 2:
+            continue
+        scene = str(row.settings.get(SCENE, ""))
+        label = ", ".join(_short(name, row.settings.get(name)) for name in over) or "run"
+        line = found.setdefault((scene, label), Line(scene, label, []))
+        line.runs.append(row.curve)
+    return list(found.values())
+
+
+def _short(name: str, value: Any) -> str:
+    if name.endswith(".name"):
+        return str(value)
+    return f"{name.rsplit('.', 1)[-1]}={value}"
+
+
+def _mean_curve(runs: Sequence[Sequence[Point]], axis: str) -> tuple[list[float], list[float]]:
+    """The mean of curves over what they have in common; a single curve as it is."""
+    if len(runs) == 1:
+        return [getattr(p, axis) for p in runs[0]], [p.psnr for p in runs[0]]
+    first = max(getattr(run[0], axis) for run in runs)
+    last = min(getattr(run[-1], axis) for run in runs)
+    places = [first + (last - first) * k / (PLACES - 1) for k in range(PLACES)]
+    values = [
+        math.fsum(interpolate([(getattr(p, axis), p.psnr) for p in run], at) for run in runs)
+        / len(runs)
+        for at in places
+    ]
+    return places, values
+
+
+def interpolate(pairs: Sequence[tuple[float, float]], place: float) -> float:
+    """The value of a polyline at a place; its ends go on flat."""
+    for (left, low), (right, high) in zip(pairs, pairs[1:], strict=False):
+        if place <= right:
+            share = (place - left) / (right - left) if right > left else 1.0
+            return low + (high - low) * min(max(share, 0.0), 1.0)
+    return pairs[-1][1]

@@ -1,0 +1,151 @@
+"""Triplanes of pictures, and a film that goes round them: `python -m xplanes triplanes`."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from xplanes.config import ConfigError, ImageLRMConfig, TrainConfig
+from xplanes.evaluation.media import render_path, write_film
+from xplanes.fields import XPlanes
+from xplanes.fields.xplanes import SPACE_PLANES
+from xplanes.lrm.model import LRM
+from xplanes.preparation.cache import StageCache
+from xplanes.preparation.encode import encode
+from xplanes.preparation.reconstruct import load_lrm, picture_crop
+from xplanes.preparation.sequence import TriplaneSequence, save_triplanes
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.renderer import DIAGONAL, Renderer
+from xplanes.scenes.batches import step_generator
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.frame import cube_frame
+from xplanes.scenes.images import load_images
+from xplanes.training.builder import training_device
+
+FRAMES, FPS, SIDE = 48, 16, 224
+SAMPLES, CELLS = 192, 64
+KINDS = (".png", ".jpg", ".jpeg")
+GRID_STREAM = 1_000_061
+"""Random stream of the points at which the preview's grid is filled."""
+
+
+def write_triplanes(
+    paths: Sequence[Path], out: Path, config: TrainConfig, *, say: Callable[[str], None]
+) -> Path:
+    """Turn pictures into triplanes, and write them and a film that goes round them.
+
+    Args:
+        paths: Pictures, or folders of them.
+        out: File to write, .safetensors or .pt; the film lies beside it.
+        config: Settings, of which the model's, the cache and the device count.
+        say: Takes lines about what happens.
+
+    Returns:
+        The film.
+
+    Raises:
+        ConfigError, LRMError, SceneError: If a setting, the weights or a picture cannot be used.
+    """
+    pictures = find_pictures(paths)
+    if out.suffix not in (".safetensors", ".pt"):
+        raise ConfigError(f"out={out}: must end in .safetensors or .pt")
+    options = config.lrm
+    if not isinstance(options, ImageLRMConfig):
+        raise ConfigError(
+            f"lrm={options.name} makes no triplanes of pictures: choose a model, such as lrm=small"
+        )
+    lrm = load_lrm(options, say=say)
+    frames = load_images(pictures, None)
+    if bool((frames[..., 3] == 255).all()):
+        say("the pictures have no transparency: the model takes the background for a thing")
+    folder = config.preparation.cache
+    device = training_device(config.trainer.accelerator)
+    encoded = encode(
+        lrm.model,
+        lrm.key,
+        frames,
+        picture_crop(frames, crop=options.crop),
+        StageCache(None if folder is None else Path(folder)),
+        device,
+        batch=options.batch,
+    )
+    decoder = lrm.model.field_decoder()
+    sequence = TriplaneSequence(encoded.triplanes, decoder.state_dict(), decoder.options)
+    save_triplanes(out, sequence)
+    count, _, channels, size = encoded.triplanes.shape[:4]
+    say(
+        f"wrote {out}: {count} triplanes of {size} x {size} texels and {channels} channels, "
+        f"{encoded.seconds / encoded.distinct:.2f} s each"
+    )
+    film = out.with_suffix(".webp")
+    write_film(film, turntable(encoded.triplanes, lrm.model, device), fps=FPS)
+    say(f"wrote {film}")
+    return film
+
+
+def find_pictures(paths: Sequence[Path]) -> list[Path]:
+    """Picture files; of a folder all that it holds, by name.
+
+    Raises:
+        SceneError: If one is missing, or there are none.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in KINDS)
+            if not inside:
+                raise SceneError(f"{path} holds no pictures ({', '.join(KINDS)})")
+            found += inside
+        elif path.is_file():
+            found.append(path)
+        else:
+            raise SceneError(f"{path}: there is no such picture or folder")
+    if not found:
+        raise SceneError("name at least one picture, or a folder of them")
+    return found
+
+
+def turntable(triplanes: Tensor, model: LRM, device: torch.device) -> Iterator[Tensor]:
+    """Frames of a camera that goes once round, from where the model's own camera stands.
+
+    Args:
+        triplanes: One or several, shown one after the other. [T, 3, C, H, H]
+        model: The model that made them.
+        device: Where to render.
+
+    Yields:
+        Pictures on white. uint8 [SIDE, SIDE, 3]
+    """
+    view = model.view
+    frame = cube_frame(view.half_side, torch.zeros(3))
+    decoder = model.field_decoder().requires_grad_(False)
+    shown, field, renderer = -1, None, None
+    for number in range(FRAMES):
+        index = number * len(triplanes) // FRAMES
+        if index != shown:
+            planes: dict[str, Tensor] = dict(zip(SPACE_PLANES, triplanes[index], strict=True))
+            field = XPlanes(planes=planes, decoder=decoder, plane_set="three").to(device)
+            grid = OccupancyGrid(CELLS, 1, step=DIAGONAL / SAMPLES).to(device)
+            with torch.no_grad():
+                grid.sweep(field, step_generator(0, index, GRID_STREAM))
+            renderer, shown = Renderer(grid, SAMPLES), index
+        assert field is not None
+        assert renderer is not None
+        turn = 2 * math.pi * number / FRAMES
+        spin = torch.eye(4)
+        spin[:2, :2] = torch.tensor(
+            [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
+        )
+        pose = spin @ view.camera_to_world().float()
+        yield from render_path(
+            field,
+            renderer,
+            frame,
+            pose[None],
+            torch.zeros(1),
+            focal=view.focal * SIDE,
+            size=SIDE,
+            background=torch.ones(3),
+        )

@@ -1,0 +1,115 @@
+"""Frames of the fixed view to triplanes, each distinct frame once."""
+
+import sys
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from xplanes.lrm.images import Crop
+from xplanes.lrm.model import LRM
+from xplanes.preparation.cache import StageCache, fingerprint
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """Triplanes of a video.
+
+    Attributes:
+        triplanes: One per frame, on the CPU. [T, 3, C, H, H]
+        distinct: Number of frames that differ.
+        cached: How many of these came from the cache.
+        seconds: Time that the distinct frames took to encode, now or when they were kept.
+    """
+
+    triplanes: Tensor
+    distinct: int
+    cached: int
+    seconds: float
+
+
+def encode(
+    model: LRM,
+    key: str,
+    frames: Tensor,
+    crop: Crop,
+    cache: StageCache,
+    device: torch.device,
+    *,
+    batch: int,
+) -> Encoded:
+    """Run the model on every distinct frame.
+
+    A frame's triplane is kept as soon as it is there, so that an interrupted video goes on where it
+    stopped. Beyond the result, memory holds one batch.
+
+    Args:
+        model: The model.
+        key: Hash of its weights and sizes.
+        frames: Premultiplied RGBA. uint8 [T, H, W, 4]
+        crop: What the model is shown of them.
+        cache: Where triplanes are kept.
+        device: Where they are computed; in bfloat16 on a GPU.
+        batch: Frames at a time.
+    """
+    places: dict[str, list[int]] = {}
+    for number, frame in enumerate(frames):
+        places.setdefault(fingerprint(frame), []).append(number)
+    shown = [crop.top, crop.left, crop.side, list(crop.kept or ())]
+    found: dict[str, Tensor] = {}
+    seconds, missing = 0.0, []
+    for frame_key in places:
+        stage = cache.find("triplane", _inputs(key, frame_key, shown, device))
+        if stage is None:
+            missing.append(frame_key)
+        else:
+            found[frame_key] = stage.content["triplane"]
+            seconds += stage.seconds
+    cached = len(found)
+    model = model.to(device)
+    for chunk in _progress(missing, batch):
+        began = time.perf_counter()
+        first = torch.tensor([places[frame_key][0] for frame_key in chunk])
+        pictures = model.prepare(crop.apply(straight_alpha(frames[first])))
+        with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
+            planes = model.encode(pictures.to(device)).float().cpu()
+        share = (time.perf_counter() - began) / len(chunk)
+        for frame_key, triplane in zip(chunk, planes, strict=True):
+            inputs = _inputs(key, frame_key, shown, device)
+            cache.keep("triplane", inputs, {"triplane": triplane.clone()}, share)
+            found[frame_key] = triplane
+            seconds += share
+    triplanes = torch.empty(len(frames), *next(iter(found.values())).shape)
+    for frame_key, numbers in places.items():
+        triplanes[numbers] = found.pop(frame_key)
+    return Encoded(triplanes, len(places), cached, seconds)
+
+
+def _inputs(key: str, frame_key: str, shown: list[Any], device: torch.device) -> list[Any]:
+    return [key, frame_key, shown, device.type]
+
+
+def straight_alpha(frames: Tensor) -> Tensor:
+    """Premultiplied bytes as colours that are not multiplied by alpha, from 0 to 1.
+
+    Args:
+        frames: Premultiplied RGBA. uint8 [T, H, W, 4]
+
+    Returns:
+        RGBA. [T, 4, H, W]
+    """
+    whole = frames.movedim(-1, 1).float() / 255
+    alpha = whole[:, 3:]
+    colour = torch.where(alpha > 0, whole[:, :3] / alpha.clamp_min(1e-6), 0.0).clamp(0, 1)
+    return torch.cat([colour, alpha], dim=1)
+
+
+def _progress(missing: list[str], batch: int) -> Any:
+    from tqdm import tqdm
+
+    chunks = [missing[start : start + batch] for start in range(0, len(missing), batch)]
+    # A bar needs a terminal: piped, it would fill the log.
+    wanted = sys.stderr.isatty()
+    return tqdm(chunks, desc="triplanes", unit="batch", leave=False, disable=not wanted)

@@ -1,0 +1,257 @@
+"""The fixed-view video: one camera, all moments.
+
+A scene may bring it. Otherwise a field is trained on the scene for a short time and rendered from
+where the Large Reconstruction Model expects its camera to stand.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from xplanes.config import DecoderConfig, ModelConfig, TrainConfig
+from xplanes.lrm.canonical import CanonicalView
+from xplanes.preparation.cache import StageCache
+from xplanes.scenes.cameras import orbit
+from xplanes.scenes.datamodule import RayDataModule
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.frame import Frame, frame_content
+from xplanes.scenes.views import Scene, Views, camera_rays
+from xplanes.training.builder import build_batches, build_module, is_still
+from xplanes.training.fit import fit
+from xplanes.training.module import RadianceModule
+
+FIELD = ModelConfig(
+    name="six_planes",
+    plane_set="six",
+    resolution=64,
+    time_resolution=None,
+    channels=32,
+    space_scale=0.1,
+    time_scale=0.1,
+    decoder=DecoderConfig(
+        width=64,
+        hidden=3,
+        activation="relu",
+        density="softplus",
+        density_scale=25.0,
+        density_start=-2.0,
+        colour_margin=0.001,
+        freeze=False,
+    ),
+)
+"""The field that the video is rendered with; the run's own model would make ablations of it differ
+in their video too."""
+
+CHECKPOINT_EVERY = 250
+"""Steps between checkpoints of that field."""
+
+
+@dataclass(frozen=True)
+class FixedView:
+    """The video.
+
+    Attributes:
+        views: Frames of one camera at moments that fill [0, 1] evenly; one where nothing moves.
+        target: World point in the middle of the scene. [3]
+        seconds: Time that it took to make.
+        words: Where it comes from, in a few words.
+    """
+
+    views: Views
+    target: Tensor
+    seconds: float
+    words: str
+
+
+def fixed_view(
+    config: TrainConfig,
+    scene: Scene,
+    frame: Frame,
+    view: CanonicalView,
+    size: int,
+    cache: StageCache,
+    *,
+    say: Callable[[str], None],
+) -> FixedView:
+    """The scene's own video, or one that a field renders.
+
+    Args:
+        config: The run's settings.
+        scene: The scene.
+        frame: The scene's frame.
+        view: The camera that the model believes in; a rendered video is taken by it.
+        size: Pixels per side that the model looks at; more are not rendered.
+        cache: Where a rendered video is kept.
+        say: Takes a line before something slow begins.
+
+    Raises:
+        SceneError: If the scene's video is asked for and there is none, or it leaves out moments.
+    """
+    options = config.preparation
+    if options.fixed_view == "video" and scene.video is None:
+        raise SceneError(
+            f"preparation.fixed_view=video: {scene.name} has no video of a fixed camera "
+            "(transforms_video.json); set preparation.fixed_view=train"
+        )
+    count = 1 if is_still(scene.splits["train"]) else options.frames
+    if scene.video is not None and options.fixed_view != "train":
+        views = pick_frames(scene.video, count)
+        return FixedView(views, frame.centre, 0.0, f"{len(views)} frames of the scene's video")
+    return _rendered(config, scene, frame, view, size, count, cache, say)
+
+
+def pick_frames(video: Views, count: int) -> Views:
+    """The frames nearest to ``count`` evenly spread moments.
+
+    Raises:
+        SceneError: If the video leaves out so much that a moment has no frame near it.
+    """
+    moments = torch.linspace(0, 1, count) if count > 1 else video.times[:1]
+    gaps = (video.times[None] - moments[:, None]).abs()
+    nearest, chosen = gaps.min(dim=1)
+    # A video of few frames may stand for each of them for a while.
+    allowed = max(0.75 / max(count - 1, 1), 0.75 / max(len(video) - 1, 1))
+    if float(nearest.max()) > allowed:
+        moment = float(moments[nearest.argmax()])
+        raise SceneError(
+            f"the video of the fixed camera has no frame near time {moment:.2f}: its frames must "
+            "spread over all times from 0 to 1; set preparation.fixed_view=train to do without it"
+        )
+    return video.subset(chosen)
+
+
+def canonical_pose(
+    views: Views,
+    frame: Frame,
+    view: CanonicalView,
+    *,
+    azimuth: float | None,
+    elevation: float,
+) -> Tensor:
+    """Where the model's camera stands if its box is to hold the scene, and its picture too.
+
+    Args:
+        views: Training views.
+        frame: The scene's frame, whose cube holds a ball around all that the views show.
+        view: The model's camera and box.
+        azimuth: Direction in degrees from the world's x axis towards y; None takes that of the
+            training camera whose height angle is nearest to ``elevation``.
+        elevation: Height angle in degrees.
+
+    Returns:
+        Camera-to-world matrix. [4, 4]
+    """
+    if azimuth is None:
+        offset = views.camera_to_world[:, :3, 3] - frame.centre
+        height = torch.asin((offset[:, 2] / offset.norm(dim=-1)).clamp(-1, 1))
+        nearest = offset[int((height - math.radians(elevation)).abs().argmin())]
+        azimuth = math.degrees(math.atan2(float(nearest[1]), float(nearest[0])))
+    radius = 1 / frame.scale
+    held = min(view.half_side, view.distance * math.sin(math.atan(0.5 / view.focal)))
+    distance = view.distance * radius / held
+    # An orbit begins on the -y side.
+    turn = math.radians(azimuth + 90)
+    pose = orbit(1, radius=distance, elevation=elevation)[0]
+    spin = torch.eye(4)
+    spin[:2, :2] = torch.tensor(
+        [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
+    )
+    pose = spin @ pose
+    pose[:3, 3] += frame.centre
+    return pose
+
+
+def _rendered(
+    config: TrainConfig,
+    scene: Scene,
+    frame: Frame,
+    view: CanonicalView,
+    size: int,
+    count: int,
+    cache: StageCache,
+    say: Callable[[str], None],
+) -> FixedView:
+    options, train = config.preparation, scene.splits["train"]
+    pose = canonical_pose(train, frame, view, azimuth=options.azimuth, elevation=options.elevation)
+    side = min(size, max(train.height, train.width))
+    focal = view.focal * side
+    trained = replace(
+        config,
+        model=FIELD,
+        trainer=replace(
+            config.trainer,
+            devices=1,
+            strategy="auto",
+            max_seconds=options.fixed_view_seconds,
+            max_steps=options.fixed_view_steps,
+            checkpoint_every=CHECKPOINT_EVERY,
+            evaluate_at=[],
+            media=False,
+        ),
+    )
+    inputs = [
+        train.images,
+        train.camera_to_world,
+        train.times,
+        train.focal,
+        frame_content(frame),
+        [asdict(part) for part in (trained.model, trained.sampler, trained.loss, trained.trainer)],
+        [config.seed, config.data.background_share, config.data.skip_background],
+        [pose, focal, side, count],
+    ]
+
+    def make() -> dict[str, Any]:
+        say(
+            f"fixed view: training a field for {options.fixed_view_seconds:g} s to film "
+            f"{count} frames from where the model's camera stands"
+        )
+        with cache.workshop("fixed_view", inputs) as folder:
+            module = _train(trained, scene, frame, folder)
+            return {"images": _film(module, frame, pose, focal, side, count)}
+
+    stage = cache.stage("fixed_view", inputs, make, alone=True)
+    views = Views(
+        stage.content["images"],
+        pose.expand(count, 4, 4),
+        torch.linspace(0, 1, count) if count > 1 else train.times[:1],
+        focal,
+        tuple(f"fixed_{number:03d}.png" for number in range(count)),
+    )
+    words = f"{count} frames filmed by a field trained for {options.fixed_view_seconds:g} s"
+    return FixedView(views, frame.centre, stage.seconds, words)
+
+
+def _train(config: TrainConfig, scene: Scene, frame: Frame, folder: Path) -> RadianceModule:
+    """Train the field, going on from where an interrupted attempt stopped."""
+    split = config.data.eval_split
+    first = torch.zeros(1, dtype=torch.long)
+    # One view is scored, for the log; nothing is chosen by it.
+    few = replace(
+        scene, splits=scene.splits | {split: scene.splits[split].subset(first)}, video=None
+    )
+    module = build_module(config, few, frame)
+    data = RayDataModule(few, frame, lambda rank: build_batches(config, few, frame, rank))
+    fit(config, module, data, folder, resume=True)
+    return module.eval()
+
+
+@torch.no_grad()
+def _film(
+    module: RadianceModule, frame: Frame, pose: Tensor, focal: float, side: int, count: int
+) -> Tensor:
+    """Frames at evenly spread moments, premultiplied. uint8 [T, side, side, 4]"""
+    device = module.grid.density.device
+    origins, directions = frame.rays(*camera_rays(pose, focal, side, side))
+    rays = origins.to(device), directions.to(device)
+    frames = []
+    for time in torch.linspace(0, 1, count).tolist():
+        # Black behind the scene leaves colours multiplied by opacity.
+        image = module.renderer.image(module.field, *rays, time, torch.zeros(3, device=device))
+        whole = torch.cat([image["colour"], image["opacity"][:, None]], dim=-1).clamp(0, 1)
+        frames.append((whole * 255).round().to(torch.uint8).view(side, side, 4).cpu())
+    return torch.stack(frames)

@@ -6,9 +6,9 @@ import torch
 from tests.pretraining.small import same, small_config, small_sizes
 from xplanes.config import ConfigError
 from xplanes.lrm import LRMError, load
+from xplanes.lrm.bundled import bundled_models, load_bundled
 from xplanes.lrm.canonical import canonical_vector
 from xplanes.lrm.config import parse_config
-from xplanes.lrm.bundled import bundled_models, load_bundled
 from xplanes.pretraining.export import export, published_state
 from xplanes.pretraining.observe import FOCAL
 from xplanes.pretraining.settings import published_sizes

@@ -77,9 +77,7 @@ class PretrainConfig:
     """The whole configuration of a pretraining."""
 
     seed: int = MISSING  # Source of all randomness.
-    start: str | None = (
-        MISSING  # Weights to go on from, of a model with smaller planes; null: none.
-    )
+    start: str | None = MISSING  # Weights with coarser planes to go on from; null: none.
     run: str = MISSING  # Folder of checkpoints and logs; an earlier run in it goes on.
     model: SizeConfig = field(default_factory=SizeConfig)
     pool: PoolConfig = field(default_factory=PoolConfig)

@@ -9,6 +9,7 @@ from typing import Any
 import yaml
 
 from xplanes import config as schemas
+from xplanes.pretraining.settings import PretrainConfig
 from xplanes.schemas import kplanes, samplers, tensor4d, tineuvox
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -111,7 +112,24 @@ def document() -> str:
     parts += ["", "## `recipe`", "", RECIPE, "", "| recipe | key | value |", "|---|---|---|"]
     for path in sorted((ROOT / "conf" / "recipe").glob("*.yaml")):
         parts += [f"| `recipe={path.stem}` | `{key}` | {value} |" for key, value in settings(path)]
-    return "\n".join(parts) + "\n"
+    return "\n".join([*parts, *pretraining()]) + "\n"
+
+
+def pretraining() -> list[str]:
+    """The settings of the other program."""
+    shared = yaml.safe_load((ROOT / "conf" / "pretrain_lrm.yaml").read_text())
+    shared.pop("defaults")
+    options = {name: {**shared, "model": values("pretrain", name)} for name in ("tiny", "mini")}
+    return [
+        "",
+        "## `python -m xplanes pretrain-lrm`, with `pretrain=tiny`, `pretrain=mini`",
+        "",
+        "Training of a small LRM on procedural objects, [its card](lrm_tiny.md).",
+        "",
+        "| key | meaning | value |",
+        "|---|---|---|",
+        *rows(PretrainConfig, options, ""),
+    ]
 
 
 RECIPE = (

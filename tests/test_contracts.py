@@ -27,9 +27,9 @@ ROOT = CONF.parent
 OPTIONS = sorted(
     (str(path.parent.relative_to(CONF)), path.stem)
     for path in CONF.rglob("*.yaml")
-    if path.parent != CONF and "hydra" not in path.relative_to(CONF).parts
+    if path.parent != CONF and not {"hydra", "pretrain"} & set(path.relative_to(CONF).parts)
 )
-"""Every option of every group of conf/."""
+"""Every option of every group that train.py knows; tests/pretraining looks after the other."""
 
 FILES_OF_KEYS = [o for o in OPTIONS if o[0] not in ("experiment", "recipe")]
 """Options that set one group; the others set keys of several."""
@@ -355,6 +355,7 @@ LAYERS = (
     ("training",),
     ("preparation",),
     ("evaluation",),
+    ("pretraining",),
     ("pipeline", "launch"),
     ("cli",),
     ("__main__",),

@@ -61,7 +61,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"xplanes {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (_add_download, _add_triplanes, _add_evaluate, _add_render, _add_view, _add_table):
+    verbs = (_add_download, _add_triplanes, _add_evaluate, _add_render, _add_view, _add_table)
+    for add in (*verbs, _add_pretrain, _add_score):
         add(commands)
     return parser
 
@@ -243,3 +244,41 @@ def _table(options: argparse.Namespace) -> None:
     from xplanes.evaluation.table import write_tables
 
     print(write_tables(options.folder, options.out), end="")
+
+
+def _add_pretrain(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser("pretrain-lrm", help="train a small LRM on procedural objects")
+    parser.add_argument(
+        "overrides", nargs="*", metavar="key=value", help="settings of conf/pretrain_lrm.yaml"
+    )
+    parser.set_defaults(command=_pretrain)
+
+
+def _pretrain(options: argparse.Namespace) -> None:
+    from xplanes.pretraining.command import run_pretraining
+
+    _say(f"wrote {run_pretraining(options.overrides, _say)}")
+
+
+def _add_score(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser("score-lrm", help="judge a small LRM by held-out objects")
+    parser.add_argument("model", help="tiny, or the weights of a run, FOLDER/NAME.safetensors")
+    parser.add_argument("--objects", type=int, default=64, help="default: %(default)s")
+    parser.add_argument(
+        "--out", type=Path, default=Path("outputs/score-lrm"), help="default: %(default)s"
+    )
+    parser.set_defaults(command=_score)
+
+
+def _score(options: argparse.Namespace) -> None:
+    from xplanes.config import ConfigError
+    from xplanes.lrm.bundled import FOLDER, load_bundled
+    from xplanes.pretraining.score import score_all
+
+    if options.objects < 1:
+        raise ConfigError(f"--objects {options.objects}: must be at least 1")
+    path = Path(options.model)
+    own = path.suffix == ".safetensors"
+    model, _ = load_bundled(path.stem if own else options.model, path.parent if own else FOLDER)
+    score_all(model, options.out, objects=options.objects, announce=_say)
+    _say(f"wrote {options.out}/scores.json, objects.png, failures.png and demo.png")

@@ -1,7 +1,24 @@
 """Attention and feed-forward layers that all transformers here are made of."""
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+
+def attend(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+    """Scaled dot-product attention. [N, H, T, E], [N, H, K, E], [N, H, K, E] -> [N, H, T, E]
+
+    In bfloat16 on the CPU plain products, one sequence at a time so that its scores stay in the
+    cache, take a third of the fused kernel's time (768 tokens, 2 heads of 64 channels).
+    """
+    if query.device.type != "cpu" or query.dtype != torch.bfloat16:
+        return F.scaled_dot_product_attention(query, key, value)
+    query = query * query.shape[-1] ** -0.5
+    mixed = [
+        (q @ k.transpose(-1, -2)).softmax(-1, dtype=q.dtype) @ v
+        for q, k, v in zip(query, key, value, strict=True)
+    ]
+    return torch.stack(mixed)
 
 
 class Attention(nn.Module):
@@ -42,7 +59,7 @@ class Attention(nn.Module):
             projected.unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for projected in (self.query(tokens), self.key(context), self.value(context))
         )
-        mixed = F.scaled_dot_product_attention(query, key, value)
+        mixed = attend(query, key, value)
         return self.out(mixed.transpose(1, 2).flatten(2))
 
 

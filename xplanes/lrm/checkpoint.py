@@ -16,7 +16,6 @@ from xplanes.lrm.model import LRM
 from xplanes.lrm.openlrm import OpenLRM
 from xplanes.lrm.published import PUBLISHED, published_config
 from xplanes.lrm.triposr import TripoSR
-from xplanes.optional import require
 
 NAMED = 4
 """Tensors named in a message at most."""
@@ -160,11 +159,12 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def _read_safetensors(path: Path) -> Any:
-    safetensors = require("safetensors", extra="lrm")
-    loader = require("safetensors.torch", extra="lrm")
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
     try:
-        return loader.load_file(path)
-    except (safetensors.SafetensorError, OSError, ValueError) as problem:
+        return load_file(path)
+    except (SafetensorError, OSError, ValueError) as problem:
         raise LRMError(f"{path} is damaged or incomplete: {problem}") from problem
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from xplanes.lrm.canonical import OPENLRM_VIEW
 from xplanes.lrm.errors import LRMError
 from xplanes.lrm.reader import Reader
 
@@ -63,6 +64,9 @@ class LRMConfig:
         camera_width: Channels of the camera embedding; 0 where there is none.
         decoder_width: Neurons of the decoder's hidden layers.
         decoder_hidden: Number of these layers.
+        source_distance: From the model's own camera to the centre of its box.
+        source_focal: That camera's focal length as a share of the image's side.
+        density_scale: Factor on the density.
     """
 
     architecture: Architecture
@@ -77,6 +81,9 @@ class LRMConfig:
     camera_width: int = 0
     decoder_width: int = 64
     decoder_hidden: int = 3
+    source_distance: float = OPENLRM_VIEW.distance
+    source_focal: float = OPENLRM_VIEW.focal
+    density_scale: float = 1.0
 
     @property
     def resolution(self) -> int:
@@ -91,7 +98,10 @@ def parse_config(config: Mapping[str, Any]) -> LRMConfig:
         config: The content of the published config.json or config.yaml (OpenLRM 1.1, TripoSR) or
             of ``kwargs`` in model.pth (OpenLRM 1.0). The key ``architecture`` may name the family:
             openlrm-1.0, openlrm-1.1 or triposr. ``image_size``, ``image_mean`` and ``image_std``
-            may override what the published file does not say.
+            may override what the published file does not say. OpenLRM models of other sizes and
+            another camera say so in ``encoder_sizes`` (img_size, patch_size, embed_dim, depth,
+            num_heads, num_register_tokens), ``source_distance``, ``source_focal`` and
+            ``density_scale``.
 
     Raises:
         LRMError: If a key is missing, out of range, or asks for what is not supported.
@@ -138,7 +148,7 @@ SOURCE_SIZES = {512: 224, 768: 336, 1024: 448}
 def _openlrm(config: Mapping[str, Any], architecture: Architecture) -> LRMConfig:
     nested = isinstance(config.get("model"), Mapping)
     model = Reader(config).inner("model") if nested else Reader(config)
-    reduced = config.get("_reduced_encoder") or model.values.get("_reduced_encoder")
+    reduced = _encoder_sizes(config) or _encoder_sizes(model.values)
     width, low = model.integer("transformer_dim"), model.integer("triplane_low_res")
     if model.integer("triplane_high_res", 2 * low) != 2 * low:
         raise LRMError(
@@ -171,7 +181,15 @@ def _openlrm(config: Mapping[str, Any], architecture: Architecture) -> LRMConfig
         channels=model.integer("triplane_dim"),
         low_resolution=low,
         camera_width=model.integer("camera_embed_dim"),
+        source_distance=model.positive("source_distance", OPENLRM_VIEW.distance),
+        source_focal=model.positive("source_focal", OPENLRM_VIEW.focal),
+        density_scale=model.positive("density_scale", 1.0),
     )
+
+
+def _encoder_sizes(config: Mapping[str, Any]) -> Any:
+    """Sizes of an encoder that is not the published one, under either of their names."""
+    return config.get("encoder_sizes") or config.get("_reduced_encoder")
 
 
 def _triposr(config: Reader) -> LRMConfig:
@@ -188,7 +206,7 @@ def _triposr(config: Reader) -> LRMConfig:
     ):
         reader.require(key, value)
     name = config.inner("image_tokenizer").values.get("pretrained_model_name_or_path")
-    encoder = _dino(name, config.values.get("_reduced_encoder"), config.values)
+    encoder = _dino(name, _encoder_sizes(config.values), config.values)
     width, channels = tokenizer.integer("num_channels"), upsampler.integer("out_channels")
     backbone.require("in_channels", width)
     backbone.require("cross_attention_dim", encoder.width)
@@ -212,7 +230,7 @@ def _triposr(config: Reader) -> LRMConfig:
 def _dino(name: Any, reduced: Any, config: Mapping[str, Any]) -> EncoderConfig:
     if name != "facebook/dino-vitb16":
         raise LRMError(f"the image encoder {name!r} is not supported: only facebook/dino-vitb16")
-    sizes = Reader(reduced or {}, "_reduced_encoder.")
+    sizes = Reader(reduced or {}, "encoder_sizes.")
     patch = sizes.integer("patch_size", 16)
     given = Reader(config)
     mean = given.triple("image_mean", sizes.triple("image_mean", IMAGENET_MEAN))
@@ -236,7 +254,7 @@ def _dinov2(name: Any, reduced: Any) -> EncoderConfig:
             f"the image encoder {name!r} is not supported: must be one of {', '.join(DINOV2)}"
         )
     width, heads = DINOV2[name]
-    sizes = Reader(reduced or {}, "_reduced_encoder.")
+    sizes = Reader(reduced or {}, "encoder_sizes.")
     width, patch = sizes.integer("embed_dim", width), sizes.integer("patch_size", 14)
     sizes.require("interpolate_antialias", True)
     sizes.require("interpolate_offset", 0.0)

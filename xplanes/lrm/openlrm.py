@@ -1,5 +1,7 @@
 """OpenLRM 1.0 and 1.1: image tokens and a camera to a triplane."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
@@ -70,9 +72,11 @@ class OpenLRM(LRM):
             hidden=config.decoder_hidden,
             activation="relu",
             density="softplus",
+            density_scale=config.density_scale,
             colour_margin=0.001,
         )
-        super().__init__(config, OPENLRM_VIEW, decoder)
+        view = replace(OPENLRM_VIEW, distance=config.source_distance, focal=config.source_focal)
+        super().__init__(config, view, decoder)
         self.camera = nn.Sequential(
             nn.Linear(16, config.camera_width),
             nn.SiLU(),
@@ -98,9 +102,12 @@ class OpenLRM(LRM):
             raise LRMError(
                 f"camera has the shape {list(camera.shape)}: must be [{len(images)}, 16]"
             )
-        embedding = self.camera(camera.to(images))
-        planes = self.planes(self.transform(self.encoder(images), embedding))
-        return turn_third_plane(planes)
+        return self.triplanes(images, camera.to(images))
+
+    def triplanes(self, images: Tensor, camera: Tensor) -> Tensor:
+        """`encode` with gradients. [N, 3, S, S], [N, 16] -> [N, 3, C, H, H]"""
+        tokens = self.transform(self.encoder(images), self.camera(camera))
+        return turn_third_plane(self.planes(tokens))
 
     def transform(self, image: Tensor, camera: Tensor) -> Tensor:
         """Tokens of the triplane from those of the image. [N, K, E], [N, F] -> [N, 3 R R, D]"""

@@ -1,5 +1,6 @@
 """Reading settings from a configuration that somebody else has published."""
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -48,6 +49,15 @@ class Reader:
             raise LRMError(
                 f"the model's configuration has {self.place}{key}={value!r}: must be a number"
             ) from None
+
+    def positive(self, key: str, default: float) -> float:
+        """A finite number above zero."""
+        value = self.number(key, default)
+        if not 0 < value < math.inf:
+            raise LRMError(
+                f"the model's configuration has {self.place}{key}={value!r}: must be above zero"
+            )
+        return value
 
     def require(self, key: str, value: Any) -> None:
         """Refuse a setting that differs from the only one that is supported."""

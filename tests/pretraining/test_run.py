@@ -1,0 +1,139 @@
+"""Pretraining of seconds: it learns, it goes on after a stop as if there had been none."""
+
+import json
+import os
+import signal
+
+import pytest
+import torch
+
+from tests.pretraining.small import OVERRIDES, same, small_config, small_pool
+from xplanes.cli import main
+from xplanes.config import ConfigError
+from xplanes.lrm import load
+from xplanes.pretraining import pool as pool_module
+from xplanes.pretraining.batches import PretrainingBatches
+from xplanes.pretraining.module import PATIENCE, PretrainingError, PretrainingModule
+from xplanes.pretraining.run import CHECKPOINT
+from xplanes.pretraining.start import start_model
+from xplanes.pretraining.upkeep import Upkeep
+
+
+@pytest.fixture(autouse=True)
+def short_shards(monkeypatch):
+    monkeypatch.setattr(pool_module, "SHARD", 8)
+    monkeypatch.setattr("xplanes.pretraining.run.SHARD", 8)
+
+
+@pytest.fixture(scope="module")
+def pool_folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("pool")
+
+
+def command(run, pool, *overrides):
+    paths = [f"run={run}", f"pool.root={pool}", "pool.objects=8"]
+    return main(["pretrain-lrm", *OVERRIDES, *paths, *overrides])
+
+
+def state(run):
+    return torch.load(run / CHECKPOINT, weights_only=True)
+
+
+def test_a_stopped_training_goes_on_as_if_it_had_not(tmp_path, pool_folder, monkeypatch, capsys):
+    steps = "schedule.max_steps=6"
+    assert command(tmp_path / "whole", pool_folder, steps) == 0
+    real = Upkeep.on_train_batch_end
+
+    def stops(self, trainer, module, *others):
+        real(self, trainer, module, *others)
+        if module.steps == 4:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Upkeep, "on_train_batch_end", stops)
+    assert command(tmp_path / "cut", pool_folder, steps) == 130
+    monkeypatch.setattr(Upkeep, "on_train_batch_end", real)
+    assert state(tmp_path / "cut")["progress"]["steps"] == 4
+    assert command(tmp_path / "cut", pool_folder, steps) == 0
+    assert "going on" in capsys.readouterr().out
+    whole, cut = state(tmp_path / "whole"), state(tmp_path / "cut")
+    assert whole["progress"]["steps"] == cut["progress"]["steps"] == 6
+    assert same(whole["state_dict"], cut["state_dict"])
+    weights = tmp_path / "cut" / "tiny.safetensors"
+    assert weights.read_bytes() == (tmp_path / "whole" / "tiny.safetensors").read_bytes()
+    assert load(json.loads(weights.with_suffix(".json").read_text()), weights).image_size == 24
+    assert list((tmp_path / "cut" / "tb").glob("events*"))
+
+
+def test_another_model_does_not_go_on_in_the_same_folder(tmp_path, pool_folder, capsys):
+    assert command(tmp_path, pool_folder, "schedule.max_steps=1") == 0
+    assert command(tmp_path, pool_folder, "schedule.max_steps=1", "model.width=24") == 1
+    assert f"run={tmp_path}" in capsys.readouterr().err
+
+
+def test_finer_planes_start_from_a_finished_run(tmp_path, pool_folder, capsys):
+    assert command(tmp_path / "coarse", pool_folder, "schedule.max_steps=1") == 0
+    start = f"start={tmp_path}/coarse/tiny.safetensors"
+    finer = ("model.low_resolution=8", start, "schedule.max_steps=1")
+    assert command(tmp_path / "fine", pool_folder, *finer) == 0
+    assert command(tmp_path / "wrong", pool_folder, *finer, "model.width=24") == 1
+    assert "start=" in capsys.readouterr().err
+
+
+def module(*overrides):
+    config = small_config("schedule.max_steps=40", "schedule.render_from=0", *overrides)
+    from tests.pretraining.small import small_sizes
+
+    model = start_model(small_sizes(), 0)
+    return config, PretrainingModule(model, config.batch, config.schedule, 0, bf16=False)
+
+
+def test_losses_fall():
+    config, taught = module("schedule.muon_lr=0.02", "schedule.adam_lr=0.01")
+    optimizers = taught.configure_optimizers()
+    taught.optimizers = lambda: optimizers
+    taught.manual_backward = lambda loss: loss.backward()
+    batch = config.batch
+    data = PretrainingBatches(
+        small_pool(3), taught.model.view, seed=0, objects=3, near=batch.near, volume=batch.volume,
+        free=batch.free, colour=batch.colour, rays=batch.rays,
+    )  # fmt: skip
+    first = float(taught.losses(data.draw(0))[0].detach())
+    for step in range(40):
+        taught.training_step(data.draw(step), step)
+    assert taught.steps == 40
+    assert float(taught.losses(data.draw(0))[0].detach()) < 0.75 * first
+    assert {"occupancy", "colour", "render", "opacity"} <= set(taught.last)
+
+
+def test_every_parameter_has_one_optimizer():
+    _, taught = module()
+    listed = [p for o in taught.configure_optimizers() for g in o.param_groups for p in g["params"]]
+    assert len(listed) == len(set(map(id, listed))) == len(list(taught.model.parameters()))
+
+
+def test_rates_rise_stay_and_fall():
+    _, taught = module("schedule.warmup_steps=4", "schedule.decay_share=0.5")
+    rates = []
+    for taught.steps in (0, 3, 10, 20, 30, 40):
+        rates.append(taught.rate)
+    assert rates == [0.25, 1, 1, 1, 0.5, 0]
+
+
+def test_losses_that_are_not_finite_end_in_words(monkeypatch):
+    _, taught = module()
+    optimizers = taught.configure_optimizers()
+    taught.optimizers = lambda: optimizers
+    broken = (torch.tensor(float("nan")), {})
+    monkeypatch.setattr(taught, "losses", lambda batch: broken)
+    for step in range(PATIENCE - 1):
+        taught.training_step(None, step)  # type: ignore[arg-type]
+    with pytest.raises(PretrainingError, match=r"schedule\.muon_lr"):
+        taught.training_step(None, PATIENCE)  # type: ignore[arg-type]
+    assert taught.steps == 0
+
+
+def test_wrong_settings_leave_the_command_in_words(capsys):
+    assert main(["pretrain-lrm", "batch.objects=0"]) == 1
+    assert "batch.objects=0" in capsys.readouterr().err
+    with pytest.raises(ConfigError):
+        small_config("schedule.max_steps=0")

@@ -1,0 +1,1 @@
+"""Small Large Reconstruction Models of our own: procedural objects, training, scores."""

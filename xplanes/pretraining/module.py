@@ -1,0 +1,179 @@
+"""The LightningModule: one model, taught by points and rays of procedural objects."""
+
+import copy
+import math
+from typing import Any
+
+import torch
+from lightning import LightningModule
+from torch import Tensor, nn
+
+from xplanes.config import ConfigError
+from xplanes.lrm.canonical import canonical_vector
+from xplanes.lrm.openlrm import OpenLRM
+from xplanes.pretraining.batches import PretrainingBatch
+from xplanes.pretraining.losses import (
+    colour_loss,
+    composite,
+    occupancy_loss,
+    ray_samples,
+    triplane_logits,
+)
+from xplanes.pretraining.settings import BatchConfig, ScheduleConfig
+from xplanes.scenes.batches import step_generator
+
+JITTER_STREAM = 1_000_211
+"""Random stream of the places of samples along rays."""
+
+PATIENCE = 20
+"""Steps in a row with a loss that is not finite after which training gives up."""
+
+
+class PretrainingError(ConfigError):
+    """Pretraining cannot go on; the message says what was seen and what to change."""
+
+
+class PretrainingModule(LightningModule):
+    """Trains a model on objects whose every point is known.
+
+    Optimisation is manual: Muon for the blocks' matrices, AdamW for all else. The budget is in
+    steps or in seconds of the training clock, whichever is used up first.
+
+    Args:
+        model: The model, as `start_model` makes it.
+        batch: What a step looks at.
+        schedule: Budget, optimisers and weights.
+        seed: The run's seed.
+        bf16: Whether blocks and decoder compute in bfloat16.
+    """
+
+    def __init__(
+        self, model: OpenLRM, batch: BatchConfig, schedule: ScheduleConfig, seed: int, *, bf16: bool
+    ) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        self.model, self.average = model, copy.deepcopy(model).requires_grad_(False)
+        self.batch, self.schedule, self.seed, self.bf16 = batch, schedule, seed, bf16
+        self.camera = canonical_vector(model.view)
+        self.steps, self.clock, self.unusable = 0, 0.0, 0
+        self.last: dict[str, float] = {}
+
+    @property
+    def progress(self) -> float:
+        """Share of the budget that is spent, of steps or of seconds, the larger."""
+        share = self.steps / self.schedule.max_steps
+        if self.schedule.max_seconds is not None:
+            share = max(share, self.clock / self.schedule.max_seconds)
+        return min(1.0, share)
+
+    def configure_optimizers(self) -> list[torch.optim.Optimizer]:
+        matrices, others = [], []
+        for name, parameter in self.model.named_parameters():
+            inner = "blocks." in name and parameter.ndim == 2 and "modulation" not in name
+            (matrices if inner else others).append(parameter)
+        options = self.schedule
+        return [
+            torch.optim.Muon(
+                matrices,
+                lr=options.muon_lr,
+                weight_decay=options.weight_decay,
+                adjust_lr_fn="match_rms_adamw",
+            ),
+            torch.optim.AdamW(
+                others,
+                lr=options.adam_lr,
+                betas=(0.9, 0.98),
+                weight_decay=options.weight_decay,
+                fused=True,
+            ),
+        ]
+
+    def training_step(self, batch: PretrainingBatch, batch_idx: int) -> None:
+        optimizers = self.optimizers()
+        assert isinstance(optimizers, list)
+        self._set_learning_rates()
+        loss, parts = self.losses(batch)
+        if not math.isfinite(float(loss.detach())):
+            self._refuse(float(loss.detach()))
+            return
+        self.unusable = 0
+        self.manual_backward(loss)
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.schedule.clip)
+        for optimizer in optimizers:
+            optimizer.step()
+            optimizer.zero_grad()
+        self.steps += 1
+        keep = min(self.schedule.average, (1 + self.steps) / (10 + self.steps))
+        with torch.no_grad():
+            for mean, value in zip(self.average.parameters(), self.model.parameters(), strict=True):
+                mean.lerp_(value, 1 - keep)
+        self.last = {**parts, "gradient": float(norm), "rate": self.rate}
+
+    def losses(self, batch: PretrainingBatch) -> tuple[Tensor, dict[str, float]]:
+        """The loss of a batch, and its terms by name."""
+        options, decoder = self.schedule, self.model.decoder
+        with torch.autocast(batch.images.device.type, torch.bfloat16, enabled=self.bf16):
+            camera = self.camera.to(batch.images).expand(len(batch.images), -1)
+            planes = self.model.triplanes(batch.images, camera).float()
+            count = batch.points.shape[1]
+            points = torch.cat([batch.points, batch.surface], dim=1)
+            logits = triplane_logits(planes, decoder, points).float()
+        occupancy = occupancy_loss(logits[:, :count], batch.inside)
+        colour = colour_loss(logits[:, count:], batch.colours, decoder.colour_margin)
+        loss = occupancy + options.colour_weight * colour
+        parts = {"occupancy": float(occupancy.detach()), "colour": float(colour.detach())}
+        if self.batch.rays and self.progress >= options.render_from:
+            rendered, seen = self._rendered(planes, batch)
+            error = (rendered - batch.ray_colours).square().mean()
+            opacity = (seen - batch.ray_alpha).square().mean()
+            loss = loss + options.render_weight * (error + 0.3 * opacity)
+            parts |= {"render": float(error.detach()), "opacity": float(opacity.detach())}
+        return loss, parts
+
+    def _rendered(self, planes: Tensor, batch: PretrainingBatch) -> tuple[Tensor, Tensor]:
+        shape = (*batch.ray_hits.shape, self.batch.samples)
+        jitter = torch.rand(shape, generator=step_generator(self.seed, self.steps, JITTER_STREAM))
+        distances, lengths = ray_samples(
+            batch.origins,
+            batch.directions,
+            batch.ray_hits,
+            half_side=self.model.half_side,
+            jitter=jitter.to(planes),
+        )
+        points = batch.origins[:, :, None] + distances[..., None] * batch.directions[:, :, None]
+        with torch.autocast(planes.device.type, torch.bfloat16, enabled=self.bf16):
+            logits = triplane_logits(planes, self.model.decoder, points.flatten(1, 2))
+        colours, density = self.model.decoder.activate(logits.flatten(0, 1))
+        return composite(density.unflatten(0, shape), colours.unflatten(0, shape), lengths)
+
+    @property
+    def rate(self) -> float:
+        """Factor on the learning rates: a warm-up, a plateau, and a fall to zero."""
+        warm = min(1.0, (self.steps + 1) / max(1, self.schedule.warmup_steps))
+        left = (1 - self.progress) / max(self.schedule.decay_share, 1e-9)
+        return warm * min(1.0, left)
+
+    def _set_learning_rates(self) -> None:
+        optimizers = self.optimizers()
+        assert isinstance(optimizers, list)
+        for optimizer, peak in zip(
+            optimizers, (self.schedule.muon_lr, self.schedule.adam_lr), strict=True
+        ):
+            for group in optimizer.param_groups:
+                group["lr"] = self.rate * peak
+
+    def _refuse(self, value: float) -> None:
+        self.unusable += 1
+        if self.unusable >= PATIENCE:
+            raise PretrainingError(
+                f"the loss was {value} for {PATIENCE} steps in a row, at step {self.steps}: lower "
+                f"schedule.muon_lr={self.schedule.muon_lr} and schedule.adam_lr="
+                f"{self.schedule.adam_lr}, then go on from an earlier checkpoint"
+            )
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["progress"] = {"steps": self.steps, "clock": self.clock}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.steps = checkpoint["progress"]["steps"]
+        self.clock = checkpoint["progress"]["clock"]

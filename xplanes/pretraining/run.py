@@ -1,0 +1,152 @@
+"""The whole job of `python -m xplanes pretrain-lrm`: pool, training, weights."""
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import torch
+from lightning import Trainer
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch.utils.data import DataLoader, IterableDataset
+
+from xplanes.backend import fast_bf16
+from xplanes.config import ConfigError
+from xplanes.files import read_json, write_json
+from xplanes.lrm import LRMConfig, load
+from xplanes.lrm.config import parse_config
+from xplanes.lrm.openlrm import OpenLRM
+from xplanes.pretraining.batches import PretrainingBatch, PretrainingBatches
+from xplanes.pretraining.export import export
+from xplanes.pretraining.module import PretrainingModule
+from xplanes.pretraining.objects import HELD_OUT_SEEDS, TRAINING_SEEDS
+from xplanes.pretraining.observe import FOCAL
+from xplanes.pretraining.pool import SHARD, ensure_pool
+from xplanes.pretraining.quick import QuickLook
+from xplanes.pretraining.settings import PretrainConfig, published_sizes
+from xplanes.pretraining.start import grow_model, start_model
+from xplanes.pretraining.upkeep import Upkeep
+from xplanes.training.fit import quiet_lightning
+from xplanes.training.interrupt import Interrupt
+
+CHECKPOINT = "last.ckpt"
+
+
+class Steps(IterableDataset):
+    """Batches from the module's step on.
+
+    Args:
+        batches: Draws the batch of a step.
+        step: Tells the step.
+    """
+
+    def __init__(self, batches: PretrainingBatches, step: Callable[[], int]) -> None:
+        self.batches, self.step = batches, step
+
+    def __iter__(self) -> Iterator[PretrainingBatch]:
+        for step in itertools.count(self.step()):
+            yield self.batches.draw(step)
+
+
+def pretrain(plain: dict, config: PretrainConfig, announce: Callable[[str], None]) -> Path:
+    """Train a model to the end of its budget, from its last checkpoint on where there is one.
+
+    Args:
+        plain: The configuration as builtins, kept beside the checkpoints.
+        config: The same, typed.
+        announce: Takes lines about what happens.
+
+    Returns:
+        The weights; their configuration lies beside them.
+
+    Raises:
+        ConfigError: If the run's folder holds a run of another model or seed.
+    """
+    quiet_lightning()
+    run = Path(config.run)
+    last = run / CHECKPOINT
+    _settle(run, plain)
+    module, data, look = assemble(config, announce)
+    if last.is_file():
+        announce(f"going on from {last}")
+    interrupt = Interrupt()
+    trainer = Trainer(
+        accelerator="cpu",
+        max_steps=-1,
+        max_epochs=-1,
+        callbacks=[Upkeep(last, config.schedule, look, announce), interrupt],
+        logger=TensorBoardLogger(run, name="", version="tb"),
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        log_every_n_steps=10**9,
+        use_distributed_sampler=False,
+    )
+    loader = DataLoader(Steps(data, lambda: module.steps), batch_size=None)
+    checkpoint = str(last) if last.is_file() else None
+    with interrupt.listening():
+        trainer.fit(module, loader, ckpt_path=checkpoint, weights_only=True)
+    return export(module.average, published_sizes(config.model, FOCAL), run, config.model.name)
+
+
+def assemble(
+    config: PretrainConfig, announce: Callable[[str], None]
+) -> tuple[PretrainingModule, PretrainingBatches, QuickLook]:
+    """The module at its start, its batches, and what looks at held-out objects."""
+    pool, batch, side = config.pool, config.batch, config.model.image_size
+    drawn = ensure_pool(
+        Path(pool.root),
+        TRAINING_SEEDS[: pool.objects],
+        views=pool.views,
+        side=side,
+        announce=announce,
+    )
+    shards = math.ceil(config.schedule.score_objects / SHARD)
+    held_out = ensure_pool(
+        Path(pool.root) / "held_out",
+        HELD_OUT_SEEDS[: shards * SHARD],
+        views=pool.views,
+        side=side,
+        announce=announce,
+    )
+    sizes = parse_config(published_sizes(config.model, FOCAL))
+    model = start_model(sizes, config.seed) if config.start is None else _grown(config.start, sizes)
+    module = PretrainingModule(
+        model, batch, config.schedule, config.seed, bf16=fast_bf16(torch.device("cpu"))
+    )
+    data = PretrainingBatches(
+        drawn,
+        model.view,
+        seed=config.seed,
+        objects=batch.objects,
+        near=batch.near,
+        volume=batch.volume,
+        free=batch.free,
+        colour=batch.colour,
+        rays=batch.rays,
+    )
+    return module, data, QuickLook(held_out, config.schedule.score_objects)
+
+
+def _grown(start: str, sizes: LRMConfig) -> OpenLRM:
+    weights = Path(start)
+    try:
+        earlier = load(read_json(weights.with_suffix(".json")), weights)
+        assert isinstance(earlier, OpenLRM)
+        return grow_model(earlier, sizes).requires_grad_(True)
+    except (OSError, ValueError, RuntimeError) as problem:
+        raise ConfigError(f"start={start}: not the weights of such a model: {problem}") from problem
+
+
+def _settle(run: Path, plain: dict) -> None:
+    """Keep the configuration in the run's folder, and refuse one that does not go on with it."""
+    path = run / "config.json"
+    if path.is_file():
+        before = read_json(path)
+        for key in ("seed", "model", "pool"):
+            if before.get(key) != plain[key]:
+                raise ConfigError(
+                    f"run={run} holds a run with {key}={before.get(key)}, asked for is "
+                    f"{plain[key]}: name another folder, or leave {key} as it was"
+                )
+    write_json(path, plain)

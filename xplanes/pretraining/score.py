@@ -1,0 +1,159 @@
+"""How well a model reconstructs: held-out procedural objects, and the demo scenes."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from xplanes.files import replacing, write_json
+from xplanes.lrm import LRM
+from xplanes.metrics import psnr, ssim
+from xplanes.pretraining.losses import triplane_logits
+from xplanes.pretraining.objects import HELD_OUT_SEEDS, procedural_object
+from xplanes.pretraining.observe import FOCAL, camera, film_solids, inside
+from xplanes.pretraining.quick import model_pose, overlap, world_to_model
+from xplanes.pretraining.render import render_view
+from xplanes.pretraining.samples import view_cameras
+from xplanes.scenes.demo.film import camera_at, film
+from xplanes.scenes.demo.scenes import DEMO_SCENES, build_demo_scene
+
+GRID = 48
+"""Points along each side of the box at which solid and empty are compared."""
+
+TURNS = (40.0, 180.0, -90.0)
+"""Degrees by which novel cameras of the demo scenes stand beside the fixed one."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Something to reconstruct.
+
+    Attributes:
+        name: For tables and pictures.
+        cameras: The input's camera, then novel ones. [V, 4, 4]
+        picture: RGB on white from a camera, given the side in pixels. [S, S, 3]
+        inside: Which world points [N, 3] are solid. [N]
+    """
+
+    name: str
+    cameras: Tensor
+    picture: Callable[[Tensor, int], Tensor]
+    inside: Callable[[Tensor], Tensor]
+
+
+def held_out(count: int) -> Iterator[Subject]:
+    """The first held-out objects, each from the cameras that its seed gives it."""
+    for seed in HELD_OUT_SEEDS[:count]:
+        solids = procedural_object(seed)
+        yield Subject(
+            f"object {seed - HELD_OUT_SEEDS.start}",
+            torch.from_numpy(np.stack([camera(*at) for at in view_cameras(seed, 4)])),
+            lambda pose, side, s=solids: torch.from_numpy(film_solids(s, pose.numpy(), side)[0]),
+            lambda points, s=solids: torch.from_numpy(inside(s, points.double().numpy())),
+        )
+
+
+def demo_subjects(time: float = 0.4) -> Iterator[Subject]:
+    """The demo scenes at one moment, from their fixed cameras and from three beside it."""
+    for name, scene in DEMO_SCENES.items():
+        posed = build_demo_scene(name).pose(time)
+        cameras = [camera_at(scene.azimuth + turn, scene.elevation) for turn in (0.0, *TURNS)]
+
+        def picture(pose: Tensor, side: int, posed=posed) -> Tensor:
+            rgba = torch.from_numpy(film(posed, pose, side)).float() / 255
+            return rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
+
+        yield Subject(name, torch.stack(cameras), picture, lambda p, q=posed: q.inside(p.float()))
+
+
+@dataclass(frozen=True)
+class Score:
+    """Scores of one subject, and a strip of pictures.
+
+    Attributes:
+        name: The subject.
+        values: IoU, and PSNR and SSIM of the input's view and of novel views (their mean).
+        strip: Input, its reconstruction, a novel view, its reconstruction. [S, 4 S, 3]
+    """
+
+    name: str
+    values: dict[str, float]
+    strip: Tensor
+
+
+@torch.no_grad()
+def score(model: LRM, subject: Subject) -> Score:
+    """Reconstruct a subject from its first view."""
+    side = model.image_size
+    pictures = [subject.picture(pose, side).float() for pose in subject.cameras]
+    planes = model.encode(pictures[0].permute(2, 0, 1)[None])
+    turn = world_to_model(subject.cameras[0], model)
+    line = model.half_side * (2 * (torch.arange(GRID) + 0.5) / GRID - 1)
+    grid = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), dim=-1).flatten(0, 2)
+    solid = torch.cat(
+        [
+            triplane_logits(planes, model.decoder, part[None])[0, :, 0] > 1
+            for part in grid.split(2**15)
+        ]
+    )
+    world = grid @ torch.linalg.inv(turn).T
+    rendered = [
+        render_view(planes, model.decoder, model_pose(pose, turn), side=side, focal=FOCAL)
+        for pose in subject.cameras
+    ]
+    quality = [(psnr(a, b), ssim(a, b)) for a, b in zip(rendered, pictures, strict=True)]
+    novel = quality[1:]
+    values = {
+        "iou": overlap(solid, subject.inside(world)),
+        "psnr_input": quality[0][0],
+        "ssim_input": quality[0][1],
+        "psnr_novel": sum(p for p, _ in novel) / len(novel),
+        "ssim_novel": sum(s for _, s in novel) / len(novel),
+    }
+    strip = torch.cat([pictures[0], rendered[0], pictures[1], rendered[1]], dim=1)
+    return Score(subject.name, values, strip)
+
+
+def score_all(
+    model: LRM, folder: Path, *, objects: int, announce: Callable[[str], None]
+) -> dict[str, dict[str, float]]:
+    """Score held-out objects and demo scenes; write scores.json, objects.png and demo.png.
+
+    Args:
+        model: The model.
+        folder: Where to write.
+        objects: Held-out objects.
+        announce: Takes lines of the table.
+
+    Returns:
+        Mean scores of the objects, and those of each demo scene, by name.
+    """
+    found = [score(model, subject) for subject in held_out(objects)]
+    scenes = [score(model, subject) for subject in demo_subjects()]
+    means = {key: sum(s.values[key] for s in found) / len(found) for key in found[0].values}
+    table = {f"{objects} held-out objects": means, **{s.name: s.values for s in scenes}}
+    announce(f"{'':24}" + "".join(f"{key:>12}" for key in means))
+    for name, values in table.items():
+        announce(f"{name:24}" + "".join(f"{value:12.3f}" for value in values.values()))
+    write_json(
+        folder / "scores.json", {"mean": table, "objects": {s.name: s.values for s in found}}
+    )
+    by_overlap = sorted(found, key=lambda s: s.values["iou"])
+    write_sheet(folder / "objects.png", [s.strip for s in found[:16]], 2)
+    write_sheet(folder / "demo.png", [s.strip for s in scenes], 1)
+    write_sheet(folder / "failures.png", [s.strip for s in by_overlap[:6]], 2)
+    return table
+
+
+def write_sheet(path: Path, strips: list[Tensor], columns: int) -> None:
+    """Strips of pictures side by side and below one another, as a PNG."""
+    rows = [torch.cat(strips[i : i + columns], dim=1) for i in range(0, len(strips), columns)]
+    width = max(row.shape[1] for row in rows)
+    filled = [torch.nn.functional.pad(r, (0, 0, 0, width - r.shape[1]), value=1.0) for r in rows]
+    pixels = (torch.cat(filled).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    with replacing(path) as temporary:
+        Image.fromarray(pixels).save(temporary, format="PNG")

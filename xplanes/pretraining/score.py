@@ -61,7 +61,7 @@ def demo_subjects(time: float = 0.4) -> Iterator[Subject]:
     """The demo scenes at one moment, from their fixed cameras and from three beside it."""
     for name, scene in DEMO_SCENES.items():
         posed = build_demo_scene(name).pose(time)
-        cameras = [camera_at(scene.azimuth + turn, scene.elevation) for turn in (0.0, *TURNS)]
+        cameras = [camera_at(scene.azimuth + turn, 0.0) for turn in (0.0, *TURNS)]
 
         def picture(pose: Tensor, side: int, posed=posed) -> Tensor:
             rgba = torch.from_numpy(film(posed, pose, side)).float() / 255

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -207,8 +207,12 @@ def build_module(
         sparse: What the products of time planes are tied to (L_r); None leaves the term out.
             [T, 3, C, H, H]
     """
+    views = scene.splits["train"]
+    if isinstance(config.model, ModelConfig) and config.model.plane_set == "three":
+        # Nothing moves in this field: all views are of one moment.
+        views = replace(views, times=torch.zeros_like(views.times))
     precision = decoder_precision(config.trainer)
-    site = Site(scene.splits["train"], frame, precision, begun=planes is not None)
+    site = Site(views, frame, precision, begun=planes is not None)
     if isinstance(config.model, ModelConfig):
         method = _xplanes_method(config, site, planes, decoder_state, sparse)
     else:

@@ -29,6 +29,7 @@ GROUPS: dict[str, dict[str, type]] = {
     "lrm": {
         "none": schemas.LRMConfig,
         "file": schemas.TriplaneFileConfig,
+        "tiny": schemas.BundledLRMConfig,
         **dict.fromkeys(("small", "base", "large", "xlarge"), schemas.PretrainedLRMConfig),
     },
     "preparation": {"default": schemas.PreparationConfig},

@@ -79,7 +79,7 @@ decomposition.noise trainer.warmup_steps""".split()
     + families.NOT_NEGATIVE
 )
 _SHARE = """data.background_share sampler.decay sampler.occlusion trainer.final_lr
-model.alpha_start model.final_rate""".split()
+model.final_rate""".split()
 _CHOICES: dict[str, tuple[str, ...]] = {
     "data.eval_split": ("test", "val"),
     "model.plane_set": ("six", "nine", "three"),

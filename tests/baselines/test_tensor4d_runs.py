@@ -103,3 +103,8 @@ def test_a_surface_needs_its_own_sampler(scenes, sampler):
 def test_triplanes_are_refused(scenes):
     with pytest.raises(ConfigError, match="lrm=file with model=tensor4d"):
         parse(baseline_config(scenes, "model=tensor4d", "lrm=file"))
+
+
+def test_a_loss_that_lacks_terms_is_refused(scenes):
+    with pytest.raises(ConfigError, match=r"loss\.eikonal .* set loss=tensor4d"):
+        parse(baseline_config(scenes, "model=tensor4d", "loss=tensor4d_density"))

@@ -75,12 +75,11 @@ model.decay_steps model.fine_resolution model.fine_channels model.blur_resolutio
 model.plane_learning_rate model.radius model.sharpness loss.smoothness_distance
 sampler.more_samples sampler.coarse_sharpness sampler.far sampler.step
 sampler.time_resolution sampler.channels sampler.width sampler.anneal_steps
-sampler.anneal_slope sampler.update_warmup sampler.learning_rate""".split()
+sampler.anneal_slope sampler.update_warmup sampler.padding sampler.learning_rate""".split()
 NOT_NEGATIVE = """model.warmup_steps model.near model.point_octaves model.time_octaves
 model.direction_octaves model.feature_octaves loss.time_identity loss.entropy
 loss.sample_colour model.fine_from model.blur_until loss.eikonal loss.opacity
-loss.smoothness sampler.near
-sampler.padding sampler.histogram sampler.total_variation sampler.time_smoothness
+loss.smoothness sampler.near sampler.histogram sampler.total_variation sampler.time_smoothness
 sampler.time_identity""".split()
 CHOICES: dict[str, tuple[str, ...]] = {
     "model.variant": ("hybrid", "explicit"),
@@ -115,10 +114,13 @@ def misfit(config: dict[str, Any], family: Family, losses: str) -> str | None:
     known = {entry.name for entry in fields(family.loss)}
     if strange := sorted(set(config["loss"]) - known):
         return f"loss.{strange[0]} with model={model}: it has no such term; set loss={losses}"
+    baseline = family in FAMILIES.values()
+    if baseline and (missing := sorted(known - set(config["loss"]))):
+        return f"loss.{missing[0]} with model={model}: it is not set; set loss={losses}"
     kind = sampler if sampler in SAMPLERS else "occupancy"
     if kind not in family.samplers:
         return f"sampler={sampler} with model={model}: must be one of {', '.join(family.samplers)}"
-    if family in FAMILIES.values() and lrm != "none":
+    if baseline and lrm != "none":
         return (
             f"lrm={lrm} with model={model}: triplanes start X-Planes alone; set lrm=none, "
             "or model=six_planes or model=nine_planes"
@@ -139,8 +141,11 @@ def conflict(config: Any) -> str | None:
             values = getattr(settings, name, [1])
             if not values or min(values) < 1:
                 return f"{group}.{name}={values}: must be one or more numbers above 0"
-    if isinstance(config.model, TiNeuVoxConfig) and config.model.near >= config.model.far:
-        return f"model.near={config.model.near}: must be below model.far={config.model.far}"
+    if isinstance(config.model, TiNeuVoxConfig):
+        if config.model.near >= config.model.far:
+            return f"model.near={config.model.near}: must be below model.far={config.model.far}"
+        if not 0 < config.model.alpha_start < 1:
+            return f"model.alpha_start={config.model.alpha_start}: must lie between 0 and 1"
     own, given = getattr(config.model, "half_side", None), config.data.half_side
     if own is not None and given is not None:
         return (

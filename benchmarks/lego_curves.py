@@ -65,6 +65,7 @@ def main() -> None:
                 result = measure(
                     [
                         *lego(args.lego),
+                        "lrm=none",
                         f"data.resolution={pixels}",
                         f"model={planes}_planes",
                         f"trainer.max_seconds={seconds}",

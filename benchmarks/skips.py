@@ -53,6 +53,7 @@ def train(scene: list[str], switches: tuple[str, ...], work: Path, args) -> Meas
     """One run with equal rays at equal steps."""
     overrides = [
         *scene,
+        "lrm=none",
         f"data.resolution={args.resolution}",
         f"trainer.max_steps={args.steps}",
         "trainer.max_seconds=null",

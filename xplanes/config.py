@@ -57,7 +57,7 @@ class ModelConfig:
     name: str = MISSING  # Name in run directories and tables.
     plane_set: str = MISSING  # six, nine, or three (no time).
     resolution: int = MISSING  # Texels along each space axis.
-    time_resolution: int | None = MISSING  # Rows of time; null: views / 2, or one per triplane.
+    time_resolution: int | None = MISSING  # Rows of time; null: half as many as distinct times.
     channels: int = MISSING  # Channels of each plane.
     space_scale: float = MISSING  # Standard deviation of the space planes at the start.
     time_scale: float = MISSING  # Standard deviation of the time planes at the start.
@@ -134,7 +134,7 @@ class PreparationConfig:
     fixed_view: str = MISSING  # The scene's video, train (a field films it), or auto.
     fixed_view_seconds: float = MISSING  # Training clock of the field that films it.
     fixed_view_steps: int = MISSING  # Its steps at most.
-    azimuth: float | None = MISSING  # Degrees from x towards y; null: a training view's.
+    azimuth: float | None = MISSING  # Degrees from x towards y; null: along an axis.
     elevation: float = MISSING  # Its height angle in degrees.
 
 

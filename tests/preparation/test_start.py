@@ -74,25 +74,31 @@ def test_no_source_is_a_random_start_that_touches_nothing(tmp_path: Path):
 
 
 @pytest.mark.parametrize("model", ["six_planes", "nine_planes"])
-@pytest.mark.parametrize(("resolution", "rows"), [(16, None), (24, None), (9, 5)])
+@pytest.mark.parametrize(("resolution", "rows"), [(16, 8), (24, 8), (9, 5)])
 def test_a_rank_one_start_explains_what_moves(tmp_path: Path, model, resolution, rows):
     begun, module = start(
         tmp_path,
         SEQUENCE,
         f"model={model}",
         f"model.resolution={resolution}",
-        f"model.time_resolution={rows or 'null'}",
+        f"model.time_resolution={rows}",
     )
     field = module.field
     count = len(TIME_ROWS[field.plane_set][-1]) * 3 if model == "nine_planes" else 3
     assert field.space.shape == (3, resolution, resolution, 8)
-    assert field.time.shape == (count, rows or 8, resolution, 8)
+    assert field.time.shape == (count, rows, resolution, 8)
     unexplained = begun.report["unexplained"]
     assert unexplained["before"] == pytest.approx(1, abs=0.05)
     # With fewer texels and rows than the blob needs, less of it can be held.
     assert unexplained["after"] < (0.3 if resolution >= 16 else 0.8)
     again = unexplained_energy(field.time, begun.sparse, rows=field.rows)
     assert again == pytest.approx(unexplained["after"], rel=1e-5)
+
+
+def test_left_open_the_rows_of_time_are_those_of_a_random_start(tmp_path: Path):
+    _, module = start(tmp_path, SEQUENCE)
+    random = build_module(parse(small_config(tmp_path)), ball_scene(), FRAME)
+    assert module.field.time.shape[1] == random.field.time.shape[1] == 3
 
 
 def test_the_field_shows_what_stands_still_where_nothing_moves(tmp_path: Path):
@@ -117,7 +123,7 @@ def test_reports_and_seconds_are_whole(tmp_path: Path):
         assert report["converged"]
         assert 1 <= report["rank"] <= 8
         assert 0 < report["sparsity"] < 1
-        assert report["residual"] <= 1e-4
+        assert report["residual"] <= 0.003
     assert set(begun.seconds) == set(STAGES)
     assert begun.seconds["fixed_view"] == 0
     assert all(begun.seconds[name] > 0 for name in STAGES[1:])

@@ -9,6 +9,7 @@ from xplanes.config import register_schemas, to_plain
 from xplanes.launch import CONF
 
 SMALL = (
+    "lrm=none",
     "data.resolution=32",
     "data.train_views=10",
     "data.test_views=3",

@@ -139,8 +139,10 @@ def canonical_pose(
         views: Training views.
         frame: The scene's frame, whose cube holds a ball around all that the views show.
         view: The model's camera and box.
-        azimuth: Direction in degrees from the world's x axis towards y; None takes that of the
-            training camera whose height angle is nearest to ``elevation``.
+        azimuth: Direction in degrees from the world's x axis towards y; None takes the axis of the
+            world that points most towards the training camera whose height angle is nearest to
+            ``elevation``. Things are often built along the world's axes, and planes hold best what
+            lies along theirs.
         elevation: Height angle in degrees.
 
     Returns:
@@ -150,7 +152,7 @@ def canonical_pose(
         offset = views.camera_to_world[:, :3, 3] - frame.centre
         height = torch.asin((offset[:, 2] / offset.norm(dim=-1)).clamp(-1, 1))
         nearest = offset[int((height - math.radians(elevation)).abs().argmin())]
-        azimuth = math.degrees(math.atan2(float(nearest[1]), float(nearest[0])))
+        azimuth = 90.0 * round(math.atan2(float(nearest[1]), float(nearest[0])) / (0.5 * math.pi))
     radius = 1 / frame.scale
     held = min(view.half_side, view.distance * math.sin(math.atan(0.5 / view.focal)))
     distance = view.distance * radius / held

@@ -24,8 +24,8 @@ from xplanes.preparation.reconstruct import LoadedLRM, load_lrm, reconstruct
 from xplanes.preparation.sequence import TriplaneSequence, load_triplanes
 from xplanes.preparation.stages import Parts, convert_stage, decompose_stage
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.views import Scene
-from xplanes.training.builder import is_still, training_device
+from xplanes.scenes.views import Scene, Views
+from xplanes.training.builder import is_still, time_rows, training_device
 
 logger = logging.getLogger(__name__)
 
@@ -156,8 +156,9 @@ def start_from(
         source: What messages call the sequence.
         seconds: Seconds of the stages that made it.
     """
-    still = is_still(scene.splits["train"])
-    model = _settled(config, sequence, moving=not still, source=source)
+    views = scene.splits["train"]
+    still = is_still(views)
+    model = _settled(config, sequence, views, source=source)
     if len(sequence.triplanes) == 1 and not still:
         logger.warning(
             "%s holds one triplane, but the scene moves: the field gets no planes of time and "
@@ -186,15 +187,15 @@ def start_from(
 
 
 def _settled(
-    config: TrainConfig, sequence: TriplaneSequence, *, moving: bool, source: str
+    config: TrainConfig, sequence: TriplaneSequence, views: Views, *, source: str
 ) -> ModelConfig:
     """The model's settings with what the sequence decides."""
     frames, _, channels = sequence.triplanes.shape[:3]
     model = replace(config.model, channels=channels)
-    if not moving or frames == 1:
+    if is_still(views) or frames == 1:
         model = replace(model, plane_set="three")
     if model.plane_set != "three":
-        model = replace(model, time_resolution=model.time_resolution or frames)
+        model = replace(model, time_resolution=model.time_resolution or time_rows(views.times))
     if sequence.decoder_config is not None:
         decoder = asdict(model.decoder) | dict(sequence.decoder_config)
         model = replace(model, decoder=build(type(model.decoder), decoder))

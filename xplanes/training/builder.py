@@ -101,6 +101,11 @@ def is_still(views: Views) -> bool:
     return bool((views.times == views.times[0]).all())
 
 
+def time_rows(times: Tensor) -> int:
+    """Rows of time where the settings leave them open: one for two distinct times. [V]"""
+    return max(2, math.ceil(len(times.unique()) / 2))
+
+
 def build_field(
     config: ModelConfig,
     times: Tensor,
@@ -128,7 +133,7 @@ def build_field(
             plane_set,
             channels=config.channels,
             resolution=config.resolution,
-            time_resolution=config.time_resolution or max(2, math.ceil(distinct / 2)),
+            time_resolution=config.time_resolution or time_rows(times),
             space_scale=config.space_scale,
             time_scale=config.time_scale,
             generator=generator,

@@ -19,21 +19,20 @@ class DemoScene:
 
     Attributes:
         build: Makes the scene in the colours of a variation.
-        azimuth: Direction of the fixed camera in degrees, from +x towards +y.
-        elevation: Its height angle in degrees.
+        azimuth: Direction of the fixed camera in degrees, from +x towards +y. The camera stands
+            level, on an axis of the world along which the scene is built.
     """
 
     build: Callable[[Variation], Assembly]
-    azimuth: float = -60.0
-    elevation: float = 20.0
+    azimuth: float = -90.0
 
 
 DEMO_SCENES: dict[str, DemoScene] = {
-    "excavator": DemoScene(excavator, azimuth=-60.0, elevation=18.0),
-    "walker": DemoScene(walker, azimuth=-50.0, elevation=12.0),
-    "balls": DemoScene(balls, azimuth=-65.0, elevation=22.0),
-    "windmill": DemoScene(windmill, azimuth=-35.0, elevation=15.0),
-    "still": DemoScene(still, azimuth=-70.0, elevation=25.0),
+    "excavator": DemoScene(excavator),
+    "walker": DemoScene(walker),
+    "balls": DemoScene(balls),
+    "windmill": DemoScene(windmill, azimuth=0.0),
+    "still": DemoScene(still),
 }
 
 

@@ -20,7 +20,7 @@ from xplanes.scenes.demo.assembly import Assembly
 from xplanes.scenes.demo.film import CAMERA_ANGLE_X, camera_at, film, hemisphere_cameras
 from xplanes.scenes.demo.scenes import build_demo_scene, demo_scene
 
-VERSION = 1
+VERSION = 2
 """Raised when the same scene would come out as other pictures."""
 
 RECORD = "demo.json"
@@ -111,7 +111,7 @@ def _shots(name: str, seed: int, counts: dict[str, int]) -> dict[str, list[Shot]
         held_out = [0.0, *((i + draw.random()) / count for i in range(1, count))]
         times = _even(count) if split == "train" else held_out
         shots[split] = list(zip(times, cameras, strict=True))
-    camera = camera_at(scene.azimuth, scene.elevation)
+    camera = camera_at(scene.azimuth, 0.0)
     shots["video"] = [(time, camera) for time in _even(VIDEO_FRAMES)]
     return shots
 

@@ -52,7 +52,7 @@ def test_a_dnerf_camera_is_its_own(name):
 @pytest.mark.parametrize("name", bundled_models())
 def test_it_reconstructs_what_it_never_saw(name):
     model, _ = load_bundled(name)
-    found = [score(model, subject).values for subject in held_out(3)]
-    assert sum(values["psnr_novel"] for values in found) / 3 > 15
-    assert sum(values["psnr_input"] for values in found) / 3 > 19
-    assert sum(values["iou"] for values in found) / 3 > 0.15
+    found = [score(model, subject).values for subject in held_out(2)]
+    assert sum(values["psnr_novel"] for values in found) / 2 > 15
+    assert sum(values["psnr_input"] for values in found) / 2 > 19
+    assert sum(values["iou"] for values in found) / 2 > 0.15

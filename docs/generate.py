@@ -10,6 +10,7 @@ import yaml
 
 from xplanes import config as schemas
 from xplanes.pretraining.settings import PretrainConfig
+from xplanes.schemas import kplanes, samplers, tensor4d, tineuvox
 
 ROOT = Path(__file__).resolve().parent.parent
 TARGET = ROOT / "docs" / "configuration.md"
@@ -18,16 +19,34 @@ _FIELD = re.compile(r"^    (\w+): [^#\n]*#\s*(.+)$", re.MULTILINE)
 
 GROUPS: dict[str, dict[str, type]] = {
     "data": {"demo": schemas.DemoConfig, "dnerf": schemas.DataConfig},
-    "model": {"six_planes": schemas.ModelConfig, "nine_planes": schemas.ModelConfig},
+    "model": {
+        **dict.fromkeys(("six_planes", "nine_planes"), schemas.ModelConfig),
+        **dict.fromkeys(("kplanes", "kplanes_explicit"), kplanes.KPlanesConfig),
+        **dict.fromkeys(("tineuvox_s", "tineuvox_b"), tineuvox.TiNeuVoxConfig),
+        "tensor4d": tensor4d.Tensor4DConfig,
+        "tensor4d_density": tensor4d.Tensor4DDensityConfig,
+    },
     "lrm": {
         "none": schemas.LRMConfig,
         "file": schemas.TriplaneFileConfig,
+        "tiny": schemas.BundledLRMConfig,
         **dict.fromkeys(("small", "base", "large", "xlarge"), schemas.PretrainedLRMConfig),
     },
     "preparation": {"default": schemas.PreparationConfig},
     "decomposition": dict.fromkeys(("default", "paper"), schemas.DecompositionConfig),
-    "sampler": {"occupancy": schemas.SamplerConfig},
-    "loss": {"default": schemas.LossConfig},
+    "sampler": {
+        "occupancy": samplers.SamplerConfig,
+        **dict.fromkeys(("proposal", "kplanes", "kplanes_explicit"), samplers.ProposalConfig),
+        "fixed_step": samplers.FixedStepConfig,
+        "neus": samplers.NeusConfig,
+    },
+    "loss": {
+        "default": schemas.LossConfig,
+        "kplanes": kplanes.KPlanesLossConfig,
+        "tineuvox": tineuvox.TiNeuVoxLossConfig,
+        "tensor4d": tensor4d.Tensor4DLossConfig,
+        "tensor4d_density": tensor4d.Tensor4DDensityLossConfig,
+    },
     "trainer": dict.fromkeys(("default", "cpu", "gpu", "ddp", "debug"), schemas.TrainerConfig),
 }
 
@@ -70,7 +89,8 @@ def document() -> str:
     parts = [
         "# Configuration",
         "",
-        "Generated from `xplanes/config.py` and `conf/` by `python docs/generate.py`.",
+        "Generated from `xplanes/config.py`, `xplanes/schemas/` and `conf/` by "
+        "`python docs/generate.py`.",
         "",
         "Every key can be set on the command line, `python train.py data.views=10 trainer=cpu`.",
         "Where the options of a group differ, their values stand in the order of the options.",
@@ -90,6 +110,9 @@ def document() -> str:
             parts += ["", f"## {names}", "", (schema.__doc__ or "").split("\n")[0], ""]
             parts += ["| key | meaning | value |", "|---|---|---|"]
             parts += rows(schema, named, f"{group}.")
+    parts += ["", "## `recipe`", "", RECIPE, "", "| recipe | key | value |", "|---|---|---|"]
+    for path in sorted((ROOT / "conf" / "recipe").glob("*.yaml")):
+        parts += [f"| `recipe={path.stem}` | `{key}` | {value} |" for key, value in settings(path)]
     return "\n".join([*parts, *pretraining()]) + "\n"
 
 
@@ -108,6 +131,18 @@ def pretraining() -> list[str]:
         "|---|---|---|",
         *rows(PretrainConfig, options, ""),
     ]
+
+
+RECIPE = (
+    "What a published baseline sets in other groups. Its model chooses it; `recipe=none` trains "
+    "it on the same rays and batches as X-Planes."
+)
+
+
+def settings(path: Path) -> list[tuple[str, Any]]:
+    """Dotted keys of a YAML file of groups, and their values."""
+    content = yaml.safe_load(path.read_text()) or {}
+    return [(f"{group}.{key}", v) for group, keys in content.items() for key, v in keys.items()]
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from xplanes.checks import parse
 from xplanes.config import SCHEMAS, ConfigError, register_schemas, to_plain
 from xplanes.launch import CONF, check_keys, prepare
 from xplanes.scenes.frame import scene_frame
-from xplanes.training.builder import build_batches, build_module
+from xplanes.training.builder import build_batches, build_frame, build_module
 
 ROOT = CONF.parent
 
@@ -31,14 +31,50 @@ OPTIONS = sorted(
 )
 """Every option of every group that train.py knows; tests/pretraining looks after the other."""
 
-TINY = (
-    "model.resolution=6",
-    "model.channels=2",
-    "model.decoder.width=8",
-    "sampler.grid_resolution=6",
-    "sampler.samples=16",
-    "trainer.rays_per_batch=32",
-)
+FILES_OF_KEYS = [o for o in OPTIONS if o[0] not in ("experiment", "recipe")]
+"""Options that set one group; the others set keys of several."""
+
+COMPANIONS = {
+    ("loss", "kplanes"): ["model=kplanes"],
+    ("loss", "tineuvox"): ["model=tineuvox_s"],
+    ("sampler", "fixed_step"): ["model=tineuvox_s"],
+    ("recipe", "kplanes"): ["model=kplanes"],
+    ("recipe", "tineuvox"): ["model=tineuvox_s"],
+    ("loss", "tensor4d"): ["model=tensor4d"],
+    ("loss", "tensor4d_density"): ["model=tensor4d_density"],
+    ("sampler", "neus"): ["model=tensor4d"],
+    ("recipe", "tensor4d"): ["model=tensor4d"],
+}
+"""What an option that only goes with some models is tried with."""
+
+TINY_MODELS = {
+    None: ("model.resolution=6", "model.channels=2", "model.decoder.width=8"),
+    "kplanes": ("model.resolution=4", "model.scales=[1,2]", "model.channels=2", "model.width=16"),
+    "tineuvox": ("model.resolution=12", "model.channels=2", "model.width=8"),
+    **dict.fromkeys(
+        ("tensor4d", "tensor4d_density"),
+        ("model.resolution=6", "model.fine_resolution=8", "model.channels=2", "model.width=8"),
+    ),
+}
+TINY_SAMPLERS = {
+    "occupancy": ("sampler.grid_resolution=6", "sampler.samples=16"),
+    "proposal": (
+        "sampler.samples=6",
+        "sampler.proposal_samples=[12,8]",
+        "sampler.resolutions=[4,6]",
+        "sampler.time_resolution=3",
+    ),
+    "fixed_step": (),
+    "neus": ("sampler.samples=8", "sampler.more_samples=5"),
+}
+
+
+def tiny(*overrides):
+    """The overrides, and those that make what they choose small."""
+    plain = composed(*overrides)
+    model, sampler = plain["model"].get("family"), plain["sampler"]["name"]
+    small = ("trainer.rays_per_batch=32", "trainer.samples_per_batch=4096")
+    return [*overrides, *TINY_MODELS[model], *TINY_SAMPLERS[sampler], *small]
 
 
 def composed(*overrides):
@@ -57,12 +93,12 @@ def test_there_is_something_to_test():
 
 @pytest.mark.parametrize(("group", "name"), OPTIONS)
 def test_every_option_composes_parses_and_builds(group, name):
-    plain = composed(f"{group}={name}", *TINY)
-    typed = parse(plain)
-    if group != "experiment":
+    companions = COMPANIONS.get((group, name), [])
+    typed = parse(composed(*tiny(*companions, f"{group}={name}")))
+    if (group, name) in FILES_OF_KEYS:
         assert getattr(typed, group) is not None
     scene = ball_scene()
-    frame = scene_frame(scene.splits["train"], typed.data.half_side)
+    frame = build_frame(typed, scene.splits["train"])
     if typed.trainer.accelerator == "gpu" and not torch.cuda.is_available():
         with pytest.raises(ConfigError, match="no GPU found"):
             build_module(typed, scene, frame)
@@ -71,10 +107,9 @@ def test_every_option_composes_parses_and_builds(group, name):
     if typed.trainer.accelerator == "auto" and torch.cuda.is_available():
         module = module.cuda()
     batch = build_batches(typed, scene, frame, 0).draw(0)
-    device = module.field.space.device
-    names = ("origins", "directions", "times", "background", "jitter")
-    rays = [batch[name].to(device) for name in names]
-    colour = module.renderer.render(module.field, *rays).colour
+    device = module.renderer.device
+    rays = {name: value.to(device) for name, value in batch.items()}
+    colour = module.sampling.render(module.field, rays, module.moment).colour
     assert colour.shape == (32, 3)
     assert colour.isfinite().all()
 
@@ -83,17 +118,18 @@ def test_every_option_composes_parses_and_builds(group, name):
 @pytest.mark.parametrize("name", [name for group, name in OPTIONS if group == "model"])
 def test_a_still_scene_gets_no_time_planes(moving, name):
     scene = ball_scene(moving=moving)
-    typed = parse(composed(f"model={name}", *TINY))
-    module = build_module(typed, scene, scene_frame(scene.splits["train"]))
-    assert (module.field.time is not None) == moving
-    assert module.grid.time_bins == (typed.sampler.time_bins if moving else 1)
+    typed = parse(composed(*tiny(f"model={name}")))
+    module = build_module(typed, scene, build_frame(typed, scene.splits["train"]))
+    assert module.field.moves == moving
+    if hasattr(module, "grid"):
+        assert module.grid.time_bins == (typed.sampler.time_bins if moving else 1)
 
 
 def test_equal_seeds_build_equal_fields_and_zero_is_a_seed():
     scene = ball_scene()
     frame = scene_frame(scene.splits["train"])
     first, again, other = (
-        build_module(parse(composed(f"seed={seed}", *TINY)), scene, frame).state_dict()
+        build_module(parse(composed(*tiny(f"seed={seed}"))), scene, frame).state_dict()
         for seed in (0, 0, 1)
     )
     assert all(torch.equal(first[key], again[key]) for key in first)
@@ -127,7 +163,7 @@ def keys_and_schema(group, name):
     content = yaml.safe_load((CONF / group / f"{name}.yaml").read_text())
     keys, schema = set(), None
     for parent in content.pop("defaults", []):
-        if parent == "_self_":
+        if parent == "_self_" or not isinstance(parent, str):
             continue
         if (group, parent) in SCHEMAS:
             schema = SCHEMAS[group, parent]
@@ -137,7 +173,7 @@ def keys_and_schema(group, name):
     return keys | yaml_leaves(content), schema
 
 
-@pytest.mark.parametrize(("group", "name"), [o for o in OPTIONS if o[0] != "experiment"])
+@pytest.mark.parametrize(("group", "name"), FILES_OF_KEYS)
 def test_yaml_files_set_every_field_of_their_schema_and_no_other(group, name):
     keys, schema = keys_and_schema(group, name)
     assert schema is not None, f"conf/{group}/{name}.yaml inherits no schema"
@@ -194,6 +230,9 @@ def test_checked_keys_exist_and_are_listed_once(kind):
 
 PLAIN = composed("lrm=small")
 
+PLAINS = [PLAIN, *(composed(f"model={name}") for name in ("kplanes", "tineuvox_s", "tensor4d"))]
+"""Configurations that hold all keys between them."""
+
 REFUSED = [
     *[(key, value) for key in CHECKED["positive"] for value in (0, -1)],
     *[(key, -1) for key in CHECKED["not negative"]],
@@ -208,14 +247,15 @@ REFUSED = [
 
 
 def changed(key, value):
-    plain = copy.deepcopy(PLAIN)
     *groups, last = key.split(".")
-    node = plain
-    for group in groups:
-        node = node[group]
-    assert last in node
-    node[last] = value
-    return plain
+    for candidate in PLAINS:
+        plain = node = copy.deepcopy(candidate)
+        for group in groups:
+            node = node.get(group, {}) if isinstance(node, dict) else {}
+        if isinstance(node, dict) and last in node:
+            node[last] = value
+            return plain
+    raise AssertionError(f"{key} is in no configuration")
 
 
 @pytest.mark.parametrize(("key", "value"), REFUSED)
@@ -306,7 +346,7 @@ def test_an_occlusion_that_hides_everything_is_refused():
 
 
 LAYERS = (
-    ("backend", "files", "optional", "config", "checks", "metrics"),
+    ("backend", "files", "optional", "schemas", "config", "checks", "metrics"),
     ("scenes",),
     ("fields",),
     ("lrm",),
@@ -327,7 +367,10 @@ An LRM brings a decoder of the fields' kind, so fields stand above it.
 
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 
-EDGES = {"launch": {"checks", "config", "files"}, "train": {"config", "launch", "pipeline"}}
+EDGES = {
+    "launch": {"checks", "config", "files", "schemas"},
+    "train": {"config", "launch", "pipeline"},
+}
 """What the ends of the command line may import, which must be quick to start."""
 
 

@@ -5,15 +5,14 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 from xplanes.config import (
+    XPLANES,
     BundledLRMConfig,
     ConfigError,
     DataConfig,
     DecompositionConfig,
     DemoConfig,
     ImageLRMConfig,
-    LossConfig,
     LRMConfig,
-    ModelConfig,
     PreparationConfig,
     PretrainedLRMConfig,
     SamplerConfig,
@@ -22,6 +21,7 @@ from xplanes.config import (
     TriplaneFileConfig,
     build,
 )
+from xplanes.schemas import families
 
 
 def parse(config: dict[str, Any]) -> TrainConfig:
@@ -38,23 +38,29 @@ def parse(config: dict[str, Any]) -> TrainConfig:
         lrm = BundledLRMConfig
     elif "architecture" in config["lrm"]:
         lrm = PretrainedLRMConfig
+    kind = config["model"].get("family")
+    family = families.FAMILIES.get(kind, XPLANES)
+    if (problem := families.misfit(config, family, kind or "default")) is not None:
+        raise ConfigError(problem)
+    sampler = families.SAMPLERS.get(config["sampler"]["name"], SamplerConfig)
     typed = TrainConfig(
         seed=config["seed"],
         resume=config.get("resume"),
         data=build(data, config["data"]),
-        model=build(ModelConfig, config["model"]),
+        model=build(family.model, config["model"]),
         lrm=build(lrm, config["lrm"]),
         preparation=build(PreparationConfig, config["preparation"]),
         decomposition=build(DecompositionConfig, config["decomposition"]),
-        sampler=build(SamplerConfig, config["sampler"]),
-        loss=build(LossConfig, config["loss"]),
+        sampler=build(sampler, config["sampler"]),
+        loss=build(family.loss, config["loss"]),
         trainer=build(TrainerConfig, config["trainer"]),
     )
     check(typed)
     return typed
 
 
-_POSITIVE = """data.resolution data.views data.half_side data.train_views data.test_views
+_POSITIVE = (
+    """data.resolution data.views data.half_side data.train_views data.test_views
 data.val_views model.resolution model.time_resolution model.channels model.decoder.width
 model.decoder.density_scale sampler.samples sampler.grid_resolution sampler.time_bins
 sampler.threshold sampler.sweep_every sampler.update_every sampler.update_cells loss.every
@@ -64,10 +70,16 @@ preparation.fixed_view_steps lrm.megabytes lrm.batch trainer.devices
 trainer.max_steps trainer.max_seconds trainer.rays_per_batch trainer.samples_per_batch
 trainer.accumulate trainer.plane_lr trainer.time_lr trainer.decoder_lr trainer.checkpoint_every
 trainer.evaluate_views trainer.log_every""".split()
-_NOT_NEGATIVE = """seed model.decoder.hidden model.decoder.colour_margin model.space_scale
+    + families.POSITIVE
+)
+_NOT_NEGATIVE = (
+    """seed model.decoder.hidden model.decoder.colour_margin model.space_scale
 model.time_scale loss.total_variation loss.time_smoothness loss.time_magnitude loss.sparse_weight
 decomposition.noise trainer.warmup_steps""".split()
-_SHARE = """data.background_share sampler.decay sampler.occlusion trainer.final_lr""".split()
+    + families.NOT_NEGATIVE
+)
+_SHARE = """data.background_share sampler.decay sampler.occlusion trainer.final_lr
+model.final_rate""".split()
 _CHOICES: dict[str, tuple[str, ...]] = {
     "data.eval_split": ("test", "val"),
     "model.plane_set": ("six", "nine", "three"),
@@ -79,10 +91,11 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "decomposition.scale": ("rms", "none"),
     "decomposition.static": ("middle", "median", "mean"),
     "decomposition.dynamic": ("random", "rank1"),
-    "loss.background": ("white", "random"),
+    "loss.background": ("white", "random", "one"),
     "trainer.accelerator": ("auto", "cpu", "gpu"),
     "trainer.strategy": ("auto", "ddp"),
     "trainer.precision": ("auto", "32", "bf16"),
+    **families.CHOICES,
 }
 
 
@@ -101,11 +114,8 @@ def check(config: TrainConfig) -> None:
             raise ConfigError(f"{key}={value}: must lie between 0 and 1")
         if key in _CHOICES and value not in _CHOICES[key]:
             raise ConfigError(f"{key}={value}: must be one of {', '.join(_CHOICES[key])}")
-    if config.sampler.occlusion >= 1:
-        raise ConfigError(
-            f"sampler.occlusion={config.sampler.occlusion}: must be below 1, or no light counts as "
-            "seen; 1e-5 is the default, sampler.skip_occluded=false skips nothing"
-        )
+    if (problem := families.conflict(config)) is not None:
+        raise ConfigError(problem)
     at = config.trainer.evaluate_at
     if any(not 0 <= share <= 1 for share in at):
         raise ConfigError(f"trainer.evaluate_at={at}: shares of the budget, from 0 to 1")
@@ -115,11 +125,6 @@ def check(config: TrainConfig) -> None:
         raise ConfigError(
             f"trainer.devices={config.trainer.devices} with trainer.strategy=auto: several devices "
             "need trainer=ddp"
-        )
-    if config.sampler.grid_resolution**3 * config.sampler.time_bins > 2**28:
-        raise ConfigError(
-            f"sampler.grid_resolution={config.sampler.grid_resolution} with sampler.time_bins="
-            f"{config.sampler.time_bins}: more than 268 million cells; lower one of them"
         )
 
 

@@ -5,6 +5,9 @@ from typing import Any
 
 from omegaconf import MISSING, DictConfig, OmegaConf
 
+from xplanes.schemas import families
+from xplanes.schemas.samplers import SamplerConfig
+
 
 class ConfigError(ValueError):
     """A setting that cannot work; the message names the key, the value and the way out."""
@@ -139,32 +142,10 @@ class PreparationConfig:
 
 
 @dataclass
-class SamplerConfig:
-    """Where rays are sampled, and which samples are never computed."""
-
-    name: str = MISSING  # Name of the sampler.
-    samples: int = MISSING  # Steps along the diagonal of the cube.
-    grid_resolution: int = MISSING  # Cells of the occupancy grid along each side.
-    time_bins: int = MISSING  # Bins of the occupancy grid along time.
-    threshold: float = MISSING  # Opacity of one step below which a cell is empty.
-    decay: float = MISSING  # Factor on a cell's density at each look.
-    skip_empty: bool = MISSING  # Skip samples in empty cells.
-    skip_occluded: bool = MISSING  # Skip samples behind opaque surfaces.
-    occlusion: float = MISSING  # Light left behind a surface below which it is opaque.
-    silhouettes: bool = MISSING  # Rule out cells that the images' alpha shows to be empty.
-    fill: bool = MISSING  # Empty cells where a start that is not random shows nothing.
-    coarse_steps: int = MISSING  # First steps, in which samples lie twice as far apart.
-    sweep_at: list[int] = MISSING  # Steps at which all occupied cells are looked at.
-    sweep_every: int = MISSING  # Steps between such sweeps later on.
-    update_every: int = MISSING  # Steps between looks at cells that no ray samples.
-    update_cells: int = MISSING  # Cells per look.
-
-
-@dataclass
 class LossConfig:
     """Terms of the loss beyond the colour's mean squared error."""
 
-    background: str = MISSING  # Behind training rays: white or random.
+    background: str = MISSING  # Behind training rays: white, random, or one (random, per batch).
     total_variation: float = MISSING  # Weight of squared differences between texels.
     time_smoothness: float = MISSING  # Weight of squared second differences along time.
     time_magnitude: float = MISSING  # Weight of squared values of the time planes.
@@ -212,9 +193,12 @@ class TrainConfig:
     preparation: PreparationConfig = field(default_factory=PreparationConfig)
     decomposition: DecompositionConfig = field(default_factory=DecompositionConfig)
     sampler: Any = MISSING
-    loss: LossConfig = field(default_factory=LossConfig)
+    loss: Any = MISSING
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
 
+
+XPLANES = families.Family(ModelConfig, LossConfig, ("occupancy", "proposal"))
+"""The family of models without ``model.family``."""
 
 SCHEMAS: dict[tuple[str | None, str], type] = {
     (None, "train_schema"): TrainConfig,
@@ -230,6 +214,7 @@ SCHEMAS: dict[tuple[str | None, str], type] = {
     ("sampler", "occupancy_schema"): SamplerConfig,
     ("loss", "loss_schema"): LossConfig,
     ("trainer", "trainer_schema"): TrainerConfig,
+    **families.SCHEMAS,
 }
 """Schema by configuration group and the name under which its YAML files inherit it."""
 

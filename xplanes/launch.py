@@ -11,6 +11,7 @@ from typing import Any
 from xplanes.checks import parse
 from xplanes.config import ConfigError, TrainConfig, register_schemas, to_plain
 from xplanes.files import read_json
+from xplanes.schemas.families import XPLANES_RATES
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 
@@ -117,6 +118,9 @@ def check_keys(arguments: list[str], conf: Path = CONF) -> None:
     chosen = [f"{key}={value.split(',')[0]}" for key, value in pairs if key in groups]
     keys = _known_keys(conf, chosen)
     for key, _ in pairs:
+        if "model.family" in keys and key in XPLANES_RATES:
+            own = sorted(name for name in keys if re.match(r"model\..*learning_rate", name))
+            raise ConfigError(f"{key}: only X-Planes use it; this model has {', '.join(own)}")
         if key in groups or key in keys:
             continue
         if any(known.startswith(f"{key}.") for known in keys):

@@ -24,10 +24,11 @@ from xplanes.optional import MissingExtraError
 from xplanes.preparation import find_source, prepare
 from xplanes.scenes.datamodule import RayDataModule
 from xplanes.scenes.errors import SceneError
-from xplanes.scenes.frame import Frame, scene_frame
+from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene
 from xplanes.training.builder import (
     build_batches,
+    build_frame,
     build_module,
     build_scene,
     training_device,
@@ -100,7 +101,7 @@ def train(
     source = find_source(config.lrm, say=say)
     started = time.monotonic()
     scene = build_scene(config.data)
-    frame = scene_frame(scene.splits["train"], config.data.half_side)
+    frame = build_frame(config, scene.splits["train"])
     loaded = time.monotonic() - started
     start = prepare(config, scene, frame, source, say=say)
     del source
@@ -120,7 +121,7 @@ def train(
         device = training_device(config.trainer.accelerator)
         record.note(
             device=torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
-            precision=module.field.decoder.precision,
+            precision=module.field.precision,
             files={name: list(views.files) for name, views in scene.splits.items()},
         )
         text = header(config, folder, scene, frame, module, device, overrides or [], start.words)

@@ -70,7 +70,7 @@ def test_no_source_is_a_random_start_that_touches_nothing(tmp_path: Path):
     assert begun.seconds == dict.fromkeys(STAGES, 0.0)
     assert not (tmp_path / "cache").exists()
     module = build_module(config, ball_scene(), FRAME)
-    assert (module.product, module.origin) == (None, None)
+    assert (module.method.product, module.origin) == (None, None)
 
 
 @pytest.mark.parametrize("model", ["six_planes", "nine_planes"])
@@ -198,7 +198,7 @@ def test_a_scene_of_one_moment_takes_the_low_rank_part_alone(tmp_path: Path):
     begun, module = start(tmp_path, SEQUENCE, moving=False)
     assert set(begun.planes) == {"xy", "xz", "yz"}
     assert module.field.time is None
-    assert (begun.sparse, module.product) == (None, None)
+    assert (begun.sparse, module.method.product) == (None, None)
     assert "no planes of time" in begun.words
     assert set(begun.report) == {"xy", "xz", "yz"}
 
@@ -251,7 +251,7 @@ def test_an_open_decomposition_is_said_once_also_from_the_cache(tmp_path: Path, 
 
 def test_no_weight_needs_no_sparse_part(tmp_path: Path):
     begun, module = start(tmp_path, SEQUENCE, "loss.sparse_weight=0")
-    assert (begun.sparse, module.product) == (None, None)
+    assert (begun.sparse, module.method.product) == (None, None)
     assert module.field.time is not None
 
 

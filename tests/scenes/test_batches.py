@@ -129,13 +129,25 @@ def test_shapes_and_ranges():
         "directions": vector,
         "target": vector,
         "background": vector,
+        "alpha": number,
         "times": number,
         "jitter": number,
     }
-    for name in ("target", "background", "jitter"):
+    for name in ("target", "background", "alpha", "jitter"):
         assert batch[name].min() >= 0
         assert batch[name].max() <= 1
         assert batch[name].dtype == torch.float32
+
+
+def test_one_background_is_shared_by_a_batch_and_changes_between_batches():
+    batches = batches_of(background="one")
+    first, second = batches.draw(0), batches.draw(1)
+    assert (first["background"] == first["background"][0]).all()
+    assert not torch.equal(first["background"], second["background"])
+    assert torch.equal(first["background"], batches.draw(0)["background"])
+    empty = first["alpha"] == 0
+    assert empty.any()
+    assert torch.equal(first["target"][empty], first["background"][empty])
 
 
 def near_share(batches, steps=40):

@@ -10,9 +10,9 @@ from torch import Tensor
 from xplanes.config import ConfigError
 from xplanes.files import replacing
 from xplanes.optional import require
+from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.box import Field
 from xplanes.rendering.pictures import colour_map, to_bytes
-from xplanes.rendering.renderer import Renderer
 from xplanes.scenes.cameras import orbit
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views, camera_rays
@@ -35,7 +35,7 @@ def film_times(frames: int, turns: float = 1.0) -> Tensor:
 
 def render_path(
     field: Field,
-    renderer: Renderer,
+    renderer: RayRenderer,
     frame: Frame,
     poses: Tensor,
     times: Tensor,
@@ -61,7 +61,7 @@ def render_path(
     Yields:
         Pictures. uint8 [size, size, 3]
     """
-    device = renderer.grid.density.device
+    device = renderer.device
     for pose, time in zip(poses, times.tolist(), strict=True):
         origins, directions = frame.rays(*camera_rays(pose, focal, size, size))
         rays = origins.to(device), directions.to(device)

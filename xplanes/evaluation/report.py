@@ -33,22 +33,21 @@ def header(
     size = sum(views.nbytes for views in scene.splits.values()) / 2**20
     trainable = sum(p.numel() for p in module.parameters() if p.requires_grad)
     frozen = sum(p.numel() for p in module.parameters()) - trainable
-    planes = " ".join(module.field.planes)
-    moving = "" if module.field.time is not None else " · one moment only: no planes of time"
+    moving = "" if module.field.moves else " · one moment only: no planes of time"
     budget = f"{config.trainer.max_steps} steps"
     if config.trainer.max_seconds is not None:
         budget += f" or {config.trainer.max_seconds:g} s, whichever comes first"
     lines = {
         "xplanes": f"{__version__} · torch {torch.__version__} · {device} · "
-        f"{torch.get_num_threads()} threads · decoder {module.field.decoder.precision} · "
+        f"{torch.get_num_threads()} threads · decoder {module.field.precision} · "
         f"{backend.name(device)}",
         "run": str(run),
         "data": f"{config.data.name} {scene.name} · {counts} views · "
         f"{train.width}x{train.height} px · {size:.1f} MB · cube {2 / frame.scale:.2f} wide",
-        "model": f"{config.model.name} ({planes}) · {config.model.channels} channels · "
+        "model": f"{config.model.name} {module.field.outline} · "
         f"{trainable:,} parameters, {frozen:,} frozen{moving}",
         "start": start,
-        "space": f"{100 * module.grid.occupied_fraction:.0f}% of the cube may be occupied",
+        "space": module.sampling.outline,
         "plan": budget,
         "changed": " ".join(overrides) or "(nothing)",
     }
@@ -116,7 +115,7 @@ def write_hparams(run: Path, config: TrainConfig, metrics: dict[str, Any]) -> No
         "channels": config.model.channels,
         "lrm": config.lrm.name,
         "seed": config.seed,
-        "plane_lr": config.trainer.plane_lr,
+        "learning_rate": getattr(config.model, "learning_rate", config.trainer.plane_lr),
     }
     scores = {f"test/{name}": value for name, value in metrics["test"].items()}
     scores["time/train_s"] = metrics["seconds"]["train"]

@@ -11,9 +11,9 @@ import yaml
 from xplanes.checks import parse
 from xplanes.config import ConfigError, ModelConfig, TrainConfig, build
 from xplanes.files import read_json
-from xplanes.scenes.frame import Frame, read_frame, scene_frame
+from xplanes.scenes.frame import Frame, read_frame
 from xplanes.scenes.views import Scene, Views
-from xplanes.training.builder import build_module, build_scene, training_device
+from xplanes.training.builder import build_frame, build_module, build_scene, training_device
 from xplanes.training.checkpoints import load_checkpoint
 from xplanes.training.module import RadianceModule
 
@@ -54,7 +54,7 @@ class TrainedRun:
     @property
     def is_still(self) -> bool:
         """Whether the field has no time."""
-        return self.module.field.time is None
+        return not self.module.field.moves
 
 
 def find_run(path: Path, outputs: Path = OUTPUTS) -> Path:
@@ -150,7 +150,7 @@ def load_run(
     config.data.root = _data_root(run, config.data.root)
     scene = build_scene(config.data, ("train", name))
     _check_views(run, scene.splits["train"])
-    frame = scene_frame(scene.splits["train"], config.data.half_side)
+    frame = build_frame(config, scene.splits["train"])
     if (origin := state.get("origin")) is not None:
         # Planes and decoder were shaped by a source that need not be there any more.
         config.model, frame = _origin(origin, f"{run}/checkpoints/{checkpoint}.ckpt")

@@ -41,7 +41,7 @@ def align(rows: list[RunRow]) -> list[RunRow]:
 
 
 def differing(rows: Sequence[RunRow]) -> list[str]:
-    """Settings in which runs differ, without those that only follow from a group's choice."""
+    """Settings in which runs differ, less those that follow from a group or the model."""
     known = [row for row in rows if row.settings]
     whole = [row for row in known if not row.status.startswith("missing")]
     overridden = {name for row in rows for name in row.overridden}
@@ -53,7 +53,9 @@ def differing(rows: Sequence[RunRow]) -> list[str]:
         if len(values) < 2 or name in UNLISTED:
             continue
         group = f"{name.split('.')[0]}.name"
-        if name == group or name in overridden or not _follows(whole, name, group):
+        # A baseline brings settings of other groups along.
+        follows = _follows(whole, name, group) or _follows(whole, name, "model.name")
+        if name == group or name in overridden or not follows:
             found.append(name)
     return found
 

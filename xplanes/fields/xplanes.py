@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
+from xplanes.fields.base import RadianceField
 from xplanes.fields.decoder import Decoder
 from xplanes.fields.lookup import Rows, plane_features
 
@@ -28,7 +29,7 @@ TIME_PLANES: dict[str, tuple[str, ...]] = {
 }
 
 
-class XPlanes(nn.Module):
+class XPlanes(RadianceField):
     """A dynamic radiance field of additively combined planes.
 
     The field lives in the cube [-1, 1]^3. Outside it the planes are zero; renderers skip what lies
@@ -82,6 +83,18 @@ class XPlanes(nn.Module):
             for names, stack in stacks
             for name, plane in zip(names, stack, strict=True)
         }
+
+    @property
+    def moves(self) -> bool:
+        return self.time is not None
+
+    @property
+    def precision(self) -> str:
+        return self.decoder.precision
+
+    @property
+    def outline(self) -> str:
+        return f"({' '.join(self.planes)}) · {self.space.shape[3]} channels"
 
     def features(self, points: Tensor, times: Tensor) -> Tensor:
         """Features that the decoder sees. [N, 3], [N] -> [N, 3 C]"""

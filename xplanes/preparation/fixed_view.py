@@ -247,7 +247,7 @@ def _film(
     module: RadianceModule, frame: Frame, pose: Tensor, focal: float, side: int, count: int
 ) -> Tensor:
     """Frames at evenly spread moments, premultiplied. uint8 [T, side, side, 4]"""
-    device = module.grid.density.device
+    device = module.renderer.device
     origins, directions = frame.rays(*camera_rays(pose, focal, side, side))
     rays = origins.to(device), directions.to(device)
     frames = []

@@ -161,8 +161,8 @@ def start_from(
     model = _settled(config, sequence, views, source=source)
     if len(sequence.triplanes) == 1 and not still:
         logger.warning(
-            "%s holds one triplane, but the scene moves: the field gets no planes of time and "
-            "stands still",
+            "nothing moves in the only triplane of %s: the field gets no planes of time and trains "
+            "as a still one",
             source,
         )
     cache = _cache(config)

@@ -1,6 +1,7 @@
-"""Where rays meet the cube in which a field lives."""
+"""Where rays meet the cube in which a field lives, and what they ask of it."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -30,3 +31,23 @@ def ray_box(origins: Tensor, directions: Tensor, half: float = 1.0) -> tuple[Ten
     near, far = near.amax(dim=-1).clamp_min(0), far.amin(dim=-1)
     hit = (far > near) & (far + origins.sum(dim=-1) + directions.sum(dim=-1)).isfinite()
     return torch.where(hit, near, 0), torch.where(hit, far, 0)
+
+
+def shade(
+    field: Any, points: Tensor, times: Tensor, directions: Tensor, ray: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Colour and density at the samples of rays.
+
+    Args:
+        field: Takes points and times, and directions too if it is ``view_dependent``.
+        points: Positions of the samples. [N, 3]
+        times: Time of each ray. [R]
+        directions: Unit direction of each ray. [R, 3]
+        ray: Ray of each sample. [N]
+
+    Returns:
+        [N, 3], [N]
+    """
+    if getattr(field, "view_dependent", False):
+        return field(points, times[ray], directions[ray])
+    return field(points, times[ray])

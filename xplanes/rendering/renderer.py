@@ -1,4 +1,4 @@
-"""Rays through a field to colours."""
+"""Rays through a field to colours, by equal steps through occupied cells."""
 
 import math
 from dataclasses import dataclass
@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xplanes.rendering.box import Field
+from xplanes.rendering.base import RayRenderer, Rendering
+from xplanes.rendering.box import Field, shade
 from xplanes.rendering.compositing import composite
-from xplanes.rendering.marching import Samples, march
+from xplanes.rendering.marching import march
 from xplanes.rendering.occupancy import OccupancyGrid
 
 DIAGONAL = 2 * math.sqrt(3)
@@ -16,26 +17,7 @@ DIAGONAL = 2 * math.sqrt(3)
 
 
 @dataclass(frozen=True)
-class Rendering:
-    """What rays see.
-
-    Attributes:
-        colour: In front of the background. [R, 3]
-        opacity: Share of the light that the scene stops. [R]
-        depth: Mean distance of what is seen, 0 where nothing is. [R]
-        density: Density of each sample, without gradient. [N]
-        samples: The samples that reached the field.
-    """
-
-    colour: Tensor
-    opacity: Tensor
-    depth: Tensor
-    density: Tensor
-    samples: Samples
-
-
-@dataclass(frozen=True)
-class Renderer:
+class Renderer(RayRenderer):
     """Renders rays through a field, skipping what cannot be seen.
 
     Attributes:
@@ -49,6 +31,10 @@ class Renderer:
     samples: int
     skip_empty: bool = True
     occlusion: float = 0.001
+
+    @property
+    def device(self) -> torch.device:
+        return self.grid.density.device
 
     @property
     def step(self) -> float:
@@ -90,7 +76,7 @@ class Renderer:
             skip_empty=self.skip_empty,
             occlusion=self.occlusion,
         )
-        colour, density = field(samples.points, times[samples.ray])
+        colour, density = shade(field, samples.points, times, directions, samples.ray)
         total, _ = composite(density * step, colour, samples.distances, samples.ray, samples.starts)
         opacity = total[:, 3]
         return Rendering(
@@ -100,29 +86,3 @@ class Renderer:
             density=density.detach(),
             samples=samples,
         )
-
-    @torch.no_grad()
-    def image(
-        self,
-        field: Field,
-        origins: Tensor,
-        directions: Tensor,
-        time: float,
-        background: Tensor,
-        *,
-        stride: int = 1,
-        chunk: int = 8192,
-    ) -> dict[str, Tensor]:
-        """Render any number of rays of one moment, a chunk at a time.
-
-        Returns:
-            ``colour`` [R, 3], ``opacity`` [R] and ``depth`` [R], on the rays' device.
-        """
-        parts = []
-        for start in range(0, max(len(origins), 1), chunk):
-            rays = origins[start : start + chunk], directions[start : start + chunk]
-            times = torch.full_like(rays[0][:, 0], time)
-            part = self.render(field, *rays, times, background, stride=stride)
-            parts.append((part.colour, part.opacity, part.depth))
-        colour, opacity, depth = (torch.cat(part) for part in zip(*parts, strict=True))
-        return {"colour": colour, "opacity": opacity, "depth": depth}

@@ -39,7 +39,8 @@ class RayBatches:
         frame: The field's frame, in which rays are served.
         rays: Rays per batch.
         seed: The run's seed.
-        background: "white", or "random": another colour behind each ray, in the target too.
+        background: Behind rays, in the target too: "white", "random" (another colour for each ray)
+            or "one" (one random colour for the batch).
         skip_background: Whether rays far from the silhouettes are drawn at ``background_share``
             instead of at their share of the pixels. They show nothing but background, and teach
             only while the grid of occupied cells is wrong.
@@ -76,7 +77,8 @@ class RayBatches:
 
         Returns:
             ``origins`` and unit ``directions`` in the field's frame [R, 3], ``times`` [R],
-            ``target`` colour before ``background`` [R, 3] each, and ``jitter`` from 0 to 1 [R].
+            ``target`` colour before ``background`` [R, 3] each, its ``alpha`` [R], and ``jitter``
+            from 0 to 1 [R].
         """
         generator = step_generator(self.seed, step, self.rank)
         uniform = torch.rand(self.rays, 3, generator=generator, dtype=torch.float64)
@@ -98,17 +100,19 @@ class RayBatches:
         origins, directions = self.frame.rays(origins, directions)
         colour = self.views.images.view(-1, 4)[pixel].float() / 255
         shape = (self.rays, 3)
-        background = (
-            torch.rand(shape, generator=generator)
-            if self.background == "random"
-            else torch.ones(shape)
-        )
+        if self.background == "random":
+            background = torch.rand(shape, generator=generator)
+        elif self.background == "one":
+            background = torch.rand(3, generator=generator).expand(shape)
+        else:
+            background = torch.ones(shape)
         return {
             "origins": origins,
             "directions": directions,
             "times": self.views.times[view],
             "target": colour[:, :3] + (1 - colour[:, 3:]) * background,
             "background": background,
+            "alpha": colour[:, 3],
             "jitter": uniform[:, 2].float(),
         }
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -19,6 +19,7 @@ from xplanes.config import (
     TrainerConfig,
 )
 from xplanes.fields import Decoder, XPlanes
+from xplanes.fields.base import RadianceField
 from xplanes.fields.decoder import Precision
 from xplanes.fields.xplanes import random_planes
 from xplanes.rendering.carving import carve
@@ -31,8 +32,11 @@ from xplanes.scenes.dnerf import read_scene
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, frame_content
 from xplanes.scenes.views import Scene, Views, joined
+from xplanes.training.assembly import PLANS, SAMPLINGS, Site, scene_cube
+from xplanes.training.methods.xplanes import XPlanesMethod
 from xplanes.training.module import RadianceModule
 from xplanes.training.product import SparseProduct
+from xplanes.training.sampling.occupancy import OccupancySampling
 
 START_STREAM = 1_000_033
 """Random stream of the start values."""
@@ -160,6 +164,12 @@ def build_field(
     return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set)
 
 
+def build_frame(config: TrainConfig, views: Views) -> Frame:
+    """The frame in which a model's field lives: the scene's cube, or the model's own."""
+    plan = PLANS.get(type(config.model))
+    return (scene_cube if plan is None else plan.frame)(config, views)
+
+
 def build_renderer(config: SamplerConfig, *, still: bool) -> Renderer:
     """The renderer with a grid in which everything may be occupied."""
     grid = OccupancyGrid(
@@ -198,34 +208,55 @@ def build_module(
             [T, 3, C, H, H]
     """
     views = scene.splits["train"]
+    if isinstance(config.model, ModelConfig) and config.model.plane_set == "three":
+        # Nothing moves in this field: all views are of one moment.
+        views = replace(views, times=torch.zeros_like(views.times))
+    precision = decoder_precision(config.trainer)
+    site = Site(views, frame, precision, begun=planes is not None)
+    if isinstance(config.model, ModelConfig):
+        method = _xplanes_method(config, site, planes, decoder_state, sparse)
+    else:
+        method = PLANS[type(config.model)].method(config, site)
+    sample = SAMPLINGS.get(type(config.sampler), _occupancy_sampling)
+    origin = {"model": asdict(config.model), "frame": frame_content(frame)}
+    return RadianceModule(
+        method,
+        sample(config, site, method.field),
+        trainer=config.trainer,
+        seed=config.seed,
+        origin=None if planes is None else origin,
+    )
+
+
+def _xplanes_method(
+    config: TrainConfig,
+    site: Site,
+    planes: Mapping[str, Tensor] | None,
+    decoder_state: Mapping[str, Tensor] | None,
+    sparse: Tensor | None,
+) -> XPlanesMethod:
     field = build_field(
         config.model,
-        views.times,
+        site.views.times,
         config.seed,
-        decoder_precision(config.trainer),
+        "bf16" if site.precision == "bf16" else "32",
         planes=planes,
         decoder_state=decoder_state,
     )
-    renderer = build_renderer(config.sampler, still=is_still(views))
-    if config.sampler.silhouettes:
-        carve(renderer.grid, views, frame)
-    if planes is not None and config.sampler.fill:
-        generator = step_generator(config.seed, 0, FILL_STREAM)
-        fill(renderer.grid, field, views, frame, step=renderer.step, generator=generator)
     product = None
     if sparse is not None and field.time is not None and config.loss.sparse_weight:
         product = SparseProduct(sparse, field.rows, config.loss.sparse_frames)
-    origin = {"model": asdict(config.model), "frame": frame_content(frame)}
-    return RadianceModule(
-        field,
-        renderer,
-        loss=config.loss,
-        sampler=config.sampler,
-        trainer=config.trainer,
-        seed=config.seed,
-        product=product,
-        origin=None if planes is None else origin,
-    )
+    return XPlanesMethod(field, loss=config.loss, trainer=config.trainer, product=product)
+
+
+def _occupancy_sampling(config: TrainConfig, site: Site, field: RadianceField) -> OccupancySampling:
+    renderer = build_renderer(config.sampler, still=is_still(site.views))
+    if config.sampler.silhouettes:
+        carve(renderer.grid, site.views, site.frame)
+    if site.begun and config.sampler.fill:
+        generator = step_generator(config.seed, 0, FILL_STREAM)
+        fill(renderer.grid, field, site.views, site.frame, step=renderer.step, generator=generator)
+    return OccupancySampling(renderer, config.sampler)
 
 
 def build_batches(config: TrainConfig, scene: Scene, frame: Frame, rank: int) -> RayBatches:

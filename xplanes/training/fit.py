@@ -82,19 +82,12 @@ def fit(
 
 def _warm_up(module: RadianceModule, data: RayDataModule) -> None:
     """Run all loops once on a few rays, so that compiling them is not on the training clock."""
-    if not cpu_loops(module.field.space):
+    if not cpu_loops(next(module.field.parameters())):
         return
     if not loops_on_disk():
         print("compiling the CPU loops, once after installation: about 20 s ...", flush=True)
     rays = {name: value[:8] for name, value in data.draw(0).items()}
-    rendering = module.renderer.render(
-        module.field,
-        rays["origins"],
-        rays["directions"],
-        rays["times"],
-        rays["background"],
-        rays["jitter"],
-    )
+    rendering = module.sampling.render(module.field, rays, module.moment)
     rendering.colour.sum().backward()
     module.zero_grad(set_to_none=True)
 

@@ -2,16 +2,14 @@
 
 from typing import Any
 
-import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
 from xplanes.training.module import RadianceModule
-from xplanes.training.regularisers import time_smoothness, total_variation
 
 
 class Scalars(Callback):
-    """Logs loss, rates, grid and regularisers every so many steps.
+    """Logs loss, rates, sampler and regularisers every so many steps.
 
     Args:
         every: Steps between entries.
@@ -43,10 +41,10 @@ class Scalars(Callback):
                 "train/psnr_batch": pl_module.last["psnr"],
                 "time/rays_per_s": rays / max(seconds, 1e-9),
                 "sampler/samples_per_ray": samples / rays,
-                "sampler/occupied": pl_module.grid.occupied_fraction,
                 "train/steps_skipped": pl_module.unusable,
                 **self._rates(pl_module),
-                **self._regularisers(pl_module),
+                **pl_module.sampling.scalars(),
+                **pl_module.method.scalars(),
             },
             step,
         )
@@ -59,15 +57,3 @@ class Scalars(Callback):
     def _rates(module: RadianceModule) -> dict[str, float]:
         optimizer: Any = module.optimizers()
         return {f"lr/{group['name']}": group["lr"] for group in optimizer.param_groups}
-
-    @staticmethod
-    @torch.no_grad()
-    def _regularisers(module: RadianceModule) -> dict[str, float]:
-        field = module.field
-        values = {"reg/total_variation": float(total_variation(field.space, (1, 2)))}
-        if field.time is not None:
-            values["reg/time_smoothness"] = float(time_smoothness(field.time))
-            values["reg/time_magnitude"] = float(field.time.square().mean())
-            if module.product is not None:
-                values["reg/sparse_product"] = module.product.value(field.time)
-        return values

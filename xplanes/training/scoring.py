@@ -10,8 +10,8 @@ from torch import Tensor
 
 from xplanes.files import read_rows, write_rows
 from xplanes.metrics import psnr, ssim
+from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.box import Field
-from xplanes.rendering.renderer import Renderer
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
 
@@ -43,7 +43,7 @@ class ViewScore:
 
 def render_view(
     field: Field,
-    renderer: Renderer,
+    renderer: RayRenderer,
     frame: Frame,
     views: Views,
     index: int,
@@ -52,7 +52,7 @@ def render_view(
     stride: int = 1,
 ) -> dict[str, Tensor]:
     """Render one view whole: ``colour`` [H, W, 3], ``opacity`` and ``depth`` [H, W], on the CPU."""
-    device = renderer.grid.density.device
+    device = renderer.device
     origins, directions = (ray.to(device) for ray in frame.rays(*views.image_rays(index)))
     time = float(views.times[index])
     image = renderer.image(field, origins, directions, time, background.to(device), stride=stride)
@@ -62,7 +62,7 @@ def render_view(
 
 def score_view(
     field: Field,
-    renderer: Renderer,
+    renderer: RayRenderer,
     frame: Frame,
     views: Views,
     index: int,

@@ -1,0 +1,70 @@
+"""What every baseline's run must do."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from xplanes.evaluation.evaluate import evaluate
+from xplanes.evaluation.render import FilmOptions, film
+from xplanes.evaluation.runs import TrainedRun, load_run
+from xplanes.pipeline import run
+from xplanes.training.clock import TrainingClock
+
+
+def metrics(folder: Path) -> dict:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def scores(folder: Path) -> list[float]:
+    with (folder / "curve.csv").open() as file:
+        return [float(row["psnr"]) for row in csv.DictReader(file)]
+
+
+def check_learns(config: dict, folder: Path, *, gain: float) -> Path:
+    """The scored views get better by ``gain`` dB, and metrics.json is whole."""
+    run(config, folder, [], resume=False)
+    found = scores(folder)
+    assert found[-1] > found[0] + gain, found
+    content = metrics(folder)
+    assert content["parameters"] > 0
+    assert content["samples_per_ray"] > 0
+    assert content["steps_skipped"] == 0
+    return folder
+
+
+def check_resume(
+    config: dict, whole: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, *, stop: int
+) -> None:
+    """A run that broke down and goes on ends where one that did not ends, bit for bit."""
+    original = TrainingClock.on_train_batch_end
+
+    def break_down(self, trainer, module, *rest) -> None:
+        original(self, trainer, module, *rest)
+        if trainer.global_step == stop:
+            raise OSError("power cut")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingClock, "on_train_batch_end", break_down)
+        with pytest.raises(OSError, match="power cut"):
+            run(config, folder, [], resume=False)
+    run(config, folder, [], resume=True)
+    assert scores(folder) == scores(whole)
+    first, second = (
+        torch.load(path / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+        for path in (whole, folder)
+    )
+    assert set(first) == set(second)
+    assert all(torch.equal(first[key], second[key]) for key in first)
+
+
+def check_reload(folder: Path) -> TrainedRun:
+    """The run's field is loaded with its scores, and films."""
+    trained = load_run(folder, device="cpu")
+    found = evaluate(trained, "none")
+    assert found["test"]["psnr"] == pytest.approx(metrics(folder)["test"]["psnr"], abs=1e-6)
+    path = film(trained, FilmOptions(frames=2, size=8))
+    assert path.stat().st_size > 0
+    return trained

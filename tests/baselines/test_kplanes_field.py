@@ -1,0 +1,190 @@
+"""K-Planes' field against loops, and against what was published."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tests.baselines.oracles import product_features
+from xplanes.fields.encodings import octaves, spherical_harmonics
+from xplanes.fields.kplanes import DensityField, ExplicitDecoder, HybridDecoder, KPlanes
+from xplanes.fields.networks import PaddedMLP, truncated_exponential
+from xplanes.fields.products import (
+    PlaneProducts,
+    plane_product,
+    plane_product_reference,
+)
+
+
+def products(time=3, channels=2, scales=(1, 2)):
+    torch.manual_seed(0)
+    found = PlaneProducts(channels, 4, scales, time, low=0.1, high=0.5)
+    with torch.no_grad():
+        for _, plane in found.planes():
+            plane.uniform_(-1, 1)
+    return found
+
+
+def count(*modules):
+    return sum(p.numel() for module in modules for p in module.parameters())
+
+
+@pytest.mark.parametrize("time", [3, None])
+def test_products_of_planes_equal_loops_inside_and_outside_the_cube(time):
+    planes = products(time).double()
+    points, times = torch.randn(40, 3).double(), torch.rand(40).double()
+    arrays = [(name, plane.detach()[0].numpy()) for name, plane in planes.planes()]
+    expected = product_features(arrays, 2, points.numpy(), times.numpy())
+    np.testing.assert_allclose(planes(points, times).detach().numpy(), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("time", [3, None])
+def test_compiled_loops_equal_their_readable_twin(dtype, time):
+    planes = products(time, channels=5).to(dtype)
+    with torch.no_grad():
+        for _, plane in planes.planes():
+            plane[..., 1, 1] = 0  # A product of zeros has gradients all the same.
+    # More points than a block holds, some of them on texels and far outside.
+    places = 1.5 * torch.randn(5000, 4, dtype=dtype)
+    places[:200] = places[:200].sign()
+    places[200] = torch.inf
+    upstream = torch.randn(5000, 5, dtype=dtype)
+    for scale in planes.scales:
+        tensors = [scale[name] for name in planes.names]
+        results = []
+        for function in (plane_product, plane_product_reference):
+            value = function(tensors, places, planes.names)
+            gradients = torch.autograd.grad((value * upstream).sum(), tensors)
+            results.append((value, *gradients))
+        tolerance = {"atol": 2e-4, "rtol": 1e-4} if dtype == torch.float32 else {}
+        for fast, plain in zip(*results, strict=True):
+            torch.testing.assert_close(fast, plain, **tolerance)
+
+
+def test_planes_start_as_published():
+    planes = PlaneProducts(4, 8, [1], 5, low=0.1, high=0.5)
+    for name, plane in planes.planes():
+        if "t" in name:
+            assert (plane == 1).all()
+            assert plane.shape == (1, 4, 5, 8)
+        else:
+            low, high = plane.detach().aminmax()
+            assert 0.1 <= float(low) < 0.15 < 0.45 < float(high) <= 0.5
+
+
+def test_parameters_number_as_published_for_lego():
+    def planes():
+        return PlaneProducts(32, 64, [1, 2, 4, 8], 25, low=0.1, high=0.5)
+
+    proposals = [
+        DensityField(PlaneProducts(8, size, [1], 50, low=0.1, high=0.15)) for size in (64, 128)
+    ]
+    assert count(KPlanes(planes(), HybridDecoder(128)), *proposals) == 36_467_008
+    explicit = count(ExplicitDecoder(128))
+    # One linear map to density; 3 inputs and 13 ones, four hidden layers, three bases of 128.
+    assert explicit == 128 + 16 * 128 + 3 * 128 * 128 + 128 * 384
+    assert count(planes()) == 35_727_360
+
+
+def test_padding_acts_as_columns_of_ones():
+    torch.manual_seed(0)
+    network = PaddedMLP([5, 16, 2]).double()
+    values = torch.randn(7, 5).double()
+    filled = torch.cat([values, torch.ones(7, 11).double()], dim=1)
+    first, second = network.weights
+    torch.testing.assert_close(network(values), (filled @ first.T).relu() @ second.T)
+    network(values).sum().backward()
+    bias = first.grad[:, 5:]
+    assert (bias == bias[:, :1]).all()
+    assert bias.abs().max() > 0
+
+
+def test_linear_network_is_one_matrix():
+    network = PaddedMLP([16, 16, 3], activation=False).double()
+    values = torch.randn(4, 16).double()
+    torch.testing.assert_close(
+        network(values), values @ network.weights[0].T @ network.weights[1].T
+    )
+
+
+def test_truncated_exponential_has_the_gradient_of_a_limited_logit():
+    logits = torch.tensor([-20.0, 0.0, 3.0, 40.0], dtype=torch.float64, requires_grad=True)
+    values = truncated_exponential(logits)
+    torch.testing.assert_close(values, logits.detach().exp())
+    values.sum().backward()
+    expected = [math.exp(min(max(x, -15), 15)) for x in (-20, 0, 3, 40)]
+    torch.testing.assert_close(logits.grad, torch.tensor(expected, dtype=torch.float64))
+
+
+def test_spherical_harmonics_are_orthonormal_and_of_their_degree():
+    # Gauss-Legendre in height times equal angles integrates all products exactly.
+    nodes, mass = np.polynomial.legendre.leggauss(8)
+    angles = 2 * math.pi * np.arange(16) / 16
+    flat = np.sqrt(1 - nodes**2)
+    directions = np.stack(
+        [
+            np.outer(flat, np.cos(angles)),
+            np.outer(flat, np.sin(angles)),
+            np.outer(nodes, 1 + 0 * angles),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    values = spherical_harmonics(torch.from_numpy(directions)).numpy()
+    area = np.repeat(mass, 16) * 2 * math.pi / 16
+    np.testing.assert_allclose(values.T @ (area[:, None] * values), np.eye(16), atol=1e-12)
+    behind = spherical_harmonics(torch.from_numpy(-directions)).numpy()
+    degree = np.array([0] + [1] * 3 + [2] * 5 + [3] * 7)
+    np.testing.assert_allclose(behind, (-1.0) ** degree * values, atol=1e-12)
+    # The pole has the zonal ones alone.
+    pole = spherical_harmonics(torch.tensor([[0.0, 0.0, 1.0]]))[0]
+    assert pole.nonzero()[:, 0].tolist() == [0, 2, 6, 12]
+    assert (pole[[0, 2, 6, 12]] > 0).all()
+
+
+def test_octaves_hold_values_sines_and_cosines():
+    values = torch.tensor([[0.5, -2.0]])
+    expected = [0.5, -2.0]
+    for factor in (1, 2, 4):
+        expected += [math.sin(factor * x) for x in (0.5, -2.0)]
+        expected += [math.cos(factor * x) for x in (0.5, -2.0)]
+    torch.testing.assert_close(octaves(values, 3), torch.tensor([expected]))
+
+
+@pytest.mark.parametrize("decoder", [HybridDecoder, ExplicitDecoder])
+def test_every_parameter_gets_a_gradient_and_shapes_fit(decoder):
+    planes = products(channels=8)
+    field = KPlanes(planes, decoder(16, 16), unit=1.3)
+    points, times = 2 * torch.rand(200, 3) - 1, torch.rand(200)
+    directions = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
+    colour, density = field(points, times, directions)
+    assert (colour.shape, density.shape) == ((200, 3), (200,))
+    assert ((colour > 0) & (colour < 1)).all()
+    assert (density > 0).all()
+    (colour.sum() + density.sum()).backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in field.parameters())
+
+
+def test_density_is_per_unit_of_the_frame():
+    planes, decoder = products(), HybridDecoder(4, 16)
+    points, times = torch.rand(5, 3), torch.rand(5)
+    one, many = (KPlanes(planes, decoder, unit)(points, times)[1] for unit in (1.0, 1.3))
+    torch.testing.assert_close(many, 1.3 * one)
+
+
+def test_colour_depends_on_the_direction_and_density_does_not():
+    field = KPlanes(products(), HybridDecoder(4, 16))
+    points, times = torch.rand(5, 3), torch.rand(5)
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(5, 3)
+    first, second = field(points, times, up), field(points, times, -up)
+    assert not torch.equal(first[0], second[0])
+    assert torch.equal(first[1], second[1])
+
+
+def test_explicit_colour_is_linear_in_the_features_before_the_sigmoid():
+    decoder = ExplicitDecoder(8, 16).double()
+    features = torch.randn(3, 8).double()
+    directions = torch.nn.functional.normalize(torch.randn(3, 3).double(), dim=1)
+    logits = decoder.colour(features, directions).logit()
+    torch.testing.assert_close(decoder.colour(2 * features, directions).logit(), 2 * logits)

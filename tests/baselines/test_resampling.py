@@ -1,0 +1,162 @@
+"""Placing samples by what earlier samples found, against loops."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.baselines import oracles
+from xplanes.rendering.compositing import composite_reference
+from xplanes.rendering.proposal import Level, ProposalRenderer, dense_samples
+from xplanes.rendering.resampling import covering_weights, ray_weights, resample, uniform_edges
+from xplanes.training.losses import histogram_loss
+
+
+def bins(rays, count, seed=0):
+    """Random ascending edges from 0 to 1, and weights, some of them 0."""
+    generator = torch.Generator().manual_seed(seed)
+    inner = torch.rand(rays, count - 1, generator=generator, dtype=torch.float64).sort(dim=1).values
+    ends = torch.zeros(rays, 1).double(), torch.ones(rays, 1).double()
+    mass = torch.rand(rays, count, generator=generator, dtype=torch.float64)
+    mass[mass < 0.3] = 0
+    return torch.cat([ends[0], inner, ends[1]], dim=1), mass / count
+
+
+@pytest.mark.parametrize("padding", [0.01, 1e-6])
+@pytest.mark.parametrize("jittered", [True, False])
+def test_resampling_equals_loops(padding, jittered):
+    edges, mass = bins(6, 9)
+    uniform = torch.rand(6, 8, dtype=torch.float64) if jittered else None
+    found = resample(edges, mass, 7, uniform, padding)
+    for r in range(6):
+        moved = uniform[r].tolist() if uniform is not None else [0.5] * 8
+        places = [(i + u) / 8 for i, u in enumerate(moved)]
+        expected = oracles.resample(edges[r].tolist(), mass[r].tolist(), places, padding)
+        np.testing.assert_allclose(found[r].numpy(), expected, atol=1e-9)
+
+
+def test_resampling_ascends_stays_inside_and_carries_no_gradient():
+    edges, mass = bins(50, 20)
+    found = resample(edges, mass.requires_grad_(), 30, torch.rand(50, 31).double(), 0.01)
+    assert (found.diff(dim=1) >= 0).all()
+    assert ((found >= 0) & (found <= 1)).all()
+    assert not found.requires_grad
+
+
+def test_samples_gather_where_the_weight_is():
+    edges = torch.linspace(0, 1, 11)[None]
+    mass = torch.zeros(1, 10)
+    mass[0, 6] = 1.0
+    found = resample(edges, mass, 100, None, 0.001)
+    assert ((found >= 0.6) & (found <= 0.7)).float().mean() > 0.95
+
+
+def test_weightless_rays_are_sampled_evenly():
+    found = resample(torch.linspace(0, 1, 5)[None], torch.zeros(1, 4), 3, None, 0.01)
+    torch.testing.assert_close(found, torch.tensor([[0.125, 0.375, 0.625, 0.875]]))
+
+
+def test_jittered_edges_keep_their_half_bins():
+    plain = uniform_edges(3, 8, None, torch.device("cpu"))
+    torch.testing.assert_close(plain[0], torch.linspace(0, 1, 9))
+    low = uniform_edges(3, 8, torch.zeros(3, 9), torch.device("cpu"))
+    high = uniform_edges(3, 8, torch.ones(3, 9), torch.device("cpu"))
+    assert (low[0, 0], high[0, -1]) == (0, 1)
+    torch.testing.assert_close(low[:, 1:], high[:, :-1])
+    torch.testing.assert_close(high[0, 0], torch.tensor(1 / 16))
+
+
+def test_covering_weights_equal_loops():
+    fine, _ = bins(8, 12, seed=1)
+    coarse, mass = bins(8, 7, seed=2)
+    found = covering_weights(fine, coarse, mass)
+    for r in range(8):
+        expected = oracles.covering(fine[r].tolist(), coarse[r].tolist(), mass[r].tolist())
+        np.testing.assert_allclose(found[r].numpy(), expected, atol=1e-12)
+
+
+def test_histogram_loss_equals_loops_and_pulls_at_the_density_fields_alone():
+    fine, mass = bins(5, 12, seed=1)
+    levels = [bins(5, count, seed=count) for count in (9, 6)]
+    masses = [m.mul(0.2).requires_grad_() for _, m in levels]
+    mass.requires_grad_()
+    made = [Level(edges, m) for (edges, _), m in zip(levels, masses, strict=True)]
+    loss = histogram_loss([*made, Level(fine, mass)])
+    expected = oracles.histogram(
+        fine.tolist(),
+        mass.tolist(),
+        [(edges.tolist(), m.tolist()) for (edges, _), m in zip(levels, masses, strict=True)],
+    )
+    assert expected > 0
+    assert loss.item() == pytest.approx(expected, rel=1e-12)
+    loss.backward()
+    assert mass.grad is None
+    # More mass in the density fields can only help.
+    assert all(m.grad.max() < 1e-12 and m.grad.min() < -1e-3 for m in masses)
+
+
+def test_histogram_loss_of_equal_histograms_is_zero():
+    edges, mass = bins(4, 10)
+    loss = histogram_loss([Level(edges, mass), Level(edges, mass)])
+    assert float(loss) == pytest.approx(0, abs=1e-20)
+
+
+def test_ray_weights_equal_loops_and_the_compositor():
+    density, lengths = 9 * torch.rand(5, 12).double(), torch.rand(5, 12).double()
+    depth = density * lengths
+    found = ray_weights(depth)
+    for r in range(5):
+        expected = oracles.weights(density[r].tolist(), lengths[r].tolist())
+        np.testing.assert_allclose(found[r].numpy(), expected, atol=1e-12)
+    samples = dense_samples(torch.zeros(60, 3), lengths)
+    colour = torch.zeros(60, 3).double()
+    args = (depth.flatten(), colour, samples.distances, samples.ray, samples.starts)
+    torch.testing.assert_close(composite_reference(*args)[1], found.flatten())
+
+
+def test_opaque_samples_make_no_nan():
+    depth = torch.tensor([[0.0, torch.inf, 1.0]], requires_grad=True)
+    weights = ray_weights(depth)
+    torch.testing.assert_close(weights.detach(), torch.tensor([[0.0, 1.0, 0.0]]))
+    weights.sum().backward()
+    assert depth.grad.isfinite().all()
+
+
+def slab(points, times):
+    """Opaque red between x = 0.2 and 0.4."""
+    inside = (points[:, 0] > 0.2) & (points[:, 0] < 0.4)
+    return torch.tensor([[1.0, 0.0, 0.0]]).expand(len(points), 3), 200.0 * inside
+
+
+class Slab(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.scale = torch.nn.Parameter(torch.ones(()))
+
+    def forward(self, points, times):
+        return self.scale * slab(points, times)[1]
+
+
+def test_a_surface_is_found_by_few_samples():
+    fields = torch.nn.ModuleList([Slab(), Slab()])
+    origins = torch.tensor([[-3.0, 0.0, 0.0], [-3.0, 5.0, 0.0]])
+    directions = torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3)
+    for bounds in ({}, {"near": 1.0, "far": 5.0}):
+        renderer = ProposalRenderer(fields, [64, 32], 16, **bounds)
+        image = renderer.render(slab, origins, directions, torch.zeros(2), torch.ones(3))
+        assert image.colour[0].tolist() == pytest.approx([1, 0, 0], abs=0.01)
+        assert float(image.depth[0]) == pytest.approx(3.2, abs=0.05)
+        assert len(image.samples) == 32
+    # The second ray passes the cube by: nothing of it can be seen through the cube's bounds.
+    outside = ProposalRenderer(fields, [64, 32], 16)
+    image = outside.render(slab, origins, directions, torch.zeros(2), torch.ones(3))
+    assert float(image.opacity[1]) == 0
+
+
+def test_density_fields_learn_only_when_told():
+    fields = torch.nn.ModuleList([Slab()])
+    renderer = ProposalRenderer(fields, [16], 8)
+    rays = (torch.tensor([[-3.0, 0.0, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]]), torch.zeros(1))
+    for learn in (False, True):
+        image = renderer.render(slab, *rays, torch.ones(3), learn=learn)
+        assert image.levels[0].weights.requires_grad == learn
+        assert not image.levels[-1].weights.requires_grad

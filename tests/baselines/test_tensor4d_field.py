@@ -1,0 +1,285 @@
+"""Tensor4D's fields, renderer and losses against loops, and against what was published."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tests.baselines import oracles
+from xplanes.fields.hierarchy import MOVING, STILL, HierarchicalPlanes, Level, bilinear
+from xplanes.fields.tensor4d import SkipNetwork, Tensor4D, Tensor4DDensity
+from xplanes.rendering.neus import NeusRenderer, section_opacity, weights_of
+from xplanes.training.losses import (
+    eikonal_error,
+    feature_change,
+    masked_colour_error,
+    silhouette_error,
+)
+
+
+def planes(groups=STILL, *, fine=True, size=6, filled=True):
+    torch.manual_seed(0)
+    levels = [Level(size, 5, 2)] + ([Level(2 * size, 5, 3)] if fine else [])
+    made = HierarchicalPlanes(groups, levels, blur=4)
+    made.fine.fill_(True)
+    made.blurred.fill_(False)
+    if filled:
+        with torch.no_grad():
+            for plane in made.planes.values():
+                plane.uniform_(-1, 1)
+    return made
+
+
+def surface(moves=True, width=16, filled=True):
+    flow = planes(MOVING, fine=False, filled=filled) if moves else None
+    return Tensor4D(planes(filled=filled), flow, width, octaves=(4, 3, 2))
+
+
+def test_reading_a_plane_equals_loops():
+    torch.manual_seed(0)
+    plane = torch.randn(4, 6, 3).double()
+    columns, rows = 1.5 * torch.randn(2, 50).double()
+    found = bilinear(plane, columns, rows)
+    expected = [
+        oracles.plane_value(plane.numpy(), c, r)
+        for c, r in zip(columns.tolist(), rows.tolist(), strict=True)
+    ]
+    np.testing.assert_allclose(found.numpy(), np.array(expected), atol=1e-12)
+
+
+def test_reading_a_plane_has_right_first_and_second_derivatives():
+    torch.manual_seed(0)
+    plane = torch.randn(4, 5, 2).double().requires_grad_()
+    # Away from the texels' centres, where the slope jumps.
+    columns, rows = torch.tensor([[-0.61, 0.13, 0.7], [0.22, -0.4, 0.91]]).double()
+    columns.requires_grad_()
+    rows.requires_grad_()
+    assert torch.autograd.gradcheck(bilinear, (plane, columns, rows))
+    assert torch.autograd.gradgradcheck(bilinear, (plane, columns, rows))
+
+
+@pytest.mark.parametrize("groups", [STILL, MOVING])
+def test_features_are_all_planes_side_by_side(groups):
+    made = planes(groups).double()
+    points, times = 2 * torch.rand(9, 3).double() - 1, torch.rand(9).double()
+    found = made(points, times)
+    for n in range(9):
+        place = dict(zip("xyz", points[n].tolist(), strict=True))
+        place["t"] = 0.95 * (2 * float(times[n]) - 1)
+        for group, features in zip(groups, found, strict=True):
+            expected = [
+                oracles.plane_value(
+                    made.planes[f"{level}_{group[0]}_{name}"].detach().numpy(),
+                    place[name[0]],
+                    place[name[1]],
+                )
+                for level in range(2)
+                for name in group
+            ]
+            np.testing.assert_allclose(
+                features[n].detach().numpy(), np.concatenate(expected), atol=1e-12
+            )
+
+
+def test_planes_are_read_coarsely_at_first():
+    made = planes()
+    points, times = 2 * torch.rand(20, 3) - 1, torch.zeros(20)
+    whole = made(points, times)
+    made.fine.fill_(False)
+    coarse = made(points, times)
+    assert all((c[:, 2:] == 0).all() for c in coarse)
+    assert all(torch.equal(c[:, :2], w[:, :2]) for c, w in zip(coarse, whole, strict=True))
+    made.blurred.fill_(True)
+    blurred = made(points, times)
+    assert not any(torch.equal(b, c) for b, c in zip(blurred, coarse, strict=True))
+    with torch.no_grad():
+        for plane in made.planes.values():
+            plane.fill_(0.7)
+    assert all(torch.allclose(b[:, :2], torch.tensor(0.7)) for b in made(points, times))
+
+
+def test_planes_number_as_published():
+    canonical = HierarchicalPlanes(STILL, [Level(128, 128, 32), Level(512, 128, 16)])
+    flow = HierarchicalPlanes(MOVING, [Level(128, 128, 32)])
+    field = Tensor4D(canonical, flow)
+    assert sum(p.numel() for p in canonical.parameters()) == 3 * (128**2 * 32 + 512**2 * 16)
+    assert sum(p.numel() for p in flow.parameters()) == 9 * 128**2 * 32
+    assert field.features(torch.zeros(1, 3)).shape == (1, 144)
+    shapes = [tuple(layer.weight.shape) for layer in field.surface.layers]
+    assert shapes == [(256, 51), (256, 256 + 144 + 51), (256, 256), (257, 256)]
+    shapes = [tuple(layer.weight.shape) for layer in field.flow.layers]
+    assert shapes == [(256, 64), (256, 256 + 96 + 64), (256, 256), (3, 256)]
+    assert field.tint[0].weight.shape == (256, 3 + 21 + 3 + 256)
+    assert float(field.sharpness.detach()) == pytest.approx(math.exp(3))
+    nine = Tensor4DDensity(HierarchicalPlanes(MOVING, [Level(128, 128, 32), Level(512, 128, 16)]))
+    assert nine.compression(nine.field_planes(torch.zeros(1, 3), torch.zeros(1))).shape == (1, 144)
+
+
+def test_surface_starts_as_a_sphere():
+    field = surface(moves=False, width=256, filled=False)
+    torch.manual_seed(1)
+    places = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
+    places *= torch.rand(200, 1) * 0.9 + 0.1
+    distance, slope, _ = field.distance_and_slope(places)
+    # A random network comes close to it, the closer the wider it is.
+    error = (distance - (places.norm(dim=1) - 0.5)).detach().abs()
+    assert error.mean() < 0.1
+    assert error.max() < 0.3
+    outward = (slope * torch.nn.functional.normalize(places, dim=1)).sum(dim=1)
+    assert outward.mean().item() == pytest.approx(1, abs=0.2)
+
+
+def test_slopes_are_the_distances_derivatives():
+    field = surface().double()
+    places = 0.8 * (2 * torch.rand(6, 3).double() - 1)
+    _, slope, _ = field.distance_and_slope(places)
+    step = 1e-6
+    for axis in range(3):
+        aside = torch.zeros(3).double()
+        aside[axis] = step
+        change = field.distance(places + aside)[0] - field.distance(places - aside)[0]
+        torch.testing.assert_close(slope[:, axis], change / (2 * step), atol=1e-5, rtol=1e-4)
+    with torch.no_grad():
+        again = field.distance_and_slope(places)[1]
+    torch.testing.assert_close(again, slope.detach())
+
+
+def test_nothing_flows_at_time_zero_and_something_later():
+    field = surface()
+    points = 2 * torch.rand(5, 3) - 1
+    assert torch.equal(field.canonical(points, torch.zeros(5)), points)
+    assert not torch.equal(field.canonical(points, torch.full((5,), 0.4)), points)
+    still = surface(moves=False)
+    assert still.canonical(points, torch.full((5,), 0.4)) is points
+    assert (field.moves, still.moves) == (True, False)
+
+
+def test_every_parameter_of_the_surface_gets_a_gradient():
+    field = surface()
+    renderer = NeusRenderer(field, samples=16, more=9, coarse_sharpness=64.0)
+    directions = torch.nn.functional.normalize(torch.randn(40, 3), dim=1)
+    origins = -3 * directions + 0.2 * torch.randn(40, 3)
+    image = renderer.render(field, origins, directions, torch.rand(40), torch.ones(3))
+    assert image.colour.shape == (40, 3)
+    assert len(image.samples) == 40 * 25
+    (image.colour.sum() + eikonal_error(image.slopes, image.inside)).backward()
+    for name, parameter in field.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.abs().sum() > 0, name
+
+
+@pytest.mark.parametrize("groups", [STILL, MOVING])
+def test_every_parameter_of_the_density_gets_a_gradient(groups):
+    field = Tensor4DDensity(planes(groups), 16, octaves=(4, 3, 2))
+    directions = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
+    colour, density = field(2 * torch.rand(200, 3) - 1, torch.rand(200), directions)
+    assert (colour.shape, density.shape) == ((200, 3), (200,))
+    (colour.sum() + density.sum()).backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in field.parameters())
+    assert field.moves == (groups is MOVING)
+
+
+def test_opacities_and_weights_equal_loops():
+    torch.manual_seed(0)
+    shape = (4, 9)
+    distance, change = torch.randn(shape).double() / 5, -torch.rand(shape).double()
+    lengths, inside = torch.rand(shape).double() / 5, torch.rand(shape) > 0.3
+    opacity = section_opacity(distance, change, lengths, 20.0) * inside
+    weights = weights_of(opacity)
+    for r in range(4):
+        rows = [t[r].tolist() for t in (distance, change, lengths)]
+        expected = oracles.surface_ray(*rows, 20.0, inside[r].tolist())
+        np.testing.assert_allclose(opacity[r].numpy(), expected[0], atol=1e-12)
+        np.testing.assert_allclose(weights[r].numpy(), expected[1], atol=1e-12)
+
+
+class Ball:
+    """A known surface: a ball of radius 0.4, red."""
+
+    sharpness = torch.tensor(400.0)
+
+    def canonical(self, points, times):
+        return points
+
+    def distance(self, places):
+        return places.norm(dim=1) - 0.4, places
+
+    def distance_and_slope(self, places):
+        return *self.distance(places), places
+
+    def colour(self, places, slopes, features, directions):
+        return torch.tensor([[1.0, 0.0, 0.0]]).expand(len(places), 3)
+
+
+def test_a_ball_is_seen_where_it_is():
+    ball = Ball()
+    ball.distance_and_slope = lambda places: (
+        places.norm(dim=1) - 0.4,
+        torch.nn.functional.normalize(places, dim=1),
+        places,
+    )
+    renderer = NeusRenderer(ball, samples=64, more=65, coarse_sharpness=64.0)
+    origins = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.7, 3.0], [0.3, 0.0, 3.0]])
+    directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)
+    image = renderer.render(ball, origins, directions, torch.zeros(3), torch.ones(3))
+    assert image.opacity.tolist() == pytest.approx([1, 0, 1], abs=0.01)
+    assert image.depth[[0, 2]].tolist() == pytest.approx([2.6, 3 - math.sqrt(0.07)], abs=0.02)
+    assert image.colour[0].tolist() == pytest.approx([1, 0, 0], abs=0.01)
+    assert image.colour[1].tolist() == pytest.approx([1, 1, 1], abs=0.01)
+
+
+def test_samples_ascend_and_gather_at_the_surface():
+    renderer = NeusRenderer(Ball(), samples=64, more=65, coarse_sharpness=64.0)
+    rays = torch.tensor([[0.0, 0.0, 3.0]]), torch.tensor([[0.0, 0.0, -1.0]]), torch.zeros(1)
+    for jitter in (None, torch.tensor([0.9])):
+        ends = renderer.place(Ball(), *rays, jitter)
+        assert ends.shape == (1, 129)
+        assert (ends.diff(dim=1) >= 0).all()
+        assert ((ends - 2.6).abs() < 0.1).sum() > 40
+
+
+def test_losses_equal_loops():
+    torch.manual_seed(0)
+    colour, target = torch.rand(5, 3).double(), torch.rand(5, 3).double()
+    mask = torch.tensor([1.0, 0, 1, 1, 0]).double()
+    errors = (colour - target).abs().tolist()
+    expected = sum(sum(e) for e, m in zip(errors, mask.tolist(), strict=True) if m) / (3 + 1e-5)
+    assert masked_colour_error(colour, target, mask).item() == pytest.approx(expected)
+
+    opacity = torch.tensor([0.0, 0.2, 0.9, 1.0, 0.5]).double()
+    total = 0.0
+    for o, m in zip(opacity.tolist(), mask.tolist(), strict=True):
+        o = min(max(o, 1e-3), 1 - 1e-3)
+        total -= math.log(o) if m else math.log(1 - o)
+    assert silhouette_error(opacity, mask).item() == pytest.approx(total / 5)
+
+    slopes, inside = torch.randn(7, 3).double(), torch.tensor([1, 1, 0, 1, 0, 1, 1]).bool()
+    lengths = [math.sqrt(sum(x * x for x in row)) for row in slopes.tolist()]
+    kept = [(v - 1) ** 2 for v, ok in zip(lengths, inside.tolist(), strict=True) if ok]
+    assert eikonal_error(slopes, inside).item() == pytest.approx(sum(kept) / (5 + 1e-5))
+    zero = torch.zeros(2, 3, requires_grad=True)
+    eikonal_error(zero, torch.ones(2, dtype=torch.bool)).backward()
+    assert zero.grad.isfinite().all()
+
+    here, nearby, weights = torch.rand(6, 4).double(), torch.rand(6, 4).double(), torch.rand(6)
+    total = 0.0
+    for n in range(6):
+        gaps = [(float(here[n, f]) - float(nearby[n, f])) ** 2 for f in range(4)]
+        total += float(weights[n]) * sum(gaps) / 4
+    assert feature_change(here, nearby, weights, 3).item() == pytest.approx(total / 3)
+
+
+def test_skip_network_lets_features_in_after_the_first_layer():
+    torch.manual_seed(0)
+    network = SkipNetwork(5, 4, 8, 2).double()
+    values, features = torch.randn(3, 5).double(), torch.randn(3, 4).double()
+
+    def soft(x):
+        return torch.nn.functional.softplus(x, beta=100)
+
+    first, second, third, last = ((la.weight, la.bias) for la in network.layers)
+    hidden = soft(values @ first[0].T + first[1])
+    hidden = torch.cat([hidden, features, values], dim=1) / math.sqrt(2)
+    hidden = soft(soft(hidden @ second[0].T + second[1]) @ third[0].T + third[1])
+    torch.testing.assert_close(network(values, features), hidden @ last[0].T + last[1])

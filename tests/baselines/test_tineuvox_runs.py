@@ -1,0 +1,85 @@
+"""What runs of TiNeuVox promise."""
+
+import pytest
+import torch
+
+from tests.baselines.checks import check_learns, check_reload, check_resume
+from tests.baselines.runs import OCCUPANCY, TINEUVOX, baseline_config
+from tests.synthetic import ball_views
+from xplanes.checks import parse
+from xplanes.config import ConfigError
+from xplanes.training.assembly.site import Site
+from xplanes.training.assembly.tineuvox import frusta_box, tineuvox_frame, tineuvox_method
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    return tmp_path_factory.mktemp("scenes")
+
+
+def test_run_learns_grows_goes_on_and_is_loaded(scenes, tmp_path, monkeypatch):
+    config = baseline_config(scenes, "model=tineuvox_s", *TINEUVOX, "trainer.max_steps=120")
+    folder = check_learns(config, tmp_path / "whole", gain=3)
+    # Between two growths, so that the grid and the moments of another size are loaded.
+    check_resume(config, folder, tmp_path / "broken", monkeypatch, stop=23)
+    trained = check_reload(folder)
+    assert int(trained.module.field.voxels) == 20**3
+
+
+def test_grid_of_occupied_cells_serves_too(scenes, tmp_path):
+    config = baseline_config(
+        scenes,
+        "model=tineuvox_b",
+        "sampler=occupancy",
+        "model.half_side=1.5",
+        *[o for o in TINEUVOX if not o.startswith("sampler")],
+        *OCCUPANCY,
+        "trainer.max_steps=120",
+    )
+    check_learns(config, tmp_path / "run", gain=2)
+
+
+def test_box_holds_what_cameras_see_between_the_bounds(scenes):
+    views = ball_views(5, 0.6)
+    box = frusta_box(views, 2.0, 6.0, 1.0)
+    larger = frusta_box(views, 2.0, 6.0, 1.05)
+    origins, directions = views.image_rays(3)
+    for distance in (2.0, 3.7, 6.0):
+        points = origins + distance * directions
+        assert ((points >= box[0]) & (points <= box[1])).all()
+    torch.testing.assert_close(larger[1] - larger[0], 1.05 * (box[1] - box[0]))
+    torch.testing.assert_close(larger.sum(dim=0), box.sum(dim=0))
+
+
+def test_learning_rates_and_cells_follow_the_published_schedule(scenes):
+    config = parse(baseline_config(scenes, "model=tineuvox_s"))
+    views = ball_views(4, 0.6)
+    method = tineuvox_method(config, Site(views, tineuvox_frame(config, views), "32"))
+    steps = (0, 1999, 2000, 4000, 6000, 19999)
+    assert [method.voxels(s) for s in steps] == [125000, 125000, 250000, 500000, 1000000, 1000000]
+    for step, since in zip(steps, (0, 1999, 0, 0, 0, 13999), strict=True):
+        assert method.rate(step, 0.5) == pytest.approx(0.1 ** (since / 20000))
+    rates = {group["name"]: group["lr"] for group in method.groups()}
+    assert (rates["grid"], rates["deformation"], rates["trunk"]) == (0.08, 0.0006, 0.0008)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("model.near=7", "must be below model.far=6.0"),
+        ("sampler.near=7", "must be below sampler.far=6.0"),
+        ("sampler.threshold=1", "must be below 1"),
+        ("model.alpha_start=1", "must lie between 0 and 1"),
+        ("model.alpha_start=0", "must lie between 0 and 1"),
+        ("lrm=file", "triplanes start X-Planes alone"),
+        ("sampler.step=0", "must be above 0"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(scenes, override, words):
+    with pytest.raises(ConfigError, match=words):
+        parse(baseline_config(scenes, "model=tineuvox_s", override))
+
+
+def test_samplers_that_need_two_stages_refuse_others(scenes):
+    with pytest.raises(ConfigError, match="sampler=fixed_step with model=six_planes: must be one"):
+        parse(baseline_config(scenes, "sampler=fixed_step"))

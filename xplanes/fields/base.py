@@ -1,0 +1,71 @@
+"""What renderers and training ask of a field."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+
+from torch import Tensor, nn
+
+
+class RadianceField(nn.Module, ABC):
+    """From points and times, and directions where it looks at them, to colour and density.
+
+    A field lives in the cube [-1, 1]^3 of its frame; its density is per unit length of that frame.
+
+    Attributes:
+        view_dependent: Whether ``forward`` takes directions as its third argument.
+    """
+
+    view_dependent = False
+
+    @property
+    @abstractmethod
+    def planes(self) -> Mapping[str, Tensor]:
+        """Feature planes, or slices of a feature grid, to look at. [C, rows, columns] each"""
+
+    @property
+    @abstractmethod
+    def moves(self) -> bool:
+        """Whether the field depends on time."""
+
+    @property
+    @abstractmethod
+    def precision(self) -> str:
+        """Number format of its matrix products: "32" or "bf16"."""
+
+    @property
+    @abstractmethod
+    def outline(self) -> str:
+        """Its size in a few words."""
+
+
+class ViewDependentField(RadianceField):
+    """A field in two stages, so that samples can be dropped before their colour is computed."""
+
+    view_dependent = True
+
+    @abstractmethod
+    def geometry(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+        """Density and the features that colour depends on. [N, 3], [N] -> [N], [N, F]"""
+
+    @abstractmethod
+    def colour(self, features: Tensor, directions: Tensor) -> Tensor:
+        """Colour seen along unit directions. [N, F], [N, 3] -> [N, 3]"""
+
+    def forward(
+        self, points: Tensor, times: Tensor, directions: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Colour and density of points at times.
+
+        Args:
+            points: Positions in the field's frame. [N, 3]
+            times: Times from 0 to 1. [N]
+            directions: Unit viewing directions in the field's frame; None looks along the third
+                axis, for callers that want the density alone. [N, 3]
+
+        Returns:
+            Colour from 0 to 1 and density per unit length of the field's frame. [N, 3], [N]
+        """
+        density, features = self.geometry(points, times)
+        if directions is None:
+            directions = points.new_tensor([0.0, 0.0, -1.0]).expand_as(points)
+        return self.colour(features, directions), density

@@ -1,0 +1,150 @@
+"""K-Planes: products of planes, decoded by MLPs (hybrid) or linearly (explicit)."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from xplanes.fields.base import ViewDependentField
+from xplanes.fields.encodings import spherical_harmonics
+from xplanes.fields.networks import PaddedMLP, truncated_exponential
+from xplanes.fields.products import PlaneProducts
+
+GEOMETRY = 15
+"""Features that the density network hands to the colour network."""
+
+
+class HybridDecoder(nn.Module):
+    """Two MLPs: features to density, and with the direction's harmonics to colour.
+
+    Args:
+        features: Columns of the input.
+        width: Neurons of the hidden layers, one for density and two for colour.
+        precision: Of the matrix products.
+
+    Source: K-Planes, hybrid decoder.
+    """
+
+    def __init__(self, features: int, width: int = 64, *, precision: str = "32") -> None:
+        super().__init__()
+        self.density = PaddedMLP([features, width, GEOMETRY + 1], precision=precision)
+        self.tint = PaddedMLP([16 + GEOMETRY, width, width, 3], precision=precision)
+
+    def geometry(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Density's logit, and features for the colour. [N, F] -> [N], [N, 15]"""
+        out = self.density(features)
+        return out[:, GEOMETRY], out[:, :GEOMETRY]
+
+    def colour(self, geometry: Tensor, directions: Tensor) -> Tensor:
+        """[N, 15], [N, 3] -> [N, 3]"""
+        return self.tint(torch.cat([spherical_harmonics(directions), geometry], dim=1)).sigmoid()
+
+
+class ExplicitDecoder(nn.Module):
+    """One linear map to density; colour is linear in the features for each direction.
+
+    Args:
+        features: Columns of the input.
+        width: Neurons of the hidden layers of the network from direction to colour basis.
+        precision: Of the matrix products.
+
+    Source: K-Planes, explicit decoder.
+    """
+
+    HIDDEN = 4
+
+    def __init__(self, features: int, width: int = 128, *, precision: str = "32") -> None:
+        super().__init__()
+        self.density = PaddedMLP([features, 1], precision=precision)
+        self.basis = PaddedMLP([3, *[width] * self.HIDDEN, 3 * features], precision=precision)
+
+    def geometry(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Density's logit, and the features. [N, F] -> [N], [N, F]"""
+        return self.density(features)[:, 0], features
+
+    def colour(self, geometry: Tensor, directions: Tensor) -> Tensor:
+        """[N, F], [N, 3] -> [N, 3]"""
+        basis = self.basis(directions).view(len(directions), 3, -1)
+        return (basis @ geometry[:, :, None])[..., 0].sigmoid()
+
+
+class KPlanes(ViewDependentField):
+    """A dynamic radiance field of multiplied planes.
+
+    Unlike X-Planes it has values outside its cube: those at the planes' borders.
+
+    Args:
+        products: Planes.
+        decoder: From their features to density and colour.
+        unit: World units per unit of the field's frame; the decoder's density is per world unit.
+
+    Source: K-Planes, Section 3.
+    """
+
+    def __init__(
+        self, products: PlaneProducts, decoder: HybridDecoder | ExplicitDecoder, unit: float = 1.0
+    ) -> None:
+        super().__init__()
+        self.products, self.decoder, self.unit = products, decoder, unit
+
+    @property
+    def planes(self) -> Mapping[str, Tensor]:
+        """The planes of the finest scale. [C, rows, columns] each"""
+        names = self.products.names
+        return {name: plane[0] for name, plane in self.products.planes()[-len(names) :]}
+
+    @property
+    def moves(self) -> bool:
+        return "xt" in self.products.names
+
+    @property
+    def precision(self) -> str:
+        return self.decoder.density.precision
+
+    @property
+    def outline(self) -> str:
+        sizes = "/".join(
+            str(plane.shape[3]) for name, plane in self.products.planes() if name == "xy"
+        )
+        return f"({' '.join(self.products.names)}, {sizes}) · {self.products.channels} channels"
+
+    def geometry(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+        logit, features = self.decoder.geometry(self.products(points, times))
+        return truncated_exponential(logit - 1) * self.unit, features
+
+    def colour(self, features: Tensor, directions: Tensor) -> Tensor:
+        return self.decoder.colour(features, directions)
+
+
+class DensityField(nn.Module):
+    """A small field of density alone, which tells where a larger one should be sampled.
+
+    Args:
+        products: Planes.
+        width: Neurons of the hidden layer.
+        linear: Whether the layers have no activation between them.
+        unit: World units per unit of the field's frame.
+        precision: Of the matrix products.
+
+    Source: K-Planes, released code; Mip-NeRF 360, Section 3.
+    """
+
+    def __init__(
+        self,
+        products: PlaneProducts,
+        width: int = 64,
+        *,
+        linear: bool = False,
+        unit: float = 1.0,
+        precision: str = "32",
+    ) -> None:
+        super().__init__()
+        self.products, self.unit = products, unit
+        self.network = PaddedMLP(
+            [products.features, width, 1], activation=not linear, precision=precision
+        )
+
+    def forward(self, points: Tensor, times: Tensor) -> Tensor:
+        """Density per unit length of the field's frame. [N, 3], [N] -> [N]"""
+        logit = self.network(self.products(points, times))[:, 0]
+        return truncated_exponential(logit - 1) * self.unit

@@ -1,0 +1,89 @@
+"""Small networks of the baselines, and the activation of their density."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+BLOCK = 16
+"""Widths are padded to multiples of it, as fused GPU networks need."""
+
+STEEPEST = 15.0
+"""Logits beyond it get the gradient of this one."""
+
+
+class PaddedMLP(nn.Module):
+    """Linear layers without biases; ones fill up the input to a multiple of 16 columns.
+
+    The padding is trained like any weight: P columns of ones act as one bias whose learning rate is
+    P times as high. Weights start uniform after Glorot, for widths rounded up to multiples of 16.
+
+    Args:
+        widths: Columns of the input, neurons of each hidden layer, columns of the output.
+        activation: Whether a ReLU stands between layers.
+        precision: "bf16" multiplies in bfloat16.
+
+    Source: tiny-cuda-nn's fully fused network, as K-Planes uses it.
+    """
+
+    def __init__(
+        self, widths: Sequence[int], *, activation: bool = True, precision: str = "32"
+    ) -> None:
+        super().__init__()
+        self.inputs, self.activation, self.precision = widths[0], activation, precision
+        padded = [_round_up(widths[0]), *widths[1:]]
+        self.weights = nn.ParameterList()
+        for columns, rows in zip(padded, padded[1:], strict=False):
+            bound = (6 / (_round_up(columns) + _round_up(rows))) ** 0.5
+            self.weights.append(nn.Parameter(torch.empty(rows, columns).uniform_(-bound, bound)))
+
+    def forward(self, values: Tensor) -> Tensor:
+        """[N, inputs] -> [N, outputs]"""
+        bf16 = self.precision == "bf16"
+        with torch.autocast(values.device.type, torch.bfloat16, enabled=bf16):
+            first = self.weights[0]
+            values = F.linear(values, first[:, : self.inputs], self._bias(first))
+            for weight in self.weights[1:]:
+                values = F.linear(values.relu() if self.activation else values, weight)
+        return values.float() if bf16 else values
+
+    def _bias(self, first: Tensor) -> Tensor | None:
+        if first.shape[1] == self.inputs:
+            return None
+        return first[:, self.inputs :].sum(dim=1)
+
+
+def _round_up(width: int) -> int:
+    return -(-width // BLOCK) * BLOCK
+
+
+class _TruncatedExponential(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, logits: Tensor) -> Tensor:
+        ctx.save_for_backward(logits)
+        return logits.exp()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        (logits,) = ctx.saved_tensors
+        return gradients[0] * logits.clamp(-STEEPEST, STEEPEST).exp()
+
+
+def truncated_exponential(logits: Tensor) -> Tensor:
+    """The exponential, with a gradient that stays finite. [...] -> [...]
+
+    Source: Instant-NGP; K-Planes.
+    """
+    return _TruncatedExponential.apply(logits)  # type: ignore[return-value]
+
+
+def layers(widths: Sequence[int]) -> nn.Sequential:
+    """Linear layers with biases and ReLUs between them."""
+    found: list[nn.Module] = []
+    for columns, rows in zip(widths, widths[1:], strict=False):
+        found += [nn.Linear(columns, rows), nn.ReLU()]
+    return nn.Sequential(*found[:-1])

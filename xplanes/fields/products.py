@@ -1,0 +1,158 @@
+"""Products of feature planes at several scales: what K-Planes reads from."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from xplanes.backend import compiled, cpu_loops
+
+AXES = "xyzt"
+
+BLOCK = 2048
+"""Points whose intermediate gradients lie in the cache together."""
+
+MOVING = ("xy", "xz", "xt", "yz", "yt", "zt")
+STILL = ("xy", "xz", "yz")
+"""Planes in the order of the product."""
+
+
+class PlaneProducts(nn.Module):
+    """At each scale the product of all planes, channel by channel.
+
+    Plane "ab" has axis a along its columns, b along its rows. Coordinates from -1 to 1 run from the
+    first texel's centre to the last one's (``align_corners=True``); what lies beyond takes the
+    value at the border.
+
+    Args:
+        channels: Channels of each plane.
+        resolution: Texels along each space axis at scale 1.
+        scales: Factors on the resolution.
+        time_resolution: Rows of time, at every scale; None for a scene that stands still.
+        low: Space planes start uniform between this
+        high: and this; time planes start at 1.
+
+    Source: K-Planes, Section 3.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        resolution: int,
+        scales: Sequence[int],
+        time_resolution: int | None,
+        *,
+        low: float,
+        high: float,
+    ) -> None:
+        super().__init__()
+        self.names = STILL if time_resolution is None else MOVING
+        self.channels = channels
+        self.scales = nn.ModuleList()
+        for scale in scales:
+            planes = nn.ParameterDict()
+            for name in self.names:
+                size = resolution * scale
+                rows = time_resolution if "t" in name else size
+                plane = torch.ones(1, channels, rows or 0, size)
+                plane = plane if "t" in name else plane.uniform_(low, high)
+                # The channels of a texel side by side: one read of memory brings them all.
+                planes[name] = nn.Parameter(plane.contiguous(memory_format=torch.channels_last))
+            self.scales.append(planes)
+
+    @property
+    def features(self) -> int:
+        """Columns of the output."""
+        return self.channels * len(self.scales)
+
+    def planes(self) -> list[tuple[str, Tensor]]:
+        """Name and parameter of every plane, scale by scale. [1, C, rows, columns] each"""
+        return [(name, scale[name]) for scale in self.scales for name in self.names]  # type: ignore[index]
+
+    def forward(self, points: Tensor, times: Tensor) -> Tensor:
+        """Features of points at times.
+
+        Args:
+            points: Positions, the planes' cube being [-1, 1]^3. [N, 3]
+            times: Times from 0 to 1. [N]
+
+        Returns:
+            The scales side by side. [N, channels * scales]
+        """
+        places = torch.cat([points, 2 * times[:, None] - 1], dim=1)
+        found = [
+            plane_product([scale[name] for name in self.names], places, self.names)  # type: ignore[index]
+            for scale in self.scales
+        ]
+        return torch.cat(found, dim=1)
+
+
+def plane_product(planes: Sequence[Tensor], places: Tensor, names: Sequence[str]) -> Tensor:
+    """What planes hold at places, multiplied channel by channel.
+
+    Gradients reach the planes only. On the CPU compiled loops do the work, elsewhere
+    `plane_product_reference`.
+
+    Args:
+        planes: Plane "ab" has axis a along its columns. [1, C, rows, columns] each
+        places: Coordinates x, y, z, t, from -1 to 1 between the outermost texels. [N, 4]
+        names: Axes of the planes.
+
+    Returns:
+        [N, C]
+
+    Source: K-Planes, Section 3.
+    """
+    if cpu_loops(planes[0]):
+        axes = torch.tensor([[AXES.index(axis) for axis in name] for name in names])
+        places = places.detach().to(planes[0].dtype).contiguous()
+        return _Product.apply(places, axes, *planes)  # type: ignore[return-value]
+    return plane_product_reference(planes, places, names)
+
+
+def plane_product_reference(
+    planes: Sequence[Tensor], places: Tensor, names: Sequence[str]
+) -> Tensor:
+    """The same as `plane_product`, written for reading: one ``grid_sample`` per plane."""
+    product = torch.ones((), device=places.device)
+    for plane, (column, row) in zip(planes, names, strict=True):
+        grid = places[:, [AXES.index(column), AXES.index(row)]][None, None].to(plane.dtype)
+        product = product * F.grid_sample(plane, grid, padding_mode="border", align_corners=True)
+    return product[0, :, 0].T
+
+
+class _Product(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, places: Tensor, axes: Tensor, *planes: Tensor) -> Tensor:
+        product = places.new_empty(len(places), planes[0].shape[1])
+        arrays = tuple(_array(plane) for plane in planes)
+        cpu = compiled("xplanes.fields.cpu")
+        cpu.multiply(arrays, places.numpy(), axes.numpy(), product.numpy())
+        ctx.save_for_backward(places, axes, *planes)
+        return product
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        places, axes, *planes = ctx.saved_tensors
+        found = [torch.zeros_like(plane, memory_format=torch.channels_last) for plane in planes]
+        spread = places.new_empty(BLOCK, len(planes), planes[0].shape[1])
+        compiled("xplanes.fields.cpu").multiply_backward(
+            tuple(_array(plane) for plane in planes),
+            places.numpy(),
+            axes.numpy(),
+            gradients[0].to(places.dtype).contiguous().numpy(),
+            spread.numpy(),
+            tuple(_array(plane) for plane in found),
+        )
+        return None, None, *found
+
+
+def _array(plane: Tensor) -> Any:
+    """A plane with its channels last, for loops. [1, C, rows, columns] -> [rows, columns, C]"""
+    return plane.detach()[0].permute(1, 2, 0).contiguous().numpy()

@@ -1,0 +1,244 @@
+"""Tensor4D: a surface in canonical space with a flow that leads there, or a density."""
+
+import math
+from collections.abc import Mapping
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.nn.utils.parametrizations import weight_norm
+
+from xplanes.fields.base import RadianceField, ViewDependentField
+from xplanes.fields.encodings import octaves
+from xplanes.fields.hierarchy import Compression, HierarchicalPlanes
+
+HIDDEN = 3
+"""Hidden layers of all networks."""
+
+DENSITY_SCALE, DENSITY_START = 25.0, -3.0
+"""Of the density that stands in for the surface: softplus of the logit, as X-Planes have it."""
+
+
+class SkipNetwork(nn.Module):
+    """Hidden layers after the first of which features, and the input once more, are let in.
+
+    Args:
+        inputs: Columns of the input; the first three are a position.
+        features: Columns of the features.
+        width: Neurons of the hidden layers.
+        outputs: Columns of the output.
+        radius: The first output starts as the distance from a sphere of this radius around the
+            origin; None starts at random.
+
+    Source: Tensor4D, released code; NeuS; IGR (start).
+    """
+
+    def __init__(
+        self, inputs: int, features: int, width: int, outputs: int, radius: float | None = None
+    ) -> None:
+        super().__init__()
+        self.inputs = inputs
+        columns = [inputs, width + features + inputs, width, width]
+        rows = [width] * HIDDEN + [outputs]
+        layers = [nn.Linear(c, r) for c, r in zip(columns, rows, strict=True)]
+        if radius is not None:
+            _start_as_sphere(layers, inputs, radius)
+        self.layers = nn.ModuleList(weight_norm(layer) for layer in layers)
+
+    def forward(self, values: Tensor, features: Tensor) -> Tensor:
+        """[N, inputs], [N, features] -> [N, outputs]"""
+        hidden = F.softplus(self.layers[0](values), beta=100)
+        hidden = torch.cat([hidden, features, values], dim=1) / math.sqrt(2)
+        for layer in self.layers[1:-1]:
+            hidden = F.softplus(layer(hidden), beta=100)
+        return self.layers[-1](hidden)
+
+
+@torch.no_grad()
+def _start_as_sphere(layers: list[nn.Linear], inputs: int, radius: float) -> None:
+    for layer in layers[:-1]:
+        nn.init.normal_(layer.weight, 0, math.sqrt(2 / layer.out_features))
+        nn.init.zeros_(layer.bias)
+    # Encodings would bend the sphere.
+    layers[0].weight[:, 3:] = 0
+    layers[1].weight[:, -(inputs - 3) :] = 0
+    last = layers[-1]
+    nn.init.normal_(last.weight, math.sqrt(math.pi / last.in_features), 1e-4)
+    nn.init.constant_(last.bias, -radius)
+
+
+def _colour_network(inputs: int, width: int) -> nn.Sequential:
+    sizes = [inputs, *[width] * HIDDEN]
+    found: list[nn.Module] = []
+    for columns, rows in zip(sizes, sizes[1:], strict=False):
+        found += [weight_norm(nn.Linear(columns, rows)), nn.ReLU()]
+    return nn.Sequential(*found, weight_norm(nn.Linear(width, 3)), nn.Sigmoid())
+
+
+class Tensor4D(RadianceField):
+    """Signed distance and colour in canonical space, and the flow from each moment to it.
+
+    Args:
+        planes: Planes of the canonical space.
+        flow_planes: Planes of the flow; None for a scene that stands still.
+        width: Neurons of the hidden layers.
+        octaves: Frequencies for positions, times and directions.
+        radius: Of the sphere at the start.
+        sharpness: The surface's width at the start is exp(-10 times this).
+
+    Source: Tensor4D, released code.
+    """
+
+    COMPRESSED = 32
+    """Columns that remain of each group of the flow's planes."""
+
+    def __init__(
+        self,
+        planes: HierarchicalPlanes,
+        flow_planes: HierarchicalPlanes | None,
+        width: int = 256,
+        *,
+        octaves: tuple[int, int, int] = (8, 6, 3),
+        radius: float = 0.5,
+        sharpness: float = 0.3,
+    ) -> None:
+        super().__init__()
+        self.octaves = octaves
+        points, times, directions = 3 + 6 * octaves[0], 1 + 2 * octaves[1], 3 + 6 * octaves[2]
+        self.canonical_planes, self.flow_planes = planes, flow_planes
+        features = len(planes.groups) * planes.width
+        self.surface = SkipNetwork(points, features, width, 1 + width, radius)
+        self.compression = self.flow = None
+        if flow_planes is not None:
+            groups = len(flow_planes.groups)
+            self.compression = Compression(groups, flow_planes.width, self.COMPRESSED)
+            self.flow = SkipNetwork(points + times, groups * self.COMPRESSED, width, 3)
+        self.tint = _colour_network(3 + directions + 3 + width, width)
+        self.steepness = nn.Parameter(torch.tensor(sharpness))
+
+    @property
+    def planes(self) -> Mapping[str, Tensor]:
+        return self.canonical_planes.pictures()
+
+    @property
+    def moves(self) -> bool:
+        return self.flow is not None
+
+    @property
+    def precision(self) -> str:
+        return "32"
+
+    @property
+    def outline(self) -> str:
+        sizes = "/".join(str(level.resolution) for level in self.canonical_planes.levels)
+        return f"(surface and flow, planes of {sizes})"
+
+    @property
+    def sharpness(self) -> Tensor:
+        """Steepness of the opacity across the surface, per unit of distance. []"""
+        return (10 * self.steepness).exp().clamp(1e-6, 1e6)
+
+    def canonical(self, points: Tensor, times: Tensor) -> Tensor:
+        """Where points of a moment lie in canonical space, that of time 0. [N, 3], [N] -> [N, 3]"""
+        if self.flow is None or self.compression is None or self.flow_planes is None:
+            return points
+        features = self.compression(self.flow_planes(points, times))
+        moment = octaves(2 * times[:, None] - 1, self.octaves[1])
+        values = torch.cat([octaves(points, self.octaves[0]), moment], dim=1)
+        return points + self.flow(values, features) * (times > 0)[:, None]
+
+    def features(self, places: Tensor) -> Tensor:
+        """What the planes hold at canonical places. [N, 3] -> [N, F]"""
+        return torch.cat(self.canonical_planes(places, torch.zeros_like(places[:, 0])), dim=1)
+
+    def distance(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance, and features for the colour. Canonical [N, 3] -> [N], [N, width]"""
+        found = self.surface(octaves(places, self.octaves[0]), self.features(places))
+        return found[:, 0], found[:, 1:]
+
+    def distance_and_slope(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The distance, its gradient in canonical space, and features; all can be trained.
+
+        Args:
+            places: In canonical space. [N, 3]
+
+        Returns:
+            [N], [N, 3], [N, width]
+        """
+        trained = torch.is_grad_enabled()
+        with torch.enable_grad():
+            if not places.requires_grad:
+                places = places.detach().requires_grad_()
+            distance, features = self.distance(places)
+            (slope,) = torch.autograd.grad(distance.sum(), places, create_graph=trained)
+        if not trained:
+            return distance.detach(), slope, features.detach()
+        return distance, slope, features
+
+    def colour(
+        self, places: Tensor, slopes: Tensor, features: Tensor, directions: Tensor
+    ) -> Tensor:
+        """Colour at canonical places. [N, 3], [N, 3], [N, width], [N, 3] -> [N, 3]"""
+        seen = octaves(directions, self.octaves[2])
+        return self.tint(torch.cat([places, seen, slopes, features], dim=1))
+
+
+class Tensor4DDensity(ViewDependentField):
+    """The nine planes of Tensor4D and its networks, with a density in place of the surface.
+
+    This is not the published model: it has no surface, no normals and no flow.
+
+    Args:
+        planes: Nine planes, or three for a scene that stands still.
+        width: Neurons of the hidden layers.
+        octaves: Frequencies for positions, times and directions.
+
+    Source: Tensor4D, released code.
+    """
+
+    COMPRESSED = 48
+    """Columns that remain of each group of planes."""
+
+    def __init__(
+        self,
+        planes: HierarchicalPlanes,
+        width: int = 256,
+        *,
+        octaves: tuple[int, int, int] = (8, 6, 3),
+    ) -> None:
+        super().__init__()
+        self.octaves, self.field_planes = octaves, planes
+        points, times, directions = 3 + 6 * octaves[0], 1 + 2 * octaves[1], 3 + 6 * octaves[2]
+        groups = len(planes.groups)
+        self.compression = Compression(groups, planes.width, self.COMPRESSED)
+        inputs = points + times if self.moves else points
+        self.trunk = SkipNetwork(inputs, groups * self.COMPRESSED, width, 1 + width)
+        self.tint = _colour_network(directions + width, width)
+
+    @property
+    def planes(self) -> Mapping[str, Tensor]:
+        return self.field_planes.pictures()
+
+    @property
+    def moves(self) -> bool:
+        return any("t" in name for group in self.field_planes.groups for name in group)
+
+    @property
+    def precision(self) -> str:
+        return "32"
+
+    @property
+    def outline(self) -> str:
+        sizes = "/".join(str(level.resolution) for level in self.field_planes.levels)
+        return f"({len(self.planes)} planes of {sizes}, density)"
+
+    def geometry(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+        values = octaves(points, self.octaves[0])
+        if self.moves:
+            moment = octaves(2 * times[:, None] - 1, self.octaves[1])
+            values = torch.cat([values, moment], dim=1)
+        found = self.trunk(values, self.compression(self.field_planes(points, times)))
+        return DENSITY_SCALE * F.softplus(found[:, 0] + DENSITY_START), found[:, 1:]
+
+    def colour(self, features: Tensor, directions: Tensor) -> Tensor:
+        return self.tint(torch.cat([octaves(directions, self.octaves[2]), features], dim=1))

@@ -1,0 +1,175 @@
+"""TiNeuVox: a grid of features that a deformation looks into, and small networks."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from xplanes.fields.base import ViewDependentField
+from xplanes.fields.encodings import octaves
+from xplanes.fields.networks import layers
+
+STRIDES = (1, 2, 4)
+"""The grid is read at every cell, every second and every fourth."""
+
+PER_CHANNEL = 5
+"""Numbers per channel that a feature's encoding, and the time's, come to at two octaves."""
+
+
+class TiNeuVox(ViewDependentField):
+    """A dynamic radiance field in canonical space.
+
+    Args:
+        box: Least and largest corner of the grid, in world units. [2, 3]
+        resolution: Cube root of the number of cells.
+        channels: Channels of a cell.
+        width: Neurons of the hidden layers.
+        octaves: Frequencies for positions, times, directions and features.
+        alpha: Opacity of one cell of the finished grid at the start.
+        halvings: How often the number of cells is halved at the start.
+        moves: Whether points are moved to canonical space; a still scene needs none of it.
+        unit: World units per unit of the field's frame.
+        precision: Of the matrix products.
+
+    Source: TiNeuVox, released code.
+    """
+
+    box: Tensor
+    voxels: Tensor
+
+    def __init__(
+        self,
+        box: Tensor,
+        resolution: int,
+        channels: int,
+        width: int,
+        *,
+        octaves: tuple[int, int, int, int] = (10, 8, 4, 2),
+        alpha: float = 1e-2,
+        halvings: int = 0,
+        moves: bool = True,
+        unit: float = 1.0,
+        precision: str = "32",
+    ) -> None:
+        super().__init__()
+        self.resolution, self.channels, self.octaves, self.unit = (
+            resolution,
+            channels,
+            octaves,
+            unit,
+        )
+        self._precision = precision
+        self.shift = math.log(1 / (1 - alpha) - 1)
+        self.register_buffer("box", box)
+        self.register_buffer("voxels", torch.tensor(resolution**3 // 2**halvings))
+        self.grid = nn.Parameter(torch.zeros(1, channels, *self._size(int(self.voxels))))
+        points, times, directions, features = (1 + 2 * count for count in octaves)
+        moment = PER_CHANNEL * channels
+        self.time = layers([times, width, moment])
+        self.deformation = layers([3 * points + moment, width, width, 3]) if moves else None
+        read = len(STRIDES) * channels * features
+        self.trunk = layers([read + moment + 3 * points, width])
+        self.density = nn.Linear(width, 1)
+        self.tint = nn.Linear(width, width)
+        self.colours = layers([width + 3 * directions, width // 2, 3])
+        self.register_load_state_dict_pre_hook(_fit_grid)
+
+    @property
+    def planes(self) -> Mapping[str, Tensor]:
+        """Slices through the middle of the grid. [C, rows, columns] each"""
+        grid = self.grid[0]
+        x, y, z = (size // 2 for size in grid.shape[1:])
+        return {
+            "xy": grid[:, :, :, z].mT,
+            "xz": grid[:, :, y].mT,
+            "yz": grid[:, x].mT,
+        }
+
+    @property
+    def moves(self) -> bool:
+        return self.deformation is not None
+
+    @property
+    def precision(self) -> str:
+        return self._precision
+
+    @property
+    def outline(self) -> str:
+        cells = " x ".join(str(size) for size in self._size(self.resolution**3))
+        return f"(grid of {cells} cells) · {self.channels} channels"
+
+    @property
+    def cell(self) -> float:
+        """Side of a cell in units of the frame."""
+        return self._cell(int(self.voxels)) / self.unit
+
+    def bounds(self) -> Tensor:
+        """Least and largest corner of the grid in the field's frame. [2, 3]"""
+        return self.box / self.unit
+
+    @torch.no_grad()
+    def resize(self, voxels: int) -> None:
+        """Resample the grid to another number of cells, in place."""
+        size = self._size(voxels)
+        self.grid.data = F.interpolate(
+            self.grid.data, size=size, mode="trilinear", align_corners=True
+        )
+        self.voxels.fill_(voxels)
+
+    def read(self, places: Tensor) -> Tensor:
+        """The grid at three spacings, zero outside. World positions [N, 3] -> [N, 3 C]"""
+        # Filled up so that the corners of all three grids fall together.
+        fill = [-(size - 1) % STRIDES[-1] for size in self.grid.shape[:1:-1]]
+        grid = F.pad(self.grid, [n for size in fill for n in (0, size)])
+        low, high = self.box
+        place = (2 * (places - low) / (high - low) - 1).flip(-1)[None, None, None]
+        found = [
+            F.grid_sample(grid[:, :, ::step, ::step, ::step], place, align_corners=True)
+            for step in STRIDES
+        ]
+        return torch.cat(found, dim=1)[0, :, 0, 0].T
+
+    def geometry(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+        places = points * self.unit
+        count = self.octaves
+        with self._mixed(points):
+            encoded = octaves(places, count[0])
+            moment = self.time(octaves(times[:, None], count[1]))
+            moved = places
+            if self.deformation is not None:
+                moved = places + self.deformation(torch.cat([encoded, moment], dim=1))
+            read = octaves(self.read(moved.to(self.grid.dtype)), count[3])
+            features = self.trunk(torch.cat([read, moment, encoded], dim=1)).relu()
+            logit = self.density(features)[:, 0]
+        per_cell = F.softplus(logit.to(points.dtype) + self.shift)
+        # The published density counts per side of a cell of the finished grid.
+        return per_cell * (self.unit / self._cell(self.resolution**3)), features
+
+    def colour(self, features: Tensor, directions: Tensor) -> Tensor:
+        with self._mixed(directions):
+            seen = octaves(directions, self.octaves[2])
+            logits = self.colours(torch.cat([self.tint(features), seen], dim=1))
+        return logits.to(directions.dtype).sigmoid()
+
+    def _mixed(self, values: Tensor) -> torch.autocast:
+        return torch.autocast(values.device.type, torch.bfloat16, enabled=self._precision == "bf16")
+
+    def _cell(self, voxels: int) -> float:
+        low, high = self.box.double()
+        return float(((high - low).prod() / voxels) ** (1 / 3))
+
+    def _size(self, voxels: int) -> list[int]:
+        low, high = self.box.double()
+        # Whole cells, but a rounding error must not cost one.
+        sides = (high - low) / self._cell(voxels) + 1e-4
+        return [max(2, int(side)) for side in sides.tolist()]
+
+
+def _fit_grid(field: TiNeuVox, state: Mapping[str, Any], prefix: str, *_rest: Any) -> None:
+    """Make room for a saved grid: one that has grown is another size than a fresh one."""
+    saved = state.get(f"{prefix}grid")
+    if isinstance(saved, Tensor) and saved.shape[:2] == field.grid.shape[:2]:
+        field.grid.data = field.grid.new_zeros(saved.shape)

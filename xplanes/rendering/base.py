@@ -1,0 +1,97 @@
+"""What all renderers share: what rays see, and whole images of it."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from xplanes.rendering.marching import Samples
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What rays see.
+
+    Attributes:
+        colour: In front of the background. [R, 3]
+        opacity: Share of the light that the scene stops. [R]
+        depth: Mean distance of what is seen, 0 where nothing is. [R]
+        density: Density of each sample, without gradient. [N]
+        samples: The samples that reached the field.
+    """
+
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    density: Tensor
+    samples: Samples
+
+
+class RayRenderer(ABC):
+    """Renders rays through a field, in a way of its own.
+
+    Attributes:
+        rays_at_once: Rays of an image rendered together.
+    """
+
+    rays_at_once = 8192
+
+    @property
+    @abstractmethod
+    def device(self) -> torch.device:
+        """Where rays must lie."""
+
+    @abstractmethod
+    def render(
+        self,
+        field: Any,
+        origins: Tensor,
+        directions: Tensor,
+        times: Tensor,
+        background: Tensor,
+        jitter: Any = None,
+        stride: int = 1,
+    ) -> Rendering:
+        """Render rays.
+
+        Args:
+            field: What the renderer takes as a field.
+            origins: Ray origins in the field's frame. [R, 3]
+            directions: Unit directions. [R, 3]
+            times: Time of each ray, from 0 to 1. [R]
+            background: Colour behind the scene. [3] or [R, 3]
+            jitter: What moves samples within their steps in training; None takes the middle.
+            stride: Steps that one sample stands for, where steps are equal.
+
+        Returns:
+            One value per ray; gradients reach the field.
+        """
+
+    @torch.no_grad()
+    def image(
+        self,
+        field: Any,
+        origins: Tensor,
+        directions: Tensor,
+        time: float,
+        background: Tensor,
+        *,
+        stride: int = 1,
+        chunk: int | None = None,
+    ) -> dict[str, Tensor]:
+        """Render any number of rays of one moment, a chunk at a time.
+
+        Returns:
+            ``colour`` [R, 3], ``opacity`` [R] and ``depth`` [R], on the rays' device.
+        """
+        parts = []
+        chunk = chunk or self.rays_at_once
+        for start in range(0, max(len(origins), 1), chunk):
+            rays = origins[start : start + chunk], directions[start : start + chunk]
+            times = torch.full_like(rays[0][:, 0], time)
+            part = self.render(field, *rays, times, background, stride=stride)
+            parts.append((part.colour, part.opacity, part.depth))
+        colour, opacity, depth = (torch.cat(part) for part in zip(*parts, strict=True))
+        return {"colour": colour, "opacity": opacity, "depth": depth}

@@ -1,0 +1,161 @@
+"""Rays through a signed distance: opacity rises where the surface is crossed from outside."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from xplanes.rendering.base import RayRenderer, Rendering
+from xplanes.rendering.proposal import dense_samples
+from xplanes.rendering.resampling import resample
+
+TINY = 1e-5
+"""Keeps quotients of vanishing opacities finite."""
+
+
+@dataclass(frozen=True)
+class SurfaceRendering(Rendering):
+    """What rays see, and the surface's samples.
+
+    Attributes:
+        places: The samples in canonical space. [N, 3]
+        slopes: Gradient of the distance there. [N, 3]
+        weights: Share of its ray's light that each sample sends, without gradient. [N]
+        inside: Which samples lie in the field's cube. [N]
+    """
+
+    places: Tensor
+    slopes: Tensor
+    weights: Tensor
+    inside: Tensor
+
+
+def section_opacity(
+    distance: Tensor, change: Tensor, lengths: Tensor, sharpness: Tensor | float
+) -> Tensor:
+    """Opacity of sections of rays, from the distance in their middle.
+
+    Args:
+        distance: Signed distance in the middle. [...]
+        change: Its derivative along the ray, not above 0. [...]
+        lengths: Length of the section. [...]
+        sharpness: Steepness of the logistic that makes opacity of distance.
+
+    Returns:
+        From 0 to 1. [...]
+
+    Source: NeuS, Eq. 13.
+    """
+    half = change * lengths / 2
+    before = ((distance - half) * sharpness).sigmoid()
+    after = ((distance + half) * sharpness).sigmoid()
+    return ((before - after + TINY) / (before + TINY)).clamp(0, 1)
+
+
+def weights_of(opacity: Tensor) -> Tensor:
+    """Share of the light that each sample of a ray sends. [R, S] -> [R, S]"""
+    through = torch.cat([torch.ones_like(opacity[:, :1]), 1 - opacity + 1e-7], dim=1)
+    return opacity * through.cumprod(dim=1)[:, :-1]
+
+
+class NeusRenderer(RayRenderer):
+    """Equal steps through the unit sphere's depth, then more where they find the surface.
+
+    Args:
+        field: Has ``canonical``, ``distance``, ``distance_and_slope``, ``colour``, ``sharpness``.
+        samples: Equal steps.
+        more: Samples added.
+        coarse_sharpness: Sharpness at which they are placed.
+
+    Source: NeuS and Tensor4D, released code.
+    """
+
+    rays_at_once = 512
+
+    def __init__(self, field: Any, *, samples: int, more: int, coarse_sharpness: float) -> None:
+        self.field, self.samples, self.more = field, samples, more
+        self.coarse_sharpness = coarse_sharpness
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.field.parameters()).device
+
+    def render(
+        self,
+        field: Any,
+        origins: Tensor,
+        directions: Tensor,
+        times: Tensor,
+        background: Tensor,
+        jitter: Tensor | None = None,
+        stride: int = 1,
+    ) -> SurfaceRendering:
+        ends = self.place(field, origins, directions, times, jitter)
+        lengths = ends.diff(dim=1)
+        lengths = torch.cat([lengths, torch.full_like(lengths[:, :1], 2 / self.samples)], dim=1)
+        distances = ends + lengths / 2
+        shape = distances.shape
+        samples = dense_samples(_points(origins, directions, distances), distances)
+        facing = directions[samples.ray]
+        places = field.canonical(samples.points, times[samples.ray])
+        distance, slopes, features = field.distance_and_slope(places)
+        change = -(-(facing * slopes).sum(dim=1)).relu()
+        inside = (samples.points.abs() <= 1).all(dim=1)
+        opacity = section_opacity(distance, change, lengths.flatten(), field.sharpness) * inside
+        weights = weights_of(opacity.view(shape))
+        colours = field.colour(places, slopes, features, facing).view(*shape, 3)
+        total = weights.sum(dim=1)
+        return SurfaceRendering(
+            colour=(weights[..., None] * colours).sum(dim=1) + (1 - total)[:, None] * background,
+            opacity=total,
+            depth=((weights * distances).sum(dim=1) / total.clamp_min(1e-6)).detach(),
+            density=(-distance).detach(),
+            samples=samples,
+            places=places,
+            slopes=slopes,
+            weights=weights.detach().flatten(),
+            inside=inside,
+        )
+
+    @torch.no_grad()
+    def place(
+        self,
+        field: Any,
+        origins: Tensor,
+        directions: Tensor,
+        times: Tensor,
+        jitter: Tensor | None,
+    ) -> Tensor:
+        """Ascending distances at which sections begin. [R, samples + more]
+
+        Args:
+            field: As for `render`.
+            origins: [R, 3]
+            directions: Unit directions. [R, 3]
+            times: [R]
+            jitter: Moves each ray's first samples by up to half a step; from 0 to 1. [R]
+        """
+        closest = -(origins * directions).sum(dim=1, keepdim=True)
+        steps = torch.linspace(-1, 1, self.samples, device=origins.device)
+        ends = (closest + steps).clamp_min(0)
+        if jitter is not None:
+            ends = (ends + (jitter[:, None] - 0.5) * 2 / self.samples).clamp_min(0)
+        points = _points(origins, directions, ends)
+        places = field.canonical(points, times.repeat_interleave(self.samples))
+        distance = field.distance(places)[0].view_as(ends)
+        lengths = ends.diff(dim=1)
+        change = distance.diff(dim=1) / (lengths + TINY)
+        # The steeper of two neighbours, so that a surface hit at a flat angle is not missed.
+        before = torch.cat([torch.zeros_like(change[:, :1]), change[:, :-1]], dim=1)
+        near = points.view(*ends.shape, 3).norm(dim=2) < 1
+        change = torch.minimum(before, change).clamp(-1e3, 0) * (near[:, 1:] | near[:, :-1])
+        middle = (distance[:, 1:] + distance[:, :-1]) / 2
+        opacity = section_opacity(middle, change, lengths, self.coarse_sharpness)
+        more = resample(ends, weights_of(opacity), self.more - 1, None, TINY)
+        return torch.cat([ends, more], dim=1).sort(dim=1).values
+
+
+def _points(origins: Tensor, directions: Tensor, distances: Tensor) -> Tensor:
+    """Points at distances [R, S] along rays. [R S, 3]"""
+    return (origins[:, None] + distances[..., None] * directions[:, None]).flatten(0, 1)

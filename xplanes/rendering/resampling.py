@@ -1,0 +1,96 @@
+"""Placing samples along rays where earlier samples found something."""
+
+import torch
+from torch import Tensor
+
+from xplanes.rendering.compositing import OPAQUE
+
+
+def ray_weights(optical_depth: Tensor) -> Tensor:
+    """Share of the light that each sample of a ray sends, by Beer and Lambert. [R, S] -> [R, S]
+
+    The same as the weights of `composite`, for rays of equally many samples and with gradients.
+    """
+    depth = optical_depth.clamp(0, OPAQUE)
+    return (depth - depth.cumsum(dim=1)).exp() * -torch.expm1(-depth)
+
+
+def uniform_edges(rays: int, count: int, uniform: Tensor | None, device: torch.device) -> Tensor:
+    """Edges of ``count`` equal bins from 0 to 1, each moved within half a bin on either side.
+
+    Args:
+        rays: Number of rays R.
+        count: Number of bins.
+        uniform: Numbers from 0 to 1; None leaves the bins equal. [R, count + 1]
+        device: Where to put them.
+
+    Returns:
+        Ascending. [R, count + 1]
+    """
+    edges = torch.linspace(0, 1, count + 1, device=device).expand(rays, -1)
+    if uniform is None:
+        return edges
+    middle = (edges[:, 1:] + edges[:, :-1]) / 2
+    lower = torch.cat([edges[:, :1], middle], dim=1)
+    upper = torch.cat([middle, edges[:, -1:]], dim=1)
+    return lower + (upper - lower) * uniform
+
+
+def resample(
+    edges: Tensor, weights: Tensor, count: int, uniform: Tensor | None, padding: float
+) -> Tensor:
+    """Edges of new bins that hold about equal weight each.
+
+    The weights, with ``padding`` added to each, are a density that is constant within bins; the new
+    edges are where its running integral passes equally spaced numbers.
+
+    Args:
+        edges: Ascending edges of the bins. [R, S + 1]
+        weights: Weight of each bin, not below 0. [R, S]
+        count: Number of new bins.
+        uniform: Numbers from 0 to 1 that move each new edge within its share; None takes the
+            middle. [R, count + 1]
+        padding: Added to each weight; above 0.
+
+    Returns:
+        Ascending edges, without gradient. [R, count + 1]
+
+    Source: K-Planes, released code; Mip-NeRF 360, Section 3; NeRF, Section 5.2.
+    """
+    with torch.no_grad():
+        padded = weights + padding
+        share = padded / padded.sum(dim=1, keepdim=True)
+        total = torch.cat([torch.zeros_like(share[:, :1]), share.cumsum(dim=1)], dim=1)
+        total = total.clamp_max(1)
+        place = torch.arange(count + 1, device=edges.device, dtype=edges.dtype)
+        place = (place + (0.5 if uniform is None else uniform)) / (count + 1)
+        place = place.expand(len(edges), -1).contiguous()
+        above = torch.searchsorted(total, place, right=True)
+        below, above = (above - 1).clamp_min(0), above.clamp_max(edges.shape[1] - 1)
+        start, end = total.gather(1, below), total.gather(1, above)
+        along = ((place - start) / (end - start)).nan_to_num(0, 0, 0).clamp(0, 1)
+        first, last = edges.gather(1, below), edges.gather(1, above)
+        return first + along * (last - first)
+
+
+def covering_weights(edges: Tensor, coarse_edges: Tensor, coarse_weights: Tensor) -> Tensor:
+    """For each bin the weight of all coarse bins that it touches.
+
+    Args:
+        edges: Ascending. [R, S + 1]
+        coarse_edges: Ascending. [R, P + 1]
+        coarse_weights: Gradients reach them. [R, P]
+
+    Returns:
+        [R, S]
+
+    Source: Mip-NeRF 360, Eq. 12.
+    """
+    zero = torch.zeros_like(coarse_weights[:, :1])
+    total = torch.cat([zero, coarse_weights.cumsum(dim=1)], dim=1)
+    last = coarse_weights.shape[1] - 1
+    starts, ends = coarse_edges[:, :-1].contiguous(), coarse_edges[:, 1:].contiguous()
+    first = torch.searchsorted(starts, edges[:, :-1].contiguous(), right=True) - 1
+    final = torch.searchsorted(ends, edges[:, 1:].contiguous(), right=True)
+    first, final = first.clamp(0, last), final.clamp(0, last)
+    return total.gather(1, final + 1) - total.gather(1, first)

@@ -1,0 +1,1 @@
+"""Settings of models, losses and samplers beyond X-Planes' own, typed."""

@@ -1,0 +1,1 @@
+"""Methods: what each family of models adds to a training step."""

@@ -1,0 +1,1 @@
+"""Samplers in training: rendering with jitter, terms of their own, and upkeep."""

@@ -7,7 +7,7 @@ from xplanes.fields.decoder import Decoder
 from xplanes.pretraining.losses import composite, triplane_logits
 from xplanes.scenes.cameras import pixel_rays
 
-CHUNK = 2**16
+CHUNK = 2**14
 """Samples decoded at a time, so that temporaries stay in the cache."""
 
 

@@ -19,6 +19,7 @@ from xplanes.pretraining.quick import model_pose, overlap, world_to_model
 from xplanes.pretraining.render import render_view
 from xplanes.pretraining.samples import view_cameras
 from xplanes.scenes.demo.film import camera_at, film
+from xplanes.scenes.demo.posed import Posed
 from xplanes.scenes.demo.scenes import DEMO_SCENES, build_demo_scene
 
 GRID = 48
@@ -26,6 +27,10 @@ GRID = 48
 
 TURNS = (40.0, 180.0, -90.0)
 """Degrees by which novel cameras of the demo scenes stand beside the fixed one."""
+
+
+RISE = 20.0
+"""Height angle of these cameras in degrees."""
 
 
 @dataclass(frozen=True)
@@ -58,16 +63,26 @@ def held_out(count: int) -> Iterator[Subject]:
 
 
 def demo_subjects(time: float = 0.4) -> Iterator[Subject]:
-    """The demo scenes at one moment, from their fixed cameras and from three beside it."""
+    """The demo scenes at one moment: from their fixed, level cameras, and from above these.
+
+    Novel cameras stand beside them, above the horizon.
+    """
     for name, scene in DEMO_SCENES.items():
         posed = build_demo_scene(name).pose(time)
-        cameras = [camera_at(scene.azimuth + turn, 0.0) for turn in (0.0, *TURNS)]
 
-        def picture(pose: Tensor, side: int, posed=posed) -> Tensor:
+        def picture(pose: Tensor, side: int, posed: Posed = posed) -> Tensor:
             rgba = torch.from_numpy(film(posed, pose, side)).float() / 255
             return rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
 
-        yield Subject(name, torch.stack(cameras), picture, lambda p, q=posed: q.inside(p.float()))
+        for rise in (0.0, RISE):
+            cameras = [camera_at(scene.azimuth, rise)]
+            cameras += [camera_at(scene.azimuth + turn, RISE) for turn in TURNS]
+            yield Subject(
+                name if rise == 0 else f"{name} from {RISE:g} degrees",
+                torch.stack(cameras),
+                picture,
+                lambda points, posed=posed: posed.inside(points.float()),
+            )
 
 
 @dataclass(frozen=True)
@@ -97,7 +112,7 @@ def score(model: LRM, subject: Subject) -> Score:
     solid = torch.cat(
         [
             triplane_logits(planes, model.decoder, part[None])[0, :, 0] > 1
-            for part in grid.split(2**15)
+            for part in grid.split(2**14)
         ]
     )
     world = grid @ torch.linalg.inv(turn).T
@@ -136,15 +151,15 @@ def score_all(
     scenes = [score(model, subject) for subject in demo_subjects()]
     means = {key: sum(s.values[key] for s in found) / len(found) for key in found[0].values}
     table = {f"{objects} held-out objects": means, **{s.name: s.values for s in scenes}}
-    announce(f"{'':24}" + "".join(f"{key:>12}" for key in means))
+    announce(f"{'':28}" + "".join(f"{key:>12}" for key in means))
     for name, values in table.items():
-        announce(f"{name:24}" + "".join(f"{value:12.3f}" for value in values.values()))
+        announce(f"{name:28}" + "".join(f"{value:12.3f}" for value in values.values()))
     write_json(
         folder / "scores.json", {"mean": table, "objects": {s.name: s.values for s in found}}
     )
     by_overlap = sorted(found, key=lambda s: s.values["iou"])
     write_sheet(folder / "objects.png", [s.strip for s in found[:16]], 2)
-    write_sheet(folder / "demo.png", [s.strip for s in scenes], 1)
+    write_sheet(folder / "demo.png", [s.strip for s in scenes], 2)
     write_sheet(folder / "failures.png", [s.strip for s in by_overlap[:6]], 2)
     return table
 

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from xplanes.config import ConfigError
 from xplanes.fields import Decoder
-from xplanes.optional import MissingExtraError
 from xplanes.preparation.tensor_file import read_content, write_content
 from xplanes.scenes.frame import Frame, check_frame, frame_content, read_frame
 
@@ -75,8 +74,6 @@ def load_triplanes(path: Path) -> TriplaneSequence:
         raise ConfigError(f"{path}: there is no such file; save_triplanes writes one")
     try:
         content = read_content(path)
-    except MissingExtraError:
-        raise
     except Exception as error:  # A damaged file fails in any of a dozen ways.
         # Its text advises to load the file as code.
         raise ConfigError(

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from xplanes.files import replacing
-from xplanes.optional import require
 
 MARK = "xplanes"
 """Key of what is not a tensor in the metadata of a safetensors file."""
@@ -25,18 +24,20 @@ def write_content(path: Path, content: dict[str, Any]) -> None:
         if path.suffix != ".safetensors":
             torch.save(content, temporary)
             return
-        save = require("safetensors.torch", extra="lrm").save_file
+        from safetensors.torch import save_file
+
         tensors, rest = _apart(content)
         tensors = {name: tensor.contiguous() for name, tensor in tensors.items()}
-        save(tensors, temporary, metadata={MARK: json.dumps(rest)})
+        save_file(tensors, temporary, metadata={MARK: json.dumps(rest)})
 
 
 def read_content(path: Path) -> Any:
     """Read what `write_content` wrote; whatever goes wrong is raised as it comes."""
     if path.suffix != ".safetensors":
         return torch.load(path, map_location="cpu", weights_only=True)
-    safetensors = require("safetensors", extra="lrm")
-    with safetensors.safe_open(path, "pt") as file:
+    from safetensors import safe_open
+
+    with safe_open(path, "pt") as file:
         content = json.loads((file.metadata() or {}).get(MARK, "{}"))
         for name in file.keys():  # noqa: SIM118, the file is no dict
             node = content

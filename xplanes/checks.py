@@ -85,6 +85,7 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "model.plane_set": ("six", "nine", "three"),
     "model.decoder.activation": ("relu", "silu"),
     "model.decoder.density": ("softplus", "exp"),
+    "lrm.precision": ("auto", "32", "bf16"),
     "lrm.matching": ("scale", "pad"),
     "preparation.fixed_view": ("auto", "video", "train"),
     "decomposition.method": ("adaptive", "growing", "admm", "exact"),

@@ -89,6 +89,7 @@ class ImageLRMConfig(LRMConfig):
     matching: str = MISSING  # Where focal lengths differ: scale, or pad the pictures (exact).
     crop: bool = MISSING  # Show the model the object at the size that it was trained with.
     batch: int = MISSING  # Pictures at a time.
+    precision: str = MISSING  # 32, bf16, or auto: bf16 where the hardware has it.
 
 
 @dataclass

@@ -94,3 +94,14 @@ def test_alpha_is_taken_out_of_colours():
     assert found[0, :, 0, 0].tolist() == [0, 0, 0, 0]
     straight[0, :3, 0, 0] = 0
     torch.testing.assert_close(found, straight, atol=0.01, rtol=0)
+
+
+def test_bfloat16_is_kept_apart_and_close(tmp_path):
+    model, frames, cache = model_of(), frames_of(3), StageCache(tmp_path)
+    crop = square_crop(*frames.shape[1:3])
+    exact = encode(model, "weights", frames, crop, cache, CPU, batch=2)
+    rough = encode(model, "weights", frames, crop, cache, CPU, batch=2, bf16=True)
+    assert rough.cached == 0
+    assert rough.triplanes.dtype == torch.float32
+    gap = (rough.triplanes - exact.triplanes).norm() / exact.triplanes.norm()
+    assert 0 < gap < 0.03

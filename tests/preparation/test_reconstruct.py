@@ -52,6 +52,7 @@ def settings(folder: Path, name: str, *overrides: str):
             *CHOICES[name],
             f"lrm.weights={path}",
             "preparation.frames=3",
+            "lrm.precision=32",
             *overrides,
         )
     )

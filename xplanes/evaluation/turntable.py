@@ -14,7 +14,7 @@ from xplanes.fields.xplanes import SPACE_PLANES
 from xplanes.lrm.model import LRM
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.encode import encode
-from xplanes.preparation.reconstruct import load_lrm, picture_crop
+from xplanes.preparation.reconstruct import load_lrm, picture_crop, wants_bf16
 from xplanes.preparation.sequence import TriplaneSequence, save_triplanes
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.renderer import DIAGONAL, Renderer
@@ -70,6 +70,7 @@ def write_triplanes(
         StageCache(None if folder is None else Path(folder)),
         device,
         batch=options.batch,
+        bf16=wants_bf16(options, device),
     )
     decoder = lrm.model.field_decoder()
     sequence = TriplaneSequence(encoded.triplanes, decoder.state_dict(), decoder.options)

@@ -39,6 +39,7 @@ def encode(
     device: torch.device,
     *,
     batch: int,
+    bf16: bool = False,
 ) -> Encoded:
     """Run the model on every distinct frame.
 
@@ -51,8 +52,9 @@ def encode(
         frames: Premultiplied RGBA. uint8 [T, H, W, 4]
         crop: What the model is shown of them.
         cache: Where triplanes are kept.
-        device: Where they are computed; in bfloat16 on a GPU.
+        device: Where they are computed.
         batch: Frames at a time.
+        bf16: Multiply in bfloat16.
     """
     places: dict[str, list[int]] = {}
     for number, frame in enumerate(frames):
@@ -61,7 +63,7 @@ def encode(
     found: dict[str, Tensor] = {}
     seconds, missing = 0.0, []
     for frame_key in places:
-        stage = cache.find("triplane", _inputs(key, frame_key, shown, device))
+        stage = cache.find("triplane", _inputs(key, frame_key, shown, device, bf16))
         if stage is None:
             missing.append(frame_key)
         else:
@@ -73,11 +75,11 @@ def encode(
         began = time.perf_counter()
         first = torch.tensor([places[frame_key][0] for frame_key in chunk])
         pictures = model.prepare(crop.apply(straight_alpha(frames[first])))
-        with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
+        with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
             planes = model.encode(pictures.to(device)).float().cpu()
         share = (time.perf_counter() - began) / len(chunk)
         for frame_key, triplane in zip(chunk, planes, strict=True):
-            inputs = _inputs(key, frame_key, shown, device)
+            inputs = _inputs(key, frame_key, shown, device, bf16)
             cache.keep("triplane", inputs, {"triplane": triplane.clone()}, share)
             found[frame_key] = triplane
             seconds += share
@@ -87,8 +89,10 @@ def encode(
     return Encoded(triplanes, len(places), cached, seconds)
 
 
-def _inputs(key: str, frame_key: str, shown: list[Any], device: torch.device) -> list[Any]:
-    return [key, frame_key, shown, device.type]
+def _inputs(
+    key: str, frame_key: str, shown: list[Any], device: torch.device, bf16: bool
+) -> list[Any]:
+    return [key, frame_key, shown, device.type, bf16]
 
 
 def straight_alpha(frames: Tensor) -> Tensor:

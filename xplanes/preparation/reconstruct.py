@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from xplanes.backend import fast_bf16
 from xplanes.config import (
     BundledLRMConfig,
     ImageLRMConfig,
@@ -137,7 +138,16 @@ def reconstruct(
     device = training_device(config.trainer.accelerator)
     frames = film.views.images
     say(f"lrm: {len(frames)} frames to triplanes")
-    encoded = encode(model, lrm.key, frames, alignment.crop, cache, device, batch=options.batch)
+    encoded = encode(
+        model,
+        lrm.key,
+        frames,
+        alignment.crop,
+        cache,
+        device,
+        batch=options.batch,
+        bf16=wants_bf16(options, device),
+    )
     # The cube is to hold the ball around all that the views show.
     offset = float((alignment.frame.centre - frame.centre).norm())
     wanted = alignment.frame.scale * (1 / frame.scale + offset)
@@ -172,6 +182,11 @@ def reconstruct(
         words=words,
         picture=film_sheet(frames, alignment.crop, model),
     )
+
+
+def wants_bf16(config: ImageLRMConfig, device: torch.device) -> bool:
+    """Whether the model multiplies in bfloat16."""
+    return config.precision == "bf16" or (config.precision == "auto" and fast_bf16(device))
 
 
 def place(film: FixedView, model: LRM, config: ImageLRMConfig) -> Alignment:

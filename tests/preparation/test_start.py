@@ -208,7 +208,7 @@ def test_one_triplane_is_the_space_planes(tmp_path: Path, caplog, moving):
     sequence = TriplaneSequence(moving_sequence(frames=1))
     with caplog.at_level(logging.WARNING):
         begun, module = start(tmp_path, sequence, "model.resolution=16", moving=moving)
-    assert ("the scene moves" in caplog.text) == moving
+    assert ("trains as a still one" in caplog.text) == moving
     assert module.field.time is None
     assert (begun.report, begun.pictures, begun.sparse) == ({}, {}, None)
     for index, name in enumerate(("xy", "xz", "yz")):

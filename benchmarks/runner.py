@@ -11,9 +11,8 @@ from typing import Any
 import torch
 from hydra import compose, initialize_config_dir
 
-from xplanes.config import register_schemas, to_plain
+from xplanes.config import CONF, register_schemas, to_plain
 from xplanes.files import read_rows
-from xplanes.launch import CONF
 from xplanes.pipeline import run
 
 RESULTS = Path(__file__).resolve().parent / "results"

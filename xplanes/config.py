@@ -1,6 +1,8 @@
 """Every setting, typed. The values live in conf/, one YAML group per thing a user varies."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
 from typing import Any
 
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -227,6 +229,32 @@ def register_schemas() -> None:
     store = ConfigStore.instance()
     for (group, name), schema in SCHEMAS.items():
         store.store(group=group, name=name, node=schema)
+
+
+CONF = Path(__file__).resolve().parent.parent / "conf"
+"""The configuration files."""
+
+
+def compose_plain(name: str, overrides: Sequence[str], conf: Path = CONF) -> dict[str, Any]:
+    """A configuration with some settings changed, resolved to builtins.
+
+    Args:
+        name: Its file in ``conf``, without ending.
+        overrides: ``key=value`` each.
+        conf: The configuration folder.
+
+    Raises:
+        ConfigError: For a key or option that does not exist, or a value of another type.
+    """
+    from hydra import compose, initialize_config_dir
+    from hydra.errors import HydraException
+
+    register_schemas()
+    try:
+        with initialize_config_dir(str(conf), version_base="1.3"):
+            return to_plain(compose(name, list(overrides)))
+    except HydraException as error:
+        raise ConfigError(f"{error}. All settings are in docs/configuration.md") from error
 
 
 def to_plain(config: DictConfig) -> dict[str, Any]:

@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from xplanes.checks import parse
-from xplanes.config import ConfigError, TrainConfig, register_schemas, to_plain
+from xplanes.config import CONF, ConfigError, TrainConfig, compose_plain, register_schemas
 from xplanes.files import read_json
 from xplanes.schemas.families import XPLANES_RATES
-
-CONF = Path(__file__).resolve().parent.parent / "conf"
 
 _OVERRIDE = re.compile(r"^(?P<mark>\+\+?|~)?(?P<key>[\w./@-]+)=(?P<value>.*)$", re.DOTALL)
 
@@ -95,16 +93,8 @@ def settings(overrides: list[str], conf: Path = CONF) -> TrainConfig:
     Raises:
         ConfigError: If a setting does not exist or cannot work.
     """
-    from hydra import compose, initialize_config_dir
-    from hydra.errors import HydraException
-
     check_keys(overrides, conf)
-    register_schemas()
-    try:
-        with initialize_config_dir(str(conf), version_base="1.3"):
-            return parse(to_plain(compose("train", overrides)))
-    except HydraException as error:
-        raise ConfigError(str(error)) from error
+    return parse(compose_plain("train", overrides, conf))
 
 
 def check_keys(arguments: list[str], conf: Path = CONF) -> None:

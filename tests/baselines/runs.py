@@ -5,8 +5,7 @@ from typing import Any
 
 from hydra import compose, initialize_config_dir
 
-from xplanes.config import register_schemas, to_plain
-from xplanes.launch import CONF
+from xplanes.config import CONF, register_schemas, to_plain
 
 SCENE = (
     "data.resolution=24",

@@ -4,10 +4,9 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from xplanes.checks import parse
-from xplanes.config import register_schemas, to_plain
+from xplanes.config import CONF, register_schemas, to_plain
 from xplanes.evaluation.sweep import RunRow
 from xplanes.evaluation.tabulate import differing
-from xplanes.launch import CONF
 
 PUBLISHED = {
     "kplanes": ("proposal", 4096, 30000),

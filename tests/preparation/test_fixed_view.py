@@ -10,11 +10,12 @@ import torch
 from tests.synthetic import ball_scene, ball_views, inside_ball
 from tests.training.runs import small_config
 from xplanes.checks import parse
+from xplanes.launch import settings as settings_of
 from xplanes.lrm.alignment import align
 from xplanes.lrm.canonical import OPENLRM_VIEW, TRIPOSR_VIEW
 from xplanes.preparation import fixed_view as module
 from xplanes.preparation.cache import StageCache
-from xplanes.preparation.fixed_view import FIELD, canonical_pose, fixed_view, pick_frames
+from xplanes.preparation.fixed_view import canonical_pose, filming_field, fixed_view, pick_frames
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, scene_frame
 
@@ -41,16 +42,8 @@ def film(config, scene, folder, size=24):
     return made, said
 
 
-def test_the_field_that_films_is_the_default_one(tmp_path: Path):
-    assert parse(small_config(tmp_path)).model.name == FIELD.name
-    from hydra import compose, initialize_config_dir
-
-    from xplanes.config import ModelConfig, build, to_plain
-    from xplanes.launch import CONF
-
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        default = to_plain(compose("train"))["model"]
-    assert build(ModelConfig, default) == FIELD
+def test_the_field_that_films_is_the_default_one():
+    assert filming_field() == settings_of([]).model
 
 
 @pytest.mark.parametrize("count", [1, 4, 9])

@@ -5,9 +5,10 @@ import dataclasses
 import pytest
 import torch
 
+from xplanes.config import CONF
 from xplanes.lrm.bundled import FOLDER, bundled_models, load_bundled
 from xplanes.lrm.config import parse_config
-from xplanes.pretraining.command import CONF, compose_pretraining
+from xplanes.pretraining.command import compose_pretraining
 from xplanes.pretraining.observe import FOCAL
 from xplanes.pretraining.score import held_out, score
 from xplanes.pretraining.settings import parse_pretraining, published_sizes

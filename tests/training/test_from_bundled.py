@@ -32,7 +32,7 @@ def curve(folder: Path, lrm: str, *overrides: str) -> list[float]:
 def test_the_default_start_is_a_model_of_the_package():
     from hydra import compose, initialize_config_dir
 
-    from xplanes.launch import CONF
+    from xplanes.config import CONF
 
     with initialize_config_dir(str(CONF), version_base="1.3"):
         assert compose("train").lrm.name in bundled_models()

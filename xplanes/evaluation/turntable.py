@@ -19,6 +19,7 @@ from xplanes.preparation.sequence import TriplaneSequence, save_triplanes
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.renderer import DIAGONAL, Renderer
 from xplanes.scenes.batches import step_generator
+from xplanes.scenes.cameras import camera_around
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import cube_frame
 from xplanes.scenes.images import load_images
@@ -123,6 +124,7 @@ def turntable(triplanes: Tensor, model: LRM, device: torch.device) -> Iterator[T
     frame = cube_frame(view.half_side, torch.zeros(3))
     decoder = model.field_decoder().requires_grad_(False)
     shown, field, renderer = -1, None, None
+    first = view.camera_to_world()[:2, 3].tolist()
     for number in range(FRAMES):
         index = number * len(triplanes) // FRAMES
         if index != shown:
@@ -134,12 +136,8 @@ def turntable(triplanes: Tensor, model: LRM, device: torch.device) -> Iterator[T
             renderer, shown = Renderer(grid, SAMPLES), index
         assert field is not None
         assert renderer is not None
-        turn = 2 * math.pi * number / FRAMES
-        spin = torch.eye(4)
-        spin[:2, :2] = torch.tensor(
-            [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
-        )
-        pose = spin @ view.camera_to_world().float()
+        azimuth = math.degrees(math.atan2(first[1], first[0])) + 360 * number / FRAMES
+        pose = camera_around(azimuth, 0.0, view.distance).float()
         yield from render_path(
             field,
             renderer,

@@ -11,44 +11,33 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from torch import Tensor
 
-from xplanes.config import DecoderConfig, ModelConfig, TrainConfig
+from xplanes.config import CONF, ModelConfig, TrainConfig, build
 from xplanes.lrm.canonical import CanonicalView
 from xplanes.preparation.cache import StageCache
-from xplanes.scenes.cameras import orbit
+from xplanes.scenes.cameras import camera_around
 from xplanes.scenes.datamodule import RayDataModule
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, frame_content
 from xplanes.scenes.views import Scene, Views, camera_rays
-from xplanes.training.builder import build_batches, build_module, is_still
+from xplanes.training.builder import build_batches, build_module
 from xplanes.training.fit import fit
 from xplanes.training.module import RadianceModule
 
-FIELD = ModelConfig(
-    name="six_planes",
-    plane_set="six",
-    resolution=64,
-    time_resolution=None,
-    channels=32,
-    space_scale=0.1,
-    time_scale=0.1,
-    decoder=DecoderConfig(
-        width=64,
-        hidden=3,
-        activation="relu",
-        density="softplus",
-        density_scale=25.0,
-        density_start=-2.0,
-        colour_margin=0.001,
-        freeze=False,
-    ),
-)
-"""The field that the video is rendered with; the run's own model would make ablations of it differ
-in their video too."""
-
 CHECKPOINT_EVERY = 250
 """Steps between checkpoints of that field."""
+
+
+def filming_field() -> ModelConfig:
+    """The field that the video is rendered with: the default one.
+
+    The run's own model would make ablations of it differ in their video too.
+    """
+    values = yaml.safe_load((CONF / "model" / "six_planes.yaml").read_text(encoding="utf-8"))
+    values.pop("defaults")
+    return build(ModelConfig, values)
 
 
 @dataclass(frozen=True)
@@ -98,7 +87,7 @@ def fixed_view(
             f"preparation.fixed_view=video: {scene.name} has no video of a fixed camera "
             "(transforms_video.json); set preparation.fixed_view=train"
         )
-    count = 1 if is_still(scene.splits["train"]) else options.frames
+    count = 1 if scene.splits["train"].is_still else options.frames
     if scene.video is not None and options.fixed_view != "train":
         views = pick_frames(scene.video, count)
         return FixedView(views, frame.centre, 0.0, f"{len(views)} frames of the scene's video")
@@ -156,16 +145,7 @@ def canonical_pose(
     radius = 1 / frame.scale
     held = min(view.half_side, view.distance * math.sin(math.atan(0.5 / view.focal)))
     distance = view.distance * radius / held
-    # An orbit begins on the -y side.
-    turn = math.radians(azimuth + 90)
-    pose = orbit(1, radius=distance, elevation=elevation)[0]
-    spin = torch.eye(4)
-    spin[:2, :2] = torch.tensor(
-        [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
-    )
-    pose = spin @ pose
-    pose[:3, 3] += frame.centre
-    return pose
+    return camera_around(azimuth, elevation, distance, frame.centre).float()
 
 
 def _rendered(
@@ -184,7 +164,7 @@ def _rendered(
     focal = view.focal * side
     trained = replace(
         config,
-        model=FIELD,
+        model=filming_field(),
         trainer=replace(
             config.trainer,
             devices=1,

@@ -3,7 +3,7 @@
 import hashlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -154,7 +154,7 @@ def reconstruct(
     # A camera before which nothing moves shows one moment, however often.
     moments = encoded.triplanes if encoded.distinct > 1 else encoded.triplanes[:1]
     triplanes, half_side = fit_cube(moments, alignment.half_side, wanted)
-    placed = alignment.frame
+    placed = replace(alignment, half_side=half_side)
     decoder = model.field_decoder(half_side)
     apart = alignment.mismatch
     report = {
@@ -162,7 +162,7 @@ def reconstruct(
         "frames": len(frames),
         "distinct": encoded.distinct,
         "cached": encoded.cached,
-        "scale": placed.scale,
+        "scale": placed.frame.scale,
         "half_side": half_side,
         "mismatch_pixels": {"largest": apart.largest, "mean": apart.mean},
     }
@@ -175,7 +175,7 @@ def reconstruct(
             triplanes,
             decoder=decoder.state_dict(),
             decoder_config=decoder.options,
-            frame=Frame(placed.scale / half_side, placed.rotation, placed.centre),
+            frame=placed.field_frame,
         ),
         seconds={"fixed_view": film.seconds, "lrm": lrm.seconds + encoded.seconds},
         report=report,

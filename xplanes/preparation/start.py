@@ -25,7 +25,7 @@ from xplanes.preparation.sequence import TriplaneSequence, load_triplanes
 from xplanes.preparation.stages import Parts, convert_stage, decompose_stage
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene, Views
-from xplanes.training.builder import is_still, time_rows, training_device
+from xplanes.training.builder import time_rows, training_device
 
 logger = logging.getLogger(__name__)
 
@@ -157,7 +157,7 @@ def start_from(
         seconds: Seconds of the stages that made it.
     """
     views = scene.splits["train"]
-    still = is_still(views)
+    still = views.is_still
     model = _settled(config, sequence, views, source=source)
     if len(sequence.triplanes) == 1 and not still:
         logger.warning(
@@ -192,7 +192,7 @@ def _settled(
     """The model's settings with what the sequence decides."""
     frames, _, channels = sequence.triplanes.shape[:3]
     model = replace(config.model, channels=channels)
-    if is_still(views) or frames == 1:
+    if views.is_still or frames == 1:
         model = replace(model, plane_set="three")
     if model.plane_set != "three":
         model = replace(model, time_resolution=model.time_resolution or time_rows(views.times))

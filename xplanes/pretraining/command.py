@@ -3,10 +3,8 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from xplanes.config import ConfigError, to_plain
+from xplanes.config import compose_plain
 from xplanes.pretraining.settings import PretrainConfig, parse_pretraining
-
-CONF = Path(__file__).resolve().parents[2] / "conf"
 
 
 def compose_pretraining(overrides: Sequence[str]) -> dict:
@@ -15,18 +13,10 @@ def compose_pretraining(overrides: Sequence[str]) -> dict:
     Raises:
         ConfigError: For a key or option that does not exist, or a value of another type.
     """
-    from hydra import compose, initialize_config_dir
     from hydra.core.config_store import ConfigStore
-    from hydra.errors import HydraException
 
     ConfigStore.instance().store(name="pretrain_schema", node=PretrainConfig)
-    try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            return to_plain(compose("pretrain_lrm", list(overrides)))
-    except HydraException as problem:
-        raise ConfigError(
-            f"{problem}. All settings are in docs/configuration.md, models in conf/pretrain/"
-        ) from problem
+    return compose_plain("pretrain_lrm", overrides)
 
 
 def run_pretraining(overrides: Sequence[str], announce: Callable[[str], None]) -> Path:

@@ -9,6 +9,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from xplanes.files import replacing, write_json
+from xplanes.lrm.bundled import CHECKSUM
 from xplanes.lrm.config import LRMConfig
 from xplanes.lrm.keys import NAMES
 from xplanes.lrm.openlrm import OpenLRM
@@ -31,7 +32,7 @@ def export(model: OpenLRM, config: dict[str, Any], folder: Path, name: str) -> P
     with replacing(path) as temporary:
         save_file(state, temporary)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    write_json(folder / f"{name}.json", {**config, "weights_sha256": digest})
+    write_json(folder / f"{name}.json", {**config, CHECKSUM: digest})
     return path
 
 

@@ -31,7 +31,6 @@ def carve(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
     points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).flip(-1)
     world = frame.to_world(points.reshape(-1, 3))
     radius = 3**0.5 / size / frame.scale
-    still = bool((views.times == views.times[0]).all())
     allowed = torch.empty(bins, size**3, dtype=torch.bool)
     likely = torch.empty_like(allowed)
     for start in range(0, size**3, CHUNK):
@@ -40,7 +39,7 @@ def carve(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
         joined = join_in_time(alone, views.times)
         for index, cover in enumerate(covers):
             likely[index, part] = joined[cover].any(dim=0)
-            allowed[index, part] = (joined if still else alone)[cover].any(dim=0)
+            allowed[index, part] = (joined if views.is_still else alone)[cover].any(dim=0)
     grid.allow(allowed)
     grid.presume(likely)
 

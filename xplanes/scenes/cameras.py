@@ -65,6 +65,29 @@ def look_at(position: Tensor, target: Tensor | None = None) -> Tensor:
     return pose
 
 
+def camera_around(
+    azimuth: float, elevation: float, distance: float, target: Tensor | None = None
+) -> Tensor:
+    """Pose of a camera that looks at ``target`` (the origin when None) from a direction.
+
+    Args:
+        azimuth: In degrees, from the world's x axis towards y.
+        elevation: Height angle above the horizontal plane, in degrees.
+        distance: From the target, in world units.
+        target: World point in the middle. [3]
+
+    Returns:
+        Camera-to-world matrix in double precision. [4, 4]
+    """
+    turn, rise = math.radians(azimuth), math.radians(elevation)
+    flat = math.cos(rise)
+    direction = [math.cos(turn) * flat, math.sin(turn) * flat, math.sin(rise)]
+    pose = look_at(distance * torch.tensor([direction], dtype=torch.float64))[0]
+    if target is not None:
+        pose[:3, 3] += target
+    return pose
+
+
 def orbit(count: int, *, radius: float, elevation: float, target: Tensor | None = None) -> Tensor:
     """Poses evenly spaced on a circle around ``target`` (the origin when None).
 

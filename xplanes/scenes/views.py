@@ -41,6 +41,11 @@ class Views:
         return self.images.shape[2]
 
     @property
+    def is_still(self) -> bool:
+        """Whether all views show one moment, so that nothing can move."""
+        return bool((self.times == self.times[0]).all())
+
+    @property
     def nbytes(self) -> int:
         """Bytes that the images take in memory."""
         return self.images.numel()

@@ -100,11 +100,6 @@ def decoder_precision(trainer: TrainerConfig) -> Precision:
     return "bf16" if trainer.precision == "bf16" else "32"
 
 
-def is_still(views: Views) -> bool:
-    """Whether all views show one moment, so that nothing can move."""
-    return bool((views.times == views.times[0]).all())
-
-
 def time_rows(times: Tensor) -> int:
     """Rows of time where the settings leave them open: one for two distinct times. [V]"""
     return max(2, math.ceil(len(times.unique()) / 2))
@@ -250,7 +245,7 @@ def _xplanes_method(
 
 
 def _occupancy_sampling(config: TrainConfig, site: Site, field: RadianceField) -> OccupancySampling:
-    renderer = build_renderer(config.sampler, still=is_still(site.views))
+    renderer = build_renderer(config.sampler, still=site.views.is_still)
     if config.sampler.silhouettes:
         carve(renderer.grid, site.views, site.frame)
     if site.begun and config.sampler.fill:

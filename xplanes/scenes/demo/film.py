@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from xplanes.scenes.cameras import focal_length, look_at, pixel_rays
+from xplanes.scenes.cameras import camera_around, focal_length, look_at, pixel_rays
 from xplanes.scenes.demo.posed import Posed
 
 CAMERA_ANGLE_X = 0.6911112070083618
@@ -59,6 +59,4 @@ def hemisphere_cameras(count: int, draw: random.Random) -> Tensor:
 
 def camera_at(azimuth: float, elevation: float) -> Tensor:
     """Camera in a direction given in degrees, azimuth from +x towards +y. [4, 4]"""
-    turn, rise = np.radians(azimuth), np.radians(elevation)
-    place = np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
-    return look_at(torch.from_numpy(place)[None] * CAMERA_DISTANCE)[0]
+    return camera_around(azimuth, elevation, CAMERA_DISTANCE)

@@ -5,7 +5,6 @@ import importlib
 import importlib.util
 import logging
 import os
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -48,12 +47,6 @@ def fast_bf16(device: torch.device) -> bool:
 def compiled(module: str) -> Any:
     """A module of compiled loops; loading the first takes a second, compiling a few more, once."""
     return importlib.import_module(module)
-
-
-def loops_on_disk() -> bool:
-    """Whether the compiled loops of an earlier process can be loaded instead of compiled."""
-    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parent)
-    return any(folder.rglob("cpu.gather-*.nbi"))
 
 
 def name(device: torch.device) -> str:

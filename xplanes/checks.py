@@ -5,6 +5,7 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 from xplanes.config import (
+    CONF,
     XPLANES,
     BundledLRMConfig,
     ConfigError,
@@ -133,6 +134,11 @@ def _check_preparation(config: TrainConfig) -> None:
     elevation = config.preparation.elevation
     if not -90 <= elevation <= 90:
         raise ConfigError(f"preparation.elevation={elevation}: must lie between -90 and 90")
+    models = sorted(path.stem for path in (CONF / "model").glob("*.yaml"))
+    if (filming := config.preparation.fixed_view_model) not in models:
+        raise ConfigError(
+            f"preparation.fixed_view_model={filming}: must be one of {', '.join(models)}"
+        )
     lrm = config.lrm
     if not isinstance(lrm, ImageLRMConfig):
         return

@@ -138,6 +138,7 @@ class PreparationConfig:
     cache: str | None = MISSING  # Folder for finished stages; null computes them anew.
     frames: int = MISSING  # Moments of the fixed view.
     fixed_view: str = MISSING  # The scene's video, train (a field films it), or auto.
+    fixed_view_model: str = MISSING  # The model that films it: a file of conf/model.
     fixed_view_seconds: float = MISSING  # Training clock of the field that films it.
     fixed_view_steps: int = MISSING  # Its steps at most.
     azimuth: float | None = MISSING  # Degrees from x towards y; null: along an axis.

@@ -7,15 +7,17 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.baselines.runs import KPLANES, PROPOSAL
 from tests.synthetic import ball_scene, ball_views, inside_ball
 from tests.training.runs import small_config
 from xplanes.checks import parse
+from xplanes.config import ConfigError, compose_plain
 from xplanes.launch import settings as settings_of
 from xplanes.lrm.alignment import align
 from xplanes.lrm.canonical import OPENLRM_VIEW, TRIPOSR_VIEW
 from xplanes.preparation import fixed_view as module
 from xplanes.preparation.cache import StageCache
-from xplanes.preparation.fixed_view import canonical_pose, filming_field, fixed_view, pick_frames
+from xplanes.preparation.fixed_view import canonical_pose, filming_settings, fixed_view, pick_frames
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, scene_frame
 
@@ -42,8 +44,48 @@ def film(config, scene, folder, size=24):
     return made, said
 
 
-def test_the_field_that_films_is_the_default_one():
-    assert filming_field() == settings_of([]).model
+def test_the_field_that_films_has_its_models_default_settings(tmp_path: Path):
+    own = settings(tmp_path, "model=nine_planes", "sampler.samples=16", "seed=3")
+    filming, default = filming_settings(own), settings_of([])
+    assert (filming.model, filming.sampler, filming.loss) == (
+        default.model,
+        default.sampler,
+        default.loss,
+    )
+    assert filming.seed == 3
+    assert filming.data == own.data
+    assert (filming.trainer.accelerator, filming.trainer.max_steps) == ("cpu", 60)
+
+
+def test_kplanes_film_as_published(tmp_path: Path):
+    filming = filming_settings(settings(tmp_path, "preparation.fixed_view_model=kplanes"))
+    published = settings_of(["model=kplanes"])
+    assert (filming.model, filming.sampler, filming.loss) == (
+        published.model,
+        published.sampler,
+        published.loss,
+    )
+    assert not filming.data.skip_background
+    assert filming.trainer.rays_per_batch == published.trainer.rays_per_batch
+
+
+def test_a_model_that_is_not_there_cannot_film(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"fixed_view_model=nerf: must be one of kplanes, "):
+        settings(tmp_path, "preparation.fixed_view_model=nerf")
+
+
+def test_kplanes_film_in_their_own_cube(tmp_path: Path, monkeypatch):
+    reduced = (*KPLANES, *PROPOSAL)
+    monkeypatch.setattr(
+        module, "compose_plain", lambda name, lines: compose_plain(name, [*lines, *reduced])
+    )
+    options = ("preparation.fixed_view_model=kplanes", "preparation.fixed_view_steps=200")
+    config = settings(tmp_path, *options)
+    made, said = film(config, ball_scene(count=12, size=24), tmp_path / "cache")
+    assert "training kplanes for" in said[0]
+    alpha = made.views.images[..., 3].float() / 255
+    # Coarse planes blur it.
+    assert alpha[:, 9:15, 9:15].mean() > 1.5 * alpha[:, :3, :3].mean() > 0
 
 
 @pytest.mark.parametrize("count", [1, 4, 9])

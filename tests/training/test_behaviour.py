@@ -2,6 +2,7 @@
 
 import csv
 import json
+import time
 from pathlib import Path
 
 import pytest
@@ -10,8 +11,10 @@ import torch
 from tests.training.runs import small_config
 from xplanes.config import ConfigError
 from xplanes.pipeline import run
+from xplanes.training import fit as fit_module
 from xplanes.training.clock import TrainingClock
 from xplanes.training.module import RadianceModule, TrainingError
+from xplanes.training.sampling.occupancy import OccupancySampling
 
 
 @pytest.fixture(scope="module")
@@ -221,3 +224,18 @@ def test_scene_of_one_moment_trains_without_planes_of_time(scenes: Path, tmp_pat
     run(still, tmp_path / "still", [], resume=False)
     state = torch.load(tmp_path / "still" / "checkpoints" / "last.ckpt", weights_only=True)
     assert "field.time" not in state["state_dict"]
+
+
+def test_a_slow_warm_up_says_what_it_does(
+    scenes: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    render = OccupancySampling.render
+
+    def slow(*args):
+        time.sleep(0.3)
+        return render(*args)
+
+    monkeypatch.setattr(fit_module, "PATIENCE", 0.05)
+    monkeypatch.setattr(OccupancySampling, "render", slow)
+    run(small_config(scenes, "trainer.max_steps=1"), tmp_path / "run", [], resume=False)
+    assert capsys.readouterr().out.count("compiling the CPU loops") == 1

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from torch import Tensor
 
-from xplanes.config import CONF, ModelConfig, TrainConfig, build
+from xplanes.checks import parse
+from xplanes.config import TrainConfig, compose_plain
 from xplanes.lrm.canonical import CanonicalView
 from xplanes.preparation.cache import StageCache
 from xplanes.scenes.cameras import camera_around
@@ -22,7 +22,7 @@ from xplanes.scenes.datamodule import RayDataModule
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, frame_content
 from xplanes.scenes.views import Scene, Views, camera_rays
-from xplanes.training.builder import build_batches, build_module
+from xplanes.training.builder import build_batches, build_frame, build_module
 from xplanes.training.fit import fit
 from xplanes.training.module import RadianceModule
 
@@ -30,14 +30,33 @@ CHECKPOINT_EVERY = 250
 """Steps between checkpoints of that field."""
 
 
-def filming_field() -> ModelConfig:
-    """The field that the video is rendered with: the default one.
+def filming_settings(config: TrainConfig) -> TrainConfig:
+    """How the field that films is trained: by its model's defaults, on the run's scene and device.
 
     The run's own model would make ablations of it differ in their video too.
+
+    Raises:
+        ConfigError: If there is no such model.
     """
-    values = yaml.safe_load((CONF / "model" / "six_planes.yaml").read_text(encoding="utf-8"))
-    values.pop("defaults")
-    return build(ModelConfig, values)
+    options, own = config.preparation, config.trainer
+    film = parse(compose_plain("train", [f"model={options.fixed_view_model}", "lrm=none"]))
+    return replace(
+        film,
+        seed=config.seed,
+        data=replace(config.data, skip_background=film.data.skip_background),
+        trainer=replace(
+            film.trainer,
+            accelerator=own.accelerator,
+            precision=own.precision,
+            deterministic=own.deterministic,
+            log_every=own.log_every,
+            max_seconds=options.fixed_view_seconds,
+            max_steps=options.fixed_view_steps,
+            checkpoint_every=CHECKPOINT_EVERY,
+            evaluate_at=[],
+            media=False,
+        ),
+    )
 
 
 @dataclass(frozen=True)
@@ -162,39 +181,32 @@ def _rendered(
     pose = canonical_pose(train, frame, view, azimuth=options.azimuth, elevation=options.elevation)
     side = min(size, max(train.height, train.width))
     focal = view.focal * side
-    trained = replace(
-        config,
-        model=filming_field(),
-        trainer=replace(
-            config.trainer,
-            devices=1,
-            strategy="auto",
-            max_seconds=options.fixed_view_seconds,
-            max_steps=options.fixed_view_steps,
-            checkpoint_every=CHECKPOINT_EVERY,
-            evaluate_at=[],
-            media=False,
-        ),
-    )
+    filming = filming_settings(config)
+    own_frame = build_frame(filming, train)
+    # Samplers may begin at a fixed distance. The model's camera stands nearer than those that the
+    # field was trained with, so its rays begin behind it.
+    away = (train.camera_to_world[:, :3, 3] - frame.centre).norm(dim=-1).mean()
+    back = float(away - (pose[:3, 3] - frame.centre).norm())
     inputs = [
         train.images,
         train.camera_to_world,
         train.times,
         train.focal,
-        frame_content(frame),
-        [asdict(part) for part in (trained.model, trained.sampler, trained.loss, trained.trainer)],
-        [config.seed, config.data.background_share, config.data.skip_background],
+        frame_content(own_frame),
+        [asdict(part) for part in (filming.model, filming.sampler, filming.loss, filming.trainer)],
+        [config.seed, filming.data.background_share, filming.data.skip_background],
         [pose, focal, side, count],
     ]
 
     def make() -> dict[str, Any]:
         say(
-            f"fixed view: training a field for {options.fixed_view_seconds:g} s to film "
-            f"{count} frames from where the model's camera stands"
+            f"fixed view: training {options.fixed_view_model} for "
+            f"{options.fixed_view_seconds:g} s to film {count} frames from where the LRM's camera "
+            "stands"
         )
         with cache.workshop("fixed_view", inputs) as folder:
-            module = _train(trained, scene, frame, folder)
-            return {"images": _film(module, frame, pose, focal, side, count)}
+            module = _train(filming, scene, own_frame, folder)
+            return {"images": _film(module, own_frame, pose, focal, side, count, back)}
 
     stage = cache.stage("fixed_view", inputs, make, alone=True)
     views = Views(
@@ -204,7 +216,10 @@ def _rendered(
         focal,
         tuple(f"fixed_{number:03d}.png" for number in range(count)),
     )
-    words = f"{count} frames filmed by a field trained for {options.fixed_view_seconds:g} s"
+    words = (
+        f"{count} frames filmed by {options.fixed_view_model} "
+        f"trained for {options.fixed_view_seconds:g} s"
+    )
     return FixedView(views, frame.centre, stage.seconds, words)
 
 
@@ -224,11 +239,18 @@ def _train(config: TrainConfig, scene: Scene, frame: Frame, folder: Path) -> Rad
 
 @torch.no_grad()
 def _film(
-    module: RadianceModule, frame: Frame, pose: Tensor, focal: float, side: int, count: int
+    module: RadianceModule,
+    frame: Frame,
+    pose: Tensor,
+    focal: float,
+    side: int,
+    count: int,
+    back: float,
 ) -> Tensor:
     """Frames at evenly spread moments, premultiplied. uint8 [T, side, side, 4]"""
     device = module.renderer.device
-    origins, directions = frame.rays(*camera_rays(pose, focal, side, side))
+    origins, directions = camera_rays(pose, focal, side, side)
+    origins, directions = frame.rays(origins - back * directions, directions)
     rays = origins.to(device), directions.to(device)
     frames = []
     for time in torch.linspace(0, 1, count).tolist():

@@ -1,13 +1,14 @@
 """Setting up Lightning's trainer and running it."""
 
 import logging
+import threading
 import warnings
 from pathlib import Path
 
 from lightning import Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from xplanes.backend import cpu_loops, loops_on_disk
+from xplanes.backend import cpu_loops
 from xplanes.config import TrainConfig
 from xplanes.scenes.datamodule import RayDataModule
 from xplanes.training.bar import StepBar
@@ -18,6 +19,9 @@ from xplanes.training.interrupt import Interrupt
 from xplanes.training.module import RadianceModule
 from xplanes.training.scalars import Scalars
 from xplanes.training.scorer import Scorer
+
+PATIENCE = 3.0
+"""Seconds of warming up after which the user is told what takes so long."""
 
 
 def fit(
@@ -84,12 +88,16 @@ def _warm_up(module: RadianceModule, data: RayDataModule) -> None:
     """Run all loops once on a few rays, so that compiling them is not on the training clock."""
     if not cpu_loops(next(module.field.parameters())):
         return
-    if not loops_on_disk():
-        print("compiling the CPU loops, once after installation: about 20 s ...", flush=True)
-    rays = {name: value[:8] for name, value in data.draw(0).items()}
-    rendering = module.sampling.render(module.field, rays, module.moment)
-    rendering.colour.sum().backward()
-    module.zero_grad(set_to_none=True)
+    words = "compiling the CPU loops, once after installation: about 20 s ..."
+    notice = threading.Timer(PATIENCE, print, [words], {"flush": True})
+    notice.start()
+    try:
+        rays = {name: value[:8] for name, value in data.draw(0).items()}
+        rendering = module.sampling.render(module.field, rays, module.moment)
+        rendering.colour.sum().backward()
+        module.zero_grad(set_to_none=True)
+    finally:
+        notice.cancel()
 
 
 def quiet_lightning() -> None:

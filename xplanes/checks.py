@@ -61,7 +61,7 @@ def parse(config: dict[str, Any]) -> TrainConfig:
 
 
 _POSITIVE = (
-    """data.resolution data.views data.half_side data.train_views data.test_views
+    """data.resolution data.views data.eval_views data.half_side data.train_views data.test_views
 data.val_views model.resolution model.time_resolution model.channels model.decoder.width
 model.decoder.density_scale sampler.samples sampler.grid_resolution sampler.time_bins
 sampler.threshold sampler.sweep_every sampler.update_every sampler.update_cells loss.every

@@ -26,6 +26,7 @@ class DataConfig:
     views: int | None = MISSING  # Training views kept, spread over time; null keeps all.
     train_on_video: bool = MISSING  # Train on the frames of the scene's fixed camera too.
     eval_split: str = MISSING  # Split that is scored: test or val.
+    eval_views: int | None = MISSING  # Views of it, spread over time; null takes all.
     half_side: float | None = MISSING  # Half the side of the scene's cube; null finds it.
     background_share: float = MISSING  # Share of rays drawn far from the silhouettes.
     skip_background: bool = MISSING  # Draw rays near the silhouettes more often than elsewhere.

@@ -1,6 +1,7 @@
 """What the choice of a baseline brings along, and who has the last word."""
 
 import pytest
+import yaml
 from hydra import compose, initialize_config_dir
 
 from xplanes.checks import parse
@@ -72,3 +73,30 @@ def test_tables_leave_out_what_follows_from_the_model():
     assert set(differing(rows)) == {"sampler.name", "model.name"}
     rows[2] = row(composed("model=tineuvox_s", "loss.background=random"), typed)
     assert set(differing(rows)) == {"sampler.name", "model.name", typed}
+
+
+ENTRIES = sorted(path.stem for path in (CONF / "entry").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
+def test_entries_of_comparisons_are_what_they_are_called(entry):
+    config = parse(composed(f"entry={entry}"))
+    start = "none" if config.lrm.name == "none" else config.lrm.name
+    extra = "_occupancy" if entry.endswith("_occupancy") else ""
+    planes = f"_{start}" if config.model.name in ("six_planes", "nine_planes") else ""
+    assert entry == f"{config.model.name}{extra}{planes}"
+    assert (config.sampler.name == "occupancy") >= bool(extra)
+
+
+@pytest.mark.parametrize("name", ["table1", "lego_models"])
+def test_comparisons_give_all_models_the_same(name):
+    text = yaml.safe_load((CONF / "experiment" / f"{name}.yaml").read_text())
+    entries = text["hydra"]["sweeper"]["params"]["entry"].split(",")
+    assert set(entries) <= set(ENTRIES)
+    lines = [f"experiment={name}", "data.scene=lego"]
+    found = [parse(composed(*lines, f"entry={entry}")) for entry in entries]
+    assert {c.trainer.max_seconds for c in found} == {text["trainer"]["max_seconds"]}
+    assert {c.trainer.max_steps for c in found} == {text["trainer"]["max_steps"]}
+    assert {(c.data.resolution, c.data.eval_split) for c in found} == {
+        (text["data"]["resolution"], text["data"]["eval_split"])
+    }

@@ -10,8 +10,9 @@ import pytest
 import yaml
 from PIL import Image
 
-from xplanes.config import ConfigError
+from xplanes.config import CONF, ConfigError
 from xplanes.evaluation.curves import _mean_curve
+from xplanes.evaluation.published import read_published
 from xplanes.evaluation.sweep import Point, read_rows
 from xplanes.evaluation.table import write_tables
 
@@ -259,3 +260,50 @@ def test_a_run_is_a_table_of_itself(trained_run):
     assert (row.name, row.status) == (trained_run.name, "finished")
     assert row.settings["model.name"] == "six_planes"
     assert {"psnr", "steps", "train_seconds", "parameters"} <= row.scores.keys()
+
+
+def dnerf(
+    folder: Path, scene: str, psnr: float, *, model: str = "kplanes", **settings: str
+) -> Path:
+    """A run of a published model on D-NeRF's data."""
+    run = make(folder, model=model, psnr=psnr)
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config["data"] |= {"name": "dnerf", "scene": scene, "resolution": 400}
+    config["sampler"] = {"name": settings.get("sampler", "proposal")}
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    return run
+
+
+def published_lines(folder: Path) -> list[list[str]]:
+    text = write_tables(folder).partition("beside published figures")[2]
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+
+
+def test_means_stand_beside_what_was_published(tmp_path: Path) -> None:
+    dnerf(tmp_path / "a", "lego", 24.0)
+    dnerf(tmp_path / "b", "hook", 27.0)
+    dnerf(tmp_path / "c", "lego", 25.0, model="six_planes", sampler="occupancy")
+    entries = [e for e in read_published() if (e["model"], e["sampler"]) == ("kplanes", "proposal")]
+    lines = published_lines(tmp_path)
+    assert len(entries) >= 1
+    assert [line[:5] for line in lines[:1]] == [["kplanes", "none", "proposal", "2", "25.50"]]
+    for line, entry in zip(lines, entries, strict=False):
+        assert line[6:] == [entry[n] for n in ("psnr", "ssim", "minutes", "scenes", "source")]
+    # Six planes at random were not published: their own figures stand alone.
+    assert lines[-1][:5] == ["six_planes", "none", "occupancy", "1", "25.00"]
+    assert set(lines[-1][6:]) == {""}
+
+
+def test_nothing_is_set_beside_other_data(tmp_path: Path) -> None:
+    make(tmp_path / "a", model="kplanes")
+    assert "published" not in write_tables(tmp_path)
+
+
+def test_published_figures_name_their_source_and_models_that_exist() -> None:
+    models = {path.stem for path in (CONF / "model").glob("*.yaml")}
+    for entry in read_published():
+        assert entry["source"]
+        assert entry["model"] in models
+        assert 10 < float(entry["psnr"]) < 50
+        assert not entry["ssim"] or 0.5 < float(entry["ssim"]) < 1

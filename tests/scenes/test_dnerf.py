@@ -58,8 +58,8 @@ class SceneFolder:
         text = json.dumps(self.contents[split])
         (self.path / f"transforms_{split}.json").write_text(text)
 
-    def read(self, resolution=None, splits=("train",), views=None):
-        return read_scene(self.path, resolution=resolution, splits=splits, views=views)
+    def read(self, resolution=None, splits=("train",), **counts):
+        return read_scene(self.path, resolution=resolution, splits=splits, **counts)
 
     def error(self, **arguments):
         with pytest.raises(SceneError) as caught:
@@ -264,10 +264,19 @@ def test_few_views_follow_time_rather_than_file_order(scene):
     assert sorted(scene.read(views=3).splits["train"].times.tolist()) == [0, 0.5, 1]
 
 
+def test_fewer_views_are_scored(scene):
+    scene.add("val", 3)
+    result = scene.read(splits=["train", "val"], eval_views=2)
+    assert len(result.splits["train"]) == 5
+    assert result.splits["val"].files == ("val/r_0.png", "val/r_2.png")
+
+
 @pytest.mark.parametrize("count", [0, -1, 6])
-def test_more_views_than_there_are(scene, count):
-    message = scene.error(views=count)
-    assert f"data.views={count}" in message
+@pytest.mark.parametrize(("key", "split"), [("views", "train"), ("eval_views", "val")])
+def test_more_views_than_there_are(scene, count, key, split):
+    scene.add("val", 5)
+    message = scene.error(splits=["train", "val"], **{key: count})
+    assert f"data.{key}={count}, but the {split} split" in message
     assert "1 to 5" in message
 
 

@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 
 from xplanes.config import ConfigError
 from xplanes.evaluation.curves import plot_curves
+from xplanes.evaluation.published import beside
 from xplanes.evaluation.sweep import RunRow, read_rows
 from xplanes.evaluation.tabulate import (
     SEED,
@@ -57,6 +58,8 @@ def write_tables(folder: Path, out: Path | None = None) -> str:
         write_rows(out / "table_seeds.csv", *seed_table(seeds, over, exact=True))
     else:
         (out / "table_seeds.csv").unlink(missing_ok=True)
+    if (published := beside(rows)) is not None:
+        text.append(published)
     if len(rows) > 1 and plot_curves(rows, names, out / "curves.png"):
         text.append("![PSNR against seconds and steps](curves.png)")
     whole = "\n\n".join(text) + "\n"

@@ -20,7 +20,12 @@ GET_DATA = (
 
 
 def read_scene(
-    folder: Path, *, resolution: int | None, splits: Sequence[str], views: int | None = None
+    folder: Path,
+    *,
+    resolution: int | None,
+    splits: Sequence[str],
+    views: int | None = None,
+    eval_views: int | None = None,
 ) -> Scene:
     """Read a scene and check all of it, so that nothing fails after training has begun.
 
@@ -30,6 +35,7 @@ def read_scene(
         splits: Names of the splits to read, such as train, val, test.
         views: Number of views to keep of the train split, spread evenly over time;
             None keeps all.
+        eval_views: The same for every other split.
 
     Returns:
         The scene, with ``video`` where transforms_video.json exists.
@@ -41,8 +47,12 @@ def read_scene(
     _check_folder(folder)
     paths = {split: _transforms_path(folder, split) for split in dict.fromkeys(splits)}
     listed = {split: read_transforms(path) for split, path in paths.items()}
-    if views is not None and "train" in listed:
-        listed["train"] = _spread(listed["train"], views, folder)
+    for split, transforms in listed.items():
+        key, count = ("views", views) if split == "train" else ("eval_views", eval_views)
+        if count is not None:
+            listed[split] = _spread(
+                transforms, count, f"data.{key}", f"the {split} split of {folder}"
+            )
     scene_views = {split: _load(transforms, resolution) for split, transforms in listed.items()}
     return Scene(folder.resolve().name, scene_views, video=_read_video(folder, resolution))
 
@@ -78,13 +88,13 @@ def _scenes_in(folder: Path) -> list[str]:
     return sorted(path.parent.name for path in folder.glob("*/transforms_train.json"))
 
 
-def _spread(transforms: Transforms, count: int, folder: Path) -> Transforms:
+def _spread(transforms: Transforms, count: int, key: str, split: str) -> Transforms:
     """Keep ``count`` frames at even ranks in time, the first and the last among them."""
     total = len(transforms.files)
     if not 1 <= count <= total:
         raise SceneError(
-            f"data.views={count}, but the train split of {folder} has {total} views. Give a "
-            f"number from 1 to {total}, or null for all."
+            f"{key}={count}, but {split} has {total} views. Give a number from 1 to "
+            f"{total}, or null for all."
         )
     by_time = transforms.times.argsort(stable=True).tolist()
     ranks = [round(i * (total - 1) / max(count - 1, 1)) for i in range(count)]

@@ -68,6 +68,7 @@ def build_scene(config: DataConfig, splits: tuple[str, ...] | None = None) -> Sc
         resolution=config.resolution,
         splits=splits or ("train", config.eval_split),
         views=config.views,
+        eval_views=config.eval_views,
     )
     parts = dict(scene.splits)
     if config.train_on_video and "train" in parts:

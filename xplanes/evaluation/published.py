@@ -1,0 +1,75 @@
+"""Published figures beside a sweep's own: read from a table that names their sources."""
+
+import csv
+import math
+from collections.abc import Sequence
+from importlib import resources
+
+from xplanes.evaluation.sweep import RunRow
+from xplanes.evaluation.tabulate import markdown
+
+FILE = "published.csv"
+KEYS = {"model": "model.name", "lrm": "lrm.name", "sampler": "sampler.name"}
+"""Columns of the file that a run must agree with, and its settings of that meaning."""
+
+HEADER = [
+    *KEYS,
+    "runs",
+    "psnr",
+    "ssim",
+    "published",
+    "published ssim",
+    "minutes",
+    "over",
+    "source",
+]
+
+
+def read_published() -> list[dict[str, str]]:
+    """The published figures: D-NeRF's data, test split, 400 pixels."""
+    with resources.files("xplanes.evaluation").joinpath(FILE).open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def beside(rows: Sequence[RunRow]) -> str | None:
+    """Means of a sweep's finished runs on D-NeRF's scenes beside what was published.
+
+    Args:
+        rows: The sweep.
+
+    Returns:
+        Words and a table in markdown; None where nothing was published of these models.
+    """
+    groups: dict[tuple[str, ...], list[RunRow]] = {}
+    for row in rows:
+        done = row.status == "finished" and {"psnr", "ssim"} <= row.scores.keys()
+        if done and row.settings.get("data.name") == "dnerf":
+            key = tuple(str(row.settings.get(name)) for name in KEYS.values())
+            groups.setdefault(key, []).append(row)
+    published: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    for entry in read_published():
+        published.setdefault(tuple(entry[name] for name in KEYS), []).append(entry)
+    if not groups.keys() & published.keys():
+        return None
+    lines = []
+    for key, runs in groups.items():
+        own = [*key, str(len(runs)), _mean(runs, "psnr", ".2f"), _mean(runs, "ssim", ".4f")]
+        for entry in published.get(key, [dict.fromkeys(("psnr", "ssim", "minutes"), "")]):
+            names = ("psnr", "ssim", "minutes", "scenes", "source")
+            lines.append([*own, *(entry.get(name, "") for name in names)])
+            own = [*key, "", "", ""]
+    used = [row for runs in groups.values() for row in runs]
+    return (
+        f"Means of these runs ({_values(used, 'data.scene')}; {_values(used, 'data.eval_split')} "
+        f"split, {_values(used, 'data.resolution')} px) beside published figures (test split, "
+        f"400 px), comparable only where scenes, split, pixels and budget are the same:\n\n"
+        f"{markdown(HEADER, lines)}"
+    )
+
+
+def _mean(runs: Sequence[RunRow], name: str, form: str) -> str:
+    return format(math.fsum(row.scores[name] for row in runs) / len(runs), form)
+
+
+def _values(rows: Sequence[RunRow], name: str) -> str:
+    return ", ".join(sorted({str(row.settings.get(name)) for row in rows}))

@@ -41,15 +41,48 @@ def test_all_cells_start_as_occupied():
     assert len(grid.density) == 2 * 4**3
 
 
-def test_presumed_cells_are_empty_until_something_shows():
+def presumed(*cells):
+    """A grid of 2 x 4^3 cells of which all but these are presumed empty."""
     grid = grid_of()
-    occupied = torch.zeros(128, dtype=torch.bool)
-    occupied[5] = True
-    grid.presume(occupied.view(2, 4, 4, 4))
+    likely = torch.zeros(128, dtype=torch.bool)
+    likely[list(cells)] = True
+    grid.presume(likely.view(2, 4, 4, 4))
+    return grid
+
+
+def test_presumed_cells_are_empty_until_something_shows():
+    grid = presumed(5)
     assert grid.occupied.nonzero().tolist() == [[5]]
     assert grid.allowed.all()
     grid.observe(torch.tensor([7]), torch.tensor([100.0]))
     assert grid.occupied.nonzero()[:, 0].tolist() == [5, 7]
+
+
+def test_presumed_cells_fill_from_their_occupied_neighbours_on():
+    # The corner (3, 0, 0) of the first time bin: its neighbours are 2, 7 and 19. The next cell in
+    # memory, 4, lies across the grid, and 64 + 3 in the other bin.
+    grid = presumed(3)
+    looked = []
+
+    def field(points, times):
+        looked.append(cells_of(grid, points, times))
+        return constant(100.0)(points, times)
+
+    grid.update(field, 3000, generator())
+    assert set(torch.cat(looked).tolist()) == {2, 3, 7, 19}
+    assert grid.occupied.nonzero()[:, 0].tolist() == [2, 3, 7, 19]
+    for _ in range(8):
+        grid.update(constant(100.0), 3000, generator())
+    assert grid.occupied[:64].all()
+    assert not grid.occupied[64:].any()
+
+
+def test_likely_cells_fill_wherever_they_are():
+    grid = presumed(3, 60)
+    grid.density.zero_()
+    grid.occupied.zero_()
+    grid.update(constant(100.0), 3000, generator())
+    assert grid.occupied.nonzero()[:, 0].tolist() == [3, 60]
 
 
 @pytest.mark.parametrize("decay", [0.0, 0.5, 0.95])

@@ -15,8 +15,8 @@ def carve(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
     """Empty the grid's cells that the silhouettes of the training views show to be empty.
 
     What one view shows empty at its time is ruled out for good. What only views of neighbouring
-    times show together is presumed empty: it may have moved in between, so the grid may fill it
-    again.
+    times show together is presumed empty: things may have moved in between, so what is occupied
+    may grow into it.
 
     Args:
         grid: Changed in place.

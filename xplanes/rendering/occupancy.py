@@ -13,7 +13,8 @@ class OccupancyGrid(nn.Module):
 
     A cell is occupied while its density could stop more than ``threshold`` of the light over one
     sample step. Cells start as occupied and lose their density by ``decay`` at each look that does
-    not confirm it. Cells that are not ``allowed`` (silhouettes show them empty) never fill.
+    not confirm it. Cells that are not ``allowed`` (silhouettes show them empty) never fill, and
+    such that are not ``likely`` only from an occupied neighbour on.
 
     Args:
         resolution: Cells along each side.
@@ -26,6 +27,7 @@ class OccupancyGrid(nn.Module):
     density: Tensor
     occupied: Tensor
     allowed: Tensor
+    likely: Tensor
 
     def __init__(
         self,
@@ -43,6 +45,7 @@ class OccupancyGrid(nn.Module):
         self.opaque_density = OPAQUE / step
         cells = time_bins * resolution**3
         self.register_buffer("allowed", torch.ones(cells, dtype=torch.bool))
+        self.register_buffer("likely", torch.ones(cells, dtype=torch.bool))
         self.register_buffer("density", torch.full((cells,), 4 * self.empty_density))
         self.register_buffer("occupied", torch.ones(cells, dtype=torch.bool))
 
@@ -59,9 +62,13 @@ class OccupancyGrid(nn.Module):
         self.density.mul_(self.allowed)
         torch.gt(self.density, self.empty_density, out=self.occupied)
 
-    def presume(self, occupied: Tensor) -> None:
-        """Empty all other cells; they fill again where the field shows something. Like `allow`."""
-        self.density.mul_(occupied.reshape(-1))
+    def presume(self, likely: Tensor) -> None:
+        """Empty all other cells; they fill only where what is occupied grows into them.
+
+        Elsewhere an untrained field would fill the air. Like `allow`.
+        """
+        self.likely.logical_and_(likely.reshape(-1))
+        self.density.mul_(self.likely)
         torch.gt(self.density, self.empty_density, out=self.occupied)
 
     @property
@@ -124,8 +131,21 @@ class OccupancyGrid(nn.Module):
             return
         pick = torch.randint(len(candidates), (count,), generator=generator).to(device)
         cells = candidates[pick]
-        points, times = self.draw(cells, torch.rand(count, 4, generator=generator).to(device))
+        cells = cells[self.likely[cells] | self._beside_occupied(cells)]
+        uniform = torch.rand(count, 4, generator=generator).to(device)[: len(cells)]
+        points, times = self.draw(cells, uniform)
         self.observe(cells, field(points, times)[1])
+
+    def _beside_occupied(self, cells: Tensor) -> Tensor:
+        """Whether a cell or one that shares a face with it is occupied. bool [N]"""
+        size = self.resolution
+        found = self.occupied[cells]
+        for stride in (1, size, size**2):
+            place = torch.div(cells, stride, rounding_mode="floor") % size
+            below = torch.where(place > 0, cells - stride, cells)
+            above = torch.where(place < size - 1, cells + stride, cells)
+            found = found | self.occupied[below] | self.occupied[above]
+        return found
 
     def _usable(self, density: Tensor) -> Tensor:
         """Densities up to opaque in one step, so that a cell can empty; NaN shows nothing."""

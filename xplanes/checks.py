@@ -68,9 +68,9 @@ sampler.threshold sampler.sweep_every sampler.update_every sampler.update_cells 
 loss.sparse_frames decomposition.penalty decomposition.tolerance decomposition.max_iterations
 preparation.frames preparation.fixed_view_seconds
 preparation.fixed_view_steps lrm.megabytes lrm.batch trainer.devices
-trainer.max_steps trainer.max_seconds trainer.rays_per_batch trainer.samples_per_batch
-trainer.accumulate trainer.plane_lr trainer.time_lr trainer.decoder_lr trainer.checkpoint_every
-trainer.evaluate_views trainer.log_every""".split()
+trainer.max_steps trainer.max_seconds trainer.plateau trainer.rays_per_batch
+trainer.samples_per_batch trainer.accumulate trainer.plane_lr trainer.time_lr trainer.decoder_lr
+trainer.checkpoint_every trainer.evaluate_views trainer.log_every""".split()
     + families.POSITIVE
 )
 _NOT_NEGATIVE = (

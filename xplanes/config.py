@@ -170,6 +170,7 @@ class TrainerConfig:
     precision: str = MISSING  # Of the decoder: 32, bf16, or auto: bf16 where the hardware has it.
     max_steps: int = MISSING  # Steps at most.
     max_seconds: float | None = MISSING  # Training clock at most; null for no limit.
+    plateau: float | None = MISSING  # End when twice the steps gain fewer dB; null: never.
     rays_per_batch: int = MISSING  # Rays of a step at most.
     samples_per_batch: int = MISSING  # Samples of a step at most, on average.
     accumulate: int = MISSING  # Batches per optimiser step.

@@ -79,7 +79,9 @@ def summary(
             "empty": counts["empty"] / candidates,
             "occluded": counts["occluded"] / candidates,
             "background": background_skipped,
+            "budget": 0.0 if module.ending is None else 1 - module.spent,
         },
+        "converged": None if module.ending is None else module.ending[0],
         "steps_skipped": module.unusable,
         "parameters": sum(p.numel() for p in module.parameters()),
         "peak_memory_bytes": device_memory(module.device),
@@ -129,6 +131,13 @@ def closing(run: Path, config: TrainConfig, metrics: dict[str, Any]) -> str:
     more = f"trainer.max_steps={2 * metrics['step']}"
     if config.trainer.max_seconds is not None:
         more = f"trainer.max_seconds={2 * config.trainer.max_seconds:g}"
+    plateau = ""
+    if metrics["converged"] is not None:
+        more = "trainer.plateau=null"
+        plateau = (
+            f"; {100 * skipped['budget']:.0f}% of the budget, as training had converged at step "
+            f"{metrics['converged']}"
+        )
     prepare = sum(seconds["prepare"].values())
     return "\n".join(
         [
@@ -142,7 +151,7 @@ def closing(run: Path, config: TrainConfig, metrics: dict[str, Any]) -> str:
             f"skipped  {100 * skipped['empty']:.0f}% of samples in empty space, "
             f"{100 * skipped['occluded']:.0f}% behind surfaces, "
             f"{100 * skipped['background']:.0f}% of pixels as background; "
-            f"{metrics['samples_per_ray']:.1f} samples a ray remained",
+            f"{metrics['samples_per_ray']:.1f} samples a ray remained{plateau}",
             f"wrote    {run}",
             f"         metrics.json  curve.csv  checkpoints/last.ckpt  {metrics.get('media', '')}",
             f"next     tensorboard --logdir {run}",

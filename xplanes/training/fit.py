@@ -17,6 +17,7 @@ from xplanes.training.checkpoints import LAST, Checkpoints
 from xplanes.training.clock import TrainingClock
 from xplanes.training.interrupt import Interrupt
 from xplanes.training.module import RadianceModule
+from xplanes.training.plateau import PlateauStop
 from xplanes.training.scalars import Scalars
 from xplanes.training.scorer import Scorer
 
@@ -54,6 +55,7 @@ def fit(
         clock=clock,
         interrupt=interrupt,
     )
+    plateau = [] if options.plateau is None else [PlateauStop(options.plateau)]
     checkpoints = Checkpoints(run / "checkpoints", options.checkpoint_every, clock)
     bar = StepBar(options.max_steps, options.max_seconds, split)
     trainer = Trainer(
@@ -61,7 +63,15 @@ def fit(
         devices=options.devices,
         strategy=options.strategy,
         max_steps=options.max_steps,
-        callbacks=[clock, Scalars(options.log_every), scorer, checkpoints, bar, interrupt],
+        callbacks=[
+            clock,
+            *plateau,
+            Scalars(options.log_every),
+            scorer,
+            checkpoints,
+            bar,
+            interrupt,
+        ],
         logger=TensorBoardLogger(run, name="", version="tb"),
         enable_checkpointing=False,
         enable_progress_bar=False,

@@ -60,14 +60,29 @@ class RadianceModule(LightningModule):
         self.unusable_in_a_row = 0
         self.last: dict[str, float] = {}
         self.improved = False
+        self.ending: tuple[int, float, int] | None = None
+        """Step and progress at which training was told to end early, and the step of the end."""
 
     @property
-    def progress(self) -> float:
+    def spent(self) -> float:
         """Share of the budget that is spent: of steps or of the training clock, the larger."""
         share = self.global_step / self.options.max_steps
         if self.options.max_seconds is not None:
             share = max(share, self.clock / self.options.max_seconds)
         return min(1.0, share)
+
+    @property
+    def progress(self) -> float:
+        """Share of training that is done: of the budget, or of what is left of it."""
+        if self.ending is None:
+            return self.spent
+        begin, done, end = self.ending
+        share = (self.global_step - begin) / (end - begin)
+        return min(1.0, max(self.spent, done + (1 - done) * share))
+
+    def end_after(self, steps: int) -> None:
+        """Let training run out over ``steps``, or with its budget if that comes first."""
+        self.ending = (self.global_step, self.spent, self.global_step + steps)
 
     @property
     def stride(self) -> int:
@@ -162,6 +177,7 @@ class RadianceModule(LightningModule):
             "rays": self.rays,
             "counts": dict(self.counts),
             "unusable": self.unusable,
+            "ending": self.ending,
         }
         if self.origin is not None:
             checkpoint["origin"] = self.origin
@@ -171,3 +187,5 @@ class RadianceModule(LightningModule):
         self.batches, self.clock = progress["batches"], progress["clock"]
         self.rays, self.counts = progress["rays"], dict(progress["counts"])
         self.unusable = progress["unusable"]
+        # A run that goes on without the rule trains through its budget.
+        self.ending = None if self.options.plateau is None else progress["ending"]

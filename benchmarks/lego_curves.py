@@ -55,7 +55,7 @@ def plot(curves: dict[str, list[tuple[float, float]]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--lego", type=Path, default=Path("../shared/scenes/lego"))
     args = parser.parse_args()
     rows, points, curves = [], [], {}

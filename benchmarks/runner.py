@@ -3,6 +3,8 @@
 import json
 import os
 import platform
+import subprocess
+import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,3 +66,30 @@ def lego(folder: Path) -> list[str]:
         f"data.scene={folder.name}",
         "data.eval_split=val",
     ]
+
+
+def run_apart(overrides: list[str], folder: Path) -> Measured:
+    """Train in a process of its own, so that memory is the run's; a finished run is not repeated.
+
+    Args:
+        overrides: As on the command line.
+        folder: The run directory; one that was begun goes on where it stopped.
+
+    Raises:
+        RuntimeError: If the run fails.
+    """
+    if not (folder / "metrics.json").is_file():
+        begun = (folder / "run.json").is_file()
+        lines = [f"resume={folder}"] if begun else [*overrides, f"hydra.run.dir={folder}"]
+        done = subprocess.run(
+            [sys.executable, str(CONF.parent / "train.py"), *lines],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if done.returncode:
+            raise RuntimeError(
+                f"{folder.name} failed:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
+            )
+    metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    return Measured(metrics, read_rows(folder / "curve.csv"))

@@ -69,7 +69,7 @@ def train(scene: list[str], switches: tuple[str, ...], work: Path, args) -> Meas
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--lego", type=Path, default=Path("../shared/scenes/lego"))
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--resolution", type=int, default=100)

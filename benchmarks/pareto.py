@@ -1,0 +1,169 @@
+"""PSNR against seconds and memory: planes, starts, resolutions, samples, precision, baselines.
+
+    python benchmarks/pareto.py [--lego FOLDER] [--seconds 30] [--resolution 100] [--work FOLDER]
+
+Writes results/pareto.md, pareto.csv and pareto.png beside this file. Every run is a process of its
+own, with nothing else running; runs kept in the work folder are not repeated.
+"""
+
+import os
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import argparse
+from pathlib import Path
+
+from runner import RESULTS, Measured, lego, machine, markdown, run_apart
+
+from xplanes.files import replacing, write_rows, write_text
+
+SMALLER = ("recipe=none", "sampler=occupancy", "model.scales=[2]", "model.warmup_steps=50")
+"""K-Planes at a size that learns within a minute on a CPU."""
+
+CASES: dict[str, tuple[str, ...]] = {
+    "six, tiny (default)": (),
+    "six, random": ("lrm=none",),
+    "nine, tiny": ("model=nine_planes",),
+    "nine, random": ("model=nine_planes", "lrm=none"),
+    "six, random, 32 texels": ("lrm=none", "model.resolution=32"),
+    "six, random, 128 texels": ("lrm=none", "model.resolution=128"),
+    "six, random, 256 texels": ("lrm=none", "model.resolution=256"),
+    "six, random, 64 samples": ("lrm=none", "sampler.samples=64"),
+    "six, random, 256 samples": ("lrm=none", "sampler.samples=256"),
+    "six, random, float32": ("lrm=none", "trainer.precision=32"),
+    "six, random, bfloat16": ("lrm=none", "trainer.precision=bf16"),
+    "K-Planes, smaller, our grid": ("model=kplanes", *SMALLER),
+    "K-Planes": ("model=kplanes",),
+    "K-Planes, our grid": ("model=kplanes", "sampler=occupancy"),
+    "TiNeuVox-S": ("model=tineuvox_s",),
+    "Tensor4D, density": ("model=tensor4d_density",),
+}
+
+COLUMNS = (
+    "scene",
+    "run",
+    "front",
+    "psnr",
+    "ssim",
+    "prepare s",
+    "train s",
+    "steps",
+    "rays/s",
+    "samples a ray",
+    "parameters",
+    "peak MB",
+)
+
+
+def points(result: Measured) -> list[tuple[float, float]]:
+    """Seconds, preparation included, and PSNR along a run."""
+    prepared = sum(result.metrics["seconds"]["prepare"].values())
+    return [(prepared + float(row["seconds"]), float(row["psnr"])) for row in result.curve]
+
+
+def on_front(name: str, curves: dict[str, list[tuple[float, float]]]) -> bool:
+    """Whether a run was at some moment better than all others had been by then."""
+    others = [point for other, curve in curves.items() if other != name for point in curve]
+    return any(
+        all(other > second or value > best for other, best in others)
+        for second, value in curves[name]
+        if second > 0
+    )
+
+
+def plot(scenes: dict[str, dict[str, list[tuple[float, float]]]]) -> None:
+    """One panel per scene: runs on the front in colour, the others in grey."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, panels = pyplot.subplots(
+        1, len(scenes), figsize=(5.2 * len(scenes), 4.6), squeeze=False
+    )
+    for axes, (scene, curves) in zip(panels[0], scenes.items(), strict=True):
+        for name, curve in curves.items():
+            seen = [point for point in curve if point[0] > 0]
+            best = on_front(name, curves)
+            axes.plot(
+                *zip(*seen, strict=True),
+                marker="o",
+                markersize=3,
+                label=name if best or name == next(iter(curves)) else None,
+                **({} if best else {"color": "0.75", "linewidth": 0.8, "zorder": 0}),
+            )
+        axes.set_xscale("log")
+        axes.set(title=scene, xlabel="seconds, preparation included", ylabel="PSNR in dB")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=7, loc="lower right")
+    figure.suptitle(f"grey: never ahead of all others; {machine()}", fontsize=8)
+    figure.tight_layout()
+    with replacing(RESULTS / "pareto.png") as temporary:
+        figure.savefig(temporary, dpi=120, format="png")
+
+
+def line(scene: str, name: str, result: Measured, front: bool) -> tuple:
+    metrics = result.metrics
+    return (
+        scene,
+        name,
+        "yes" if front else "",
+        f"{metrics['test']['psnr']:.2f}",
+        f"{metrics['test']['ssim']:.4f}",
+        f"{sum(metrics['seconds']['prepare'].values()):.1f}",
+        f"{metrics['seconds']['train']:.1f}",
+        metrics["step"],
+        f"{metrics['rays_per_second'] / 1000:.1f}k",
+        f"{metrics['samples_per_ray']:.1f}",
+        f"{metrics['parameters'] / 1e6:.1f} M",
+        f"{metrics['peak_memory_bytes'] / 2**20:.0f}",
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--lego", type=Path, default=Path("../shared/scenes/lego"))
+    parser.add_argument("--seconds", type=float, default=30)
+    parser.add_argument("--resolution", type=int, default=100)
+    parser.add_argument("--work", type=Path, default=Path("outputs/benchmarks/pareto"))
+    args = parser.parse_args()
+    scenes = {"excavator": ["data.scene=excavator"], "balls": ["data.scene=balls"]}
+    if args.lego.is_dir():
+        scenes = {"lego": lego(args.lego.resolve())} | scenes
+    rows, curves = [], {}
+    for scene, overrides in scenes.items():
+        results = {}
+        for number, (name, case) in enumerate(CASES.items()):
+            common = [
+                f"data.resolution={args.resolution}",
+                f"trainer.max_seconds={args.seconds}",
+                "trainer.max_steps=1000000",
+                "trainer.accelerator=cpu",
+                "trainer.media=false",
+                "trainer.evaluate_views=4",
+                "data.eval_views=5",
+                # A stage taken from the cache would cost its run nothing.
+                "preparation.cache=null",
+            ]
+            folder = args.work / f"{scene}_{args.resolution}px_{args.seconds:g}s" / f"{number:02d}"
+            print(f"{scene}: {name}", flush=True)
+            results[name] = run_apart([*overrides, *common, *case], folder.absolute())
+        curves[scene] = {name: points(result) for name, result in results.items()}
+        rows += [line(scene, n, r, on_front(n, curves[scene])) for n, r in results.items()]
+    write_rows(RESULTS / "pareto.csv", COLUMNS, rows)
+    page = f"""# PSNR against seconds
+
+{args.seconds:g} s of training clock for each run, {args.resolution} px, five views of the test
+split (lego: val); {machine()}. Script: `benchmarks/pareto.py`. "front": at some moment better than
+every other run had been by then, preparation included. On the way four views are scored.
+
+![PSNR against seconds](pareto.png)
+
+{markdown(COLUMNS, rows)}
+"""
+    write_text(RESULTS / "pareto.md", page)
+    plot(curves)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""Seconds per frame against PSNR: image sizes and samples a ray, of one trained field.
+
+    python benchmarks/rendering.py [--lego FOLDER] [--seconds 60] [--work FOLDER]
+
+Writes results/rendering.md and rendering.csv beside this file.
+"""
+
+import os
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import argparse
+import statistics
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from runner import RESULTS, lego, machine, markdown, run_apart
+
+from xplanes.evaluation.runs import TrainedRun, load_run
+from xplanes.files import write_rows, write_text
+from xplanes.rendering.renderer import Renderer
+from xplanes.scenes.views import Views
+from xplanes.training.builder import build_scene
+from xplanes.training.scoring import mean, render_view, score_view
+
+SIZES = (100, 200, 400, 800)
+SAMPLES = (64, 128, 256)
+FRAMES = 3
+COLUMNS = ("pixels", "samples along the cube", "seconds a frame", "frames/s", "rays/s", "psnr")
+
+
+def views_at(run: TrainedRun, size: int) -> tuple[Views, bool]:
+    """Views of the scored split at a size, and whether true images of that size exist."""
+    whole = replace(run.config.data, resolution=None, eval_views=FRAMES)
+    native = build_scene(whole, (run.split,)).splits[run.split]
+    if size <= native.width:
+        scene = build_scene(replace(whole, resolution=size), (run.split,))
+        return scene.splits[run.split], True
+    blank = torch.zeros(FRAMES, size, size, 4, dtype=torch.uint8)
+    focal = native.focal * size / native.width
+    return replace(native, images=blank, focal=focal), False
+
+
+@torch.no_grad()
+def measure(run: TrainedRun, size: int, samples: int) -> tuple:
+    """One line of the table."""
+    renderer = run.module.renderer
+    assert isinstance(renderer, Renderer)
+    renderer = replace(renderer, samples=samples)
+    views, known = views_at(run, size)
+    parts = (run.module.field, renderer, run.frame, views)
+    background = run.scene.background
+    render_view(*parts, 0, background)
+    seconds = []
+    for index in range(FRAMES):
+        began = time.perf_counter()
+        render_view(*parts, index, background)
+        seconds.append(time.perf_counter() - began)
+    spent = statistics.median(seconds)
+    score = ""
+    if known:
+        score = f"{mean([score_view(*parts, i, background).psnr for i in range(FRAMES)]):.2f}"
+    return (
+        size,
+        samples,
+        f"{spent:.3f}",
+        f"{1 / spent:.1f}",
+        f"{size * size / spent / 1000:.0f}k",
+        score,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--lego", type=Path, default=Path("../shared/scenes/lego"))
+    parser.add_argument("--seconds", type=float, default=60)
+    parser.add_argument("--work", type=Path, default=Path("outputs/benchmarks/rendering"))
+    args = parser.parse_args()
+    name, scene = "lego (val)", lego(args.lego.resolve())
+    if not args.lego.is_dir():
+        name, scene = "excavator", ["data.scene=excavator", "data.resolution=400"]
+    else:
+        scene.append("data.resolution=200")
+    folder = (args.work / f"{args.seconds:g}s").absolute()
+    overrides = ["lrm=none", f"trainer.max_seconds={args.seconds:g}", "trainer.accelerator=cpu"]
+    run_apart([*scene, *overrides, "trainer.media=false"], folder)
+    run = load_run(folder)
+    rows = [measure(run, size, samples) for size in SIZES for samples in SAMPLES]
+    write_rows(RESULTS / "rendering.csv", COLUMNS, rows)
+    page = f"""# Rendering: seconds per frame against PSNR
+
+{name}, six planes at random trained for {args.seconds:g} s at
+{run.scene.splits["train"].width} px with 128 samples along the cube's diagonal; median of {FRAMES}
+views, PSNR their mean, blank where the scene has no images of that size; {machine()}. Script:
+`benchmarks/rendering.py`.
+
+{markdown(COLUMNS, rows)}
+"""
+    write_text(RESULTS / "rendering.md", page)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,124 @@
+"""Where a run's wall time goes, stage by stage, from the start of Python to its last line.
+
+    python benchmarks/where_time_goes.py [--name default] [key=value ...]
+
+Writes results/time_NAME.md beside this file. The functions of each stage are timed as they are
+called, without what they call in other stages; what no stage claims is shown too.
+"""
+
+import os
+import time
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import argparse
+import functools
+import importlib
+import tempfile
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+BEGAN = time.perf_counter()
+
+STAGES = (
+    ("scene", "xplanes.pipeline", "build_scene"),
+    ("preparation", "xplanes.pipeline", "prepare"),
+    ("preparation: weights", "xplanes.pipeline", "find_source"),
+    ("building the model", "xplanes.pipeline", "build_module"),
+    ("compiled loops and first call", "xplanes.training.fit", "_warm_up"),
+    ("drawing rays", "xplanes.scenes.batches", "RayBatches.draw"),
+    ("marching", "xplanes.rendering.renderer", "march"),
+    ("lookup", "xplanes.fields.cpu", "gather"),
+    ("lookup, backward", "xplanes.fields.cpu", "scatter_space"),
+    ("lookup, backward", "xplanes.fields.cpu", "scatter_time"),
+    ("lookup, backward", "xplanes.fields.cpu", "product_gradients"),
+    ("decoder", "xplanes.fields.decoder", "Decoder.forward"),
+    ("compositing", "xplanes.rendering.renderer", "composite"),
+    ("rest of forward", "xplanes.rendering.renderer", "Renderer.render"),
+    ("rest of backward", "xplanes.training.module", "RadianceModule.manual_backward"),
+    ("optimiser", "torch.optim", "Adam.step"),
+    ("regularisers", "xplanes.training.methods.xplanes", "XPlanesMethod.regularise"),
+    ("occupancy grid", "xplanes.training.sampling.occupancy", "OccupancySampling.keep_up"),
+    ("occupancy grid", "xplanes.training.sampling.occupancy", "OccupancySampling.observe"),
+    ("rest of the step", "xplanes.training.module", "RadianceModule.training_step"),
+    ("scoring", "xplanes.training.scorer", "Scorer._score"),
+    ("checkpoints", "xplanes.training.checkpoints", "Checkpoints.on_train_batch_end"),
+    ("checkpoints", "xplanes.training.checkpoints", "Checkpoints.finish"),
+    ("TensorBoard", "xplanes.training.scalars", "Scalars.on_train_batch_end"),
+    ("film", "xplanes.pipeline", "_film"),
+    ("Lightning's loop", "xplanes.pipeline", "fit"),
+)
+"""Name of the stage, module and function."""
+
+COLUMNS = ("stage", "seconds", "share", "calls")
+
+
+class Watch:
+    """Seconds that belong to each stage alone."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.calls: dict[str, int] = defaultdict(int)
+        self._inner = [0.0]
+
+    def watch(self, stage: str, module: str, path: str) -> None:
+        """Replace a function by one that is timed."""
+        owner: Any = importlib.import_module(module)
+        *parts, last = path.split(".")
+        for part in parts:
+            owner = getattr(owner, part)
+        function = getattr(owner, last)
+
+        @functools.wraps(function)
+        def timed(*args: Any, **options: Any) -> Any:
+            began = time.perf_counter()
+            self._inner.append(0.0)
+            try:
+                return function(*args, **options)
+            finally:
+                spent = time.perf_counter() - began
+                self.seconds[stage] += spent - self._inner.pop()
+                self.calls[stage] += 1
+                self._inner[-1] += spent
+
+        setattr(owner, last, timed)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--name", default="default")
+    parser.add_argument("overrides", nargs="*")
+    args = parser.parse_args()
+
+    from runner import RESULTS, machine, markdown, measure
+
+    from xplanes.files import write_text
+
+    watch = Watch()
+    for stage in STAGES:
+        watch.watch(*stage)
+    imported = time.perf_counter() - BEGAN
+    with tempfile.TemporaryDirectory() as work:
+        metrics = measure(args.overrides, Path(work)).metrics
+    whole = time.perf_counter() - BEGAN
+    found = {"imports": imported, **watch.seconds}
+    found["not accounted for"] = whole - sum(found.values())
+    rows = [
+        (name, f"{spent:.2f}", f"{100 * spent / whole:.1f}%", watch.calls.get(name, ""))
+        for name, spent in sorted(found.items(), key=lambda item: -item[1])
+    ]
+    page = f"""# Where the time goes: {args.name}
+
+`python train.py {" ".join(args.overrides)}`: {whole:.1f} s in all, {metrics["step"]} steps, PSNR
+{metrics["test"]["psnr"]:.2f}; {machine()}. Script: `benchmarks/where_time_goes.py`. Each stage
+without the stages that it calls.
+
+{markdown(COLUMNS, rows)}
+"""
+    write_text(RESULTS / f"time_{args.name}.md", page)
+    print(page)
+
+
+if __name__ == "__main__":
+    main()

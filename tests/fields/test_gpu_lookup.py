@@ -134,6 +134,7 @@ def test_half_precision_planes_are_added_up_in_float32(dtype):
         assert error.max() < torch.finfo(dtype).eps
 
 
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")  # The interpreter's, on purpose.
 def test_infinite_points_are_outside_and_nan_stays_nan():
     space, time = stacks("six", torch.float32)
     points = torch.zeros(6, 3)

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from xplanes.backend import compiled, cpu_loops, gpu_kernels, proven
+from xplanes.backend import compiled, cpu_loops, gpu_kernels, proven, waves
 
 Rows = tuple[tuple[int, int], ...]
 """For each space plane, the two time planes whose product is added to it."""
@@ -175,19 +175,14 @@ class _Kernels(torch.autograd.Function):
 def _kernels_hold(device: torch.device, dtype: torch.dtype, channels: int, rows: Rows) -> bool:
     """Whether the kernels prove themselves for such planes, gradients included."""
 
-    def waves(*shape: int) -> Tensor:
-        # Not random: a trial must leave the state of the generators alone.
-        count = torch.Size(shape).numel()
-        return torch.arange(count, device=device, dtype=torch.float32).mul(0.7).sin().view(shape)
-
     def attempt(function: Callable[..., Tensor], precision: torch.dtype) -> list[Tensor]:
-        stacks = [waves(3, 5, 5, channels)]
+        stacks = [waves(device, 3, 5, 5, channels)]
         if rows:
-            stacks.append(waves(len(time_plane_axes(rows)), 4, 7, channels))
+            stacks.append(waves(device, len(time_plane_axes(rows)), 4, 7, channels))
         leaves = [stack.to(dtype).to(precision).requires_grad_() for stack in stacks]
-        moving, points, times = leaves[1] if rows else None, waves(50, 3), waves(50)
+        moving, points, times = leaves[1] if rows else None, waves(device, 50, 3), waves(device, 50)
         value = function(leaves[0], moving, 1.4 * points, 0.5 + 0.6 * times, rows)
-        pull = waves(50, 3, channels).to(precision)
+        pull = waves(device, 50, 3, channels).to(precision)
         return [value, *torch.autograd.grad((value * pull).sum(), leaves)]
 
     exact = torch.promote_types(dtype, torch.float32)

@@ -1,8 +1,5 @@
 """Triton kernels of the plane lookup: on a GPU if there is one, else in triton's interpreter."""
 
-import os
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -255,41 +252,3 @@ def test_when_kernels_apply(monkeypatch):
         torch.use_deterministic_algorithms(False)
     monkeypatch.setenv("XPLANES_GPU_KERNELS", "0")
     assert not backend.gpu_kernels(on_gpu)
-
-
-COMPILE = """
-import sys
-import triton
-from triton.backends.compiler import GPUTarget
-from triton.compiler import ASTSource
-from xplanes.fields import gpu
-from xplanes.fields.lookup import time_plane_axes
-from xplanes.fields.xplanes import PLANE_SETS
-
-rows = PLANE_SETS["six"]
-constants = {"ROWS": rows, "AXES": tuple(time_plane_axes(rows)), **gpu.tiles(9, 40)[1]}
-for kernel, more in ((gpu.forward, {}), (gpu.backward, {"SPACE": True})):
-    known = {**constants, **more}
-    names = kernel.arg_names
-    kinds = {n: "i32" if n in gpu.SIZES else "*fp32" for n in names}
-    kinds.update(dict.fromkeys(known, "constexpr"))
-    aligned = {(i,): [["tt.divisibility", 16]] for i, n in enumerate(names) if kinds[n][0] == "*"}
-    fixed = {(names.index(n),): value for n, value in known.items()}
-    source = ASTSource(kernel, kinds, fixed, aligned)
-    text = triton.compile(source, target=GPUTarget("cuda", 90, 32)).asm["ptx"]
-    print(text.count("ld.global.v4"), text.count("add.v4.f32"))
-"""
-
-
-def test_the_compiler_takes_them_and_moves_four_numbers_at_once(tmp_path):
-    """Needs no GPU: up to the text of the assembler. The interpreter allows more than it does."""
-    if tuple(map(int, triton.__version__.split(".")[:2])) < (3, 4):
-        pytest.skip(f"triton {triton.__version__} wants another call")
-    environment = {**os.environ, "TRITON_INTERPRET": "0", "TRITON_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-c", COMPILE]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    forward, backward = (line.split() for line in done.stdout.splitlines())
-    # Four corners of three space planes and of three time planes, each once.
-    assert forward == ["24", "0"]
-    assert backward[1] == "24"

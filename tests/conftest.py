@@ -1,8 +1,14 @@
 """Lets every test import `tests.oracles`, from wherever pytest is started."""
 
+import os
 from pathlib import Path
 
 import pytest
+import torch
+
+if not torch.cuda.is_available():
+    # Triton reads this when it is imported, and torch imports triton where it is installed.
+    os.environ.setdefault("TRITON_INTERPRET", "1")
 
 
 @pytest.fixture(scope="session")

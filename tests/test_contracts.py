@@ -17,8 +17,8 @@ from hydra.errors import HydraException
 from tests.synthetic import ball_scene
 from xplanes import checks
 from xplanes.checks import parse
-from xplanes.config import SCHEMAS, ConfigError, register_schemas, to_plain
-from xplanes.launch import CONF, check_keys, prepare
+from xplanes.config import CONF, SCHEMAS, ConfigError, register_schemas, to_plain
+from xplanes.launch import check_keys, prepare
 from xplanes.scenes.frame import scene_frame
 from xplanes.training.builder import build_batches, build_frame, build_module
 
@@ -31,7 +31,7 @@ OPTIONS = sorted(
 )
 """Every option of every group that train.py knows; tests/pretraining looks after the other."""
 
-FILES_OF_KEYS = [o for o in OPTIONS if o[0] not in ("experiment", "recipe")]
+FILES_OF_KEYS = [o for o in OPTIONS if o[0] not in ("entry", "experiment", "recipe")]
 """Options that set one group; the others set keys of several."""
 
 COMPANIONS = {

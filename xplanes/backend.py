@@ -5,6 +5,7 @@ import importlib
 import importlib.util
 import logging
 import os
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -35,6 +36,73 @@ def cpu_loops(tensor: Tensor) -> bool:
     )
 
 
+@functools.cache
+def triton_found() -> bool:
+    """Whether triton is installed; says so once where it is not."""
+    if importlib.util.find_spec("triton") is None:
+        logger.warning(
+            "triton is not installed: the GPU takes the plain torch path, which is slower. "
+            "`pip install triton` brings it (torch for CUDA on Linux comes with it)."
+        )
+        return False
+    return True
+
+
+def gpu_kernels(tensor: Tensor) -> bool:
+    """Whether Triton kernels apply to ``tensor``: on CUDA, where results may vary in the last bits.
+
+    Which of several threads adds first to a gradient is chance, so the kernels stay out of runs
+    that must be deterministic.
+    """
+    return (
+        tensor.device.type == "cuda"
+        and os.environ.get("XPLANES_GPU_KERNELS", "1") != "0"
+        and not torch.are_deterministic_algorithms_enabled()
+        and triton_found()
+    )
+
+
+def waves(device: torch.device, *shape: int) -> Tensor:
+    """Numbers from -1 to 1 for a trial, which must leave all random generators alone."""
+    count = torch.arange(torch.Size(shape).numel(), device=device, dtype=torch.float32)
+    return count.mul(0.7).sin().view(shape)
+
+
+def proven(
+    what: str,
+    kernels: Callable[[], Sequence[Tensor]],
+    plain: Callable[[], Sequence[Tensor]],
+    tolerance: float = 1e-4,
+) -> bool:
+    """Whether kernels compile, run and come to the numbers of their readable twin.
+
+    Says so where they do not. Callers keep the answer: the trial compiles and waits for the device.
+
+    Args:
+        what: Name of the work, for the message.
+        kernels: Runs them on a small input; returns values and gradients.
+        plain: Runs the twin.
+        tolerance: Largest difference, relative or absolute.
+    """
+    try:
+        with torch.inference_mode(False), torch.enable_grad():
+            for ours, theirs in zip(kernels(), plain(), strict=True):
+                torch.testing.assert_close(
+                    ours, theirs, atol=tolerance, rtol=tolerance, check_dtype=False
+                )
+    except Exception as error:
+        # Whatever keeps a compiler from working is no reason to fail: there is another way.
+        logger.warning(
+            "the Triton kernels for %s are not used: %s: %s. Plain torch does the same, slower; "
+            "XPLANES_GPU_KERNELS=0 hides this message.",
+            what,
+            type(error).__name__,
+            str(error).strip().split("\n")[0] or "no reason given",
+        )
+        return False
+    return True
+
+
 def fast_bf16(device: torch.device) -> bool:
     """Whether a device multiplies bfloat16 matrices faster than float32 ones, in hardware."""
     if device.type == "cuda":
@@ -51,4 +119,7 @@ def compiled(module: str) -> Any:
 
 def name(device: torch.device) -> str:
     """Name of the inner loops on a device, for the header of a run."""
-    return "compiled loops" if cpu_loops(torch.empty(0, device=device)) else "torch"
+    probe = torch.empty(0, device=device)
+    if gpu_kernels(probe):
+        return "Triton kernels"
+    return "compiled loops" if cpu_loops(probe) else "torch"

@@ -238,4 +238,4 @@ def test_a_slow_warm_up_says_what_it_does(
     monkeypatch.setattr(fit_module, "PATIENCE", 0.05)
     monkeypatch.setattr(OccupancySampling, "render", slow)
     run(small_config(scenes, "trainer.max_steps=1"), tmp_path / "run", [], resume=False)
-    assert capsys.readouterr().out.count("compiling the CPU loops") == 1
+    assert capsys.readouterr().out.count("compiling the inner loops") == 1

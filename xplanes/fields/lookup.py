@@ -8,6 +8,8 @@ Space axes follow the LRMs' convention: coordinates from -1 to 1 run over the wh
 (t = 0) to the last (t = 1), so that with as many rows as frames each frame owns one.
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -15,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from xplanes.backend import compiled, cpu_loops
+from xplanes.backend import compiled, cpu_loops, gpu_kernels, proven, waves
 
 Rows = tuple[tuple[int, int], ...]
 """For each space plane, the two time planes whose product is added to it."""
@@ -38,8 +40,8 @@ def plane_features(
 ) -> Tensor:
     """Features of Eq. 15: each space plane plus the product of its two time planes.
 
-    Gradients reach the planes only. On the CPU compiled loops do the work, elsewhere
-    `plane_features_reference`.
+    Gradients reach the planes only. On the CPU compiled loops do the work, on CUDA Triton kernels
+    where they prove themselves, elsewhere `plane_features_reference`.
 
     Args:
         space: Planes xy, xz, yz. [3, H, H, C]
@@ -55,6 +57,10 @@ def plane_features(
     """
     if cpu_loops(space):
         return _Features.apply(space, time, points, times, rows)  # type: ignore[return-value]
+    if gpu_kernels(space) and _kernels_hold(
+        space.device, space.dtype, space.shape[3], rows if time is not None else ()
+    ):
+        return plane_features_gpu(space, time, points, times, rows)
     return plane_features_reference(space, time, points, times, rows)
 
 
@@ -80,6 +86,16 @@ def plane_features_reference(
         factors = [sample(p, points[:, axis], line) for p, axis in zip(time, axes, strict=True)]
         features = [f + factors[a] * factors[b] for f, (a, b) in zip(features, rows, strict=True)]
     return torch.stack(features, dim=1)
+
+
+def plane_features_gpu(
+    space: Tensor, time: Tensor | None, points: Tensor, times: Tensor, rows: Rows
+) -> Tensor:
+    """The same as `plane_features`, in Triton kernels: one for the values, one for the gradients.
+
+    Planes of half precision are read and added up in float32.
+    """
+    return _Kernels.apply(space, time, points, times, rows)  # type: ignore[return-value]
 
 
 class _Features(torch.autograd.Function):
@@ -118,6 +134,64 @@ class _Features(torch.autograd.Function):
             cpu.product_gradients(*_arrays(pairs, gradient, factors, spread))
             cpu.scatter_time(*_arrays(points, times, axes, spread, time))
         return space, time, None, None, None
+
+
+class _Kernels(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, space: Tensor, time: Tensor | None, points: Tensor, times: Tensor, rows: Rows
+    ) -> Tensor:
+        exact = torch.promote_types(space.dtype, torch.float32)
+        points, times = points.to(exact).contiguous(), times.to(exact).contiguous()
+        space, time = space.contiguous(), None if time is None else time.contiguous()
+        axes = () if time is None else tuple(time_plane_axes(rows))
+        features = space.new_empty(len(points), 3, space.shape[3])
+        if len(points):
+            gpu = compiled("xplanes.fields.gpu")
+            gpu.gather(space, time, points, times, rows, axes, features)
+        ctx.save_for_backward(time, points, times)
+        ctx.space, ctx.rows, ctx.axes = (space.shape, space.dtype), rows, axes
+        return features
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        time, points, times = ctx.saved_tensors
+        (shape, dtype), rows, axes = ctx.space, ctx.rows, ctx.axes
+        gradient = gradients[0].to(points.dtype).contiguous()
+        of_space = gradient.new_zeros(shape) if ctx.needs_input_grad[0] else None
+        of_time = gradient.new_zeros(time.shape) if ctx.needs_input_grad[1] else None
+        if len(points):
+            gpu = compiled("xplanes.fields.gpu")
+            gpu.scatter(shape[1], time, points, times, rows, axes, gradient, of_space, of_time)
+        of_space = None if of_space is None else of_space.to(dtype)
+        of_time = None if of_time is None else of_time.to(time.dtype)
+        return of_space, of_time, None, None, None
+
+
+@functools.cache
+def _kernels_hold(device: torch.device, dtype: torch.dtype, channels: int, rows: Rows) -> bool:
+    """Whether the kernels prove themselves for such planes, gradients included."""
+
+    def attempt(function: Callable[..., Tensor], precision: torch.dtype) -> list[Tensor]:
+        stacks = [waves(device, 3, 5, 5, channels)]
+        if rows:
+            stacks.append(waves(device, len(time_plane_axes(rows)), 4, 7, channels))
+        leaves = [stack.to(dtype).to(precision).requires_grad_() for stack in stacks]
+        moving, points, times = leaves[1] if rows else None, waves(device, 50, 3), waves(device, 50)
+        value = function(leaves[0], moving, 1.4 * points, 0.5 + 0.6 * times, rows)
+        pull = waves(device, 50, 3, channels).to(precision)
+        return [value, *torch.autograd.grad((value * pull).sum(), leaves)]
+
+    exact = torch.promote_types(dtype, torch.float32)
+    return proven(
+        f"plane lookup ({channels} channels, {dtype})",
+        lambda: [found.to(exact) for found in attempt(plane_features_gpu, dtype)],
+        lambda: attempt(plane_features_reference, exact),
+        1e-4 if dtype == exact else 0.05,
+    )
 
 
 def _arrays(*tensors: Tensor) -> tuple[Any, ...]:

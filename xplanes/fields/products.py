@@ -1,6 +1,7 @@
 """Products of feature planes at several scales: what K-Planes reads from."""
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -8,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from xplanes.backend import compiled, cpu_loops
+from xplanes.backend import compiled, cpu_loops, gpu_kernels, proven, waves
 
 AXES = "xyzt"
 
@@ -93,8 +94,8 @@ class PlaneProducts(nn.Module):
 def plane_product(planes: Sequence[Tensor], places: Tensor, names: Sequence[str]) -> Tensor:
     """What planes hold at places, multiplied channel by channel.
 
-    Gradients reach the planes only. On the CPU compiled loops do the work, elsewhere
-    `plane_product_reference`.
+    Gradients reach the planes only. On the CPU compiled loops do the work, on CUDA Triton kernels
+    where they prove themselves, elsewhere `plane_product_reference`.
 
     Args:
         planes: Plane "ab" has axis a along its columns. [1, C, rows, columns] each
@@ -110,6 +111,11 @@ def plane_product(planes: Sequence[Tensor], places: Tensor, names: Sequence[str]
         axes = torch.tensor([[AXES.index(axis) for axis in name] for name in names])
         places = places.detach().to(planes[0].dtype).contiguous()
         return _Product.apply(places, axes, *planes)  # type: ignore[return-value]
+    first = planes[0]
+    if gpu_kernels(first) and _kernels_hold(
+        first.device, first.dtype, first.shape[1], tuple(names)
+    ):
+        return plane_product_gpu(planes, places, names)
     return plane_product_reference(planes, places, names)
 
 
@@ -119,9 +125,17 @@ def plane_product_reference(
     """The same as `plane_product`, written for reading: one ``grid_sample`` per plane."""
     product = torch.ones((), device=places.device)
     for plane, (column, row) in zip(planes, names, strict=True):
-        grid = places[:, [AXES.index(column), AXES.index(row)]][None, None].to(plane.dtype)
+        # Columns one by one: a list of numbers would be sent to the device and waited for.
+        grid = torch.stack([places[:, AXES.index(axis)] for axis in (column, row)], dim=1)
+        grid = grid[None, None].to(plane.dtype)
         product = product * F.grid_sample(plane, grid, padding_mode="border", align_corners=True)
     return product[0, :, 0].T
+
+
+def plane_product_gpu(planes: Sequence[Tensor], places: Tensor, names: Sequence[str]) -> Tensor:
+    """The same as `plane_product`, in Triton kernels: one for the values, one for the gradients."""
+    axes = tuple((AXES.index(column), AXES.index(row)) for column, row in names)
+    return _Kernels.apply(places, axes, *planes)  # type: ignore[return-value]
 
 
 class _Product(torch.autograd.Function):
@@ -153,6 +167,73 @@ class _Product(torch.autograd.Function):
         return None, None, *found
 
 
+class _Kernels(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, places: Tensor, axes: tuple[tuple[int, int], ...], *planes: Tensor
+    ) -> Tensor:
+        first = planes[0]
+        places = places.to(torch.promote_types(first.dtype, torch.float32)).contiguous()
+        product = first.new_empty(len(places), first.shape[1])
+        if len(places):
+            gpu = compiled("xplanes.fields.gpu_products")
+            gpu.multiply(tuple(_rows(plane) for plane in planes), places, axes, product)
+        ctx.save_for_backward(places, *planes)
+        ctx.axes = axes
+        return product
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        places, *planes = ctx.saved_tensors
+        channels_last = torch.channels_last
+        found = [
+            torch.zeros_like(plane, dtype=places.dtype, memory_format=channels_last)
+            for plane in planes
+        ]
+        if len(places):
+            compiled("xplanes.fields.gpu_products").multiply_backward(
+                tuple(_rows(plane) for plane in planes),
+                places,
+                ctx.axes,
+                gradients[0].to(places.dtype).contiguous(),
+                tuple(_rows(plane) for plane in found),
+            )
+        return None, None, *(g.to(plane.dtype) for g, plane in zip(found, planes, strict=True))
+
+
+@functools.cache
+def _kernels_hold(
+    device: torch.device, dtype: torch.dtype, channels: int, names: tuple[str, ...]
+) -> bool:
+    """Whether the kernels prove themselves for such planes, gradients included."""
+
+    def attempt(function: Callable[..., Tensor], precision: torch.dtype) -> list[Tensor]:
+        planes = [
+            waves(device, 1, channels, 4 if "t" in name else 5, 5).to(dtype).to(precision)
+            for name in names
+        ]
+        planes = [plane.requires_grad_() for plane in planes]
+        value = function(planes, 1.2 * waves(device, 50, 4), names)
+        pull = waves(device, 50, channels).to(precision)
+        return [value, *torch.autograd.grad((value * pull).sum(), planes)]
+
+    exact = torch.promote_types(dtype, torch.float32)
+    return proven(
+        f"products of planes ({channels} channels, {dtype})",
+        lambda: [found.to(exact) for found in attempt(plane_product_gpu, dtype)],
+        lambda: attempt(plane_product_reference, exact),
+        1e-4 if dtype == exact else 0.05,
+    )
+
+
+def _rows(plane: Tensor) -> Tensor:
+    """A plane with its channels last. [1, C, rows, columns] -> [rows, columns, C]"""
+    return plane.detach()[0].permute(1, 2, 0).contiguous()
+
+
 def _array(plane: Tensor) -> Any:
     """A plane with its channels last, for loops. [1, C, rows, columns] -> [rows, columns, C]"""
-    return plane.detach()[0].permute(1, 2, 0).contiguous().numpy()
+    return _rows(plane).numpy()

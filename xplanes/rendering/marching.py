@@ -122,8 +122,8 @@ def march_reference(
 
 def _starts(ray: Tensor, rays: int) -> Tensor:
     """Index of each ray's first sample. [N] -> [rays]"""
-    counts = torch.bincount(ray, minlength=rays)
-    return counts.cumsum(0) - counts
+    # Unlike counting, looking up in what is sorted needs no word from the device on its size.
+    return torch.searchsorted(ray, torch.arange(rays, device=ray.device))
 
 
 def _march_cpu(

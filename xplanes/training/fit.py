@@ -5,6 +5,7 @@ import threading
 import warnings
 from pathlib import Path
 
+import torch
 from lightning import Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 
@@ -80,7 +81,7 @@ def fit(
         log_every_n_steps=10**9,
         use_distributed_sampler=False,
     )
-    _warm_up(module, data)
+    _warm_up(module, data, trainer.strategy.root_device)
     last = run / "checkpoints" / LAST
     with interrupt.listening():
         trainer.fit(
@@ -94,15 +95,18 @@ def fit(
     return scorer
 
 
-def _warm_up(module: RadianceModule, data: RayDataModule) -> None:
+def _warm_up(module: RadianceModule, data: RayDataModule, device: torch.device) -> None:
     """Run all loops once on a few rays, so that compiling them is not on the training clock."""
-    if not cpu_loops(next(module.field.parameters())):
+    if device.type == "cuda":
+        # The kernels are tried where they will run; Lightning would move the module a little later.
+        module.to(device)
+    elif not cpu_loops(next(module.field.parameters())):
         return
-    words = "compiling the CPU loops, once after installation: about 20 s ..."
+    words = "compiling the inner loops, once after installation: about 20 s ..."
     notice = threading.Timer(PATIENCE, print, [words], {"flush": True})
     notice.start()
     try:
-        rays = {name: value[:8] for name, value in data.draw(0).items()}
+        rays = {name: value[:8].to(device) for name, value in data.draw(0).items()}
         rendering = module.sampling.render(module.field, rays, module.moment)
         rendering.colour.sum().backward()
         module.zero_grad(set_to_none=True)

@@ -23,6 +23,7 @@ _PACKAGES = (
     "torchmetrics",
     "tensorboard",
     "numba",
+    "triton",
 )
 
 

@@ -1,0 +1,95 @@
+"""Triton kernels for products of planes: on a GPU if there is one, else in the interpreter."""
+
+import pytest
+import torch
+
+from xplanes.fields import products
+from xplanes.fields.products import MOVING, STILL, plane_product_gpu, plane_product_reference
+
+pytest.importorskip("triton", reason="triton is not installed")
+
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def both(names, dtype, *, channels, count, sizes=(3, 4, 5), reach=1.3):
+    """Values and gradients of the kernels, and of the twin in float64 from the same numbers."""
+    generator = torch.Generator().manual_seed(4)
+    steps, *rest = sizes
+    stacks = [
+        1.3 - torch.rand(1, channels, steps if "t" in n else rest[0], rest[1], generator=generator)
+        for n in names
+    ]
+    places = (2 * torch.rand(count, 4, generator=generator) - 1) * reach
+    places[:4, 0] = torch.tensor([1.0, -1.0, 1e30, -1e30])[:count]
+    results = []
+    for function, precision in (
+        (plane_product_gpu, dtype),
+        (plane_product_reference, torch.float64),
+    ):
+        planes = [p.to(DEVICE, dtype).to(precision).requires_grad_() for p in stacks]
+        value = function(planes, places.to(DEVICE), names)
+        pull = torch.linspace(-1, 1, value.numel(), device=DEVICE).to(precision).view_as(value)
+        gradients = torch.autograd.grad((value * pull).sum(), planes)
+        results.append([found.detach().cpu() for found in (value, *gradients)])
+    return results
+
+
+@pytest.mark.parametrize(
+    ("names", "channels", "count"),
+    [(MOVING, 1, 9), (MOVING, 8, 70), (MOVING, 40, 13), (STILL, 3, 129), (STILL, 32, 16)],
+)
+def test_values_and_gradients_are_the_twins(names, channels, count):
+    ours, theirs = both(names, torch.float32, channels=channels, count=count)
+    assert len(ours) == len(names) + 1
+    for a, b in zip(ours, theirs, strict=True):
+        assert a.dtype == torch.float32
+        assert b.abs().max() > 0.1
+        torch.testing.assert_close(a, b, atol=5e-5, rtol=5e-5, check_dtype=False)
+
+
+@pytest.mark.parametrize("sizes", [(3, 4, 5), (1, 1, 1)])
+def test_in_float64_nothing_but_rounding_is_left(sizes):
+    ours, theirs = both(MOVING, torch.float64, channels=2, count=7, sizes=sizes)
+    for a, b in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-12, rtol=1e-12)
+
+
+def test_no_point():
+    ours, theirs = both(STILL, torch.float32, channels=4, count=0)
+    assert ours[0].shape == theirs[0].shape == (0, 4)
+    assert all((gradient == 0).all() for gradient in ours[1:])
+
+
+def test_points_that_fill_up_a_block_spread_no_nan():
+    planes = [torch.full((1, 4, 3, 3), torch.nan, device=DEVICE) for _ in STILL]
+    for plane in planes:
+        plane[..., 0, 0] = 1.0
+        plane.requires_grad_()
+    value = plane_product_gpu(planes, torch.full((1, 4), -1.0, device=DEVICE), STILL)
+    value.sum().backward()
+    assert (value == 1).all()
+    for plane in planes:
+        assert plane.grad is not None
+        assert plane.grad[..., 0, 0].eq(1).all()
+        assert plane.grad.sum() == 4
+
+
+def test_planes_reach_the_kernels_once_these_have_proven_themselves(monkeypatch, caplog):
+    monkeypatch.setattr(products, "cpu_loops", lambda tensor: False)
+    monkeypatch.setattr(products, "gpu_kernels", lambda tensor: True)
+    products._kernels_hold.cache_clear()
+    calls = []
+    monkeypatch.setattr(
+        products,
+        "plane_product_gpu",
+        lambda *given: calls.append(given) or plane_product_gpu(*given),
+    )
+    torch.manual_seed(0)
+    planes = products.PlaneProducts(2, 4, (1,), 3, low=0.1, high=0.5).to(DEVICE)
+    found = planes(torch.zeros(5, 3, device=DEVICE), torch.full((5,), 0.3, device=DEVICE))
+    assert len(calls) == 2  # The trial and the use.
+    assert not caplog.records
+    spaces = [planes.scales[0][name] for name in planes.names]
+    places = torch.tensor([[0.0, 0.0, 0.0, -0.4]], device=DEVICE).expand(5, -1)
+    torch.testing.assert_close(found, plane_product_reference(spaces, places, planes.names))
+    products._kernels_hold.cache_clear()

@@ -35,7 +35,7 @@ class OccupancyGrid(nn.Module):
         time_bins: int,
         *,
         step: float,
-        threshold: float = 0.01,
+        threshold: float = 0.003,
         decay: float = 0.95,
     ) -> None:
         super().__init__()

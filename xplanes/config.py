@@ -25,6 +25,7 @@ class DataConfig:
     resolution: int | None = MISSING  # Pixels per side; null keeps the native size.
     views: int | None = MISSING  # Training views kept, spread over time; null keeps all.
     train_on_video: bool = MISSING  # Train on the frames of the scene's fixed camera too.
+    still: bool | None = MISSING  # Nothing moves; null: where the fixed camera's frames are equal.
     eval_split: str = MISSING  # Split that is scored: test or val.
     eval_views: int | None = MISSING  # Views of it, spread over time; null takes all.
     half_side: float | None = MISSING  # Half the side of the scene's cube; null finds it.

@@ -226,6 +226,30 @@ def test_scene_of_one_moment_trains_without_planes_of_time(scenes: Path, tmp_pat
     assert "field.time" not in state["state_dict"]
 
 
+@pytest.mark.parametrize(
+    ("overrides", "moves"),
+    [
+        (["data.scene=still"], False),
+        (["data.scene=still", "data.still=false"], True),
+        (["data.scene=balls"], True),
+        (["data.scene=balls", "data.still=true"], False),
+    ],
+)
+def test_a_scene_without_motion_has_no_planes_of_time(
+    overrides, moves, scenes: Path, tmp_path: Path
+) -> None:
+    config = small_config(scenes, "trainer.max_steps=2", "trainer.evaluate_at=[]", *overrides)
+    run(config, tmp_path / "run", [], resume=False)
+    state = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
+    assert ("field.time" in state["state_dict"]) == moves
+    assert metrics(tmp_path / "run")["skipped"]["static"] == (0.0 if moves else 1.0)
+    text = (tmp_path / "run" / "train.log").read_text()
+    if not moves:
+        reason = "data.still=true" if "balls" in overrides[0] else "frames are equal"
+        assert reason in text
+    assert ("trains as a still one" in text) == (not moves)
+
+
 def test_a_slow_warm_up_says_what_it_does(
     scenes: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:

@@ -33,7 +33,10 @@ def header(
     size = sum(views.nbytes for views in scene.splits.values()) / 2**20
     trainable = sum(p.numel() for p in module.parameters() if p.requires_grad)
     frozen = sum(p.numel() for p in module.parameters()) - trainable
-    moving = "" if module.field.moves else " · one moment only: no planes of time"
+    moving = ""
+    if not module.field.moves:
+        reason = scene.still or "one moment only"
+        moving = f" · trains as a still one, without planes of time: {reason}"
     budget = f"{config.trainer.max_steps} steps"
     if config.trainer.max_seconds is not None:
         budget += f" or {config.trainer.max_seconds:g} s, whichever comes first"
@@ -79,6 +82,7 @@ def summary(
             "empty": counts["empty"] / candidates,
             "occluded": counts["occluded"] / candidates,
             "background": background_skipped,
+            "static": float(not module.field.moves),
             "budget": 0.0 if module.ending is None else 1 - module.spent,
         },
         "converged": None if module.ending is None else module.ending[0],

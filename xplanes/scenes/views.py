@@ -101,12 +101,14 @@ class Scene:
         splits: Views by split name: train, val, test.
         video: Frames of a fixed camera, where the scene has one.
         background: What lies behind the scene in scores and pictures. [3]
+        still: How it is known that nothing moves; empty where something may.
     """
 
     name: str
     splits: dict[str, Views]
     video: Views | None = None
     background: Tensor = field(default_factory=lambda: torch.ones(3))
+    still: str = ""
 
 
 def camera_rays(

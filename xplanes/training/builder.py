@@ -31,6 +31,7 @@ from xplanes.scenes.demo import ensure_demo_scene
 from xplanes.scenes.dnerf import read_scene
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, frame_content
+from xplanes.scenes.still import at_one_moment, stands_still
 from xplanes.scenes.views import Scene, Views, joined
 from xplanes.training.assembly import PLANS, SAMPLINGS, Site, scene_cube
 from xplanes.training.methods.xplanes import XPlanesMethod
@@ -78,7 +79,12 @@ def build_scene(config: DataConfig, splits: tuple[str, ...] | None = None) -> Sc
                 "(transforms_video.json); set it to false"
             )
         parts["train"] = joined(parts["train"], scene.video)
-    return Scene(config.scene, parts, scene.video, scene.background)
+    scene = replace(scene, name=config.scene, splits=parts)
+    if config.still:
+        return at_one_moment(scene, "data.still=true")
+    if config.still is None and scene.video is not None and stands_still(scene.video):
+        return at_one_moment(scene, f"the fixed camera's {len(scene.video)} frames are equal")
+    return scene
 
 
 def training_device(name: str) -> torch.device:

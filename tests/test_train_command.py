@@ -128,3 +128,22 @@ def test_killed_and_resumed_run_ends_with_the_same_numbers(scenes: str, tmp_path
     result = train(f"resume={killed}")
     assert result.returncode == 0, result.stderr
     assert exact(killed) == exact(whole)
+
+
+def test_a_field_films_the_scene_inside_a_job(scenes: str, tmp_path: Path) -> None:
+    # The film's own settings are composed while Hydra's job is under way.
+    folder = tmp_path / "run"
+    result = train(
+        scenes,
+        *(line for line in SMALL if line not in ("lrm=none", "trainer.max_steps=40")),
+        "lrm=tiny",
+        "preparation.cache=null",
+        "preparation.fixed_view=train",
+        "preparation.fixed_view_steps=2",
+        "preparation.frames=3",
+        "trainer.max_steps=2",
+        f"hydra.run.dir={folder}",
+    )
+    assert result.returncode == 0, result.stderr
+    assert "training six_planes for" in result.stdout
+    assert (folder / "metrics.json").is_file()

@@ -251,14 +251,21 @@ def compose_plain(name: str, overrides: Sequence[str], conf: Path = CONF) -> dic
         ConfigError: For a key or option that does not exist, or a value of another type.
     """
     from hydra import compose, initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.singleton import Singleton
     from hydra.errors import HydraException
 
     register_schemas()
+    # Inside a job there is a Hydra already, which must be there again afterwards.
+    outer = Singleton.get_state()
+    GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(conf), version_base="1.3"):
             return to_plain(compose(name, list(overrides)))
     except HydraException as error:
         raise ConfigError(f"{error}. All settings are in docs/configuration.md") from error
+    finally:
+        Singleton.set_state(outer)
 
 
 def to_plain(config: DictConfig) -> dict[str, Any]:

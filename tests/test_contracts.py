@@ -346,7 +346,7 @@ def test_an_occlusion_that_hides_everything_is_refused():
 
 
 LAYERS = (
-    ("backend", "files", "optional", "schemas", "config", "checks", "metrics"),
+    ("backend", "files", "locks", "optional", "schemas", "config", "checks", "metrics"),
     ("scenes",),
     ("fields",),
     ("lrm",),

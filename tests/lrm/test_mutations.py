@@ -67,7 +67,12 @@ MISTAKES = [
     ("tanh GELU in the gate", "attention.py", "F.gelu(gate)", 'F.gelu(gate, approximate="tanh")'),
     ("gate and value swapped", "attention.py", "value, gate =", "gate, value ="),
     ("SiLU in the gate", "attention.py", "F.gelu(gate)", "F.silu(gate)"),
-    ("query and key swapped", "attention.py", "product_attention(query, key", "product_attention(key, query"),
+    (
+        "query and key swapped",
+        "attention.py",
+        "product_attention(query, key",
+        "product_attention(key, query",
+    ),
     (
         "attention scale",
         "attention.py",

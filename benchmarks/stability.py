@@ -47,7 +47,8 @@ threads) as a share of the largest expected value; each test states what it allo
 
 {markdown(COLUMNS, rows)}
 {others}
-Robust PCA at its extremes has a [table of its own](../../benchmarks/results/decomposition_stress.md).
+Robust PCA at its extremes:
+[a table of its own](../../benchmarks/results/decomposition_stress.md).
 """
 
 

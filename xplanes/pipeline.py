@@ -96,6 +96,8 @@ def _recorded(config: TrainConfig, folder: Path, overrides: list[str], *, resume
             # On a full disk the record stays "running", as after a power cut; resume= takes both.
             with suppress(StorageError):
                 record.end("failed", f"{type(error).__name__}: {error}")
+            if isinstance(error, OSError | TrainingError):
+                say(f"\nstopped. When that is mended: python train.py resume={folder}")
             raise
     return metrics["test"]["psnr"]
 

@@ -176,6 +176,12 @@ class RadianceModule(LightningModule):
 
     @property
     def _way_out(self) -> str:
+        if self.global_step == 0:
+            largest = max(float(p.detach().abs().max()) for p in self.field.parameters())
+            return (
+                f"No step was done yet, so the start is to blame, whose largest value is "
+                f"{largest:.3g}: set lrm=none, or make the start anew"
+            )
         precision = "" if self.field.precision == "32" else ", or set trainer.precision=32"
         return f"{self.method.advice}{precision}; resume= goes on from the last checkpoint"
 

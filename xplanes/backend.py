@@ -61,7 +61,7 @@ def _settle_threads() -> None:
     import numba
 
     count = torch.get_num_threads()
-    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+    numba.set_num_threads(min(count, numba.get_num_threads()))
     torch.set_num_threads(count)
 
 

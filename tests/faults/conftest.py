@@ -83,6 +83,7 @@ class Nursery:
             text=True,
         )
         self.count = 0
+        assert self._number() == 0
 
     def start(self, config: dict[str, Any], folder: Path, *, resume: bool, **more: Any) -> Child:
         self.count += 1

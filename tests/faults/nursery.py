@@ -2,7 +2,7 @@
 
 Reads one JSON object per line: ``config``, ``folder``, ``resume``, ``log`` and, if wanted,
 ``file_limit`` (bytes) and ``clock`` (seconds by which the wall clock jumps at every reading).
-Answers with the process id and, once the run has ended, with its exit status.
+Answers with 0 once it is ready, then with the process id and, once the run has ended, with its exit status.
 """
 
 import json
@@ -57,6 +57,7 @@ def main() -> None:
     import xplanes.pipeline
     import xplanes.rendering.cpu  # noqa: F401
 
+    print(0, flush=True)
     for line in sys.stdin:
         job = json.loads(line)
         child = os.fork()

@@ -115,13 +115,23 @@ def test_a_resumed_run_takes_new_learning_rates(scenes, tmp_path, monkeypatch) -
     assert seen[0][1] == pytest.approx(10 * seen[0][0])
 
 
-def test_a_damaged_checkpoint_gives_way_to_the_best(scenes, tmp_path, caplog) -> None:
+def shortened(content: bytes) -> bytes:
+    return content[:-1000]
+
+
+def flipped(content: bytes) -> bytes:
+    place = len(content) // 2
+    return content[:place] + bytes([content[place] ^ 16]) + content[place + 1 :]
+
+
+@pytest.mark.parametrize("damage", [shortened, flipped])
+def test_a_damaged_checkpoint_gives_way_to_the_best(scenes, tmp_path, caplog, damage) -> None:
     whole, folder = tmp_path / "whole", tmp_path / "damaged"
     settings = (*FEW, "trainer.evaluate_at=[0.4]")
     run(small_config(scenes, *settings), whole, [], resume=False)
     run(small_config(scenes, *settings), folder, [], resume=False)
     last = folder / "checkpoints" / "last.ckpt"
-    last.write_bytes(last.read_bytes()[:-1000])
+    last.write_bytes(damage(last.read_bytes()))
     run(small_config(scenes, *settings), folder, [], resume=True)
     assert "last.ckpt cannot be read" in caplog.text
     assert "Going on from" in caplog.text

@@ -2,6 +2,7 @@
 
 import logging
 import shutil
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +123,10 @@ def load_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
             "(trainer.checkpoint_every)"
         )
     try:
+        # torch reads changed bytes without a murmur, though it keeps their checksums.
+        with zipfile.ZipFile(path) as archive:
+            if (name := archive.testzip()) is not None:
+                raise zipfile.BadZipFile(f"wrong checksum of {name}")
         return torch.load(path, map_location=device, weights_only=True)
     except Exception as error:
         raise ConfigError(

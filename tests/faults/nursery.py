@@ -2,7 +2,8 @@
 
 Reads one JSON object per line: ``config``, ``folder``, ``resume``, ``log`` and, if wanted,
 ``file_limit`` (bytes) and ``clock`` (seconds by which the wall clock jumps at every reading).
-Answers with 0 once it is ready, then with the process id and, once the run has ended, with its exit status.
+Answers with 0 once it is ready, then with the process id and, once the run has ended, with its
+exit status.
 """
 
 import json

@@ -56,7 +56,7 @@ def test_shared_scene_and_cache(tally, nursery, other, whole, tmp_path: Path) ->
     tally.recovered()
 
 
-@pytest.mark.parametrize("seconds", [-86_400.0, 86_400.0, -1e9])
+@pytest.mark.parametrize("seconds", [-3600.0, 86_400.0, -86_400.0])
 def test_clock_jumps(tally, nursery, shared, whole, tmp_path: Path, seconds: float) -> None:
     """Wall clock set back or on at every reading"""
     config = config_of(shared, "none", None, "trainer.max_seconds=600")

@@ -79,6 +79,12 @@ def test_gradients_that_stay_bad_end_training_in_words(scenes, tmp_path, monkeyp
     assert state(tmp_path / "all")["global_step"] == 5
 
 
+def test_a_start_that_cannot_be_trained_is_to_blame(scenes, tmp_path, monkeypatch) -> None:
+    spoil_gradient(monkeypatch, 1e30, range(1000))
+    with pytest.raises(TrainingError, match=r"step 0.*start is to blame.*lrm=none"):
+        run(small_config(scenes, *FEW), tmp_path / "start", [], resume=False)
+
+
 def test_a_checkpoint_never_holds_what_is_not_finite(scenes, tmp_path, monkeypatch) -> None:
     original = TrainingClock.on_train_batch_end
 

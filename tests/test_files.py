@@ -57,6 +57,7 @@ def test_a_disk_that_refuses_is_said_in_words(tmp_path: Path, code: int, words: 
 
 def test_other_problems_are_not_the_disk_s(tmp_path: Path) -> None:
     assert storage_error(ConnectionRefusedError(errno.ECONNREFUSED, "refused")) is None
+    assert storage_error(PermissionError(errno.EACCES, "denied", "weights.ckpt")) is None
     with pytest.raises(OSError, match="power cut") as caught:
         begin(tmp_path / "a", OSError("power cut"))
     assert not isinstance(caught.value, StorageError)

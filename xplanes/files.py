@@ -25,10 +25,11 @@ def storage_error(problem: OSError, path: Path | None = None) -> StorageError | 
 
     Args:
         problem: What went wrong.
-        path: What was to be written; as the problem says when None.
+        path: What was to be written; None where it may have been to be read, and is as the
+            problem says.
     """
     way_out = _WAYS_OUT.get(problem.errno or 0)
-    if way_out is None:
+    if way_out is None or (path is None and problem.errno not in _ONLY_WRITING):
         return None
     place = path if path is not None else Path(problem.filename or "a file")
     room = ""
@@ -54,6 +55,9 @@ _WAYS_OUT = {
     errno.EIO: "The disk or its connection fails; choose a folder on another disk",
 }
 
+_ONLY_WRITING = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
+"""Problems that reading cannot have."""
+
 
 def _existing(path: Path) -> Path:
     """The path itself or the nearest folder above it that exists."""
@@ -73,7 +77,9 @@ def require_writable(folder: Path) -> None:
         with tempfile.TemporaryFile(dir=place) as file:
             file.write(bytes(1 << 16))
     except OSError as problem:
-        raise storage_error(problem, folder) or problem from problem
+        if (words := storage_error(problem, folder)) is None:
+            raise
+        raise words from problem
 
 
 @contextmanager
@@ -96,9 +102,9 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.chmod(0o644)
         temporary.replace(path)
     except OSError as problem:
-        if isinstance(problem, StorageError):
+        if (words := storage_error(problem, path)) is None:
             raise
-        raise storage_error(problem, path) or problem from problem
+        raise words from problem
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)

@@ -75,9 +75,9 @@ def run(config: dict[str, Any], folder: Path, overrides: list[str], *, resume: b
             write_text(folder / "overrides.txt", "".join(f"{line}\n" for line in overrides))
             return _recorded(typed, folder, overrides, resume=resume)
     except OSError as problem:
-        if isinstance(problem, StorageError):
+        if (words := storage_error(problem)) is None:
             raise
-        raise storage_error(problem) or problem from problem
+        raise words from problem
 
 
 def _recorded(config: TrainConfig, folder: Path, overrides: list[str], *, resume: bool) -> float:

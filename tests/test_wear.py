@@ -79,6 +79,15 @@ def test_no_place_for_the_output_is_said_before_anything_is_loaded(tmp_path: Pat
         prepare([f"hydra.run.dir={tmp_path / 'file' / 'run'}"])
 
 
+def test_overrides_that_were_cut_short_are_not_taken_for_whole(tmp_path: Path) -> None:
+    path = tmp_path / "overrides.txt"
+    path.write_text("seed=3\ntrainer.max_steps=400")
+    with pytest.raises(ConfigError, match=r"overrides\.txt is damaged.*config\.yaml"):
+        prepare([f"resume={tmp_path}"])
+    path.write_text("seed=3\ntrainer.max_steps=400\n")
+    assert "trainer.max_steps=400" in prepare([f"resume={tmp_path}"])
+
+
 def test_the_best_is_written_before_the_last(tmp_path: Path, monkeypatch) -> None:
     """Killed in between, a run whose last checkpoint knows of a best one would never write it."""
     original, written = Checkpoints.save, []

@@ -63,11 +63,17 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
     if not path.is_file():
         raise ConfigError(f"resume={run}: not a run directory, no overrides.txt in it")
     require_writable(run)
+    text = path.read_text(encoding="utf-8")
+    if text and not text.endswith("\n"):
+        raise ConfigError(
+            f"{path} is damaged: its last line is cut short. Mend it from {run / 'config.yaml'}, "
+            "one key=value a line"
+        )
     new = [a for a in arguments if not a.startswith(("resume=", "hydra.run.dir="))]
     changed = {key for key, _ in _split(new)}
     old = [
         line
-        for line in path.read_text(encoding="utf-8").splitlines()
+        for line in text.splitlines()
         if line and not {key for key, _ in _split([line])} & changed
     ]
     return [*old, *new, f"hydra.run.dir={run}", f"resume={run}"]

@@ -79,9 +79,9 @@ def test_all_checkpoints(tally, nursery, shared, half, tmp_path: Path) -> None:
     tally.content["cases"] += 1
 
 
-@pytest.mark.parametrize("name", ["run.json", "config.yaml", "overrides.txt", "curve.csv"])
+@pytest.mark.parametrize("name", ["run.json", "config.yaml", "curve.csv"])
 def test_small_files(tally, nursery, shared, whole, half, tmp_path: Path, name: str) -> None:
-    """run.json, config.yaml, overrides.txt, curve.csv cut short"""
+    """run.json, config.yaml, curve.csv cut short"""
     folder = tmp_path / "run"
     shutil.copytree(half, folder)
     cut(folder / name, 0.6)

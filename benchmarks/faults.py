@@ -39,11 +39,11 @@ def page(found: Gatherer) -> str:
     return f"""# Faults
 
 Runs of 40 steps on a scene of 32 pixels, a checkpoint every 3 steps, planes at random or from
-`tiny`. "Same end": once the fault is gone, the run (resumed where one had begun) comes to the
-parameters, scores and curve of an uninterrupted one, bit for bit, and leaves no unfinished file.
-A curve.csv that was cut short
-itself loses rows; all else is the same. "Messages": the words that a user saw, checked for the file, the reason and the way out. Cases with
-no end of their own are files that must be refused.
+`tiny`, forked from one process that has loaded everything. "Same end": once the fault is gone, the
+run (resumed where one had begun) comes to the parameters, scores and curve of an uninterrupted one,
+bit for bit, and leaves no unfinished file; a curve.csv that was cut short itself loses rows.
+"Messages": the words that a user saw, checked for the file, the reason and the way out. Cases with
+no end of their own are files and folders that must be refused.
 
 {machine()}; {found.seconds:.0f} s on one thread. Script: `benchmarks/faults.py`; tests:
 `python -m pytest -m stress tests/faults`.

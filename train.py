@@ -13,6 +13,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from xplanes.config import ConfigError, register_schemas, to_plain
+from xplanes.files import StorageError
 from xplanes.launch import prepare
 
 
@@ -46,6 +47,6 @@ if __name__ == "__main__":
     register_schemas()
     try:
         sys.argv[1:] = prepare(sys.argv[1:])
-    except ConfigError as error:
+    except (ConfigError, StorageError) as error:
         sys.exit(f"error: {error}")
     main()

@@ -114,7 +114,22 @@ def fast_bf16(device: torch.device) -> bool:
 
 def compiled(module: str) -> Any:
     """A module of compiled loops; loading the first takes a second, compiling a few more, once."""
+    _settle_threads()
     return importlib.import_module(module)
+
+
+@functools.cache
+def _settle_threads() -> None:
+    """Start the loops' threads, as many as torch has, and leave torch's number as it is.
+
+    Where both use OpenMP, starting them gives torch the number of all cores: what was asked for is
+    lost, and sums come out otherwise before and after the first loop.
+    """
+    import numba
+
+    count = torch.get_num_threads()
+    numba.set_num_threads(min(count, numba.get_num_threads()))
+    torch.set_num_threads(count)
 
 
 def name(device: torch.device) -> str:

@@ -1,30 +1,128 @@
 """Writing files so that a reader never finds half of one."""
 
 import csv
+import errno
 import json
 import os
+import shutil
 import tempfile
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+MARK = ".tmp-"
+"""Part of the name of every file that is not whole yet."""
+
+
+class StorageError(OSError):
+    """What cannot be written; the message names it, the reason and the way out."""
+
+
+def storage_error(problem: OSError, path: Path | None = None) -> StorageError | None:
+    """The same problem in words, if it is one of the disk.
+
+    Args:
+        problem: What went wrong.
+        path: What was to be written; None where it may have been to be read, and is as the
+            problem says.
+    """
+    way_out = _WAYS_OUT.get(problem.errno or 0)
+    if way_out is None or (path is None and problem.errno not in _ONLY_WRITING):
+        return None
+    place = path if path is not None else Path(problem.filename or "a file")
+    room = ""
+    if problem.errno in (errno.ENOSPC, errno.EDQUOT):
+        try:
+            room = f" ({shutil.disk_usage(_existing(place)).free / 2**20:.1f} MB free)"
+        except OSError:
+            room = ""
+    reason = os.strerror(problem.errno or 0)
+    return StorageError(f"{place} cannot be written: {reason}{room}. {way_out}")
+
+
+_FREE = "Free some space, or choose a folder on another disk; what was there before is still whole"
+_OPEN = "Choose a folder that can be written"
+_WAYS_OUT = {
+    errno.ENOSPC: _FREE,
+    errno.EDQUOT: _FREE,
+    errno.EFBIG: "Raise the limit on the size of files (ulimit -f)",
+    errno.EROFS: _OPEN,
+    errno.EACCES: _OPEN,
+    errno.EPERM: _OPEN,
+    errno.ENOTDIR: "A file stands where a folder should be: choose another folder",
+    errno.EIO: "The disk or its connection fails; choose a folder on another disk",
+}
+
+_ONLY_WRITING = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
+"""Problems that reading cannot have."""
+
+
+def _existing(path: Path) -> Path:
+    """The path itself or the nearest folder above it that exists."""
+    return next((p for p in (path, *path.absolute().parents) if p.exists()), Path("/"))
+
+
+def require_writable(folder: Path) -> None:
+    """Try whether a folder, which need not exist yet, can take a small file.
+
+    Raises:
+        StorageError: If it cannot.
+    """
+    place = _existing(folder.absolute())
+    try:
+        if not place.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, "", str(place))
+        with tempfile.TemporaryFile(dir=place) as file:
+            file.write(bytes(1 << 16))
+    except OSError as problem:
+        if (words := storage_error(problem, folder)) is None:
+            raise
+        raise words from problem
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside ``path`` that takes its name when the block ends well."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
-    os.close(handle)
-    temporary = Path(name)
+    """A temporary path beside ``path`` that takes its name when the block ends well.
+
+    Raises:
+        StorageError: If the disk is full, cannot be written, or fails.
+    """
+    temporary = None
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        prefix = f".{path.name}{MARK}"
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=path.suffix)
+        os.close(handle)
+        temporary = Path(name)
         yield temporary
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
         temporary.chmod(0o644)
         temporary.replace(path)
+    except OSError as problem:
+        if (words := storage_error(problem, path)) is None:
+            raise
+        raise words from problem
     finally:
-        temporary.unlink(missing_ok=True)
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def clear_unfinished(folder: Path, older_than: float = 0.0) -> None:
+    """Remove what writers that were killed left half-written below a folder.
+
+    Args:
+        folder: Where to look, in all folders below it too.
+        older_than: Age in seconds below which a file may still be somebody's.
+    """
+    for path in folder.rglob(f".*{MARK}*"):
+        try:
+            if path.is_file() and time.time() - path.stat().st_mtime >= older_than:
+                path.unlink()
+        except OSError:
+            continue  # Another process was first, or the folder cannot be written.
 
 
 def write_text(path: Path, text: str) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from xplanes.checks import parse
 from xplanes.config import CONF, ConfigError, TrainConfig, compose_plain, register_schemas
-from xplanes.files import read_json
+from xplanes.files import read_json, require_writable
 from xplanes.schemas.families import XPLANES_RATES
 
 _OVERRIDE = re.compile(r"^(?P<mark>\+\+?|~)?(?P<key>[\w./@-]+)=(?P<value>.*)$", re.DOTALL)
@@ -28,10 +28,14 @@ def prepare(arguments: list[str], conf: Path = CONF) -> list[str]:
 
     Raises:
         ConfigError: For an unknown key, with near matches, or a run that cannot be resumed.
+        StorageError: If the folder of the run cannot be written.
     """
     check_keys(arguments, conf)
     values = dict(_split(arguments))
     resume = values.get("resume", "null")
+    if resume in ("null", "", "None", "auto"):
+        place = "hydra.sweep.dir" if _is_multirun(arguments) else "hydra.run.dir"
+        require_writable(Path(values.get(place, "outputs")))
     if resume in ("null", "", "None"):
         return arguments
     folder = values.get("hydra.run.dir")
@@ -58,11 +62,18 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
     path = run / "overrides.txt"
     if not path.is_file():
         raise ConfigError(f"resume={run}: not a run directory, no overrides.txt in it")
+    require_writable(run)
+    text = path.read_text(encoding="utf-8")
+    if text and not text.endswith("\n"):
+        raise ConfigError(
+            f"{path} is damaged: its last line is cut short. Mend it from {run / 'config.yaml'}, "
+            "one key=value a line"
+        )
     new = [a for a in arguments if not a.startswith(("resume=", "hydra.run.dir="))]
     changed = {key for key, _ in _split(new)}
     old = [
         line
-        for line in path.read_text(encoding="utf-8").splitlines()
+        for line in text.splitlines()
         if line and not {key for key, _ in _split([line])} & changed
     ]
     return [*old, *new, f"hydra.run.dir={run}", f"resume={run}"]

@@ -5,7 +5,7 @@ import os
 import time
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,8 @@ from xplanes.checks import parse
 from xplanes.config import ConfigError, TrainConfig
 from xplanes.evaluation.media import film_times, orbit_poses, render_path, write_film
 from xplanes.evaluation.report import closing, header, summary, write_hparams, write_start
-from xplanes.files import write_json, write_text
+from xplanes.files import StorageError, clear_unfinished, storage_error, write_json, write_text
+from xplanes.locks import alone_in
 from xplanes.lrm import LRMError
 from xplanes.optional import MissingExtraError
 from xplanes.preparation import find_source, prepare
@@ -39,7 +40,7 @@ from xplanes.training.record import RunRecord, claim
 
 logger = logging.getLogger(__name__)
 
-KNOWN_ERRORS = (ConfigError, SceneError, LRMError, TrainingError, MissingExtraError)
+KNOWN_ERRORS = (ConfigError, SceneError, LRMError, TrainingError, MissingExtraError, StorageError)
 """Errors whose message says all; their traceback goes to train.log alone."""
 
 FILM_FRAMES, FILM_FPS, FILM_SIZE = 48, 16, 200
@@ -58,28 +59,45 @@ def run(config: dict[str, Any], folder: Path, overrides: list[str], *, resume: b
         PSNR of the scored split in dB; NaN in helper processes of a distributed run.
 
     Raises:
-        ConfigError, SceneError, LRMError, TrainingError: With a message that says what to do.
+        ConfigError, SceneError, LRMError, TrainingError, StorageError: With a message that says
+            what to do.
         KeyboardInterrupt: If the user stopped it; the state is saved.
     """
     typed = parse(config)
     if int(os.environ.get("LOCAL_RANK", "0")):
         train(typed, folder, resume=resume)
         return float("nan")
-    claim(folder, resume=resume)
-    write_text(folder / "config.yaml", yaml.safe_dump(config, sort_keys=False))
-    write_text(folder / "overrides.txt", "".join(f"{line}\n" for line in overrides))
-    record = RunRecord(folder, typed.seed)
+    try:
+        with alone_in(folder):
+            claim(folder, resume=resume)
+            clear_unfinished(folder)
+            write_text(folder / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+            write_text(folder / "overrides.txt", "".join(f"{line}\n" for line in overrides))
+            return _recorded(typed, folder, overrides, resume=resume)
+    except OSError as problem:
+        if (words := storage_error(problem)) is None:
+            raise
+        raise words from problem
+
+
+def _recorded(config: TrainConfig, folder: Path, overrides: list[str], *, resume: bool) -> float:
+    """Train with run.json and train.log kept, and give PSNR."""
     with _logged(folder / "train.log"):
+        record = RunRecord(folder, config.seed)
         try:
-            metrics = train(typed, folder, resume=resume, record=record, overrides=overrides)
+            metrics = train(config, folder, resume=resume, record=record, overrides=overrides)
             record.end("finished")
         except KeyboardInterrupt:
             record.end("interrupted")
             say(f"\nstopped. Go on with: python train.py resume={folder}")
             raise
         except BaseException as error:
-            record.end("failed", f"{type(error).__name__}: {error}")
             logger.error("failed\n%s", traceback.format_exc())
+            # On a full disk the record stays "running", as after a power cut; resume= takes both.
+            with suppress(StorageError):
+                record.end("failed", f"{type(error).__name__}: {error}")
+            if isinstance(error, OSError | TrainingError):
+                say(f"\nstopped. When that is mended: python train.py resume={folder}")
             raise
     return metrics["test"]["psnr"]
 
@@ -178,7 +196,7 @@ def _film(module: RadianceModule, frame: Frame, scene: Scene, folder: Path) -> P
 @contextmanager
 def _logged(path: Path) -> Iterator[None]:
     """Send log records and warnings to a file, our own warnings to the terminal too."""
-    file, terminal = logging.FileHandler(path), logging.StreamHandler()
+    file, terminal = _LogFile(path), logging.StreamHandler()
     file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     terminal.setFormatter(logging.Formatter("warning: %(message)s"))
     terminal.addFilter(_own_warning)
@@ -194,7 +212,15 @@ def _logged(path: Path) -> Iterator[None]:
         logging.captureWarnings(False)
         for handler in handlers:
             root.removeHandler(handler)
-            handler.close()
+            with suppress(OSError):
+                handler.close()
+
+
+class _LogFile(logging.FileHandler):
+    """A log that a full disk cuts short, without a word for each line on the terminal."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+        return
 
 
 def _own_warning(record: logging.LogRecord) -> bool:

@@ -71,6 +71,15 @@ def test_gradients_are_the_product_rule_s(merge, scale):
         np.testing.assert_allclose(a, b, atol=1e-10)
 
 
+@BOTH
+def test_thick_media_keep_their_digits_in_the_gradient(merge):
+    depth = torch.tensor([20.0], requires_grad=True)
+    nothing = torch.zeros(1, dtype=torch.long)
+    total, _ = merge(depth, torch.ones(1, 3), torch.ones(1), nothing, nothing)
+    total[0, 3].backward()
+    assert float(depth.grad) == pytest.approx(math.exp(-20), rel=1e-5)
+
+
 def test_gradients_are_finite_differences():
     depth, colour, *rest = rays_of((0, 2, 0, 4, 1))
     depth.requires_grad_()

@@ -182,7 +182,7 @@ def test_non_finite_loss_is_skipped_then_diagnosed(
 
     monkeypatch.setattr(RadianceModule, "on_train_batch_start", spoil)
     folder = tmp_path / "spoiled"
-    with pytest.raises(TrainingError, match=r"parameters space.*trainer\.plane_lr"):
+    with pytest.raises(TrainingError, match=r"not finite: field\.space;.*trainer\.plane_lr"):
         run(small_config(scenes), folder, [], resume=False)
     assert status(folder)["status"] == "failed"
     assert "field" not in status(folder)["reason"].split(":")[0]

@@ -19,14 +19,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from xplanes.files import replacing
-
-try:
-    import fcntl
-except ImportError:  # Not on Windows; two processes may then do the same work.
-    fcntl = None
+from xplanes.files import clear_unfinished, replacing
+from xplanes.locks import in_turn
 
 logger = logging.getLogger(__name__)
+
+DAY = 86_400.0
+"""Seconds after which an unfinished entry is nobody's any more."""
 
 VERSION = 2
 """Raised when a stage would come out differently from the same inputs."""
@@ -81,7 +80,7 @@ class StageCache:
         path = path if keep else None
         if (found := _find(path, key)) is not None:
             return found
-        with _lock(path if alone else None) as waited:
+        with in_turn(path.with_suffix(".lock") if path and alone else None) as waited:
             if waited and (found := _find(path, key)) is not None:
                 return found
             began = time.perf_counter()
@@ -133,27 +132,6 @@ def _find(path: Path | None, key: str) -> Stage | None:
     return Stage(content, seconds, True, key)
 
 
-@contextmanager
-def _lock(path: Path | None) -> Iterator[bool]:
-    """Hold what other processes wait for; gives whether this one had to wait.
-
-    The system frees it when a process ends, however it ends.
-    """
-    if path is None or fcntl is None:
-        yield False
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.with_suffix(".lock").open("a") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            waited = False
-        except BlockingIOError:
-            logger.warning("%s: another process is making it; waiting", path)
-            fcntl.flock(file, fcntl.LOCK_EX)
-            waited = True
-        yield waited
-
-
 class _UnusableError(Exception):
     """An entry that cannot be used; the message completes "the file is ..."."""
 
@@ -188,6 +166,7 @@ def _write(path: Path, key: str, content: dict[str, Any], seconds: float) -> Non
         "seconds": seconds,
         "content": content,
     }
+    clear_unfinished(path.parent, older_than=DAY)
     try:
         with replacing(path) as temporary:
             torch.save(payload, temporary)

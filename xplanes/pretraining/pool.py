@@ -59,7 +59,7 @@ def ensure_pool(
         announce: Takes a line now and then while objects are drawn.
 
     Raises:
-        ConfigError: If the folder holds a pool of another kind.
+        ConfigError: If the folder holds a pool of another kind, or its record is damaged.
     """
     if len(seeds) % SHARD:
         raise ConfigError(f"pool.objects={len(seeds)}: must be a multiple of {SHARD}")
@@ -85,7 +85,12 @@ def _read(folder: Path, kind: dict[str, int]) -> dict[str, Any]:
     path = folder / RECORD
     if not path.is_file():
         return {**kind, "sha256": {}}
-    record = read_json(path)
+    try:
+        record = read_json(path)
+    except ValueError as problem:
+        raise ConfigError(
+            f"pool.root={folder}: {problem}; delete it, and the objects are drawn again"
+        ) from problem
     found = {key: record.get(key) for key in kind}
     if found != kind:
         raise ConfigError(

@@ -48,10 +48,19 @@ def composite_reference(
     depth = optical_depth.clamp(0, OPAQUE)
     # A NaN must not reach other rays through the running sum; it stays in its own sample's weight.
     before = depth_before(depth.nan_to_num(0), ray, starts)
-    weights = before.neg().exp().to(depth.dtype) * -torch.expm1(-depth)
+    weights = before.neg().exp().to(depth.dtype) * stopped(depth)
     values = torch.cat([colour, torch.ones_like(distances)[:, None], distances[:, None]], dim=1)
     total = torch.zeros(len(starts), 5, dtype=depth.dtype, device=depth.device)
     return total.index_add(0, ray, weights[:, None] * values), weights.detach()
+
+
+def stopped(optical_depth: Tensor) -> Tensor:
+    """Share of the light that an optical depth stops, all digits kept in value and gradient. [...]
+
+    The gradient of ``expm1`` is taken from its value, which is near -1 in thick media.
+    """
+    thin = -torch.expm1(-optical_depth)
+    return torch.where(optical_depth < 0.5, thin, 1 - (-optical_depth).exp())
 
 
 def depth_before(optical_depth: Tensor, ray: Tensor, starts: Tensor) -> Tensor:

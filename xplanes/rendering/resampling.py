@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from xplanes.rendering.compositing import OPAQUE
+from xplanes.rendering.compositing import OPAQUE, stopped
 
 
 def ray_weights(optical_depth: Tensor) -> Tensor:
@@ -12,7 +12,7 @@ def ray_weights(optical_depth: Tensor) -> Tensor:
     The same as the weights of `composite`, for rays of equally many samples and with gradients.
     """
     depth = optical_depth.clamp(0, OPAQUE)
-    return (depth - depth.cumsum(dim=1)).exp() * -torch.expm1(-depth)
+    return (depth - depth.cumsum(dim=1)).exp() * stopped(depth)
 
 
 def uniform_edges(rays: int, count: int, uniform: Tensor | None, device: torch.device) -> Tensor:

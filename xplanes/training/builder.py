@@ -64,13 +64,20 @@ def build_scene(config: DataConfig, splits: tuple[str, ...] | None = None) -> Sc
             val_views=config.val_views,
             test_views=config.test_views,
         )
-    scene = read_scene(
-        folder,
-        resolution=config.resolution,
-        splits=splits or ("train", config.eval_split),
-        views=config.views,
-        eval_views=config.eval_views,
-    )
+    try:
+        scene = read_scene(
+            folder,
+            resolution=config.resolution,
+            splits=splits or ("train", config.eval_split),
+            views=config.views,
+            eval_views=config.eval_views,
+        )
+    except SceneError as problem:
+        if not isinstance(config, DemoConfig):
+            raise
+        raise SceneError(
+            f"{problem} This is a demo scene: delete {folder}, and it is rendered again"
+        ) from problem
     parts = dict(scene.splits)
     if config.train_on_video and "train" in parts:
         if scene.video is None:

@@ -14,7 +14,7 @@ from xplanes.config import TrainConfig
 from xplanes.scenes.datamodule import RayDataModule
 from xplanes.training.bar import StepBar
 from xplanes.training.builder import training_device
-from xplanes.training.checkpoints import LAST, Checkpoints
+from xplanes.training.checkpoints import Checkpoints, find_resumable
 from xplanes.training.clock import TrainingClock
 from xplanes.training.interrupt import Interrupt
 from xplanes.training.module import RadianceModule
@@ -36,10 +36,14 @@ def fit(
         module: The module to train, changed in place.
         data: Its rays.
         run: The run directory.
-        resume: Whether to go on from ``checkpoints/last.ckpt``.
+        resume: Whether to go on from the last checkpoint.
 
     Returns:
         The scorer, whose ``latest`` holds the final scores on rank 0.
+
+    Raises:
+        ConfigError: If no checkpoint of the run to go on with can be read.
+        TrainingError: If numbers stopped being finite.
     """
     quiet_lightning()
     options = config.trainer
@@ -82,12 +86,12 @@ def fit(
         use_distributed_sampler=False,
     )
     _warm_up(module, data, trainer.strategy.root_device)
-    last = run / "checkpoints" / LAST
+    last = find_resumable(run / "checkpoints") if resume else None
     with interrupt.listening():
         trainer.fit(
             module,
             data,
-            ckpt_path=str(last) if resume and last.is_file() else None,
+            ckpt_path=None if last is None else str(last),
             weights_only=True,
         )
         scorer.finish(trainer, module)

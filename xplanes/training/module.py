@@ -6,16 +6,16 @@ from typing import Any
 import torch
 from lightning import LightningModule
 from lightning.pytorch.core.optimizer import LightningOptimizer
-from torch import Tensor
 
 from xplanes.config import TrainerConfig
-from xplanes.rendering.base import RayRenderer
+from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.scenes.batches import Batch
+from xplanes.training.health import all_usable, not_finite, unusable_gradients
 from xplanes.training.methods.base import Method
 from xplanes.training.sampling.base import Moment, Sampling
 
 PATIENCE = 20
-"""Steps in a row with a loss that is not finite after which training gives up."""
+"""Steps in a row with a loss or gradient that is not finite after which training gives up."""
 
 
 class TrainingError(RuntimeError):
@@ -60,6 +60,7 @@ class RadianceModule(LightningModule):
         self.unusable_in_a_row = 0
         self.last: dict[str, float] = {}
         self.improved = False
+        self._peaks: list[float] = []
         self.ending: tuple[int, float, int] | None = None
         """Step and progress at which training was told to end early, and the step of the end."""
 
@@ -101,8 +102,8 @@ class RadianceModule(LightningModule):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         groups = [*self.method.groups(), *self.sampling.groups()]
-        for group in groups:
-            group["peak_lr"] = group["lr"]
+        # Not part of the optimiser, whose state a resumed run takes over: settings may change.
+        self._peaks = [group["lr"] for group in groups]
         return self.method.optimizer(groups)
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
@@ -123,20 +124,26 @@ class RadianceModule(LightningModule):
         # All ranks must skip a step together: one that waits for the others' gradients would hang.
         usable = self.trainer.strategy.reduce_boolean_decision(math.isfinite(value), all=True)
         if not usable:
-            self._refuse(value, rendering.density)
+            self._refuse(f"the loss was {value}", not_finite(self.named_parameters()), rendering)
             return
-        self.unusable_in_a_row = 0
         self.manual_backward(loss / self.options.accumulate)
         self.sampling.observe(rendering)
         self._count(rendering.samples, len(rays["times"]))
         error = value if error is loss else float(error.detach())
         self.last = {"loss": value, "psnr": -10 * math.log10(max(error, 1e-10))}
         if self.batches % self.options.accumulate == 0:
-            self._update(optimizer, moment)
+            self._update(optimizer, moment, rendering)
 
-    def _update(self, optimizer: LightningOptimizer, moment: Moment) -> None:
+    def _update(self, optimizer: LightningOptimizer, moment: Moment, rendering: Rendering) -> None:
         self.method.regularise(moment)
         self.sampling.regularise()
+        usable = all_usable(self.parameters())
+        if not self.trainer.strategy.reduce_boolean_decision(usable, all=True):
+            broken = [f"gradient of {name}" for name in unusable_gradients(self.named_parameters())]
+            optimizer.zero_grad()
+            self._refuse("a gradient was infinite, NaN or too large to square", broken, rendering)
+            return
+        self.unusable_in_a_row = 0
         optimizer.step()
         optimizer.zero_grad()
         self.sampling.keep_up(self.field, moment)
@@ -145,8 +152,8 @@ class RadianceModule(LightningModule):
         factor = self.method.rate(self.global_step, self.progress)
         optimizer = self.optimizers()
         assert isinstance(optimizer, LightningOptimizer)
-        for group in optimizer.param_groups:
-            group["lr"] = factor * group["peak_lr"]
+        for group, peak in zip(optimizer.param_groups, self._peaks, strict=True):
+            group["lr"] = factor * peak
 
     def _count(self, samples: Any, rays: int) -> None:
         for name in ("candidates", "empty", "occluded"):
@@ -157,18 +164,41 @@ class RadianceModule(LightningModule):
         room = self.options.samples_per_batch * rays / max(1, len(samples))
         self.rays = max(64, min(self.options.rays_per_batch, int(room)))
 
-    def _refuse(self, value: float, density: Tensor) -> None:
+    def _refuse(self, what: str, broken: list[str], rendering: Rendering) -> None:
+        """Leave a step out, and give up after `PATIENCE` of them in a row."""
         self.unusable += 1
         self.unusable_in_a_row += 1
         if self.unusable_in_a_row < PATIENCE:
             return
-        broken = [name for name, p in self.field.named_parameters() if not p.isfinite().all()]
-        where = f"parameters {', '.join(broken)}" if broken else "the rendered rays alone"
+        density = rendering.density
         raise TrainingError(
-            f"the loss was {value} for {PATIENCE} steps in a row, at step {self.global_step}; not "
-            f"finite: {where}; largest density {float(density.max()) if len(density) else 0:.3g}. "
-            f"{self.method.advice}, or set trainer.precision=32."
+            f"{what} for {PATIENCE} steps in a row, at step {self.global_step}; not finite: "
+            f"{', '.join(broken) or 'the rendered rays alone'}; largest density "
+            f"{float(density.max()) if len(density) else 0:.3g}. {self._way_out}"
         )
+
+    def require_finite(self) -> None:
+        """Refuse to go on with, or to keep, parameters that are not finite.
+
+        Raises:
+            TrainingError: Naming them.
+        """
+        if broken := not_finite(self.named_parameters()):
+            raise TrainingError(
+                f"not finite at step {self.global_step}: {', '.join(broken)}. No checkpoint was "
+                f"written over the last sound one. {self._way_out}"
+            )
+
+    @property
+    def _way_out(self) -> str:
+        if self.global_step == 0:
+            largest = max(float(p.detach().abs().max()) for p in self.field.parameters())
+            return (
+                f"No step was done yet, so the start is to blame, whose largest value is "
+                f"{largest:.3g}: set lrm=none, or make the start anew"
+            )
+        precision = "" if self.field.precision == "32" else ", or set trainer.precision=32"
+        return f"{self.method.advice}{precision}; resume= goes on from the last checkpoint"
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["progress"] = {

@@ -1,5 +1,6 @@
 """run.json: what ran, where, and how it ended."""
 
+import logging
 import os
 import platform
 import subprocess
@@ -12,6 +13,8 @@ from typing import Any, Literal
 from xplanes import __version__
 from xplanes.config import ConfigError
 from xplanes.files import read_json, write_json
+
+logger = logging.getLogger(__name__)
 
 Status = Literal["running", "finished", "failed", "interrupted"]
 
@@ -38,7 +41,7 @@ class RunRecord:
     def __init__(self, run: Path, seed: int) -> None:
         self.path = run / "run.json"
         self._began = time.monotonic()
-        earlier = read_json(self.path) if self.path.is_file() else {}
+        earlier = _earlier(self.path)
         self._before = float(earlier.get("total_seconds", 0.0))
         self.content: dict[str, Any] = {
             "status": "running",
@@ -77,9 +80,14 @@ class RunRecord:
 
 
 def run_status(run: Path) -> str | None:
-    """Status in run.json; None where the folder holds no run."""
+    """Status in run.json, "damaged" if it cannot be read; None where the folder holds no run."""
     path = run / "run.json"
-    return read_json(path).get("status") if path.is_file() else None
+    if not path.is_file():
+        return None
+    try:
+        return str(read_json(path).get("status"))
+    except ValueError:
+        return "damaged"
 
 
 def claim(run: Path, *, resume: bool) -> None:
@@ -95,7 +103,21 @@ def claim(run: Path, *, resume: bool) -> None:
             "or choose another hydra.run.dir"
         )
     if status is None and resume:
-        raise ConfigError(f"resume={run}: no run.json there, so no run to go on with")
+        raise ConfigError(
+            f"resume={run}: no run.json there, so no run to go on with; start it with "
+            f"hydra.run.dir={run} instead of resume"
+        )
+
+
+def _earlier(path: Path) -> dict[str, Any]:
+    """run.json of the run that goes on; nothing where there is none or it is damaged."""
+    if not path.is_file():
+        return {}
+    try:
+        return read_json(path)
+    except ValueError as problem:
+        logger.warning("%s: the record of this run begins anew", problem)
+        return {"resumed": 0}
 
 
 def _now() -> str:

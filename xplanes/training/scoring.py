@@ -1,5 +1,6 @@
 """Scores of views, and the curve of them over training."""
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +15,8 @@ from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.box import Field
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -110,11 +113,13 @@ class Curve:
 
     def __init__(self, path: Path, until: int) -> None:
         self.path = path
-        self.rows = [
-            tuple(row[name] for name in self.HEADER)
-            for row in read_rows(path)
-            if int(row["step"]) <= until
-        ]
+        self.rows: list[tuple[str, ...]] = []
+        for row in read_rows(path):
+            values = tuple(row.get(name) or "" for name in self.HEADER)
+            if not all(values) or not values[1].isdecimal():
+                logger.warning("%s is damaged: a row without all its numbers is dropped", path)
+            elif int(values[1]) <= until:
+                self.rows.append(values)
 
     def add(self, seconds: float, step: int, split: str, scores: Sequence[ViewScore]) -> None:
         """Append the means over views; a row of the same step is replaced."""

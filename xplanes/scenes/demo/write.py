@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from time import time as now
 from typing import Any
 
 import torch
@@ -31,6 +32,9 @@ USUAL_VIEWS = {"train": 50, "val": 10, "test": 12}
 
 VIDEO_FRAMES = 50
 """Frames of the fixed-camera video."""
+
+DAY = 86_400.0
+"""Seconds after which an unfinished folder is nobody's any more."""
 
 _RENDERING = threading.Lock()
 
@@ -83,6 +87,7 @@ def ensure_demo_scene(
         f"Rendering demo scene {name} ({total} pictures of {resolution} pixels) to {folder}"
     )
     folder.parent.mkdir(parents=True, exist_ok=True)
+    _clear_unfinished(folder)
     fresh = _sibling(folder)
     try:
         with _one_thread():
@@ -184,6 +189,13 @@ def _sibling(folder: Path) -> Path:
     sibling = folder.with_name(f".{folder.name}.{os.getpid()}.{secrets.token_hex(4)}")
     sibling.mkdir()
     return sibling
+
+
+def _clear_unfinished(folder: Path) -> None:
+    """Remove what renderers that were killed a day ago left beside ``folder``."""
+    for path in folder.parent.glob(f".{folder.name}.*"):
+        if now() - path.stat().st_mtime > DAY:
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _publish(fresh: Path, folder: Path, record: dict[str, Any]) -> None:

@@ -1,0 +1,70 @@
+"""What becomes of runs when processes, disks, files and clocks fail: the fault tests, as a table.
+
+    python benchmarks/faults.py [--select EXPRESSION]
+
+Writes docs/results/faults.md. Some minutes; a few tests mount a small disk and need root for that.
+"""
+
+import os
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import sys
+from pathlib import Path
+
+from runner import machine, markdown
+from tally import Gatherer, gather
+
+from xplanes.files import write_text
+
+ROOT = Path(__file__).resolve().parent.parent
+COLUMNS = ("fault", "cases", "same end", "messages in words", "failed", "skipped")
+
+
+def page(found: Gatherer) -> str:
+    """The table and the words around it."""
+    rows, total = [], [0] * 5
+    for kind, row in found.rows.items():
+        counts = [row.counts.get(name, 0) for name in ("cases", "recovered", "said")]
+        counts += [row.failed, len(row.skipped)]
+        total = [a + b for a, b in zip(total, counts, strict=True)]
+        rows.append((kind, *counts))
+    rows.append(("**all**", *total))
+    reasons = sorted({reason for row in found.rows.values() for reason in row.skipped})
+    notes = "".join(f"\n{reason}\n" for reason in reasons)
+    if found.other_failures:
+        notes += f"\nFailed without a count: {', '.join(found.other_failures)}.\n"
+    return f"""# Faults
+
+Runs of 40 steps on a scene of 32 pixels, a checkpoint every 3 steps, planes at random or from
+`tiny`, forked from one process that has loaded everything. "Same end": once the fault is gone, the
+run (resumed where one had begun) comes to the parameters, scores and curve of an uninterrupted one,
+bit for bit, and leaves no unfinished file; a curve.csv that was cut short itself loses rows.
+"Messages": the words that a user saw, checked for the file, the reason and the way out. Cases with
+no end of their own are files and folders that must be refused.
+
+{machine()}; {found.seconds:.0f} s on one thread. Script: `benchmarks/faults.py`; tests:
+`python -m pytest -m stress tests/faults`.
+
+{markdown(COLUMNS, rows)}
+{notes}"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--select", help="as pytest -k: these tests alone, printed, not written")
+    args = parser.parse_args()
+    chosen = ["-k", args.select] if args.select else []
+    found = gather(["-m", "stress", str(ROOT / "tests" / "faults"), *chosen])
+    text = page(found)
+    if args.select:
+        print(text)
+    else:
+        write_text(ROOT / "docs" / "results" / "faults.md", text)
+    sys.exit(bool(found.other_failures) or any(row.failed for row in found.rows.values()))
+
+
+if __name__ == "__main__":
+    main()

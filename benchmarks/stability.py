@@ -1,0 +1,70 @@
+"""What becomes of numbers at their extremes: the stress suite, as a table.
+
+    python benchmarks/stability.py [--select EXPRESSION]
+
+Writes docs/results/stability.md. One process, one thread, some minutes.
+"""
+
+import os
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import sys
+from pathlib import Path
+
+from runner import machine, markdown
+from tally import Gatherer, gather
+
+from xplanes.files import write_text
+
+ROOT = Path(__file__).resolve().parent.parent
+COLUMNS = ("kind of stress", "cases", "finite", "stopped with a diagnosis", "failed", "worst error")
+
+
+def page(found: Gatherer) -> str:
+    """The table and the words around it."""
+    rows, total = [], [0, 0, 0, 0]
+    for kind, row in found.rows.items():
+        counts = [row.counts.get(name, 0) for name in ("cases", "finite", "diagnosed")]
+        counts.append(row.failed)
+        total = [a + b for a, b in zip(total, counts, strict=True)]
+        rows.append((kind, *counts, "" if row.error is None else f"{row.error:.1e}"))
+    rows.append(("**all**", *total, ""))
+    others = ""
+    if found.other_failures:
+        others = f"\nFailed without a count: {', '.join(found.other_failures)}.\n"
+    return f"""# Numerical stability
+
+Each case runs forward and backward, or trains 50 steps (Tensor4D 15): all values, gradients and
+parameters must be finite to the end, or training must stop with words that name what is not finite
+and the way out. Errors are the largest difference from float64 (or from the other number of
+threads) as a share of the largest expected value; each test states what it allows.
+
+{machine()}; {found.seconds:.0f} s on one thread. Script: `benchmarks/stability.py`; tests:
+`python -m pytest -m stress tests/stress`.
+
+{markdown(COLUMNS, rows)}
+{others}
+Robust PCA at its extremes:
+[a table of its own](../../benchmarks/results/decomposition_stress.md).
+"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--select", help="as pytest -k: these tests alone, printed, not written")
+    args = parser.parse_args()
+    chosen = ["-k", args.select] if args.select else []
+    found = gather(["-m", "stress", str(ROOT / "tests" / "stress"), *chosen])
+    text = page(found)
+    if args.select:
+        print(text)
+    else:
+        write_text(ROOT / "docs" / "results" / "stability.md", text)
+    sys.exit(bool(found.other_failures) or any(row.failed for row in found.rows.values()))
+
+
+if __name__ == "__main__":
+    main()

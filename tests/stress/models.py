@@ -1,0 +1,108 @@
+"""Every model, small, on scenes of `tests.stress.scenes`."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX
+from xplanes.checks import parse
+from xplanes.config import TrainConfig, compose_plain
+from xplanes.pipeline import run
+from xplanes.scenes.frame import Frame
+from xplanes.training.builder import build_frame, build_module, build_scene
+from xplanes.training.module import RadianceModule
+
+XPLANES = (
+    "model.resolution=16",
+    "model.channels=8",
+    "model.decoder.width=32",
+    "sampler.grid_resolution=16",
+    "sampler.samples=48",
+    "sampler.update_cells=256",
+    "sampler.coarse_steps=10",
+    "sampler.sweep_at=[15]",
+    "trainer.rays_per_batch=128",
+)
+SMALLER = ("model.width=16", "trainer.rays_per_batch=32")
+
+MODELS: dict[str, tuple[str, ...]] = {
+    "six_planes": XPLANES,
+    "nine_planes": XPLANES,
+    "kplanes": (*KPLANES, *PROPOSAL),
+    "kplanes_explicit": (*KPLANES, *PROPOSAL),
+    "tineuvox_s": TINEUVOX,
+    "tineuvox_b": TINEUVOX,
+    "tensor4d_density": (*TENSOR4D, *SMALLER),
+    "tensor4d": (*TENSOR4D, *SMALLER, *NEUS),
+}
+"""Overrides by model."""
+
+SLOW = ("tensor4d", "tensor4d_density")
+"""Models that get fewer steps."""
+
+RATES = {
+    "six_planes": ("trainer.plane_lr", "trainer.time_lr", "trainer.decoder_lr"),
+    "nine_planes": ("trainer.plane_lr", "trainer.time_lr", "trainer.decoder_lr"),
+    "kplanes": ("model.learning_rate",),
+    "kplanes_explicit": ("model.learning_rate",),
+    "tineuvox_s": ("model.grid_learning_rate", "model.network_learning_rate"),
+    "tineuvox_b": ("model.grid_learning_rate", "model.network_learning_rate"),
+    "tensor4d_density": ("model.learning_rate", "model.plane_learning_rate"),
+    "tensor4d": ("model.learning_rate", "model.plane_learning_rate"),
+}
+"""Learning rates by model."""
+
+
+def settings(model: str, scene: Path, *overrides: str) -> dict[str, Any]:
+    """The configuration of a small run."""
+    steps = 15 if model in SLOW else 50
+    return compose_plain(
+        "train",
+        [
+            "data=dnerf",
+            f"data.root={scene.parent}",
+            f"data.scene={scene.name}",
+            "data.resolution=null",
+            f"model={model}",
+            "lrm=none",
+            *MODELS[model],
+            "trainer.accelerator=cpu",
+            "trainer.precision=32",
+            f"trainer.max_steps={steps}",
+            "trainer.max_seconds=null",
+            "trainer.evaluate_at=[]",
+            "trainer.media=false",
+            "preparation.cache=null",
+            *overrides,
+        ],
+    )
+
+
+def faster(model: str, factor: float) -> list[str]:
+    """Overrides that multiply all learning rates of a model."""
+    plain = compose_plain("train", [f"model={model}", *MODELS[model]])
+    found = []
+    for key in RATES[model]:
+        group, name = key.split(".")
+        found.append(f"{key}={plain[group][name] * factor}")
+    return found
+
+
+def trained(config: dict[str, Any], folder: Path) -> dict[str, Tensor]:
+    """Run it whole, and give parameters, buffers and scores."""
+    run(config, folder, [], resume=False)
+    checkpoint = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    scores = json.loads((folder / "metrics.json").read_text())["test"]
+    return checkpoint["state_dict"] | {f"score.{k}": torch.tensor(v) for k, v in scores.items()}
+
+
+def built(config: dict[str, Any]) -> tuple[TrainConfig, RadianceModule, Frame]:
+    """The module of a run that has not begun."""
+    typed = parse(config)
+    scene = build_scene(typed.data)
+    frame = build_frame(typed, scene.splits["train"])
+    torch.manual_seed(0)
+    return typed, build_module(typed, scene, frame), frame

@@ -1,0 +1,109 @@
+"""Fields of the X-Planes with planes of every size: forward, backward, and as starts of runs."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import settings as options
+from hypothesis import strategies as st
+
+from tests.stress.models import settings, trained
+from tests.stress.references import worst
+from tests.stress.scenes import write_scene
+from tests.stress.test_lookup import spread
+from xplanes.fields import Decoder, XPlanes
+from xplanes.fields.xplanes import SPACE_PLANES, TIME_PLANES
+from xplanes.preparation.sequence import TriplaneSequence, save_triplanes
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.renderer import DIAGONAL, Renderer
+
+pytestmark = pytest.mark.stress
+
+VALUES = (0.0, 1e-30, 1.0, 1e4, 1e30, "mixed")
+
+
+def field_of(value, plane_set, precision, density, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(0)
+    names = (*SPACE_PLANES, *TIME_PLANES[plane_set])
+    planes = {name: spread((4, 6, 6), value, generator).to(dtype) for name in names}
+    torch.manual_seed(0)
+    decoder = Decoder(
+        4, width=16, hidden=2, density=density, density_scale=25.0, precision=precision
+    ).to(dtype)
+    return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set)
+
+
+def seen(field, samples, rays=16):
+    generator = torch.Generator().manual_seed(1)
+    origins = torch.randn(rays, 3, generator=generator)
+    origins = 3 * origins / origins.norm(dim=1, keepdim=True)
+    aim = 0.5 * torch.randn(rays, 3, generator=generator) - origins
+    directions = aim / aim.norm(dim=1, keepdim=True)
+    times = torch.linspace(0, 1, rays)
+    renderer = Renderer(OccupancyGrid(8, 2, step=DIAGONAL / samples), samples)
+    inputs = (t.to(field.space.dtype) for t in (origins, directions, times, torch.ones(3)))
+    rendering = renderer.render(field, *inputs)
+    rendering.colour.square().sum().backward()
+    return rendering, [p.grad for p in field.parameters()]
+
+
+@pytest.mark.parametrize("density", ["softplus", "exp"])
+@pytest.mark.parametrize("precision", ["32", "bf16", "64"])
+@pytest.mark.parametrize("plane_set", ["three", "six", "nine"])
+def test_planes_of_every_size(tally, plane_set, precision, density) -> None:
+    """Fields: planes of 0 to 1e4, 1 to 1024 samples, three types"""
+    dtype = torch.float64 if precision == "64" else torch.float32
+    for value in (0.0, 1e-30, 1.0, 1e4):
+        for samples in (1, 16, 1024):
+            number = "bf16" if precision == "bf16" else "32"
+            field = field_of(value, plane_set, number, density, dtype)
+            rendering, gradients = seen(field, samples)
+            tally.finite(rendering.colour, rendering.opacity, rendering.depth, *gradients)
+
+
+def test_bfloat16_stays_near_float64(tally) -> None:
+    """Fields: colours of the bfloat16 decoder against float64"""
+    for value in (0.0, 1e-30, 0.1, 1.0):
+        half, _ = seen(field_of(value, "six", "bf16", "softplus"), 64)
+        exact, _ = seen(field_of(value, "six", "32", "softplus", torch.float64), 64)
+        tally.finite(half.colour)
+        tally.error(worst(half.colour.detach(), exact.colour.detach()), 0.02)
+
+
+def test_float32_stays_near_float64(tally) -> None:
+    """Fields: colours and gradients of float32 against float64"""
+    for value in (0.0, 1e-30, 0.1, 1.0, 10.0):
+        for plane_set in ("three", "six", "nine"):
+            single, gradients = seen(field_of(value, plane_set, "32", "softplus"), 64)
+            exact, expected = seen(field_of(value, plane_set, "32", "softplus", torch.float64), 64)
+            tally.finite(single.colour, *gradients)
+            tally.error(worst(single.colour.detach(), exact.colour.detach()), 1e-4)
+            for ours, theirs in zip(gradients, expected, strict=True):
+                tally.error(worst(ours, theirs, 1e-20), 2e-3)
+
+
+def test_drawn_fields(tally) -> None:
+    """Fields: drawn sizes of planes, density scales and samples"""
+
+    @options(max_examples=150, deadline=None, derandomize=True, database=None)
+    @given(st.floats(-30, 4), st.floats(-30, 8), st.integers(1, 1024))
+    def case(exponent, scale, samples):
+        field = field_of(10**exponent, "six", "32", "softplus")
+        field.decoder.density_scale = 10**scale
+        rendering, gradients = seen(field, samples, rays=4)
+        tally.finite(rendering.colour, rendering.depth, *gradients)
+
+    case()
+
+
+@pytest.mark.parametrize("frames", [1, 6, 300])
+@pytest.mark.parametrize("value", VALUES)
+def test_starts_of_every_size(tally, tmp_path: Path, value, frames) -> None:
+    """Runs from triplanes of 0, 1e-30, 1, 1e4, 1e30 and mixed, 1 to 300 frames"""
+    scene = write_scene(tmp_path / "scenes", "ball")
+    planes = spread((frames, 3, 4, 8, 8), value, torch.Generator().manual_seed(0)).float()
+    save_triplanes(tmp_path / "start.pt", TriplaneSequence(planes))
+    plain = settings("six_planes", scene, "lrm=file", f"lrm.triplanes={tmp_path / 'start.pt'}")
+    state = tally.trained(lambda: trained(plain, tmp_path / "run"))
+    assert state is not None or value in (1e30, "mixed")

@@ -1,0 +1,92 @@
+"""Files appear whole or not at all, and what cannot be written is said in words."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from xplanes.files import (
+    StorageError,
+    clear_unfinished,
+    replacing,
+    require_writable,
+    storage_error,
+    write_text,
+)
+
+
+def begin(path: Path, problem: Exception) -> None:
+    """Write half a file, then fail."""
+    with replacing(path) as temporary:
+        temporary.write_text("ha")
+        raise problem
+
+
+def listed(folder: Path) -> list[str]:
+    return [path.name for path in folder.iterdir()]
+
+
+def test_a_block_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    write_text(path, "whole")
+    with pytest.raises(ValueError, match="half"):
+        begin(path, ValueError("half"))
+    assert path.read_text() == "whole"
+    assert listed(tmp_path) == ["a.json"]
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (errno.ENOSPC, r"No space left.*MB free.*Free some space"),
+        (errno.EDQUOT, r"quota.*Free some space"),
+        (errno.EFBIG, r"too large.*ulimit -f"),
+        (errno.EROFS, r"Read-only.*Choose a folder"),
+        (errno.EIO, r"disk or its connection"),
+    ],
+)
+def test_a_disk_that_refuses_is_said_in_words(tmp_path: Path, code: int, words: str) -> None:
+    path = tmp_path / "last.ckpt"
+    write_text(path, "old")
+    with pytest.raises(StorageError, match=rf"last\.ckpt cannot be written.*{words}"):
+        begin(path, OSError(code, os.strerror(code)))
+    assert path.read_text() == "old"
+    assert listed(tmp_path) == ["last.ckpt"]
+
+
+def test_other_problems_are_not_the_disk_s(tmp_path: Path) -> None:
+    assert storage_error(ConnectionRefusedError(errno.ECONNREFUSED, "refused")) is None
+    assert storage_error(PermissionError(errno.EACCES, "denied", "weights.ckpt")) is None
+    with pytest.raises(OSError, match="power cut") as caught:
+        begin(tmp_path / "a", OSError("power cut"))
+    assert not isinstance(caught.value, StorageError)
+
+
+def test_a_file_in_the_place_of_a_folder_is_named(tmp_path: Path) -> None:
+    (tmp_path / "outputs").write_text("")
+    with pytest.raises(StorageError, match=r"outputs/run/a\.txt.*file stands where a folder"):
+        write_text(tmp_path / "outputs" / "run" / "a.txt", "")
+    with pytest.raises(StorageError, match=r"outputs/run cannot.*file stands where a folder"):
+        require_writable(tmp_path / "outputs" / "run")
+
+
+def test_a_folder_that_can_be_written_stays_as_it_is(tmp_path: Path) -> None:
+    require_writable(tmp_path / "new" / "run")
+    assert listed(tmp_path) == []
+
+
+def test_only_unfinished_files_are_cleared(tmp_path: Path) -> None:
+    kept = tmp_path / "checkpoints" / "last.ckpt"
+    write_text(kept, "whole")
+    hidden = tmp_path / ".lock"
+    hidden.write_text("")
+    writer = replacing(kept)
+    left = writer.__enter__()
+    left.write_text("ha")
+    clear_unfinished(tmp_path, older_than=3600.0)
+    assert left.exists()
+    clear_unfinished(tmp_path)
+    assert not left.exists()
+    assert kept.read_text() == "whole"
+    assert hidden.exists()

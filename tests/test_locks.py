@@ -1,0 +1,42 @@
+"""Two processes never write into one run directory."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from xplanes.config import ConfigError
+from xplanes.locks import alone_in, in_turn
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from xplanes.locks import alone_in
+with alone_in(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_second_process_is_refused_until_the_first_is_killed(tmp_path: Path) -> None:
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
+    assert holder.stdout is not None
+    assert holder.stdout.readline() == "held\n"
+    try:
+        with pytest.raises(ConfigError, match=f"in use by process {holder.pid}: wait"):
+            alone_in(tmp_path).__enter__()
+    finally:
+        holder.kill()
+        holder.wait()
+    with alone_in(tmp_path):
+        assert (tmp_path / ".lock").is_file()
+
+
+def test_turns_are_free_when_nobody_holds_them(tmp_path: Path) -> None:
+    with in_turn(tmp_path / "a.lock") as waited:
+        assert not waited
+    with in_turn(None) as waited:
+        assert not waited

@@ -1,0 +1,121 @@
+"""What killed processes leave behind is cleared, and what others damaged is said in words."""
+
+import os
+import shutil
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.training.runs import small_config
+from xplanes.checks import parse
+from xplanes.config import ConfigError
+from xplanes.files import MARK, StorageError
+from xplanes.launch import prepare
+from xplanes.pipeline import run
+from xplanes.preparation.cache import DAY, StageCache
+from xplanes.pretraining.pool import RECORD, SHARD, ensure_pool
+from xplanes.scenes.demo import ensure_demo_scene
+from xplanes.scenes.errors import SceneError
+from xplanes.training.builder import build_scene
+from xplanes.training.checkpoints import LAST, Checkpoints
+from xplanes.training.scoring import Curve
+
+
+def aged(path: Path) -> Path:
+    past = time.time() - 2 * DAY
+    os.utime(path, (past, past))
+    return path
+
+
+def test_the_cache_clears_what_is_a_day_old(tmp_path: Path) -> None:
+    old, new = (tmp_path / f".parts-{age}.pt{MARK}x.pt" for age in ("old", "new"))
+    old.write_bytes(b"half")
+    new.write_bytes(b"half")
+    aged(old)
+    StageCache(tmp_path).stage("parts", [1], lambda: {"planes": torch.zeros(2)})
+    assert (old.exists(), new.exists()) == (False, True)
+
+
+def test_rendering_a_scene_clears_what_is_a_day_old(tmp_path: Path) -> None:
+    small = {"resolution": 8, "train_views": 1, "val_views": 1, "test_views": 1}
+    folder = ensure_demo_scene(tmp_path, "still", **small)
+    shutil.rmtree(folder)
+    old, new = (tmp_path / f".{folder.name}.{number}.0a" for number in (1, 2))
+    old.mkdir()
+    new.mkdir()
+    aged(old)
+    ensure_demo_scene(tmp_path, "still", **small)
+    assert (old.exists(), new.exists(), folder.exists()) == (False, True, True)
+
+
+def test_a_damaged_demo_scene_says_to_delete_it(tmp_path: Path) -> None:
+    data = parse(small_config(tmp_path)).data
+    build_scene(data)
+    (picture,) = tmp_path.glob("*/train/r_003.png")
+    picture.write_bytes(picture.read_bytes()[:50])
+    with pytest.raises(SceneError, match=r"r_003\.png.*demo scene: delete .* rendered again"):
+        build_scene(data)
+
+
+def test_a_damaged_record_of_a_pool_is_named(tmp_path: Path) -> None:
+    (tmp_path / RECORD).write_text('{"version": 1,')
+    with pytest.raises(ConfigError, match=r"pool\.json is damaged.*delete it"):
+        ensure_pool(tmp_path, range(SHARD), views=1, side=4)
+
+
+def test_a_damaged_row_of_a_curve_is_dropped(tmp_path: Path, caplog) -> None:
+    path = tmp_path / "curve.csv"
+    path.write_text("seconds,step,split,psnr,ssim\n0.0,0,test,9.1,0.2\n1.5,20,te")
+    curve = Curve(path, until=40)
+    assert [row[1] for row in curve.rows] == ["0"]
+    assert "curve.csv is damaged" in caplog.text
+
+
+def test_no_place_for_the_output_is_said_before_anything_is_loaded(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match=r"file/run cannot be written: Not a directory"):
+        prepare([f"hydra.run.dir={tmp_path / 'file' / 'run'}"])
+
+
+def test_overrides_that_were_cut_short_are_not_taken_for_whole(tmp_path: Path) -> None:
+    path = tmp_path / "overrides.txt"
+    path.write_text("seed=3\ntrainer.max_steps=400")
+    with pytest.raises(ConfigError, match=r"overrides\.txt is damaged.*config\.yaml"):
+        prepare([f"resume={tmp_path}"])
+    path.write_text("seed=3\ntrainer.max_steps=400\n")
+    assert "trainer.max_steps=400" in prepare([f"resume={tmp_path}"])
+
+
+def test_the_best_is_written_before_the_last(tmp_path: Path, monkeypatch) -> None:
+    """Killed in between, a run whose last checkpoint knows of a best one would never write it."""
+    original, written = Checkpoints.save, []
+
+    def note(self, trainer, name) -> None:
+        written.append((trainer.global_step, name))
+        original(self, trainer, name)
+
+    monkeypatch.setattr(Checkpoints, "save", note)
+    run(small_config(tmp_path / "scenes"), tmp_path / "run", [], resume=False)
+    both = [name for step, name in written if step == 20]
+    assert both == ["best.ckpt", "last.ckpt"]
+
+
+def test_a_disk_that_fills_up_ends_a_run_in_words(tmp_path: Path, monkeypatch, capsys) -> None:
+    from lightning import Trainer
+
+    original = Trainer.save_checkpoint
+
+    def fill_up(self, path, *rest, **more) -> None:
+        if self.global_step == 30:
+            raise OSError(28, "No space left on device", str(path))
+        original(self, path, *rest, **more)
+
+    monkeypatch.setattr(Trainer, "save_checkpoint", fill_up)
+    folder = tmp_path / "run"
+    with pytest.raises(StorageError, match=r"last\.ckpt cannot be written.*Free some space"):
+        run(small_config(tmp_path / "scenes"), folder, [], resume=False)
+    assert f"resume={folder}" in capsys.readouterr().out
+    state = torch.load(folder / "checkpoints" / LAST, weights_only=True)
+    assert state["global_step"] == 20

@@ -1,0 +1,165 @@
+"""Numbers that are not finite reach neither parameters nor checkpoints."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from tests.training.runs import small_config
+from xplanes.config import ConfigError
+from xplanes.pipeline import run
+from xplanes.training.checkpoints import find_resumable
+from xplanes.training.clock import TrainingClock
+from xplanes.training.health import all_usable, not_finite, unusable_gradients, usable
+from xplanes.training.methods.xplanes import XPlanesMethod
+from xplanes.training.module import RadianceModule, TrainingError
+
+FEW = ("trainer.max_steps=12", "trainer.checkpoint_every=5", "trainer.evaluate_at=[]")
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("scenes")
+
+
+def state(run_folder: Path) -> dict:
+    return torch.load(run_folder / "checkpoints" / "last.ckpt", weights_only=True)
+
+
+@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [(0.0, True), (1e18, True), (2e19, False), (math.inf, False), (math.nan, False)],
+)
+def test_a_gradient_is_usable_if_adam_can_square_it(value, expected, layout) -> None:
+    gradient = torch.zeros(1, 4, 3, 5).to(memory_format=layout)
+    gradient[0, 2, 1, 3] = value
+    assert usable(gradient) is expected
+
+
+def test_names_are_those_of_the_broken() -> None:
+    module = nn.Linear(2, 1)
+    module.bias.grad = torch.tensor([math.inf])
+    assert not all_usable(module.parameters())
+    assert unusable_gradients(module.named_parameters()) == ["bias"]
+    assert not_finite(module.named_parameters()) == []
+    with torch.no_grad():
+        module.weight[0, 1] = math.nan
+        module.bias.fill_(3e38)
+    assert not_finite(module.named_parameters()) == ["weight"]
+
+
+def spoil_gradient(monkeypatch: pytest.MonkeyPatch, value: float, steps: range) -> None:
+    original = XPlanesMethod.regularise
+
+    def spoil(self, moment) -> None:
+        original(self, moment)
+        if moment.batch in steps:
+            self.field.space.grad[0, 0, 0, 0] = value
+
+    monkeypatch.setattr(XPlanesMethod, "regularise", spoil)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e25])
+def test_one_bad_gradient_costs_one_step(scenes, tmp_path, monkeypatch, value) -> None:
+    spoil_gradient(monkeypatch, value, range(3, 4))
+    run(small_config(scenes, *FEW), tmp_path / "one", [], resume=False)
+    content = json.loads((tmp_path / "one" / "metrics.json").read_text())
+    assert (content["steps_skipped"], content["step"]) == (1, 12)
+    assert not_finite(state(tmp_path / "one")["state_dict"].items()) == []
+
+
+def test_gradients_that_stay_bad_end_training_in_words(scenes, tmp_path, monkeypatch) -> None:
+    spoil_gradient(monkeypatch, math.nan, range(7, 1000))
+    with pytest.raises(TrainingError, match=r"20 steps.*step 7.*gradient of field\.space.*resume="):
+        run(small_config(scenes, *FEW), tmp_path / "all", [], resume=False)
+    assert state(tmp_path / "all")["global_step"] == 5
+
+
+def test_a_start_that_cannot_be_trained_is_to_blame(scenes, tmp_path, monkeypatch) -> None:
+    spoil_gradient(monkeypatch, 1e30, range(1000))
+    with pytest.raises(TrainingError, match=r"step 0.*start is to blame.*lrm=none"):
+        run(small_config(scenes, *FEW), tmp_path / "start", [], resume=False)
+
+
+def test_a_checkpoint_never_holds_what_is_not_finite(scenes, tmp_path, monkeypatch) -> None:
+    original = TrainingClock.on_train_batch_end
+
+    def spoil(self, trainer, module, *rest) -> None:
+        original(self, trainer, module, *rest)
+        if trainer.global_step == 10:
+            with torch.no_grad():
+                module.field.decoder.layers[0].bias[0] = math.inf
+
+    monkeypatch.setattr(TrainingClock, "on_train_batch_end", spoil)
+    with pytest.raises(TrainingError, match=r"step 10: field\.decoder\.layers\.0\.bias"):
+        run(small_config(scenes, *FEW), tmp_path / "spoiled", [], resume=False)
+    assert state(tmp_path / "spoiled")["global_step"] == 5
+    monkeypatch.undo()
+    run(small_config(scenes, *FEW), tmp_path / "spoiled", [], resume=True)
+    assert state(tmp_path / "spoiled")["global_step"] == 12
+
+
+def test_a_resumed_run_takes_new_learning_rates(scenes, tmp_path, monkeypatch) -> None:
+    folder, seen = tmp_path / "slower", []
+    run(small_config(scenes, *FEW), folder, [], resume=False)
+    original = RadianceModule._set_learning_rates
+
+    def note(self) -> None:
+        original(self)
+        optimizer = self.optimizers().optimizer
+        seen.append([group["lr"] for group in optimizer.param_groups])
+
+    monkeypatch.setattr(RadianceModule, "_set_learning_rates", note)
+    changed = (*FEW, "trainer.max_steps=14", "trainer.plane_lr=0.02", "trainer.warmup_steps=0")
+    run(small_config(scenes, *changed), folder, [], resume=True)
+    assert len(seen) == 2
+    assert all(rates[0] < 0.021 for rates in seen)
+    assert seen[0][1] == pytest.approx(10 * seen[0][0])
+
+
+def shortened(content: bytes) -> bytes:
+    return content[:-1000]
+
+
+def flipped(content: bytes) -> bytes:
+    place = len(content) // 2
+    return content[:place] + bytes([content[place] ^ 16]) + content[place + 1 :]
+
+
+@pytest.mark.parametrize("damage", [shortened, flipped])
+def test_a_damaged_checkpoint_gives_way_to_the_best(scenes, tmp_path, caplog, damage) -> None:
+    whole, folder = tmp_path / "whole", tmp_path / "damaged"
+    settings = (*FEW, "trainer.evaluate_at=[0.4]")
+    run(small_config(scenes, *settings), whole, [], resume=False)
+    run(small_config(scenes, *settings), folder, [], resume=False)
+    last = folder / "checkpoints" / "last.ckpt"
+    last.write_bytes(damage(last.read_bytes()))
+    run(small_config(scenes, *settings), folder, [], resume=True)
+    assert "last.ckpt cannot be read" in caplog.text
+    assert "Going on from" in caplog.text
+    for name, value in state(whole)["state_dict"].items():
+        assert torch.equal(value, state(folder)["state_dict"][name]), name
+
+
+def test_damaged_checkpoints_alone_are_refused_in_words(tmp_path: Path) -> None:
+    assert find_resumable(tmp_path) is None
+    for name in ("last.ckpt", "best.ckpt"):
+        (tmp_path / name).write_bytes(b"half")
+        with pytest.raises(ConfigError, match=r"last\.ckpt cannot be read.*delete .*begin anew"):
+            find_resumable(tmp_path)
+
+
+def test_a_damaged_record_does_not_end_a_run(scenes, tmp_path, caplog) -> None:
+    folder = tmp_path / "record"
+    run(small_config(scenes, *FEW), folder, [], resume=False)
+    (folder / "run.json").write_text('{"status": "runn')
+    with pytest.raises(ConfigError, match=r"holds a run already \(damaged\)"):
+        run(small_config(scenes, *FEW), folder, [], resume=False)
+    run(small_config(scenes, *FEW), folder, [], resume=True)
+    assert "record of this run begins anew" in caplog.text
+    record = json.loads((folder / "run.json").read_text())
+    assert (record["status"], record["resumed"]) == ("finished", 1)

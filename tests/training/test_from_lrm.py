@@ -80,7 +80,7 @@ def test_a_stopped_preparation_goes_on_from_the_last_finished_stage(
         assert (tmp_path / "cache" / name).stat().st_mtime_ns == written
     told = metrics(folder)
     assert told["seconds"]["prepare"]["fixed_view"] > 0
-    assert "filmed by a field" in told["lrm"]["fixed_view"]
+    assert "filmed by six_planes" in told["lrm"]["fixed_view"]
     uninterrupted = tmp_path / "other"
     run(config, uninterrupted, [], resume=False)
     assert told["test"] == metrics(uninterrupted)["test"]

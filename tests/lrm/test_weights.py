@@ -15,7 +15,7 @@ from xplanes.lrm import LRMError
 from xplanes.lrm.config import parse_config
 from xplanes.lrm.published import published_config
 from xplanes.lrm.reachable import Probe
-from xplanes.lrm.weights import WeightSource, find_weights, load_source, read_config
+from xplanes.lrm.weights import WeightSource, find_weights, load_weights, read_config
 
 safetensors = pytest.importorskip("safetensors.torch")
 pytest.importorskip("huggingface_hub")
@@ -30,6 +30,12 @@ SOURCE = WeightSource(
 )
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 NOWHERE = "http://127.0.0.1:9"
+
+
+def load_source(source, *, announce=print, **options):
+    """Find weights and load them."""
+    path = find_weights(source, announce=announce, **options)
+    return load_weights(source, path, announce=announce)
 
 
 class Hub(http.server.BaseHTTPRequestHandler):

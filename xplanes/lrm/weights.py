@@ -49,35 +49,13 @@ class WeightSource:
         return f"https://huggingface.co/{self.repository}/resolve/{self.revision}/{self.file}"
 
 
-def load_source(
-    source: WeightSource,
-    *,
-    announce: Callable[[str], None] = print,
-    endpoint: str | None = None,
-    cache: Path | None = None,
-) -> LRM:
-    """Find the weights of a model and load them.
-
-    Weights of other than the published sizes need their configuration: the file that
-    ``source.config`` names, or one named config.json or config.yaml beside the weights.
-
-    Args:
-        source: Where the weights come from.
-        announce: Takes a line before anything is downloaded.
-        endpoint: Address of the hub; the usual one when None.
-        cache: The hub's cache; the usual one when None.
-
-    Raises:
-        LRMError: If no weights can be had, or they do not fit the architecture.
-    """
-    path = find_weights(source, announce=announce, endpoint=endpoint, cache=cache)
-    return load_weights(source, path, announce=announce)
-
-
 def load_weights(
     source: WeightSource, path: Path, *, announce: Callable[[str], None] = print
 ) -> LRM:
     """Load the weights of a model from a file that `find_weights` found.
+
+    Weights of other than the published sizes need their configuration: the file that
+    ``source.config`` names, or one named config.json or config.yaml beside the weights.
 
     Raises:
         LRMError: If they do not fit the architecture.

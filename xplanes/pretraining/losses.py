@@ -5,6 +5,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from xplanes.fields.decoder import Decoder
+from xplanes.rendering.box import ray_box
 
 
 def triplane_logits(planes: Tensor, decoder: Decoder, points: Tensor) -> Tensor:
@@ -57,10 +58,7 @@ def ray_samples(
         Rising distances and the length that each stands for, 0 on rays that miss the box.
         [B, R, S], [B, R, S]
     """
-    inverse = 1 / torch.where(directions.abs() < 1e-9, 1e-9, directions)
-    middle, reach = -origins * inverse, half_side * inverse.abs()
-    near, far = (middle - reach).amax(-1), (middle + reach).amin(-1)
-    missed, far = near >= far, torch.maximum(near, far)
+    near, far = ray_box(origins, directions, half_side)
     even = jitter.shape[-1] // 2
     steps = torch.arange(jitter.shape[-1], device=hits.device)
     share = torch.where(steps < even, steps, steps - even) + jitter
@@ -76,7 +74,7 @@ def ray_samples(
     distances = distances.sort(dim=-1).values
     between = 0.5 * (distances[..., 1:] + distances[..., :-1])
     edges = torch.cat([near[..., None], between, far[..., None]], dim=-1)
-    lengths = (edges[..., 1:] - edges[..., :-1]).masked_fill(missed[..., None], 0.0)
+    lengths = (edges[..., 1:] - edges[..., :-1]).masked_fill((near >= far)[..., None], 0.0)
     return distances, lengths
 
 

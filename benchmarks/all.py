@@ -1,0 +1,50 @@
+"""All benchmarks, one after the other: some two hours on two cores.
+
+    python benchmarks/all.py [--lego FOLDER] [--only NAME ...]
+
+Each script writes its own page; one that fails does not stop the others. Nothing else should run.
+"""
+
+import argparse
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+SCRIPTS = {
+    "where_time_goes": False,
+    "lego_curves": True,
+    "skips": True,
+    "rendering": True,
+    "stages": False,
+    "pareto": True,
+    "decomposition_speed": False,
+    "decomposition_stress": False,
+    "conversion_options": False,
+    "stability": False,
+    "faults": False,
+}
+"""Name of each script, and whether it takes the folder of lego."""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--lego", default="../shared/scenes/lego")
+    parser.add_argument("--only", nargs="+", choices=list(SCRIPTS), default=list(SCRIPTS))
+    args = parser.parse_args()
+    failed = []
+    for name in args.only:
+        options = ["--lego", args.lego] if SCRIPTS[name] else []
+        began = time.perf_counter()
+        code = subprocess.run([sys.executable, str(HERE / f"{name}.py"), *options], check=False)
+        print(f"{name}: {time.perf_counter() - began:.0f} s, exit {code.returncode}", flush=True)
+        if code.returncode:
+            failed.append(name)
+    if failed:
+        print(f"failed: {', '.join(failed)}")
+    return bool(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -50,13 +50,19 @@ def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> boo
         return False
     scenes = list(dict.fromkeys(line.scene for line in lines))
     labels = list(dict.fromkeys(line.label for line in lines))
-    figure = Figure(figsize=(1 + 4.2 * len(scenes), 7), layout="constrained")
+    across = max(1, round(1.5 * len(scenes)))
+    height = 7 + 0.2 * -(-len(labels) // across)
+    width = max(1 + 4.2 * len(scenes), 7)
+    figure = Figure(figsize=(width, height), layout="constrained")
     panels = figure.subplots(2, len(scenes), squeeze=False)
     for line in lines:
         column = scenes.index(line.scene)
         for row, (axis, title) in enumerate((("seconds", "seconds"), ("step", "steps"))):
             panel = panels[row][column]
-            places, values = _mean_curve(line.runs, axis)
+            # Models of unlike speed fill a logarithmic axis evenly; it has no place for 0.
+            pairs = [p for p in zip(*_mean_curve(line.runs, axis), strict=True) if p[0] > 0]
+            places, values = zip(*pairs, strict=True) if pairs else ((), ())
+            panel.set_xscale("log")
             panel.plot(
                 places, values, label=line.label, color=f"C{labels.index(line.label)}", marker="."
             )
@@ -64,7 +70,18 @@ def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> boo
             panel.set_ylabel("PSNR, dB")
             panel.set_title(line.scene)
             panel.grid(alpha=0.3)
-    panels[0][0].legend(fontsize="small")
+    handles = {
+        label: handle
+        for panel in panels[0]
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        [handles[label] for label in labels],
+        labels,
+        loc="outside lower center",
+        ncols=across,
+        fontsize="small",
+    )
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)
     return True
@@ -77,7 +94,9 @@ def _lines(rows: Sequence[RunRow], names: Sequence[str]) -> list[Line]:
         if len(row.curve) < 2:
             continue
         scene = str(row.settings.get(SCENE, ""))
-        label = ", ".join(_short(name, row.settings.get(name)) for name in over) or "run"
+        settings = {name: row.settings.get(name) for name in over}
+        parts = [_short(name, value) for name, value in settings.items() if value is not None]
+        label = ", ".join(parts) or "run"
         line = found.setdefault((scene, label), Line(scene, label, []))
         line.runs.append(row.curve)
     return list(found.values())

@@ -9,7 +9,7 @@ from typing import Any
 from xplanes.evaluation.sweep import MEASURES, RunRow
 
 SEED = "seed"
-UNLISTED = ("resume",)
+UNLISTED = ("resume", "trainer.evaluate_at", "trainer.media", "trainer.log_every")
 """Settings that say nothing about a result."""
 
 LABELS = {

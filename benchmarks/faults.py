@@ -10,16 +10,10 @@ import os
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import argparse
-import sys
-from pathlib import Path
 
 from runner import machine, markdown
-from tally import Gatherer, gather
+from tally import Gatherer, write_page
 
-from xplanes.files import write_text
-
-ROOT = Path(__file__).resolve().parent.parent
 COLUMNS = ("fault", "cases", "same end", "messages in words", "failed", "skipped")
 
 
@@ -52,19 +46,5 @@ no end of their own are files and folders that must be refused.
 {notes}"""
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--select", help="as pytest -k: these tests alone, printed, not written")
-    args = parser.parse_args()
-    chosen = ["-k", args.select] if args.select else []
-    found = gather(["-m", "stress", str(ROOT / "tests" / "faults"), *chosen])
-    text = page(found)
-    if args.select:
-        print(text)
-    else:
-        write_text(ROOT / "docs" / "results" / "faults.md", text)
-    sys.exit(bool(found.other_failures) or any(row.failed for row in found.rows.values()))
-
-
 if __name__ == "__main__":
-    main()
+    write_page("faults", page, "faults.md", (__doc__ or "").split("\n")[0])

@@ -1,9 +1,17 @@
 """Runs tests and gathers what they counted: one row per test function, named by its docstring."""
 
+import argparse
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pytest
+
+from xplanes.files import write_text
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 @dataclass
@@ -49,3 +57,25 @@ def gather(arguments: list[str]) -> Gatherer:
     gatherer = Gatherer()
     pytest.main(["-q", "-p", "no:cacheprovider", *arguments], plugins=[gatherer])
     return gatherer
+
+
+def write_page(folder: str, page: Callable[[Gatherer], str], name: str, words: str) -> None:
+    """Run a folder of the stress suite, write its page, and exit with whether anything failed.
+
+    Args:
+        folder: Folder below tests.
+        page: From what was counted to markdown.
+        name: File below docs/results.
+        words: What the script does, for its help.
+    """
+    parser = argparse.ArgumentParser(description=words)
+    parser.add_argument("--select", help="as pytest -k: these tests alone, printed, not written")
+    args = parser.parse_args()
+    chosen = ["-k", args.select] if args.select else []
+    found = gather(["-m", "stress", str(ROOT / "tests" / folder), *chosen])
+    text = page(found)
+    if args.select:
+        print(text)
+    else:
+        write_text(ROOT / "docs" / "results" / name, text)
+    sys.exit(bool(found.other_failures) or any(row.failed for row in found.rows.values()))

@@ -15,15 +15,21 @@ logger = logging.getLogger(__name__)
 
 
 @functools.cache
+def _found(package: str, consequence: str) -> bool:
+    """Whether a package is installed; says once what follows where it is not."""
+    if importlib.util.find_spec(package) is not None:
+        return True
+    logger.warning("%s is not installed: %s", package, consequence)
+    return False
+
+
 def numba_found() -> bool:
     """Whether the compiled CPU loops can be used; says so once where they cannot."""
-    if importlib.util.find_spec("numba") is None:
-        logger.warning(
-            "numba is not installed: the CPU takes the plain torch path, several times slower. "
-            "Install it with `pip install numba`."
-        )
-        return False
-    return True
+    return _found(
+        "numba",
+        "the CPU takes the plain torch path, several times slower. "
+        "Install it with `pip install numba`.",
+    )
 
 
 def cpu_loops(tensor: Tensor) -> bool:
@@ -36,16 +42,13 @@ def cpu_loops(tensor: Tensor) -> bool:
     )
 
 
-@functools.cache
 def triton_found() -> bool:
     """Whether triton is installed; says so once where it is not."""
-    if importlib.util.find_spec("triton") is None:
-        logger.warning(
-            "triton is not installed: the GPU takes the plain torch path, which is slower. "
-            "`pip install triton` brings it (torch for CUDA on Linux comes with it)."
-        )
-        return False
-    return True
+    return _found(
+        "triton",
+        "the GPU takes the plain torch path, which is slower. "
+        "`pip install triton` brings it (torch for CUDA on Linux comes with it).",
+    )
 
 
 def gpu_kernels(tensor: Tensor) -> bool:
@@ -70,9 +73,10 @@ def waves(device: torch.device, *shape: int) -> Tensor:
 
 def proven(
     what: str,
-    kernels: Callable[[], Sequence[Tensor]],
-    plain: Callable[[], Sequence[Tensor]],
-    tolerance: float = 1e-4,
+    attempt: Callable[[Callable[..., Tensor], torch.dtype], Sequence[Tensor]],
+    kernels: Callable[..., Tensor],
+    plain: Callable[..., Tensor],
+    dtype: torch.dtype,
 ) -> bool:
     """Whether kernels compile, run and come to the numbers of their readable twin.
 
@@ -80,15 +84,19 @@ def proven(
 
     Args:
         what: Name of the work, for the message.
-        kernels: Runs them on a small input; returns values and gradients.
-        plain: Runs the twin.
-        tolerance: Largest difference, relative or absolute.
+        attempt: Runs one of them on a small input of some precision; returns values and gradients.
+        kernels: What is tried.
+        plain: Its twin.
+        dtype: Type of the planes; the twin computes in float32 at least.
     """
+    exact = torch.promote_types(dtype, torch.float32)
+    tolerance = 1e-4 if dtype == exact else 0.05
     try:
         with torch.inference_mode(False), torch.enable_grad():
-            for ours, theirs in zip(kernels(), plain(), strict=True):
+            pairs = zip(attempt(kernels, dtype), attempt(plain, exact), strict=True)
+            for ours, theirs in pairs:
                 torch.testing.assert_close(
-                    ours, theirs, atol=tolerance, rtol=tolerance, check_dtype=False
+                    ours.to(exact), theirs, atol=tolerance, rtol=tolerance, check_dtype=False
                 )
     except Exception as error:
         # Whatever keeps a compiler from working is no reason to fail: there is another way.

@@ -54,7 +54,7 @@ def beside(rows: Sequence[RunRow]) -> str | None:
     lines = []
     for key, runs in groups.items():
         own = [*key, str(len(runs)), _mean(runs, "psnr", ".2f"), _mean(runs, "ssim", ".4f")]
-        for entry in published.get(key, [dict.fromkeys(("psnr", "ssim", "minutes"), "")]):
+        for entry in published.get(key, [{}]):
             names = ("psnr", "ssim", "minutes", "scenes", "source")
             lines.append([*own, *(entry.get(name, "") for name in names)])
             own = [*key, "", "", ""]

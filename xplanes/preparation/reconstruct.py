@@ -151,9 +151,7 @@ def reconstruct(
     # The cube is to hold the ball around all that the views show.
     offset = float((alignment.frame.centre - frame.centre).norm())
     wanted = alignment.frame.scale * (1 / frame.scale + offset)
-    # A camera before which nothing moves shows one moment, however often.
-    moments = encoded.triplanes if encoded.distinct > 1 else encoded.triplanes[:1]
-    triplanes, half_side = fit_cube(moments, alignment.half_side, wanted)
+    triplanes, half_side = fit_cube(encoded.triplanes, alignment.half_side, wanted)
     placed = replace(alignment, half_side=half_side)
     decoder = model.field_decoder(half_side)
     apart = alignment.mismatch

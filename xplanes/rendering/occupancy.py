@@ -13,8 +13,8 @@ class OccupancyGrid(nn.Module):
 
     A cell is occupied while its density could stop more than ``threshold`` of the light over one
     sample step. Cells start as occupied and lose their density by ``decay`` at each look that does
-    not confirm it. Cells that are not ``allowed`` (silhouettes show them empty) never fill, and
-    such that are not ``likely`` only from an occupied neighbour on.
+    not confirm it. Cells that are not ``allowed`` (silhouettes show them empty) never fill; those
+    that are not ``likely`` fill only beside an occupied cell.
 
     Args:
         resolution: Cells along each side.

@@ -63,10 +63,10 @@ def parse(config: dict[str, Any]) -> TrainConfig:
 _POSITIVE = (
     """data.resolution data.views data.eval_views data.half_side data.train_views data.test_views
 data.val_views model.resolution model.time_resolution model.channels model.decoder.width
-model.decoder.density_scale sampler.samples sampler.grid_resolution sampler.time_bins
-sampler.threshold sampler.sweep_every sampler.update_every sampler.update_cells loss.every
-loss.sparse_frames decomposition.penalty decomposition.tolerance decomposition.max_iterations
-preparation.frames preparation.fixed_view_seconds
+model.decoder.density_scale sampler.samples sampler.render_samples sampler.grid_resolution
+sampler.time_bins sampler.threshold sampler.sweep_every sampler.update_every sampler.update_cells
+loss.every loss.sparse_frames decomposition.penalty decomposition.tolerance
+decomposition.max_iterations preparation.frames preparation.fixed_view_seconds
 preparation.fixed_view_steps lrm.megabytes lrm.batch trainer.devices
 trainer.max_steps trainer.max_seconds trainer.plateau trainer.rays_per_batch
 trainer.samples_per_batch trainer.accumulate trainer.plane_lr trainer.time_lr trainer.decoder_lr

@@ -52,7 +52,6 @@ class RayRenderer(ABC):
         times: Tensor,
         background: Tensor,
         jitter: Any = None,
-        stride: int = 1,
     ) -> Rendering:
         """Render rays.
 
@@ -63,7 +62,6 @@ class RayRenderer(ABC):
             times: Time of each ray, from 0 to 1. [R]
             background: Colour behind the scene. [3] or [R, 3]
             jitter: What moves samples within their steps in training; None takes the middle.
-            stride: Steps that one sample stands for, where steps are equal.
 
         Returns:
             One value per ray; gradients reach the field.
@@ -78,7 +76,6 @@ class RayRenderer(ABC):
         time: float,
         background: Tensor,
         *,
-        stride: int = 1,
         chunk: int | None = None,
     ) -> dict[str, Tensor]:
         """Render any number of rays of one moment, a chunk at a time.
@@ -91,7 +88,7 @@ class RayRenderer(ABC):
         for start in range(0, max(len(origins), 1), chunk):
             rays = origins[start : start + chunk], directions[start : start + chunk]
             times = torch.full_like(rays[0][:, 0], time)
-            part = self.render(field, *rays, times, background, stride=stride)
+            part = self.render(field, *rays, times, background)
             parts.append((part.colour, part.opacity, part.depth))
         colour, opacity, depth = (torch.cat(part) for part in zip(*parts, strict=True))
         return {"colour": colour, "opacity": opacity, "depth": depth}

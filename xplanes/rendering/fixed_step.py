@@ -61,9 +61,8 @@ class FixedStepRenderer(RayRenderer):
         times: Tensor,
         background: Tensor,
         jitter: None = None,
-        stride: int = 1,
     ) -> FixedStepRendering:
-        step = self.step * field.cell * stride
+        step = self.step * field.cell
         samples = self.place(origins, directions, field.bounds(), step)
         density, features = field.geometry(samples.points, times[samples.ray])
         depth = density * step

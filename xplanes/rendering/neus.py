@@ -89,7 +89,6 @@ class NeusRenderer(RayRenderer):
         times: Tensor,
         background: Tensor,
         jitter: Tensor | None = None,
-        stride: int = 1,
     ) -> SurfaceRendering:
         ends = self.place(field, origins, directions, times, jitter)
         lengths = ends.diff(dim=1)

@@ -79,7 +79,6 @@ class ProposalRenderer(RayRenderer):
         times: Tensor,
         background: Tensor,
         jitter: torch.Generator | None = None,
-        stride: int = 1,
         *,
         anneal: float = 1.0,
         learn: bool = False,
@@ -94,7 +93,6 @@ class ProposalRenderer(RayRenderer):
             times: Time of each ray, from 0 to 1. [R]
             background: Colour behind the scene. [3] or [R, 3]
             jitter: Moves all samples; None leaves them where they are.
-            stride: Without meaning here.
             anneal: Exponent of the weights before samples are drawn.
             learn: Whether gradients reach the density fields.
 

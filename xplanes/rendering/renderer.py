@@ -49,7 +49,6 @@ class Renderer(RayRenderer):
         times: Tensor,
         background: Tensor,
         jitter: Tensor | None = None,
-        stride: int = 1,
     ) -> Rendering:
         """Render rays.
 
@@ -60,24 +59,24 @@ class Renderer(RayRenderer):
             times: Time of each ray, from 0 to 1. [R]
             background: Colour behind the scene. [3] or [R, 3]
             jitter: Place of each ray's samples within their steps; the middle when None. [R]
-            stride: Steps that one sample stands for.
 
         Returns:
             One value per ray; gradients reach the field.
         """
-        step = self.step * stride
         samples = march(
             origins,
             directions,
             times,
             torch.full_like(times, 0.5) if jitter is None else jitter,
             self.grid,
-            step=step,
+            step=self.step,
             skip_empty=self.skip_empty,
             occlusion=self.occlusion,
         )
         colour, density = shade(field, samples.points, times, directions, samples.ray)
-        total, _ = composite(density * step, colour, samples.distances, samples.ray, samples.starts)
+        total, _ = composite(
+            density * self.step, colour, samples.distances, samples.ray, samples.starts
+        )
         opacity = total[:, 3]
         return Rendering(
             colour=total[:, :3] + (1 - opacity)[:, None] * background,

@@ -10,7 +10,8 @@ class SamplerConfig:
     """Where rays are sampled, and which samples are never computed."""
 
     name: str = MISSING  # Name of the sampler.
-    samples: int = MISSING  # Steps along the diagonal of the cube.
+    samples: int = MISSING  # Steps along the diagonal of the cube in training.
+    render_samples: int = MISSING  # The same in pictures, for scores and films.
     grid_resolution: int = MISSING  # Cells of the occupancy grid along each side.
     time_bins: int = MISSING  # Bins of the occupancy grid along time.
     threshold: float = MISSING  # Opacity of one step below which a cell is empty.

@@ -86,14 +86,14 @@ class RadianceModule(LightningModule):
         self.ending = (self.global_step, self.spent, self.global_step + steps)
 
     @property
-    def stride(self) -> int:
-        """Steps that one sample stands for."""
-        return self.sampling.stride(self.global_step)
-
-    @property
     def renderer(self) -> RayRenderer:
         """Renders images of the field."""
         return self.sampling.renderer
+
+    @property
+    def renderer_now(self) -> RayRenderer:
+        """The same for the field as far as it is trained."""
+        return self.sampling.renderer_at(self.global_step)
 
     @property
     def moment(self) -> Moment:

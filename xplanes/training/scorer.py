@@ -9,6 +9,7 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
+from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.pictures import plane_sheet, strip, write_png
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
@@ -64,7 +65,7 @@ class Scorer(Callback):
         fresh = trainer.global_step == 0
         self._next = sum(share <= pl_module.progress for share in self.at)
         if fresh and self.at and self.at[0] == 0:
-            self._score(trainer, pl_module, self.indices, pl_module.stride)
+            self._score(trainer, pl_module, self.indices, pl_module.renderer_now)
         self.clock.pause()
 
     def on_train_batch_end(
@@ -74,15 +75,15 @@ class Scorer(Callback):
         due = sum(share <= pl_module.progress for share in self.at)
         if due > self._next and pl_module.progress < 1 and not trainer.should_stop:
             self._next = due
-            self._score(trainer, pl_module, self.indices, pl_module.stride)
+            self._score(trainer, pl_module, self.indices, pl_module.renderer_now)
             self.clock.pause()
 
     def finish(self, trainer: Trainer, module: RadianceModule) -> None:
         """Score all views with all samples: the figures of the final model."""
-        self._score(trainer, module, list(range(len(self.views))), stride=1)
+        self._score(trainer, module, list(range(len(self.views))), module.renderer)
 
     def _score(
-        self, trainer: Trainer, module: RadianceModule, indices: list[int], stride: int
+        self, trainer: Trainer, module: RadianceModule, indices: list[int], renderer: RayRenderer
     ) -> None:
         if not trainer.is_global_zero:
             return
@@ -94,15 +95,7 @@ class Scorer(Callback):
         for index in indices:
             self.interrupt.check()
             latest.append(
-                score_view(
-                    module.field,
-                    module.renderer,
-                    self.frame,
-                    self.views,
-                    index,
-                    self.background,
-                    stride=stride,
-                )
+                score_view(module.field, renderer, self.frame, self.views, index, self.background)
             )
         self.latest = latest
         module.train()

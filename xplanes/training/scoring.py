@@ -51,14 +51,12 @@ def render_view(
     views: Views,
     index: int,
     background: Tensor,
-    *,
-    stride: int = 1,
 ) -> dict[str, Tensor]:
     """Render one view whole: ``colour`` [H, W, 3], ``opacity`` and ``depth`` [H, W], on the CPU."""
     device = renderer.device
     origins, directions = (ray.to(device) for ray in frame.rays(*views.image_rays(index)))
     time = float(views.times[index])
-    image = renderer.image(field, origins, directions, time, background.to(device), stride=stride)
+    image = renderer.image(field, origins, directions, time, background.to(device))
     shape = (views.height, views.width)
     return {name: value.cpu().view(*shape, *value.shape[1:]) for name, value in image.items()}
 
@@ -70,11 +68,9 @@ def score_view(
     views: Views,
     index: int,
     background: Tensor,
-    *,
-    stride: int = 1,
 ) -> ViewScore:
     """Render one view and compare it with the true image in front of ``background``."""
-    image = render_view(field, renderer, frame, views, index, background, stride=stride)
+    image = render_view(field, renderer, frame, views, index, background)
     truth = views.composite(index, background)
     colour = image["colour"].float().clamp(0, 1)
     return ViewScore(

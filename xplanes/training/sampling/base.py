@@ -45,7 +45,7 @@ class Sampling(ABC):
     @property
     @abstractmethod
     def renderer(self) -> RayRenderer:
-        """Renders a step's rays, and images."""
+        """Renders images."""
 
     @property
     def parts(self) -> dict[str, nn.Module]:
@@ -65,9 +65,9 @@ class Sampling(ABC):
         """Rays of the first batch, of ``most`` at most."""
         return most
 
-    def stride(self, step: int) -> int:
-        """Steps that one sample stands for."""
-        return 1
+    def renderer_at(self, step: int) -> RayRenderer:
+        """Renders images when so many steps are done."""
+        return self.renderer
 
     @abstractmethod
     def render(self, field: Any, rays: Batch, moment: Moment) -> Rendering:

@@ -1,5 +1,7 @@
 """The occupancy grid in training."""
 
+import math
+from dataclasses import replace
 from typing import Any
 
 from torch import nn
@@ -23,12 +25,14 @@ class OccupancySampling(Sampling):
     """
 
     def __init__(self, renderer: Renderer, config: SamplerConfig) -> None:
-        self._renderer, self.config = renderer, config
-        self.grid = renderer.grid
+        self.config, self.grid = config, renderer.grid
+        self._coarse = replace(renderer, samples=math.ceil(renderer.samples / 2))
+        self._training = renderer
+        self._pictures = replace(renderer, samples=config.render_samples)
 
     @property
     def renderer(self) -> Renderer:
-        return self._renderer
+        return self._pictures
 
     @property
     def parts(self) -> dict[str, nn.Module]:
@@ -41,19 +45,19 @@ class OccupancySampling(Sampling):
     def first_rays(self, most: int) -> int:
         return min(most, 256)
 
-    def stride(self, step: int) -> int:
-        """Steps that one sample stands for: the first training steps look at half the samples."""
-        return 2 if step < self.config.coarse_steps else 1
+    def renderer_at(self, step: int) -> Renderer:
+        # At first the grid hides little, and pictures of all samples would take longer than steps.
+        return self._coarse if step < self.config.coarse_steps else self._pictures
 
     def render(self, field: Any, rays: Batch, moment: Moment) -> Rendering:
-        return self._renderer.render(
+        coarse = moment.step < self.config.coarse_steps
+        return (self._coarse if coarse else self._training).render(
             field,
             rays["origins"],
             rays["directions"],
             rays["times"],
             rays["background"],
             rays["jitter"],
-            stride=self.stride(moment.step),
         )
 
     def observe(self, rendering: Rendering) -> None:

@@ -1,0 +1,60 @@
+"""Where training samples rays, and where pictures do."""
+
+import pytest
+import torch
+
+from tests.training.runs import small_config
+from xplanes.checks import parse
+from xplanes.config import ConfigError
+from xplanes.training.builder import build_renderer
+from xplanes.training.sampling.base import Moment
+from xplanes.training.sampling.occupancy import OccupancySampling
+
+STEPS_OF_A_RAY = {"first": 8, "later": 15, "pictures": 40}
+
+
+def fog(points, times):
+    return torch.ones_like(points), torch.ones_like(points[:, 0])
+
+
+@pytest.fixture
+def sampling(tmp_path) -> OccupancySampling:
+    config = small_config(
+        tmp_path, "sampler.samples=15", "sampler.render_samples=40", "sampler.coarse_steps=10"
+    )
+    sampler = parse(config).sampler
+    return OccupancySampling(build_renderer(sampler, still=True), sampler)
+
+
+def along_the_diagonal() -> dict[str, torch.Tensor]:
+    ray = torch.full((1, 3), 3**-0.5)
+    return {
+        "origins": -3 * ray,
+        "directions": ray,
+        "times": torch.zeros(1),
+        "background": torch.ones(3),
+        "jitter": torch.full((1,), 0.5),
+    }
+
+
+@pytest.mark.parametrize(("step", "phase"), [(0, "first"), (9, "first"), (10, "later")])
+def test_the_first_steps_take_half_the_samples(sampling, step, phase) -> None:
+    seen = sampling.render(fog, along_the_diagonal(), Moment(0, step, step, 0))
+    assert len(seen.samples) == STEPS_OF_A_RAY[phase]
+
+
+@pytest.mark.parametrize(("step", "phase"), [(0, "first"), (9, "first"), (10, "pictures")])
+def test_pictures_on_the_way_are_as_coarse_as_the_first_steps(sampling, step, phase) -> None:
+    seen = sampling.renderer_at(step).render(fog, **along_the_diagonal())
+    assert len(seen.samples) == STEPS_OF_A_RAY[phase]
+
+
+def test_pictures_of_the_trained_field_have_samples_of_their_own(sampling) -> None:
+    seen = sampling.renderer.render(fog, **along_the_diagonal())
+    assert len(seen.samples) == STEPS_OF_A_RAY["pictures"]
+    assert sampling.renderer.grid is sampling.grid
+
+
+def test_no_samples_for_pictures_are_refused(tmp_path) -> None:
+    with pytest.raises(ConfigError, match=r"sampler\.render_samples=0"):
+        parse(small_config(tmp_path, "sampler.render_samples=0"))

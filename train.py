@@ -4,8 +4,10 @@ import os
 import sys
 from pathlib import Path
 
-# Spinning OpenMP threads waste the cores of a shared machine; must be set before torch is loaded.
+# OpenMP threads wait a moment for more work, then sleep: those that spin on waste the cores of a
+# shared machine. Must be set before torch is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 import hydra
 from hydra.core.hydra_config import HydraConfig

@@ -7,6 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from xplanes.fields.half import half_rows
+
 Activation = Literal["relu", "silu"]
 DensityActivation = Literal["softplus", "exp"]
 Precision = Literal["32", "bf16"]
@@ -76,10 +78,10 @@ class Decoder(nn.Module):
         """The last layer's output before the activations. [N, 3 C] -> [N, 4]"""
         bf16 = self.precision == "bf16"
         with torch.autocast(features.device.type, torch.bfloat16, enabled=bf16):
-            hidden = features
+            hidden = half_rows(features) if bf16 else features
             for layer in self.layers[:-1]:
                 hidden = self.activation(layer(hidden))
-            return self.layers[-1](hidden)
+            return self.layers[-1](hidden)[: len(features)]
 
     def activate(self, logits: Tensor) -> tuple[Tensor, Tensor]:
         """Colour and density from logits, at least in float32. [N, 4] -> [N, 3], [N]"""

@@ -8,6 +8,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from xplanes.fields.half import half_rows
+
 BLOCK = 16
 """Widths are padded to multiples of it, as fused GPU networks need."""
 
@@ -45,10 +47,11 @@ class PaddedMLP(nn.Module):
         bf16 = self.precision == "bf16"
         with torch.autocast(values.device.type, torch.bfloat16, enabled=bf16):
             first = self.weights[0]
-            values = F.linear(values, first[:, : self.inputs], self._bias(first))
+            hidden = half_rows(values) if bf16 else values
+            hidden = F.linear(hidden, first[:, : self.inputs], self._bias(first))
             for weight in self.weights[1:]:
-                values = F.linear(values.relu() if self.activation else values, weight)
-        return values.float() if bf16 else values
+                hidden = F.linear(hidden.relu() if self.activation else hidden, weight)
+        return hidden[: len(values)].float() if bf16 else hidden
 
     def _bias(self, first: Tensor) -> Tensor | None:
         if first.shape[1] == self.inputs:

@@ -20,6 +20,9 @@ from xplanes.files import replacing, write_rows, write_text
 SMALLER = ("recipe=none", "sampler=occupancy", "model.scales=[2]", "model.warmup_steps=50")
 """K-Planes at a size that learns within a minute on a CPU."""
 
+SELDOM = ("trainer.evaluate_at=[0.5,1.0]", "trainer.evaluate_views=2")
+"""How often a baseline is scored: a picture takes it seconds."""
+
 CASES: dict[str, tuple[str, ...]] = {
     "six, tiny (default)": (),
     "six, random": ("lrm=none",),
@@ -32,11 +35,11 @@ CASES: dict[str, tuple[str, ...]] = {
     "six, random, 256 samples": ("lrm=none", "sampler.samples=256"),
     "six, random, float32": ("lrm=none", "trainer.precision=32"),
     "six, random, bfloat16": ("lrm=none", "trainer.precision=bf16"),
-    "K-Planes, smaller, our grid": ("model=kplanes", *SMALLER),
-    "K-Planes": ("model=kplanes",),
-    "K-Planes, our grid": ("model=kplanes", "sampler=occupancy"),
-    "TiNeuVox-S": ("model=tineuvox_s",),
-    "Tensor4D, density": ("model=tensor4d_density",),
+    "K-Planes, smaller, our grid": ("model=kplanes", *SMALLER, *SELDOM),
+    "K-Planes": ("model=kplanes", *SELDOM),
+    "K-Planes, our grid": ("model=kplanes", "sampler=occupancy", *SELDOM),
+    "TiNeuVox-S": ("model=tineuvox_s", *SELDOM),
+    "Tensor4D, density": ("model=tensor4d_density", *SELDOM),
 }
 
 COLUMNS = (

@@ -48,7 +48,9 @@ def machine() -> str:
             if line.startswith("model name"):
                 name = line.split(":", 1)[1].strip()
                 break
-    return f"{os.cpu_count()} cores, {name}, torch {torch.__version__}"
+    cores, threads = os.cpu_count(), torch.get_num_threads()
+    used = f"{cores} cores" if threads == cores else f"{threads} of {cores} cores"
+    return f"{used}, {name}, torch {torch.__version__}"
 
 
 def markdown(columns: tuple[str, ...], rows: list[tuple]) -> str:

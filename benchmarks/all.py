@@ -19,6 +19,7 @@ SCRIPTS = {
     "rendering": True,
     "stages": False,
     "pareto": True,
+    "lrm_sizes": False,
     "decomposition_speed": False,
     "decomposition_stress": False,
     "conversion_options": False,

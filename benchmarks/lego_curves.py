@@ -9,6 +9,7 @@ one process with nothing else running.
 import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 import argparse
 import tempfile

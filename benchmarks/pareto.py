@@ -9,6 +9,7 @@ own, with nothing else running; runs kept in the work folder are not repeated.
 import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 import argparse
 from pathlib import Path
@@ -158,7 +159,8 @@ def main() -> None:
 
 {args.seconds:g} s of training clock for each run, {args.resolution} px, five views of the test
 split (lego: val); {machine()}. Script: `benchmarks/pareto.py`. "front": at some moment better than
-every other run had been by then, preparation included. On the way four views are scored.
+every other run had been by then, preparation included. On the way four views are scored; of
+the baselines two, and seldom.
 
 ![PSNR against seconds](pareto.png)
 

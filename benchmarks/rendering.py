@@ -8,6 +8,7 @@ Writes results/rendering.md and rendering.csv beside this file.
 import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 import argparse
 import statistics

@@ -4,10 +4,9 @@ import os
 import sys
 from pathlib import Path
 
-# OpenMP threads wait a moment for more work, then sleep: those that spin on waste the cores of a
-# shared machine. Must be set before torch is loaded.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+from xplanes.threads import waiting
+
+os.environ.update(waiting(os.environ))  # before torch is loaded
 
 import hydra
 from hydra.core.hydra_config import HydraConfig

@@ -8,8 +8,9 @@ published names, then loaded strictly and shown one picture, in a process of its
 
 import os
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+from xplanes.threads import waiting
+
+os.environ.update(waiting(os.environ))
 
 import json
 import resource
@@ -98,8 +99,10 @@ def main() -> None:
         print(*rows[-1], flush=True)
     page = f"""# Published LRMs at full size
 
-Random weights in float32, one picture of 512 pixels; {machine()}.
-Script: `benchmarks/lrm_sizes.py`.
+Random weights in float32, saved as safetensors without tensors that the model never uses
+(OpenLRM 1.0 and TripoSR are published as pickles), one picture of 512 pixels;
+{machine()}. The file is mapped into memory, so that it is
+read while the picture is encoded. Script: `benchmarks/lrm_sizes.py`.
 
 {markdown(COLUMNS, rows)}
 """

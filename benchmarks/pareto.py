@@ -8,8 +8,9 @@ own, with nothing else running; runs kept in the work folder are not repeated.
 
 import os
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+from xplanes.threads import waiting
+
+os.environ.update(waiting(os.environ))
 
 import argparse
 from pathlib import Path

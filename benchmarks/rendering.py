@@ -7,8 +7,9 @@ Writes results/rendering.md and rendering.csv beside this file.
 
 import os
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+from xplanes.threads import waiting
+
+os.environ.update(waiting(os.environ))
 
 import argparse
 import statistics

@@ -8,8 +8,9 @@ one process with nothing else running; compare them within one scene only.
 
 import os
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+from xplanes.threads import waiting
+
+os.environ.update(waiting(os.environ))
 
 import argparse
 import tempfile

@@ -7,8 +7,9 @@ Writes docs/results/stability.md. One process, one thread, some minutes.
 
 import os
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+from xplanes.threads import waiting
+
+os.environ.update(waiting(os.environ))
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 

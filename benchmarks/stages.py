@@ -10,8 +10,9 @@ both as logarithms.
 
 import os
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+from xplanes.threads import waiting
+
+os.environ.update(waiting(os.environ))
 
 import math
 import time

@@ -9,8 +9,9 @@ called, without what they call in other stages; what no stage claims is shown to
 import os
 import time
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+from xplanes.threads import waiting
+
+os.environ.update(waiting(os.environ))
 
 import argparse
 import functools

@@ -346,7 +346,7 @@ def test_an_occlusion_that_hides_everything_is_refused():
 
 
 LAYERS = (
-    ("backend", "files", "locks", "optional", "schemas", "config", "checks", "metrics"),
+    ("backend", "files", "locks", "optional", "threads", "schemas", "config", "checks", "metrics"),
     ("scenes",),
     ("fields",),
     ("lrm",),
@@ -369,7 +369,7 @@ LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 
 EDGES = {
     "launch": {"checks", "config", "files", "schemas"},
-    "train": {"config", "files", "launch", "pipeline"},
+    "train": {"config", "files", "launch", "pipeline", "threads"},
 }
 """What the ends of the command line may import, which must be quick to start."""
 

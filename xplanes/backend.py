@@ -5,13 +5,39 @@ import importlib
 import importlib.util
 import logging
 import os
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass
+class WarmUp:
+    """The time that loops took to load and compile, which belongs to no stage.
+
+    Attributes:
+        seconds: Since the process began.
+    """
+
+    seconds: float = 0.0
+
+    @contextmanager
+    def timed(self) -> Iterator[None]:
+        """Counts what is done inside."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds += time.perf_counter() - began
+
+
+warm_up = WarmUp()
 
 
 @functools.cache

@@ -14,6 +14,7 @@ import torch
 import yaml
 from lightning import seed_everything
 
+from xplanes.backend import warm_up
 from xplanes.checks import parse
 from xplanes.config import ConfigError, TrainConfig
 from xplanes.evaluation.media import film_times, orbit_poses, render_path, write_film
@@ -117,6 +118,7 @@ def train(
     """
     seed_everything(config.seed, verbose=False)
     source = find_source(config.lrm, say=say)
+    warm = warm_up.seconds
     started = time.monotonic()
     scene = build_scene(config.data)
     frame = build_frame(config, scene.splits["train"])
@@ -151,6 +153,7 @@ def train(
         return {}
     seconds = {
         "load": loaded,
+        "warm_up": warm_up.seconds - warm,
         "prepare": dict(start.seconds),
         "train": module.clock,
         "evaluate": scorer.seconds,

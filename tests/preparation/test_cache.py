@@ -1,11 +1,13 @@
 """Finished stages are found again, and nothing damaged is ever used."""
 
 import logging
+import time
 from pathlib import Path
 
 import pytest
 import torch
 
+from xplanes.backend import warm_up
 from xplanes.preparation import cache as cache_module
 from xplanes.preparation.cache import StageCache, fingerprint
 
@@ -41,6 +43,17 @@ def test_a_stage_is_made_once_and_comes_back_the_same(folder: Path):
     fresh = make()
     assert torch.equal(stage.content["planes"], fresh["planes"])
     assert stage.content["report"] == fresh["report"]
+
+
+def test_compiling_is_no_part_of_a_stages_time(folder: Path, monkeypatch):
+    def make():
+        with warm_up.timed():
+            return {}
+
+    before, clock = warm_up.seconds, iter([0.0, 10.0, 40.0, 45.0])
+    monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
+    assert StageCache(folder).stage("film", [1], make).seconds == pytest.approx(15)
+    assert warm_up.seconds - before == pytest.approx(30)
 
 
 @pytest.mark.parametrize(

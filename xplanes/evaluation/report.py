@@ -143,13 +143,14 @@ def closing(run: Path, config: TrainConfig, metrics: dict[str, Any]) -> str:
             f"{metrics['converged']}"
         )
     prepare = sum(seconds["prepare"].values())
+    warm_up = f"compiling {seconds['warm_up']:.1f} s · " if seconds["warm_up"] >= 1 else ""
     return "\n".join(
         [
             "",
             f"{metrics['split']:<9}psnr {metrics['test']['psnr']:.2f}  ssim "
             f"{metrics['test']['ssim']:.4f}  over {len(metrics['views'])} views, step "
             f"{metrics['step']}",
-            f"time     prepare {prepare:.1f} s + train {seconds['train']:.1f} s · scoring "
+            f"time     prepare {prepare:.1f} s + train {seconds['train']:.1f} s · {warm_up}scoring "
             f"{seconds['evaluate']:.1f} s · {seconds['total']:.1f} s in all · "
             f"{metrics['rays_per_second'] / 1000:.1f}k rays/s",
             f"skipped  {100 * skipped['empty']:.0f}% of samples in empty space, "

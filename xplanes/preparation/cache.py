@@ -19,6 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from xplanes.backend import warm_up
 from xplanes.files import clear_unfinished, replacing
 from xplanes.locks import in_turn
 
@@ -37,7 +38,7 @@ class Stage:
 
     Attributes:
         content: Tensors and builtins.
-        seconds: How long it took to make, also where it came from the cache.
+        seconds: How long it took to make, also where it came from the cache; without warming up.
         cached: Whether it came from the cache.
         key: Hash of what went into it; empty where nothing is kept.
     """
@@ -83,9 +84,9 @@ class StageCache:
         with in_turn(path.with_suffix(".lock") if path and alone else None) as waited:
             if waited and (found := _find(path, key)) is not None:
                 return found
-            began = time.perf_counter()
+            began = time.perf_counter() - warm_up.seconds
             content = make()
-            seconds = time.perf_counter() - began
+            seconds = time.perf_counter() - warm_up.seconds - began
             if path is not None:
                 _write(path, key, content, seconds)
         return Stage(content, seconds, False, key)

@@ -9,7 +9,7 @@ import torch
 from lightning import Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from xplanes.backend import cpu_loops
+from xplanes.backend import cpu_loops, warm_up
 from xplanes.config import TrainConfig
 from xplanes.scenes.datamodule import RayDataModule
 from xplanes.training.bar import StepBar
@@ -110,10 +110,11 @@ def _warm_up(module: RadianceModule, data: RayDataModule, device: torch.device) 
     notice = threading.Timer(PATIENCE, print, [words], {"flush": True})
     notice.start()
     try:
-        rays = {name: value[:8].to(device) for name, value in data.draw(0).items()}
-        rendering = module.sampling.render(module.field, rays, module.moment)
-        rendering.colour.sum().backward()
-        module.zero_grad(set_to_none=True)
+        with warm_up.timed():
+            rays = {name: value[:8].to(device) for name, value in data.draw(0).items()}
+            rendering = module.sampling.render(module.field, rays, module.moment)
+            rendering.colour.sum().backward()
+            module.zero_grad(set_to_none=True)
     finally:
         notice.cancel()
 

@@ -79,8 +79,8 @@ model.time_scale loss.total_variation loss.time_smoothness loss.time_magnitude l
 decomposition.noise trainer.warmup_steps""".split()
     + families.NOT_NEGATIVE
 )
-_SHARE = """data.background_share sampler.decay sampler.occlusion trainer.final_lr
-model.final_rate""".split()
+_SHARE = """data.background_share data.background_jitter sampler.decay sampler.occlusion
+trainer.final_lr model.final_rate""".split()
 _CHOICES: dict[str, tuple[str, ...]] = {
     "data.eval_split": ("test", "val"),
     "model.plane_set": ("six", "nine", "three"),

@@ -30,6 +30,7 @@ class DataConfig:
     eval_views: int | None = MISSING  # Views of it, spread over time; null takes all.
     half_side: float | None = MISSING  # Half the side of the scene's cube; null finds it.
     background_share: float = MISSING  # Share of rays drawn far from the silhouettes.
+    background_jitter: float = MISSING  # Share of all time by which their times are moved at most.
     skip_background: bool = MISSING  # Draw rays near the silhouettes more often than elsewhere.
 
 

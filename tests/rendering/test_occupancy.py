@@ -77,6 +77,47 @@ def test_presumed_cells_fill_from_their_occupied_neighbours_on():
     assert not grid.occupied[64:].any()
 
 
+def test_half_of_the_looks_go_where_the_scene_is():
+    grid = grid_of(resolution=16, bins=3)
+    ball = torch.zeros(3, 16, 16, 16)
+    ball[1, 4:7, 4:7, 4:7] = 100.0
+    hole = ((1 * 16 + 5) * 16 + 5) * 16 + 6
+    grid.density.copy_(ball.view(-1))
+    grid.density[hole] = 0
+    grid.occupied.copy_(grid.density > 0)
+    around = torch.zeros_like(ball, dtype=torch.bool)
+    around[1, 3:8, 3:8, 3:8] = True
+    near = []
+
+    def field(points, times):
+        cells = cells_of(grid, points, times)
+        near.append(around.view(-1)[cells].float().mean())
+        return torch.zeros(len(points), 3), ball.view(-1)[cells]
+
+    grid.update(field, 2000, generator())
+    assert near[0] == pytest.approx(0.5, abs=0.03)
+    assert grid.occupied[hole]
+    assert torch.equal(grid.occupied, ball.view(-1) > 0)
+
+
+@pytest.mark.parametrize("corner", [0, 63])
+def test_looks_beside_the_scene_stay_in_the_cube(corner):
+    grid = grid_of(bins=1)
+    grid.density.zero_()
+    grid.density[corner] = 100.0
+    grid.occupied.copy_(grid.density > 0)
+    seen = []
+
+    def field(points, times):
+        seen.append(cells_of(grid, points, times))
+        return constant(0.0)(points, times)
+
+    grid.likely.zero_()
+    grid.update(field, 2000, generator())
+    place = torch.stack([seen[0] % 4, seen[0] // 4 % 4, seen[0] // 16])
+    assert ((place - (0 if corner == 0 else 3)).abs().amax(dim=0) <= 1).all()
+
+
 def test_likely_cells_fill_wherever_they_are():
     grid = presumed(3, 60)
     grid.density.zero_()

@@ -209,3 +209,25 @@ def test_jitter_is_even():
     jitter = torch.cat([batches_of(rays=1000).draw(step)["jitter"] for step in range(10)])
     counts = torch.histc(jitter, bins=10, min=0, max=1)
     assert ((counts - 1000).abs() < 150).all()
+
+
+def test_only_rays_far_from_silhouettes_move_in_time_and_not_far():
+    still = batches_of(rays=4000, background_share=0.3).draw(3)
+    moved = batches_of(rays=4000, background_share=0.3, background_jitter=0.2).draw(3)
+    for name in ("origins", "directions", "target", "jitter"):
+        assert torch.equal(still[name], moved[name]), name
+    change = moved["times"] - still["times"]
+    shown = still["alpha"] > 0
+    assert shown.any()
+    assert not change[shown].any()
+    # Two of the five views stand at an end of time, where half of all moves lead nowhere.
+    assert (change != 0).float().mean() == pytest.approx(0.3 * 0.8, abs=0.03)
+    assert change.abs().max() == pytest.approx(0.2, abs=0.01)
+    assert abs(float(change[change != 0].mean())) < 0.02
+    assert moved["times"].min() >= 0
+    assert moved["times"].max() <= 1
+
+
+def test_a_still_scene_has_no_other_times():
+    still = replace(VIEWS, times=torch.zeros(len(VIEWS)))
+    assert not batches_of(still, background_jitter=0.2).draw(0)["times"].any()

@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 DAY = 86_400.0
 """Seconds after which an unfinished entry is nobody's any more."""
 
-VERSION = 2
+VERSION = 3
 """Raised when a stage would come out differently from the same inputs."""
 
 

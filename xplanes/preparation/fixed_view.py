@@ -43,7 +43,11 @@ def filming_settings(config: TrainConfig) -> TrainConfig:
     return replace(
         film,
         seed=config.seed,
-        data=replace(config.data, skip_background=film.data.skip_background),
+        data=replace(
+            config.data,
+            skip_background=film.data.skip_background,
+            background_jitter=film.data.background_jitter,
+        ),
         trainer=replace(
             film.trainer,
             accelerator=own.accelerator,
@@ -195,6 +199,7 @@ def _rendered(
         frame_content(own_frame),
         [asdict(part) for part in (filming.model, filming.sampler, filming.loss, filming.trainer)],
         [config.seed, filming.data.background_share, filming.data.skip_background],
+        [filming.data.background_jitter],
         [pose, focal, side, count],
     ]
 

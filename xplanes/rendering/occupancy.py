@@ -35,7 +35,7 @@ class OccupancyGrid(nn.Module):
         time_bins: int,
         *,
         step: float,
-        threshold: float = 0.003,
+        threshold: float = 0.001,
         decay: float = 0.95,
     ) -> None:
         super().__init__()
@@ -116,25 +116,41 @@ class OccupancyGrid(nn.Module):
 
     @torch.no_grad()
     def update(self, field: Field, count: int, generator: torch.Generator) -> None:
-        """Look at ``count`` random cells that samples do not reach, at random points and times.
+        """Look at random cells that samples do not reach, so that a wrong guess is corrected.
 
-        Cells that are allowed but empty are looked at, so that a wrong guess is corrected.
+        Half of them lie anywhere, the other half beside occupied cells, where most that is missing
+        is. Each is looked at in a random point at a random time.
 
         Args:
             field: From points [N, 3] and times [N] to colour [N, 3] and density [N].
-            count: Number of cells.
+            count: Number of cells at most; those that are not allowed are left out.
             generator: Source of randomness; equal generators keep the grids of all ranks equal.
         """
         device = self.density.device
-        candidates = self.allowed.nonzero()[:, 0]
-        if not len(candidates):
-            return
-        pick = torch.randint(len(candidates), (count,), generator=generator).to(device)
-        cells = candidates[pick]
+        beside = self._near_occupied(count // 2, generator)
+        total = self.density.numel()
+        cells = torch.randint(total, (count - count // 2,), generator=generator).to(device)
+        cells = torch.cat([cells, beside])
+        cells = cells[self.allowed[cells]]
         cells = cells[self.likely[cells] | self._beside_occupied(cells)]
+        if not len(cells):
+            return
         uniform = torch.rand(count, 4, generator=generator).to(device)[: len(cells)]
         points, times = self.draw(cells, uniform)
         self.observe(cells, field(points, times)[1])
+
+    def _near_occupied(self, count: int, generator: torch.Generator) -> Tensor:
+        """Random cells of the same time within one step of an occupied one, along each axis."""
+        device, size = self.density.device, self.resolution
+        cells = self.occupied.nonzero()[:, 0]
+        if not len(cells):
+            return cells
+        cells = cells[torch.randint(len(cells), (count,), generator=generator).to(device)]
+        moves = torch.randint(-1, 2, (3, count), generator=generator).to(device)
+        for stride, move in zip((1, size, size**2), moves, strict=True):
+            place = torch.div(cells, stride, rounding_mode="floor") % size
+            cells = cells + ((place + move).clamp(0, size - 1) - place) * stride
+        return cells
 
     def _beside_occupied(self, cells: Tensor) -> Tensor:
         """Whether a cell or one that shares a face with it is occupied. bool [N]"""

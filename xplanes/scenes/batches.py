@@ -45,6 +45,8 @@ class RayBatches:
             instead of at their share of the pixels. They show nothing but background, and teach
             only while the grid of occupied cells is wrong.
         background_share: Share of a batch drawn far from the silhouettes.
+        background_jitter: Share of all time by which their times are moved at most. What is far
+            from a silhouette stays empty for a while before and after, which no view shows.
         rank: Number of this process among those that split the rays.
     """
 
@@ -58,11 +60,12 @@ class RayBatches:
         background: str,
         skip_background: bool,
         background_share: float,
+        background_jitter: float = 0.0,
         rank: int = 0,
     ) -> None:
         self.views, self.frame = views, frame
         self.rays, self.seed, self.rank = rays, seed, rank
-        self.background = background
+        self.background, self.background_jitter = background, background_jitter
         margin = max(1, round(NEAR_SILHOUETTE * views.width))
         near = foreground(views, margin).flatten()
         self.near, self.far = near.nonzero()[:, 0], (~near).nonzero()[:, 0]
@@ -82,8 +85,9 @@ class RayBatches:
         """
         generator = step_generator(self.seed, step, self.rank)
         uniform = torch.rand(self.rays, 3, generator=generator, dtype=torch.float64)
+        far = uniform[:, 0] < self.far_share
         pixel = torch.where(
-            uniform[:, 0] < self.far_share,
+            far,
             _pick(self.far if len(self.far) else self.near, uniform[:, 1]),
             _pick(self.near if len(self.near) else self.far, uniform[:, 1]),
         )
@@ -109,12 +113,20 @@ class RayBatches:
         return {
             "origins": origins,
             "directions": directions,
-            "times": self.views.times[view],
+            "times": self._times(view, far, generator),
             "target": colour[:, :3] + (1 - colour[:, 3:]) * background,
             "background": background,
             "alpha": colour[:, 3],
             "jitter": uniform[:, 2].float(),
         }
+
+    def _times(self, view: Tensor, far: Tensor, generator: torch.Generator) -> Tensor:
+        """Times of rays, those far from silhouettes moved. int64 [R], bool [R] -> [R]"""
+        times = self.views.times[view]
+        if not self.background_jitter or self.views.is_still or not len(self.far):
+            return times
+        move = self.background_jitter * (2 * torch.rand(self.rays, generator=generator) - 1)
+        return torch.where(far, (times + move).clamp(0, 1), times)
 
 
 def _pick(pool: Tensor, uniform: Tensor) -> Tensor:

@@ -278,5 +278,6 @@ def build_batches(config: TrainConfig, scene: Scene, frame: Frame, rank: int) ->
         background=config.loss.background,
         skip_background=config.data.skip_background,
         background_share=config.data.background_share,
+        background_jitter=config.data.background_jitter,
         rank=rank,
     )

@@ -1,6 +1,6 @@
 """What each saving saves, and what it costs: same steps and rays, one saving off at a time.
 
-    python benchmarks/skips.py [--lego FOLDER] [--steps 400] [--resolution 100]
+    python benchmarks/skips.py [--lego FOLDER] [--steps 1000] [--resolution 100] [--seeds 2]
 
 Writes results/skips.md and results/skips.csv beside this file. Seconds are the training clock of
 one process with nothing else running; compare them within one scene only.
@@ -14,7 +14,9 @@ os.environ.update(waiting(os.environ))
 
 import argparse
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from statistics import fmean
 
 from runner import RESULTS, Measured, lego, machine, markdown, measure
 
@@ -36,14 +38,24 @@ SWITCHES = {
     ),
 }
 
+KINDS = ("empty", "occluded", "background")
+
+FIGURES: dict[str, Callable[[dict], float]] = {
+    "seconds": lambda run: run["seconds"]["train"],
+    "psnr": lambda run: run["test"]["psnr"],
+    "ssim": lambda run: run["test"]["ssim"],
+    "samples": lambda run: run["samples_per_ray"],
+    **{kind: lambda run, kind=kind: run["skipped"][kind] for kind in KINDS},
+}
+
 COLUMNS = (
     "scene",
     "savings",
-    "steps",
     "seconds",
     "times slower",
     "psnr",
     "psnr change",
+    "ssim",
     "samples a ray",
     "empty",
     "occluded",
@@ -51,11 +63,12 @@ COLUMNS = (
 )
 
 
-def train(scene: list[str], switches: tuple[str, ...], work: Path, args) -> Measured:
+def train(scene: list[str], switches: tuple[str, ...], seed: int, work: Path, args) -> Measured:
     """One run with equal rays at equal steps."""
     overrides = [
         *scene,
         "lrm=none",
+        f"seed={seed}",
         f"data.resolution={args.resolution}",
         f"trainer.max_steps={args.steps}",
         "trainer.max_seconds=null",
@@ -73,8 +86,9 @@ def train(scene: list[str], switches: tuple[str, ...], work: Path, args) -> Meas
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--lego", type=Path, default=Path("../shared/scenes/lego"))
-    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--resolution", type=int, default=100)
+    parser.add_argument("--seeds", type=int, default=2)
     args = parser.parse_args()
     scenes = {
         "demo excavator": ["data.scene=excavator"],
@@ -85,32 +99,33 @@ def main() -> None:
     rows = []
     with tempfile.TemporaryDirectory() as work:
         for name, scene in scenes.items():
-            base: dict = {}
+            base: dict[str, float] = {}
             for label, switches in SWITCHES.items():
-                metrics = train(scene, switches, Path(work), args).metrics
-                base = base or metrics
-                seconds, psnr = metrics["seconds"]["train"], metrics["test"]["psnr"]
+                runs = [
+                    train(scene, switches, seed, Path(work), args).metrics
+                    for seed in range(args.seeds)
+                ]
+                means = {key: fmean(find(run) for run in runs) for key, find in FIGURES.items()}
+                base = base or means
                 rows.append(
                     (
                         name,
                         label,
-                        metrics["step"],
-                        f"{seconds:.1f}",
-                        f"{seconds / base['seconds']['train']:.2f}",
-                        f"{psnr:.2f}",
-                        f"{psnr - base['test']['psnr']:+.2f}",
-                        f"{metrics['samples_per_ray']:.1f}",
-                        *(
-                            f"{100 * metrics['skipped'][kind]:.0f}%"
-                            for kind in ("empty", "occluded", "background")
-                        ),
+                        f"{means['seconds']:.1f}",
+                        f"{means['seconds'] / base['seconds']:.2f}",
+                        f"{means['psnr']:.2f}",
+                        f"{means['psnr'] - base['psnr']:+.2f}",
+                        f"{means['ssim']:.3f}",
+                        f"{means['samples']:.1f}",
+                        *(f"{100 * means[kind]:.0f}%" for kind in KINDS),
                     )
                 )
+                print(*rows[-1], flush=True)
     write_rows(RESULTS / "skips.csv", COLUMNS, rows)
     page = f"""# Savings, one switched off at a time
 
-{args.steps} steps of 512 rays, {args.resolution} px, six planes at random; {machine()}.
-Script: `benchmarks/skips.py`.
+{args.steps} steps of 512 rays, {args.resolution} px, six planes at random,
+means of {args.seeds} seeds; {machine()}. Script: `benchmarks/skips.py`.
 
 empty and occluded: shares of the samples in the box; background: share of the pixels.
 

@@ -78,13 +78,44 @@ def test_piped_output_is_plain_and_ends_with_scores_and_paths(scenes: str, tmp_p
     assert str(run) in tail
 
 
+EACH_RANK = """
+import sys
+import torch
+sys.path.insert(0, {root!r})
+from xplanes.training.module import RadianceModule
+def keep(module):
+    torch.save(module.state_dict(), {folder!r} + f"/rank{{module.global_rank}}.pt")
+RadianceModule.on_fit_end = keep
+# The second process starts with sys.argv[0], so that must stay this file.
+exec(compile(open({train!r}).read(), {train!r}, "exec"), globals())
+"""
+
+
 def test_two_processes_share_the_rays_and_end_with_one_model(scenes: str, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    result = train(scenes, *SMALL, "trainer=ddp", "trainer.max_steps=6", f"hydra.run.dir={run}")
+    run, script = tmp_path / "run", tmp_path / "each_rank.py"
+    script.write_text(
+        EACH_RANK.format(root=str(ROOT), train=str(ROOT / "train.py"), folder=str(tmp_path))
+    )
+    settings = [scenes, *SMALL, "trainer=ddp", "trainer.max_steps=20", f"hydra.run.dir={run}"]
+    result = subprocess.run(
+        [sys.executable, str(script), *settings],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
     assert result.returncode == 0, result.stderr
     state = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
-    assert state["global_step"] == 6
+    assert state["global_step"] == 20
     assert (run / "metrics.json").is_file()
+    first, second = (torch.load(tmp_path / f"rank{n}.pt", weights_only=True) for n in range(2))
+    # Each rank's grid saw its own samples last; the next step begins with that of the first.
+    parameters = [name for name in first if name.startswith("field.")]
+    assert len(parameters) > 6
+    for name in parameters:
+        assert torch.equal(first[name], second[name]), name
+        assert torch.equal(first[name], state["state_dict"][name]), name
 
 
 def start(run: Path, scenes: str) -> subprocess.Popen[bytes]:

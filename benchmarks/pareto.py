@@ -27,6 +27,7 @@ SELDOM = ("trainer.evaluate_at=[0.5,1.0]", "trainer.evaluate_views=2")
 
 CASES: dict[str, tuple[str, ...]] = {
     "six, tiny (default)": (),
+    "six, mini": ("lrm=mini",),
     "six, random": ("lrm=none",),
     "nine, tiny": ("model=nine_planes",),
     "nine, random": ("model=nine_planes", "lrm=none"),

@@ -29,7 +29,7 @@ GROUPS: dict[str, dict[str, type]] = {
     "lrm": {
         "none": schemas.LRMConfig,
         "file": schemas.TriplaneFileConfig,
-        "tiny": schemas.BundledLRMConfig,
+        **dict.fromkeys(("tiny", "mini"), schemas.BundledLRMConfig),
         **dict.fromkeys(("small", "base", "large", "xlarge"), schemas.PretrainedLRMConfig),
     },
     "preparation": {"default": schemas.PreparationConfig},
@@ -125,7 +125,7 @@ def pretraining() -> list[str]:
         "",
         "## `python -m xplanes pretrain-lrm`, with `pretrain=tiny`, `pretrain=mini`",
         "",
-        "Training of a small LRM on procedural objects, [its card](lrm_tiny.md).",
+        "Training of a small LRM on procedural objects: cards of [tiny](lrm_tiny.md) and [mini](lrm_mini.md).",
         "",
         "| key | meaning | value |",
         "|---|---|---|",

@@ -125,7 +125,7 @@ def pretraining() -> list[str]:
         "",
         "## `python -m xplanes pretrain-lrm`, with `pretrain=tiny`, `pretrain=mini`",
         "",
-        "Training of a small LRM on procedural objects: cards of [tiny](lrm_tiny.md) and [mini](lrm_mini.md).",
+        "Training of a small LRM: cards of [tiny](lrm_tiny.md) and [mini](lrm_mini.md).",
         "",
         "| key | meaning | value |",
         "|---|---|---|",

@@ -46,6 +46,7 @@ def filming_settings(config: TrainConfig) -> TrainConfig:
         data=replace(
             config.data,
             skip_background=film.data.skip_background,
+            background_share=film.data.background_share,
             background_jitter=film.data.background_jitter,
         ),
         trainer=replace(

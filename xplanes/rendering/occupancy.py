@@ -118,13 +118,13 @@ class OccupancyGrid(nn.Module):
     def update(self, field: Field, count: int, generator: torch.Generator) -> None:
         """Look at random cells that samples do not reach, so that a wrong guess is corrected.
 
-        Half of them lie anywhere, the other half beside occupied cells, where most that is missing
-        is. Each is looked at in a random point at a random time.
+        Half of them may lie anywhere, the other half beside occupied cells, where most of what is
+        missing is. Each is looked at in a random point at a random time.
 
         Args:
             field: From points [N, 3] and times [N] to colour [N, 3] and density [N].
-            count: Number of cells at most; those that are not allowed are left out.
-            generator: Source of randomness; equal generators keep the grids of all ranks equal.
+            count: Number of cells at most; of those drawn, some must stay empty and are left out.
+            generator: Source of randomness.
         """
         device = self.density.device
         beside = self._near_occupied(count // 2, generator)

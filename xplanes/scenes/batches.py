@@ -42,11 +42,11 @@ class RayBatches:
         background: Behind rays, in the target too: "white", "random" (another colour for each ray)
             or "one" (one random colour for the batch).
         skip_background: Whether rays far from the silhouettes are drawn at ``background_share``
-            instead of at their share of the pixels. They show nothing but background, and teach
-            only while the grid of occupied cells is wrong.
+            instead of at their share of the pixels. They show nothing but background; a few keep
+            the air clear of specks.
         background_share: Share of a batch drawn far from the silhouettes.
-        background_jitter: Share of all time by which their times are moved at most. What is far
-            from a silhouette stays empty for a while before and after, which no view shows.
+        background_jitter: Share of all time by which their times are then moved at most. What is
+            far from a silhouette is taken to be empty a moment before and after, too.
         rank: Number of this process among those that split the rays.
     """
 
@@ -65,13 +65,14 @@ class RayBatches:
     ) -> None:
         self.views, self.frame = views, frame
         self.rays, self.seed, self.rank = rays, seed, rank
-        self.background, self.background_jitter = background, background_jitter
+        self.background = background
         margin = max(1, round(NEAR_SILHOUETTE * views.width))
         near = foreground(views, margin).flatten()
         self.near, self.far = near.nonzero()[:, 0], (~near).nonzero()[:, 0]
         natural = len(self.far) / near.numel()
         skip = skip_background and 0 < natural < 1
         self.far_share = min(background_share, natural) if skip else natural
+        self.background_jitter = background_jitter if skip and not views.is_still else 0.0
         self.skipped = max(0.0, 1 - self.far_share / natural) * natural if skip else 0.0
         """Share of all pixels that uniform drawing would have shown and this one leaves out."""
 
@@ -123,7 +124,7 @@ class RayBatches:
     def _times(self, view: Tensor, far: Tensor, generator: torch.Generator) -> Tensor:
         """Times of rays, those far from silhouettes moved. int64 [R], bool [R] -> [R]"""
         times = self.views.times[view]
-        if not self.background_jitter or self.views.is_still or not len(self.far):
+        if not self.background_jitter:
             return times
         move = self.background_jitter * (2 * torch.rand(self.rays, generator=generator) - 1)
         return torch.where(far, (times + move).clamp(0, 1), times)

@@ -28,6 +28,7 @@ STAGES = (
     ("preparation", "xplanes.pipeline", "prepare"),
     ("preparation: weights", "xplanes.pipeline", "find_source"),
     ("building the model", "xplanes.pipeline", "build_module"),
+    ("compiled loops and first call", "xplanes.training.builder", "render_one_ray"),
     ("compiled loops and first call", "xplanes.training.fit", "_warm_up"),
     ("drawing rays", "xplanes.scenes.batches", "RayBatches.draw"),
     ("marching", "xplanes.rendering.renderer", "march"),

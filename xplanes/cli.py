@@ -262,7 +262,7 @@ def _pretrain(options: argparse.Namespace) -> None:
 
 def _add_score(commands: "argparse._SubParsersAction") -> None:
     parser = commands.add_parser("score-lrm", help="judge a small LRM by held-out objects")
-    parser.add_argument("model", help="tiny, or the weights of a run, FOLDER/NAME.safetensors")
+    parser.add_argument("model", help="tiny, mini, or weights: FOLDER/NAME.safetensors")
     parser.add_argument("--objects", type=int, default=64, help="default: %(default)s")
     parser.add_argument(
         "--out", type=Path, default=Path("outputs/score-lrm"), help="default: %(default)s"

@@ -126,7 +126,7 @@ def train(
     start = prepare(config, scene, frame, source, say=say)
     del source
     config, frame = replace(config, model=start.model), start.frame
-    began = time.monotonic()
+    began = time.monotonic() - warm_up.seconds
     module = build_module(
         config,
         scene,
@@ -136,7 +136,7 @@ def train(
         sparse=start.sparse,
     )
     data = RayDataModule(scene, frame, lambda rank: build_batches(config, scene, frame, rank))
-    loaded += time.monotonic() - began
+    loaded += time.monotonic() - warm_up.seconds - began
     if record is not None:
         device = training_device(config.trainer.accelerator)
         record.note(

@@ -16,8 +16,9 @@ from xplanes.scenes.demo.film import CAMERA_ANGLE_X, CAMERA_DISTANCE
 
 
 def test_there_is_one_and_all_together_are_small():
-    assert "tiny" in bundled_models()
-    assert set(bundled_models()) <= {path.stem for path in (CONF / "pretrain").glob("*.yaml")}
+    assert set(bundled_models()) == {"tiny", "mini"}
+    for group in ("pretrain", "lrm"):
+        assert set(bundled_models()) <= {path.stem for path in (CONF / group).glob("*.yaml")}
     assert sum(path.stat().st_size for path in FOLDER.iterdir()) < 20e6
 
 

@@ -101,21 +101,13 @@ def test_half_of_the_looks_go_where_the_scene_is():
 
 
 @pytest.mark.parametrize("corner", [0, 63])
-def test_looks_beside_the_scene_stay_in_the_cube(corner):
-    grid = grid_of(bins=1)
-    grid.density.zero_()
-    grid.density[corner] = 100.0
-    grid.occupied.copy_(grid.density > 0)
-    seen = []
-
-    def field(points, times):
-        seen.append(cells_of(grid, points, times))
-        return constant(0.0)(points, times)
-
-    grid.likely.zero_()
-    grid.update(field, 2000, generator())
-    place = torch.stack([seen[0] % 4, seen[0] // 4 % 4, seen[0] // 16])
-    assert ((place - (0 if corner == 0 else 3)).abs().amax(dim=0) <= 1).all()
+def test_looks_beside_the_scene_stay_in_the_cube_and_its_time(corner):
+    grid = grid_of(bins=3)
+    grid.occupied.zero_()
+    grid.occupied[64 + corner] = True
+    near = grid._near_occupied(2000, generator())
+    block = {x + 4 * y + 16 * z for x in (0, 1) for y in (0, 1) for z in (0, 1)}
+    assert set(near.tolist()) == {64 + (cell if corner == 0 else 63 - cell) for cell in block}
 
 
 def test_likely_cells_fill_wherever_they_are():

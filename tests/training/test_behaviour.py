@@ -67,7 +67,7 @@ def test_run_directory_holds_what_it_promises(trained: Path) -> None:
     content = metrics(trained)
     assert content["split"] == "test"
     assert len(content["views"]) == 3
-    assert content["seconds"]["warm_up"] > 0
+    assert "warm_up" in content["seconds"]
     assert set(content["seconds"]["prepare"]) == {"fixed_view", "lrm", "decomposition", "convert"}
     assert set(content["skipped"]) >= {"empty", "occluded", "background"}
     assert all(0 <= share <= 1 for share in content["skipped"].values())

@@ -24,8 +24,8 @@ class SamplerConfig:
     coarse_steps: int = MISSING  # First steps, in which samples lie twice as far apart.
     sweep_at: list[int] = MISSING  # Steps at which all occupied cells are looked at.
     sweep_every: int = MISSING  # Steps between such sweeps later on.
-    update_every: int = MISSING  # Steps between looks at cells that no ray samples.
-    update_cells: int = MISSING  # Cells per look.
+    update_every: int = MISSING  # Steps between looks at cells that no sample may reach.
+    update_cells: int = MISSING  # Cells per look at most.
 
 
 @dataclass

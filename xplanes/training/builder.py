@@ -38,6 +38,7 @@ from xplanes.training.methods.xplanes import XPlanesMethod
 from xplanes.training.module import RadianceModule
 from xplanes.training.product import SparseProduct
 from xplanes.training.sampling.occupancy import OccupancySampling
+from xplanes.training.warming import render_one_ray
 
 START_STREAM = 1_000_033
 """Random stream of the start values."""
@@ -263,6 +264,7 @@ def _occupancy_sampling(config: TrainConfig, site: Site, field: RadianceField) -
     if config.sampler.silhouettes:
         carve(renderer.grid, site.views, site.frame)
     if site.begun and config.sampler.fill:
+        render_one_ray(field, renderer)
         generator = step_generator(config.seed, 0, FILL_STREAM)
         fill(renderer.grid, field, site.views, site.frame, step=renderer.step, generator=generator)
     return OccupancySampling(renderer, config.sampler)

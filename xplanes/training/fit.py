@@ -1,7 +1,6 @@
 """Setting up Lightning's trainer and running it."""
 
 import logging
-import threading
 import warnings
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import torch
 from lightning import Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from xplanes.backend import cpu_loops, warm_up
+from xplanes.backend import cpu_loops
 from xplanes.config import TrainConfig
 from xplanes.scenes.datamodule import RayDataModule
 from xplanes.training.bar import StepBar
@@ -21,9 +20,7 @@ from xplanes.training.module import RadianceModule
 from xplanes.training.plateau import PlateauStop
 from xplanes.training.scalars import Scalars
 from xplanes.training.scorer import Scorer
-
-PATIENCE = 3.0
-"""Seconds of warming up after which the user is told what takes so long."""
+from xplanes.training.warming import warming_up
 
 
 def fit(
@@ -106,17 +103,11 @@ def _warm_up(module: RadianceModule, data: RayDataModule, device: torch.device) 
         module.to(device)
     elif not cpu_loops(next(module.field.parameters())):
         return
-    words = "compiling the inner loops, once after installation: about 20 s ..."
-    notice = threading.Timer(PATIENCE, print, [words], {"flush": True})
-    notice.start()
-    try:
-        with warm_up.timed():
-            rays = {name: value[:8].to(device) for name, value in data.draw(0).items()}
-            rendering = module.sampling.render(module.field, rays, module.moment)
-            rendering.colour.sum().backward()
-            module.zero_grad(set_to_none=True)
-    finally:
-        notice.cancel()
+    with warming_up():
+        rays = {name: value[:8].to(device) for name, value in data.draw(0).items()}
+        rendering = module.sampling.render(module.field, rays, module.moment)
+        rendering.colour.sum().backward()
+        module.zero_grad(set_to_none=True)
 
 
 def quiet_lightning() -> None:

@@ -13,7 +13,7 @@ from xplanes.scenes.batches import Batch, step_generator
 from xplanes.training.sampling.base import Moment, Sampling
 
 GRID_STREAM = 1_000_003
-"""Random stream of the occupancy grid, equal on all ranks so that their grids stay equal."""
+"""Random stream of the occupancy grid, the same on all ranks."""
 
 
 class OccupancySampling(Sampling):

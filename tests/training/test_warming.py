@@ -1,0 +1,26 @@
+"""First calls of the inner loops are told apart from what they are part of."""
+
+import time
+
+import torch
+
+from xplanes.backend import warm_up
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.renderer import DIAGONAL, Renderer
+from xplanes.training import warming
+
+
+def test_the_first_ray_asks_the_field_and_is_counted(monkeypatch, capsys):
+    asked = []
+
+    def field(points, times):
+        asked.append(points)
+        time.sleep(0.2)
+        return torch.rand(len(points), 3), torch.rand(len(points))
+
+    monkeypatch.setattr(warming, "PATIENCE", 0.05)
+    before = warm_up.seconds
+    warming.render_one_ray(field, Renderer(OccupancyGrid(4, 1, step=DIAGONAL / 8), 8))
+    assert sum(map(len, asked)) > 0
+    assert warm_up.seconds - before >= 0.2
+    assert "compiling the inner loops" in capsys.readouterr().out

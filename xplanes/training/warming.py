@@ -1,0 +1,36 @@
+"""First calls of the inner loops, which load and compile them."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from xplanes.backend import warm_up
+from xplanes.rendering.box import Field
+from xplanes.rendering.renderer import Renderer
+
+PATIENCE = 3.0
+"""Seconds of warming up after which the user is told what takes so long."""
+
+
+@contextmanager
+def warming_up() -> Iterator[None]:
+    """Count what is done inside as warming up, and say so where it takes long."""
+    words = "compiling the inner loops, once after installation: about 20 s ..."
+    notice = threading.Timer(PATIENCE, print, [words], {"flush": True})
+    notice.start()
+    try:
+        with warm_up.timed():
+            yield
+    finally:
+        notice.cancel()
+
+
+@torch.no_grad()
+def render_one_ray(field: Field, renderer: Renderer) -> None:
+    """Render a ray from the middle of the cube, as a first call of all that pictures need."""
+    with warming_up():
+        renderer.render(
+            field, torch.zeros(1, 3), torch.eye(3)[:1], torch.zeros(1), background=torch.ones(3)
+        )

@@ -13,6 +13,7 @@ from xplanes.threads import waiting
 os.environ.update(waiting(os.environ))
 
 import argparse
+import re
 from pathlib import Path
 
 from runner import RESULTS, Measured, lego, machine, markdown, run_apart
@@ -59,6 +60,11 @@ COLUMNS = (
     "parameters",
     "peak MB",
 )
+
+
+def slug(name: str) -> str:
+    """A case as the name of its folder."""
+    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
 
 
 def points(result: Measured) -> list[tuple[float, float]]:
@@ -139,7 +145,7 @@ def main() -> None:
     rows, curves = [], {}
     for scene, overrides in scenes.items():
         results = {}
-        for number, (name, case) in enumerate(CASES.items()):
+        for name, case in CASES.items():
             common = [
                 f"data.resolution={args.resolution}",
                 f"trainer.max_seconds={args.seconds}",
@@ -151,7 +157,7 @@ def main() -> None:
                 # A stage taken from the cache would cost its run nothing.
                 "preparation.cache=null",
             ]
-            folder = args.work / f"{scene}_{args.resolution}px_{args.seconds:g}s" / f"{number:02d}"
+            folder = args.work / f"{scene}_{args.resolution}px_{args.seconds:g}s" / slug(name)
             print(f"{scene}: {name}", flush=True)
             results[name] = run_apart([*overrides, *common, *case], folder.absolute())
         curves[scene] = {name: points(result) for name, result in results.items()}

@@ -35,6 +35,8 @@ def measure(overrides: list[str], work: Path) -> Measured:
         config = to_plain(compose("train", overrides))
     folder = Path(tempfile.mkdtemp(dir=work)) / "run"
     run(config, folder, overrides, resume=False)
+    if (kept := (folder / "overrides.txt").read_text(encoding="utf-8").splitlines()) != overrides:
+        raise RuntimeError(f"{folder} holds a run with {' '.join(kept)}: move it away")
     metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
     return Measured(metrics, read_rows(folder / "curve.csv"))
 
@@ -78,7 +80,7 @@ def run_apart(overrides: list[str], folder: Path) -> Measured:
         folder: The run directory; one that was begun goes on where it stopped.
 
     Raises:
-        RuntimeError: If the run fails.
+        RuntimeError: If the run fails, or the folder holds another one.
     """
     if not (folder / "metrics.json").is_file():
         begun = (folder / "run.json").is_file()

@@ -11,7 +11,7 @@ import torch
 from tests.training.runs import small_config
 from xplanes.config import ConfigError
 from xplanes.pipeline import run
-from xplanes.training import fit as fit_module
+from xplanes.training import warming
 from xplanes.training.clock import TrainingClock
 from xplanes.training.module import RadianceModule, TrainingError
 from xplanes.training.sampling.occupancy import OccupancySampling
@@ -260,7 +260,7 @@ def test_a_slow_warm_up_says_what_it_does(
         time.sleep(0.3)
         return render(*args)
 
-    monkeypatch.setattr(fit_module, "PATIENCE", 0.05)
+    monkeypatch.setattr(warming, "PATIENCE", 0.05)
     monkeypatch.setattr(OccupancySampling, "render", slow)
     run(small_config(scenes, "trainer.max_steps=1"), tmp_path / "run", [], resume=False)
     assert capsys.readouterr().out.count("compiling the inner loops") == 1

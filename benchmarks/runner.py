@@ -35,8 +35,6 @@ def measure(overrides: list[str], work: Path) -> Measured:
         config = to_plain(compose("train", overrides))
     folder = Path(tempfile.mkdtemp(dir=work)) / "run"
     run(config, folder, overrides, resume=False)
-    if (kept := (folder / "overrides.txt").read_text(encoding="utf-8").splitlines()) != overrides:
-        raise RuntimeError(f"{folder} holds a run with {' '.join(kept)}: move it away")
     metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
     return Measured(metrics, read_rows(folder / "curve.csv"))
 
@@ -82,6 +80,12 @@ def run_apart(overrides: list[str], folder: Path) -> Measured:
     Raises:
         RuntimeError: If the run fails, or the folder holds another one.
     """
+    listed = folder / "overrides.txt"
+    if listed.is_file():
+        lines = listed.read_text(encoding="utf-8").splitlines()
+        kept = [line for line in lines if not line.startswith("resume=")]
+        if kept != overrides:
+            raise RuntimeError(f"{folder} holds a run with {' '.join(kept)}: move it away")
     if not (folder / "metrics.json").is_file():
         begun = (folder / "run.json").is_file()
         lines = [f"resume={folder}"] if begun else [*overrides, f"hydra.run.dir={folder}"]

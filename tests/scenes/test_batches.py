@@ -24,6 +24,7 @@ def batches_of(views=VIEWS, frame=FRAME, **options):
         "background": "white",
         "skip_background": True,
         "background_share": 0.1,
+        "background_jitter": 0.0,
     }
     return RayBatches(views, frame, **{**defaults, **options})
 

@@ -23,6 +23,7 @@ def module_of(trained=0, rank=0):
             background="random",
             skip_background=True,
             background_share=0.1,
+            background_jitter=0.0,
             rank=number,
         )
 

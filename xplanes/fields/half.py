@@ -14,11 +14,7 @@ product, and the samples of every training step are another number.
 
 def half_rows(values: Tensor) -> Tensor:
     """The values in bfloat16, on the CPU with rows of zeros below. [N, C] -> [at least N, C]"""
-    return fill_rows(values.to(torch.bfloat16))
-
-
-def fill_rows(values: Tensor) -> Tensor:
-    """The values, on the CPU with zeros below. [N, ...] -> [at least N, ...]"""
+    values = values.to(torch.bfloat16)
     if values.device.type != "cpu":
         return values
-    return F.pad(values, (0, 0) * (values.ndim - 1) + (0, -len(values) % ROWS))
+    return F.pad(values, (0, 0, 0, -len(values) % ROWS))

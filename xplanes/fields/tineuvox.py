@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from xplanes.fields.base import ViewDependentField
 from xplanes.fields.encodings import octaves
-from xplanes.fields.half import fill_rows
 from xplanes.fields.networks import layers
 
 STRIDES = (1, 2, 4)
@@ -134,10 +133,8 @@ class TiNeuVox(ViewDependentField):
         return torch.cat(found, dim=1)[0, :, 0, 0].T
 
     def geometry(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
-        total, count = len(points), self.octaves
-        if self._precision == "bf16":
-            points, times = fill_rows(points), fill_rows(times)
         places = points * self.unit
+        count = self.octaves
         with self._mixed(points):
             encoded = octaves(places, count[0])
             moment = self.time(octaves(times[:, None], count[1]))
@@ -149,17 +146,13 @@ class TiNeuVox(ViewDependentField):
             logit = self.density(features)[:, 0]
         per_cell = F.softplus(logit.to(points.dtype) + self.shift)
         # The published density counts per side of a cell of the finished grid.
-        density = per_cell * (self.unit / self._cell(self.resolution**3))
-        return density[:total], features[:total]
+        return per_cell * (self.unit / self._cell(self.resolution**3)), features
 
     def colour(self, features: Tensor, directions: Tensor) -> Tensor:
-        total = len(features)
-        if self._precision == "bf16":
-            features, directions = fill_rows(features), fill_rows(directions)
         with self._mixed(directions):
             seen = octaves(directions, self.octaves[2])
             logits = self.colours(torch.cat([self.tint(features), seen], dim=1))
-        return logits[:total].to(directions.dtype).sigmoid()
+        return logits.to(directions.dtype).sigmoid()
 
     def _mixed(self, values: Tensor) -> torch.autocast:
         return torch.autocast(values.device.type, torch.bfloat16, enabled=self._precision == "bf16")

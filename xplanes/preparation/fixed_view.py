@@ -199,8 +199,8 @@ def _rendered(
         train.focal,
         frame_content(own_frame),
         [asdict(part) for part in (filming.model, filming.sampler, filming.loss, filming.trainer)],
-        [config.seed, filming.data.background_share, filming.data.skip_background],
-        [filming.data.background_jitter],
+        [config.seed, filming.data.skip_background],
+        [filming.data.background_share, filming.data.background_jitter],
         [pose, focal, side, count],
     ]
 

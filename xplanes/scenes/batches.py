@@ -60,7 +60,7 @@ class RayBatches:
         background: str,
         skip_background: bool,
         background_share: float,
-        background_jitter: float = 0.0,
+        background_jitter: float,
         rank: int = 0,
     ) -> None:
         self.views, self.frame = views, frame

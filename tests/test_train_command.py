@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from tests.training.runs import SMALL
+from xplanes.launch import prepare
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -64,6 +65,24 @@ def test_devices_in_a_sweep_are_refused(tmp_path: Path) -> None:
     result = train("-m", "trainer=ddp", "seed=0,1", f"hydra.sweep.dir={tmp_path}")
     assert result.returncode != 0
     assert "one device per job" in (result.stdout + result.stderr)
+
+
+def test_an_experiment_says_itself_that_it_is_a_multirun() -> None:
+    assert prepare(["experiment=planes"]) == ["experiment=planes", "--multirun"]
+    for already in ("-m", "--multirun", "hydra.mode=MULTIRUN"):
+        assert prepare([already, "experiment=planes"]) == [already, "experiment=planes"]
+    assert prepare(["experiment=published"]) == ["experiment=published"]
+    assert prepare(["seed=1"]) == ["seed=1"]
+
+
+def test_an_experiment_needs_no_flag(scenes: str, tmp_path: Path) -> None:
+    place = f"hydra.sweep.dir={tmp_path}"
+    result = train(
+        "experiment=planes", *SMALL, scenes, "model=six_planes", "model.resolution=8,9", place
+    )
+    assert result.returncode == 0, result.stderr
+    assert len(list(tmp_path.glob("*/metrics.json"))) == 2
+    assert (tmp_path / "table.md").is_file()
 
 
 def test_piped_output_is_plain_and_ends_with_scores_and_paths(scenes: str, tmp_path: Path) -> None:

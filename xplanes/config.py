@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -227,6 +228,7 @@ SCHEMAS: dict[tuple[str | None, str], type] = {
 """Schema by configuration group and the name under which its YAML files inherit it."""
 
 
+@cache
 def register_schemas() -> None:
     """Make the schemas known to Hydra; calling it again changes nothing."""
     from hydra.core.config_store import ConfigStore

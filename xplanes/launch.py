@@ -8,6 +8,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from xplanes.checks import parse
 from xplanes.config import CONF, ConfigError, TrainConfig, compose_plain, register_schemas
 from xplanes.files import read_json, require_writable
@@ -32,6 +34,9 @@ def prepare(arguments: list[str], conf: Path = CONF) -> list[str]:
     """
     check_keys(arguments, conf)
     values = dict(_split(arguments))
+    if not _is_multirun(arguments) and _is_sweep(values.get("experiment", ""), conf):
+        # Hydra from 1.4 on takes the mode from here, not from the experiment's file.
+        arguments = [*arguments, "--multirun"]
     resume = values.get("resume", "null")
     if resume in ("null", "", "None", "auto"):
         place = "hydra.sweep.dir" if _is_multirun(arguments) else "hydra.run.dir"
@@ -166,4 +171,13 @@ def _split(arguments: list[str]) -> list[tuple[str, str]]:
 
 
 def _is_multirun(arguments: list[str]) -> bool:
-    return "-m" in arguments or "--multirun" in arguments
+    return not {"-m", "--multirun", "hydra.mode=MULTIRUN"}.isdisjoint(arguments)
+
+
+def _is_sweep(experiment: str, conf: Path) -> bool:
+    """Whether the experiment's file says that it is a multirun."""
+    path = conf / "experiment" / f"{experiment}.yaml"
+    if not path.is_file():
+        return False
+    content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    return content.get("hydra", {}).get("mode") == "MULTIRUN"

@@ -1,8 +1,9 @@
 """What each saving saves, and what it costs: same steps and rays, one saving off at a time.
 
     python benchmarks/skips.py [--lego FOLDER] [--steps 1000] [--resolution 100] [--seeds 2]
+        [--only SAVING ...] [--name skips]
 
-Writes results/skips.md and results/skips.csv beside this file. Seconds are the training clock of
+Writes results/NAME.md and results/NAME.csv beside this file. Seconds are the training clock of
 one process with nothing else running; compare them within one scene only.
 """
 
@@ -29,16 +30,18 @@ SWITCHES = {
     "silhouettes off": ("sampler.silhouettes=false",),
     "background off": ("data.skip_background=false",),
     "coarse start off": ("sampler.coarse_steps=0",),
+    "thinning off": ("sampler.thinning=0",),
     "all off": (
         "sampler.skip_empty=false",
         "sampler.skip_occluded=false",
         "sampler.silhouettes=false",
         "data.skip_background=false",
         "sampler.coarse_steps=0",
+        "sampler.thinning=0",
     ),
 }
 
-KINDS = ("empty", "occluded", "background")
+KINDS = ("empty", "occluded", "background", "gradients")
 
 FIGURES: dict[str, Callable[[dict], float]] = {
     "seconds": lambda run: run["seconds"]["train"],
@@ -60,6 +63,7 @@ COLUMNS = (
     "empty",
     "occluded",
     "background",
+    "gradients",
 )
 
 
@@ -89,6 +93,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--resolution", type=int, default=100)
     parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--only", nargs="+", choices=SWITCHES, default=list(SWITCHES))
+    parser.add_argument("--name", default="skips")
     args = parser.parse_args()
     scenes = {
         "demo excavator": ["data.scene=excavator"],
@@ -100,9 +106,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as work:
         for name, scene in scenes.items():
             base: dict[str, float] = {}
-            for label, switches in SWITCHES.items():
+            for label in args.only:
                 runs = [
-                    train(scene, switches, seed, Path(work), args).metrics
+                    train(scene, SWITCHES[label], seed, Path(work), args).metrics
                     for seed in range(args.seeds)
                 ]
                 means = {key: fmean(find(run) for run in runs) for key, find in FIGURES.items()}
@@ -121,17 +127,18 @@ def main() -> None:
                     )
                 )
                 print(*rows[-1], flush=True)
-    write_rows(RESULTS / "skips.csv", COLUMNS, rows)
+    write_rows(RESULTS / f"{args.name}.csv", COLUMNS, rows)
     page = f"""# Savings, one switched off at a time
 
 {args.steps} steps of 512 rays, {args.resolution} px, six planes at random,
 means of {args.seeds} seeds; {machine()}. Script: `benchmarks/skips.py`.
 
-empty and occluded: shares of the samples in the box; background: share of the pixels.
+empty and occluded: shares of the samples in the box; background: share of the pixels; gradients:
+share of the samples left that needed none.
 
 {markdown(COLUMNS, rows)}
 """
-    write_text(RESULTS / "skips.md", page)
+    write_text(RESULTS / f"{args.name}.md", page)
 
 
 if __name__ == "__main__":

@@ -81,6 +81,7 @@ def summary(
         "skipped": {
             "empty": counts["empty"] / candidates,
             "occluded": counts["occluded"] / candidates,
+            "gradients": 1 - counts["passed"] / max(1, counts["samples"]),
             "background": background_skipped,
             "static": float(not module.field.moves),
             "budget": 0.0 if module.ending is None else 1 - module.spent,
@@ -156,7 +157,8 @@ def closing(run: Path, config: TrainConfig, metrics: dict[str, Any]) -> str:
             f"skipped  {100 * skipped['empty']:.0f}% of samples in empty space, "
             f"{100 * skipped['occluded']:.0f}% behind surfaces, "
             f"{100 * skipped['background']:.0f}% of pixels as background; "
-            f"{metrics['samples_per_ray']:.1f} samples a ray remained{plateau}",
+            f"{metrics['samples_per_ray']:.1f} samples a ray remained, gradients of "
+            f"{100 * (1 - skipped['gradients']):.0f}% of them{plateau}",
             f"wrote    {run}",
             f"         metrics.json  curve.csv  checkpoints/last.ckpt  {metrics.get('media', '')}",
             f"next     tensorboard --logdir {run}",

@@ -1,13 +1,14 @@
 """What all renderers share: what rays see, and whole images of it."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from xplanes.rendering.marching import Samples
+from xplanes.rendering.thinning import Cut
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,7 @@ class Rendering:
         depth: Mean distance of what is seen, 0 where nothing is. [R]
         density: Density of each sample, without gradient. [N]
         samples: The samples that reached the field.
+        cut: Where gradients wait to be passed on to the field; None if they reach it by themselves.
     """
 
     colour: Tensor
@@ -27,6 +29,7 @@ class Rendering:
     depth: Tensor
     density: Tensor
     samples: Samples
+    cut: Cut | None = field(default=None, kw_only=True)
 
 
 class RayRenderer(ABC):

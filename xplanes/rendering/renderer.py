@@ -11,6 +11,7 @@ from xplanes.rendering.box import Field, shade
 from xplanes.rendering.compositing import composite
 from xplanes.rendering.marching import march
 from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.thinning import Cut
 
 DIAGONAL = 2 * math.sqrt(3)
 """Longest way through the field's cube."""
@@ -25,12 +26,15 @@ class Renderer(RayRenderer):
         samples: Steps along the diagonal of the field's cube.
         skip_empty: Skip samples in empty cells.
         occlusion: Skip samples behind surfaces that leave less light than this; 0 skips none.
+        thinning: Where gradients are wanted, samples whose own is below this times the mean may be
+            left out, see `Cut.pass_on`; 0 leaves none out.
     """
 
     grid: OccupancyGrid
     samples: int
     skip_empty: bool = True
     occlusion: float = 0.001
+    thinning: float = 0.0
 
     @property
     def device(self) -> torch.device:
@@ -61,7 +65,8 @@ class Renderer(RayRenderer):
             jitter: Place of each ray's samples within their steps; the middle when None. [R]
 
         Returns:
-            One value per ray; gradients reach the field.
+            One value per ray; gradients reach the field, with `thinning` once ``cut`` passes them
+            on.
         """
         samples = march(
             origins,
@@ -73,7 +78,14 @@ class Renderer(RayRenderer):
             skip_empty=self.skip_empty,
             occlusion=self.occlusion,
         )
-        colour, density = shade(field, samples.points, times, directions, samples.ray)
+
+        def ask(chosen: Tensor | slice) -> tuple[Tensor, Tensor]:
+            points, ray = samples.points[chosen], samples.ray[chosen]
+            return shade(field, points, times, directions, ray)
+
+        thin = self.thinning > 0 and torch.is_grad_enabled()
+        cut = Cut.of(ask, self.thinning) if thin else None
+        colour, density = (cut.colour, cut.density) if cut else ask(slice(None))
         total, _ = composite(
             density * self.step, colour, samples.distances, samples.ray, samples.starts
         )
@@ -84,4 +96,5 @@ class Renderer(RayRenderer):
             depth=(total[:, 4] / opacity.clamp_min(1e-6)).detach(),
             density=density.detach(),
             samples=samples,
+            cut=cut,
         )

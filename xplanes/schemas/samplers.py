@@ -19,6 +19,7 @@ class SamplerConfig:
     skip_empty: bool = MISSING  # Skip samples in empty cells.
     skip_occluded: bool = MISSING  # Skip samples behind opaque surfaces.
     occlusion: float = MISSING  # Light left behind a surface below which it is opaque.
+    thinning: float = MISSING  # Gradients below this times the mean go on at random; 0: all do.
     silhouettes: bool = MISSING  # Rule out cells that the images' alpha shows to be empty.
     fill: bool = MISSING  # Empty cells where a start that is not random shows nothing.
     coarse_steps: int = MISSING  # First steps, in which samples lie twice as far apart.

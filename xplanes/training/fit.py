@@ -107,6 +107,7 @@ def _warm_up(module: RadianceModule, data: RayDataModule, device: torch.device) 
         rays = {name: value[:8].to(device) for name, value in data.draw(0).items()}
         rendering = module.sampling.render(module.field, rays, module.moment)
         rendering.colour.sum().backward()
+        module.sampling.pass_on(rendering, module.moment)
         module.zero_grad(set_to_none=True)
 
 

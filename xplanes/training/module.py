@@ -17,6 +17,10 @@ from xplanes.training.sampling.base import Moment, Sampling
 PATIENCE = 20
 """Steps in a row with a loss or gradient that is not finite after which training gives up."""
 
+COUNTS = ("rays", "candidates", "empty", "occluded", "samples", "passed")
+"""What a run counts: rays, samples in their box, those dropped as empty or occluded, those left,
+and those whose gradients reached the field."""
+
 
 class TrainingError(RuntimeError):
     """Training cannot go on; the message says what was seen and what to change."""
@@ -55,7 +59,7 @@ class RadianceModule(LightningModule):
         self.batches = 0
         self.clock = 0.0
         self.rays = sampling.first_rays(trainer.rays_per_batch)
-        self.counts = dict.fromkeys(("rays", "candidates", "empty", "occluded", "samples"), 0)
+        self.counts = dict.fromkeys(COUNTS, 0)
         self.unusable = 0
         self.unusable_in_a_row = 0
         self.last: dict[str, float] = {}
@@ -127,6 +131,7 @@ class RadianceModule(LightningModule):
             self._refuse(f"the loss was {value}", not_finite(self.named_parameters()), rendering)
             return
         self.manual_backward(loss / self.options.accumulate)
+        self.counts["passed"] += self.sampling.pass_on(rendering, moment)
         self.sampling.observe(rendering)
         self._count(rendering.samples, len(rays["times"]))
         error = value if error is loss else float(error.detach())

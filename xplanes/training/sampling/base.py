@@ -73,6 +73,14 @@ class Sampling(ABC):
     def render(self, field: Any, rays: Batch, moment: Moment) -> Rendering:
         """Render the rays of a batch, with jitter."""
 
+    def pass_on(self, rendering: Any, moment: Moment) -> int:
+        """Take gradients to the field where rendering cut them off.
+
+        Returns:
+            Number of samples that the field got gradients of.
+        """
+        return len(rendering.samples)
+
     def loss(self, rendering: Any) -> Tensor | None:
         """The sampler's own term of the loss, weighted; None for none."""
         return None

@@ -15,6 +15,9 @@ from xplanes.training.sampling.base import Moment, Sampling
 GRID_STREAM = 1_000_003
 """Random stream of the occupancy grid, the same on all ranks."""
 
+THINNING_STREAM = 1_000_241
+"""Random stream of the samples whose gradients are passed on."""
+
 
 class OccupancySampling(Sampling):
     """Equal steps through occupied cells; the grid is kept up to date here.
@@ -26,8 +29,8 @@ class OccupancySampling(Sampling):
 
     def __init__(self, renderer: Renderer, config: SamplerConfig) -> None:
         self.config, self.grid = config, renderer.grid
-        self._coarse = replace(renderer, samples=math.ceil(renderer.samples / 2))
-        self._training = renderer
+        self._training = replace(renderer, thinning=config.thinning)
+        self._coarse = replace(self._training, samples=math.ceil(renderer.samples / 2))
         self._pictures = replace(renderer, samples=config.render_samples)
 
     @property
@@ -59,6 +62,11 @@ class OccupancySampling(Sampling):
             rays["background"],
             rays["jitter"],
         )
+
+    def pass_on(self, rendering: Rendering, moment: Moment) -> int:
+        if rendering.cut is None:
+            return len(rendering.samples)
+        return rendering.cut.pass_on(moment.generator(rendering.density.device, THINNING_STREAM))
 
     def observe(self, rendering: Rendering) -> None:
         self.grid.observe(rendering.samples.cells, rendering.density)

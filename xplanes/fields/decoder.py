@@ -16,7 +16,7 @@ Precision = Literal["32", "bf16"]
 MOST_EXPONENT = 60.0
 """Logits beyond it give the density of this one: an infinite density has gradients that are NaN."""
 
-_ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"relu": F.relu, "silu": F.silu}
+_ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"relu": torch.relu_, "silu": F.silu}
 
 
 class Decoder(nn.Module):

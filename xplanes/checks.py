@@ -76,7 +76,7 @@ trainer.checkpoint_every trainer.evaluate_views trainer.log_every""".split()
 _NOT_NEGATIVE = (
     """seed model.decoder.hidden model.decoder.colour_margin model.space_scale
 model.time_scale loss.total_variation loss.time_smoothness loss.time_magnitude loss.sparse_weight
-decomposition.noise trainer.warmup_steps sampler.thinning""".split()
+decomposition.noise trainer.warmup_steps sampler.thinning loss.start_weight""".split()
     + families.NOT_NEGATIVE
 )
 _SHARE = """data.background_share data.background_jitter sampler.decay sampler.occlusion

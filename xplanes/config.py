@@ -159,6 +159,7 @@ class LossConfig:
     time_magnitude: float = MISSING  # Weight of squared values of the time planes.
     sparse_weight: float = MISSING  # Weight of L_r: time planes' products near what moves.
     sparse_frames: int = MISSING  # Random frames per application of L_r.
+    start_weight: float = MISSING  # Pull to a start's planes, over the number of views squared.
     every: int = MISSING  # Steps between applications of these, at as many times the weight.
 
 

@@ -256,7 +256,10 @@ def _xplanes_method(
     product = None
     if sparse is not None and field.time is not None and config.loss.sparse_weight:
         product = SparseProduct(sparse, field.rows, config.loss.sparse_frames)
-    return XPlanesMethod(field, loss=config.loss, trainer=config.trainer, product=product)
+    hold = config.loss.start_weight / len(site.views) ** 2 if site.begun else 0.0
+    return XPlanesMethod(
+        field, loss=config.loss, trainer=config.trainer, product=product, hold=hold
+    )
 
 
 def _occupancy_sampling(config: TrainConfig, site: Site, field: RadianceField) -> OccupancySampling:

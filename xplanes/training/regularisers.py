@@ -46,3 +46,9 @@ def add_time_smoothness_gradient(gradient: Tensor, planes: Tensor, weight: float
     gradient.narrow(1, 0, length).add_(bend, alpha=scale)
     gradient.narrow(1, 1, length).add_(bend, alpha=-2 * scale)
     gradient.narrow(1, 2, length).add_(bend, alpha=scale)
+
+
+@torch.no_grad()
+def add_distance_gradient(gradient: Tensor, plane: Tensor, start: Tensor, weight: float) -> None:
+    """Add ``weight`` times the gradient of the mean squared distance from ``start``."""
+    gradient.add_(plane - start, alpha=2 * weight / plane.numel())

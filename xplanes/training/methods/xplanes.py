@@ -1,6 +1,7 @@
 """X-Planes in training: regularisers of the planes, and L_r."""
 
 import torch
+from torch import Tensor
 
 from xplanes.config import LossConfig, TrainerConfig
 from xplanes.fields import XPlanes
@@ -8,6 +9,7 @@ from xplanes.scenes.batches import step_generator
 from xplanes.training.methods.base import Method, warm_cosine
 from xplanes.training.product import SparseProduct
 from xplanes.training.regularisers import (
+    add_distance_gradient,
     add_time_smoothness_gradient,
     add_total_variation_gradient,
     time_smoothness,
@@ -27,6 +29,7 @@ class XPlanesMethod(Method):
         loss: Weights of the regularisers.
         trainer: Learning rates.
         product: What the products of time planes are tied to (L_r); None leaves the term out.
+        hold: Weight of the planes' mean squared distances from their start.
     """
 
     def __init__(
@@ -36,8 +39,11 @@ class XPlanesMethod(Method):
         loss: LossConfig,
         trainer: TrainerConfig,
         product: SparseProduct | None = None,
+        hold: float = 0.0,
     ) -> None:
         self._field, self.weights, self.options, self.product = field, loss, trainer, product
+        self.hold = hold
+        self._starts = [plane.detach().clone() for plane in self._planes] if hold else []
         self.advice = (
             f"Lower trainer.plane_lr={trainer.plane_lr} or trainer.decoder_lr={trainer.decoder_lr}"
         )
@@ -45,6 +51,10 @@ class XPlanesMethod(Method):
     @property
     def field(self) -> XPlanes:
         return self._field
+
+    @property
+    def _planes(self) -> list[Tensor]:
+        return [p for p in (self._field.space, self._field.time) if p is not None]
 
     def groups(self) -> list[Group]:
         field = self._field
@@ -66,6 +76,12 @@ class XPlanesMethod(Method):
         every, field = self.weights.every, self._field
         if moment.step % every or field.space.grad is None:
             return
+        if self.hold:
+            # The field may have moved to another device since.
+            self._starts = [start.to(field.space.device) for start in self._starts]
+            for plane, start in zip(self._planes, self._starts, strict=True):
+                if plane.grad is not None:
+                    add_distance_gradient(plane.grad, plane, start, self.hold * every)
         if weight := self.weights.total_variation * every:
             add_total_variation_gradient(field.space.grad, field.space, (1, 2), weight)
         if field.time is None or field.time.grad is None:

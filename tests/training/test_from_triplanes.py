@@ -1,6 +1,7 @@
 """Runs that start from a triplane file: what they write, how they go on, how they are loaded."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from PIL import Image
 
 from tests.preparation.sequences import moving_sequence
 from tests.training.runs import small_config
+from xplanes.checks import parse
 from xplanes.config import ConfigError
 from xplanes.decomposition import TIME_ROWS, decompose, unexplained_energy
 from xplanes.decomposition.conversion import frame_profiles
@@ -17,10 +19,12 @@ from xplanes.evaluation.runs import load_run
 from xplanes.fields import Decoder, XPlanes
 from xplanes.files import read_rows
 from xplanes.pipeline import run
-from xplanes.preparation import TriplaneSequence, save_triplanes
+from xplanes.preparation import TriplaneSequence, find_source, prepare, save_triplanes
 from xplanes.preparation import stages as stages_module
 from xplanes.scenes.frame import Frame
+from xplanes.training.builder import build_frame, build_module, build_scene
 from xplanes.training.clock import TrainingClock
+from xplanes.training.methods.xplanes import XPlanesMethod
 
 OPTIONS = {
     "width": 16,
@@ -140,6 +144,33 @@ def test_the_loss_changes_the_run(trained: Path, place: Path, tmp_path: Path) ->
     )
 
 
+def test_a_start_holds_the_planes(place: Path, tmp_path: Path) -> None:
+    def planes(name: str, *overrides: str) -> torch.Tensor:
+        run(settings(place, *overrides), tmp_path / name, [], resume=False)
+        kept = weights(tmp_path / name)
+        return torch.cat([kept["field.space"].flatten(), kept["field.time"].flatten()])
+
+    start = planes("start", "trainer.max_steps=1")
+    free, held = (planes(w, f"loss.start_weight={w}") for w in ("0", "1000"))
+    assert float((held - start).norm()) < 0.5 * float((free - start).norm())
+
+
+@pytest.mark.parametrize("lrm", ["file", "none"])
+def test_the_hold_falls_with_the_square_of_the_views(place: Path, lrm: str) -> None:
+    def hold(views: int) -> float:
+        overrides = [f"data.views={views}", "loss.start_weight=8"]
+        config = parse(settings(place, *overrides) | ({} if lrm == "file" else none))
+        scene = build_scene(config.data)
+        frame = build_frame(config, scene.splits["train"])
+        start = prepare(config, scene, frame, find_source(config.lrm, say=print), say=print)
+        module = build_module(replace(config, model=start.model), scene, frame, planes=start.planes)
+        assert isinstance(module.method, XPlanesMethod)
+        return module.method.hold
+
+    none = {"lrm": small_config(place / "scenes", "lrm=none")["lrm"]}
+    assert [hold(2), hold(4)] == ([2.0, 0.5] if lrm == "file" else [0.0, 0.0])
+
+
 @pytest.mark.parametrize("model", ["six_planes", "nine_planes"])
 def test_the_loss_pulls_random_planes_towards_the_sparse_part(
     place: Path, tmp_path: Path, model: str
@@ -154,6 +185,7 @@ def test_the_loss_pulls_random_planes_towards_the_sparse_part(
             "decomposition.noise=0.1",
             f"loss.sparse_weight={weight}",
             "loss.every=1",
+            "loss.start_weight=0",
             "trainer.time_lr=0.03",
             "trainer.max_steps=150",
             "trainer.evaluate_at=[]",

@@ -8,6 +8,7 @@ import torch
 
 from tests import oracles
 from xplanes.training.regularisers import (
+    add_distance_gradient,
     add_time_smoothness_gradient,
     add_total_variation_gradient,
     time_smoothness,
@@ -75,3 +76,13 @@ def test_float32_planes_are_changed_in_place_without_a_graph():
     assert not gradient.requires_grad
     assert gradient.abs().max() > 0
     assert np.isclose(float(gradient.sum()), 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_distance_gradient_is_autograd_s(shape):
+    planes, start = planes_of(shape).requires_grad_(), planes_of(shape, seed=2)
+    before = planes_of(shape, seed=1)
+    gradient = before.clone()
+    add_distance_gradient(gradient, planes, start, 0.6)
+    (0.6 * (planes - start).square().mean()).backward()
+    torch.testing.assert_close(gradient - before, planes.grad, atol=1e-13, rtol=0)

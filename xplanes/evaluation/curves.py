@@ -46,6 +46,7 @@ def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> boo
         return False
     try:
         from matplotlib.figure import Figure
+        from matplotlib.ticker import LogLocator, NullFormatter
     except ImportError:
         return False
     scenes = list(dict.fromkeys(line.scene for line in lines))
@@ -63,6 +64,9 @@ def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> boo
             pairs = [p for p in zip(*_mean_curve(line.runs, axis), strict=True) if p[0] > 0]
             places, values = zip(*pairs, strict=True) if pairs else ((), ())
             panel.set_xscale("log")
+            panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            panel.xaxis.set_major_formatter("{x:g}")
+            panel.xaxis.set_minor_formatter(NullFormatter())
             panel.plot(
                 places, values, label=line.label, color=f"C{labels.index(line.label)}", marker="."
             )

@@ -180,4 +180,4 @@ def _is_sweep(experiment: str, conf: Path) -> bool:
     if not path.is_file():
         return False
     content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    return content.get("hydra", {}).get("mode") == "MULTIRUN"
+    return (content.get("hydra") or {}).get("mode") == "MULTIRUN"

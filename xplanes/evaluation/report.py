@@ -124,7 +124,7 @@ def write_hparams(run: Path, config: TrainConfig, metrics: dict[str, Any]) -> No
         "seed": config.seed,
         "learning_rate": getattr(config.model, "learning_rate", config.trainer.plane_lr),
     }
-    scores = {f"test/{name}": value for name, value in metrics["test"].items()}
+    scores = {f"{metrics['split']}/{name}": value for name, value in metrics["test"].items()}
     scores["time/train_s"] = metrics["seconds"]["train"]
     with SummaryWriter(str(run / "tb")) as writer:
         writer.add_hparams(parameters, scores, run_name=".", global_step=metrics["step"])

@@ -22,6 +22,7 @@ from xplanes.scenes.datamodule import RayDataModule
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, frame_content
 from xplanes.scenes.views import Scene, Views, camera_rays
+from xplanes.schemas.samplers import SamplerConfig
 from xplanes.training.builder import build_batches, build_frame, build_module
 from xplanes.training.fit import fit
 from xplanes.training.module import RadianceModule
@@ -33,16 +34,21 @@ CHECKPOINT_EVERY = 250
 def filming_settings(config: TrainConfig) -> TrainConfig:
     """How the field that films is trained: by its model's defaults, on the run's scene and device.
 
-    The run's own model would make ablations of it differ in their video too.
+    The run's own model would make ablations of it differ in their video too. Where training and
+    pictures may be sampled at different densities, training's does: a model looks at few pixels.
 
     Raises:
         ConfigError: If there is no such model.
     """
     options, own = config.preparation, config.trainer
     film = parse(compose_plain("train", [f"model={options.fixed_view_model}", "lrm=none"]))
+    sampler = film.sampler
+    if isinstance(sampler, SamplerConfig):
+        sampler = replace(sampler, render_samples=sampler.samples)
     return replace(
         film,
         seed=config.seed,
+        sampler=sampler,
         data=replace(
             config.data,
             skip_background=film.data.skip_background,

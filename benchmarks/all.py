@@ -2,7 +2,9 @@
 
     python benchmarks/all.py [--lego FOLDER] [--only NAME ...]
 
-Each script writes its own page; one that fails does not stop the others. Nothing else should run.
+Needs the extra `plots` and D-NeRF's lego (`python -m xplanes download dnerf`). Each script writes
+its own page anew, in benchmarks/results or docs/results; one that fails does not stop the others.
+Nothing else should run.
 """
 
 import argparse
@@ -31,9 +33,13 @@ SCRIPTS = {
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--lego", default="../shared/scenes/lego")
+    parser.add_argument("--lego", default="data/dnerf/lego")
     parser.add_argument("--only", nargs="+", choices=list(SCRIPTS), default=list(SCRIPTS))
     args = parser.parse_args()
+    if any(SCRIPTS[name] for name in args.only) and not Path(args.lego).is_dir():
+        parser.error(
+            f"--lego {args.lego}: there is no such folder; python -m xplanes download dnerf"
+        )
     failed = []
     for name in args.only:
         options = ["--lego", args.lego] if SCRIPTS[name] else []

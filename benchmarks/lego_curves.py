@@ -58,7 +58,7 @@ def plot(curves: dict[str, list[tuple[float, float]]]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--lego", type=Path, default=Path("../shared/scenes/lego"))
+    parser.add_argument("--lego", type=Path, default=Path("data/dnerf/lego"))
     args = parser.parse_args()
     rows, points, curves = [], [], {}
     with tempfile.TemporaryDirectory() as work:

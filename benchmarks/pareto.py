@@ -134,7 +134,7 @@ def line(scene: str, name: str, result: Measured, front: bool) -> tuple:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--lego", type=Path, default=Path("../shared/scenes/lego"))
+    parser.add_argument("--lego", type=Path, default=Path("data/dnerf/lego"))
     parser.add_argument("--seconds", type=float, default=30)
     parser.add_argument("--resolution", type=int, default=100)
     parser.add_argument("--work", type=Path, default=Path("outputs/benchmarks/pareto"))

@@ -63,7 +63,7 @@ def measure(run: TrainedRun, size: int, samples: int) -> tuple:
     spent = statistics.median(seconds)
     score = ""
     if known:
-        score = f"{mean([score_view(*parts, i, background).psnr for i in range(FRAMES)]):.2f}"
+        score = f"{mean([score_view(*parts, i, background)[0].psnr for i in range(FRAMES)]):.2f}"
     return (
         size,
         samples,
@@ -76,7 +76,7 @@ def measure(run: TrainedRun, size: int, samples: int) -> tuple:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--lego", type=Path, default=Path("../shared/scenes/lego"))
+    parser.add_argument("--lego", type=Path, default=Path("data/dnerf/lego"))
     parser.add_argument("--seconds", type=float, default=60)
     parser.add_argument("--work", type=Path, default=Path("outputs/benchmarks/rendering"))
     args = parser.parse_args()

@@ -111,9 +111,10 @@ def main() -> None:
         (name, f"{spent:.2f}", f"{100 * spent / whole:.1f}%", watch.calls.get(name, ""))
         for name, spent in sorted(found.items(), key=lambda item: -item[1])
     ]
+    command = " ".join(["python train.py", *args.overrides])
     page = f"""# Where the time goes: {args.name}
 
-`python train.py {" ".join(args.overrides)}`: {whole:.1f} s in all, {metrics["step"]} steps, PSNR
+`{command}`: {whole:.1f} s in all, {metrics["step"]} steps, PSNR
 {metrics["test"]["psnr"]:.2f}; {machine()}. Script: `benchmarks/where_time_goes.py`. Each stage
 without the stages that it calls.
 

@@ -87,10 +87,22 @@ def test_known_errors_are_one_line(arguments, words, trained_run: Path, tmp_path
     assert "Traceback" not in error
 
 
+def test_a_disk_that_takes_nothing_is_said_before_anything_is_rendered(
+    trained_run: Path, tmp_path: Path, monkeypatch, capsys
+):
+    from xplanes.evaluation import render
+
+    monkeypatch.setattr(render, "render_path", lambda *_, **__: pytest.fail("rendered first"))
+    (tmp_path / "file").write_text("in the way")
+    target = tmp_path / "file" / "film.webp"
+    assert main(["render", str(trained_run), "--out", str(target)]) == 1
+    assert capsys.readouterr().err.startswith("error: ")
+
+
 def test_a_missing_extra_is_named(trained_run: Path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["view", str(trained_run)]) == 1
-    assert 'pip install "xplanes[viewer]"' in capsys.readouterr().err
+    assert 'pip install -e ".[viewer]"' in capsys.readouterr().err
 
 
 def test_other_errors_keep_their_traceback(trained_run: Path, monkeypatch):

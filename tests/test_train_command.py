@@ -1,5 +1,6 @@
 """`python train.py` as a user types it."""
 
+import json
 import os
 import signal
 import subprocess
@@ -28,8 +29,6 @@ def train(*arguments: str, timeout: float = 240) -> subprocess.CompletedProcess[
 
 
 def exact(folder: Path) -> tuple:
-    import json
-
     content = json.loads((folder / "metrics.json").read_text())
     return content["test"], content["views"], content["samples_per_ray"], content["skipped"]
 
@@ -137,8 +136,28 @@ def test_two_processes_share_the_rays_and_end_with_one_model(scenes: str, tmp_pa
         assert torch.equal(first[name], state["state_dict"][name]), name
 
 
-def start(run: Path, scenes: str) -> subprocess.Popen[bytes]:
+def test_two_processes_stop_together_and_go_on(scenes: str, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    checkpoint = run / "checkpoints" / "last.ckpt"
+    process = start(run, scenes, "trainer=ddp", "trainer.max_steps=100000")
+    try:
+        wait_for(checkpoint, process)
+        before = checkpoint.stat().st_mtime_ns
+        process.send_signal(signal.SIGINT)  # to the first alone
+        process.wait(60)
+    finally:
+        process.kill()
+    assert checkpoint.stat().st_mtime_ns > before
+    step = torch.load(checkpoint, weights_only=True)["global_step"]
+    assert json.loads((run / "run.json").read_text())["status"] == "interrupted"
+    goes_on = train(f"resume={run}", f"trainer.max_steps={step + 5}")
+    assert goes_on.returncode == 0, goes_on.stderr
+    assert torch.load(checkpoint, weights_only=True)["global_step"] == step + 5
+
+
+def start(run: Path, scenes: str, *overrides: str) -> subprocess.Popen[bytes]:
     arguments = [scenes, *SMALL, "trainer.max_steps=400", "trainer.checkpoint_every=20"]
+    arguments += overrides
     return subprocess.Popen(
         [sys.executable, str(ROOT / "train.py"), *arguments, f"hydra.run.dir={run}"],
         cwd=ROOT,

@@ -5,6 +5,7 @@ import importlib
 import importlib.util
 import logging
 import os
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -159,11 +160,28 @@ def _settle_threads() -> None:
     Where both use OpenMP, starting them gives torch the number of all cores: what was asked for is
     lost, and sums come out otherwise before and after the first loop.
     """
-    import numba
-
     count = torch.get_num_threads()
-    numba.set_num_threads(min(count, numba.get_num_threads()))
-    torch.set_num_threads(count)
+    importlib.import_module("numba")
+    use_threads(count)
+
+
+def use_threads(count: int) -> None:
+    """Let torch and the compiled loops, if they are loaded, share work among so many threads."""
+    if numba := sys.modules.get("numba"):
+        numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+    if torch.get_num_threads() != count:  # Setting it, torch makes a pool of threads anew.
+        torch.set_num_threads(count)
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """`use_threads` for the time of the block."""
+    before = torch.get_num_threads()
+    use_threads(count)
+    try:
+        yield
+    finally:
+        use_threads(before)
 
 
 def name(device: torch.device) -> str:

@@ -46,11 +46,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _known_errors() -> tuple[type[Exception], ...]:
     """Errors whose message says all."""
     from xplanes.config import ConfigError
+    from xplanes.files import StorageError
     from xplanes.lrm.errors import LRMError
     from xplanes.optional import MissingExtraError
     from xplanes.scenes.errors import SceneError
 
-    return ConfigError, SceneError, LRMError, MissingExtraError, PermissionError
+    return ConfigError, SceneError, LRMError, MissingExtraError, StorageError, PermissionError
 
 
 def build_parser() -> argparse.ArgumentParser:

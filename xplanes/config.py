@@ -145,7 +145,7 @@ class PreparationConfig:
     fixed_view_model: str = MISSING  # The model that films it: a file of conf/model.
     fixed_view_seconds: float = MISSING  # Training clock of the field that films it.
     fixed_view_steps: int = MISSING  # Its steps at most.
-    azimuth: float | None = MISSING  # Degrees from x towards y; null: along an axis.
+    azimuth: float | None = MISSING  # The filming camera, degrees from x to y; null: an axis.
     elevation: float = MISSING  # Its height angle in degrees.
 
 
@@ -187,7 +187,7 @@ class TrainerConfig:
     evaluate_at: list[float] = MISSING  # Shares of the budget at which the views are scored.
     evaluate_views: int | None = MISSING  # Views scored on the way; null scores all.
     log_every: int = MISSING  # Steps between TensorBoard scalars.
-    deterministic: bool = MISSING  # Refuse operations whose result may vary.
+    deterministic: bool = MISSING  # The same digits each time; CPU only, budget in steps.
     media: bool = MISSING  # Write the turning render at the end.
 
 

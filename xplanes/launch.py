@@ -44,6 +44,8 @@ def prepare(arguments: list[str], conf: Path = CONF) -> list[str]:
     if resume in ("null", "", "None"):
         return arguments
     folder = values.get("hydra.run.dir")
+    if folder is not None:
+        folder = folder.strip("\"'")  # As Lightning hands it on to the other processes of a run.
     if resume == "auto":
         if _is_multirun(arguments):
             return arguments

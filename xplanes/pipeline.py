@@ -116,6 +116,7 @@ def train(
     Returns:
         The content of metrics.json; empty without a ``record``.
     """
+    _check_device(config)
     seed_everything(config.seed, verbose=False)
     source = find_source(config.lrm, say=say)
     warm = warm_up.seconds
@@ -158,7 +159,7 @@ def train(
         "train": module.clock,
         "evaluate": scorer.seconds,
     }
-    skipped = build_batches(config, scene, frame, 0).skipped
+    skipped = data.batches(0).skipped
     metrics = summary(module, scorer.latest, config.data.eval_split, seconds, skipped)
     metrics["decomposition"] = start.report
     metrics["lrm"] = start.lrm
@@ -173,6 +174,15 @@ def train(
     return metrics
 
 
+def _check_device(config: TrainConfig) -> None:
+    """Refuse what the device cannot do, before anything slow begins."""
+    if config.trainer.deterministic and training_device(config.trainer.accelerator).type == "cuda":
+        raise ConfigError(
+            "trainer.deterministic=true: sums on a GPU come out in any order; set trainer=cpu, or "
+            "do without"
+        )
+
+
 def say(text: str) -> None:
     """Print a line at once."""
     print(text, flush=True)
@@ -182,14 +192,15 @@ def _film(module: RadianceModule, frame: Frame, scene: Scene, folder: Path) -> P
     """The scene turning once while its time runs forth and back."""
     views = scene.splits["train"]
     say(f"filming {FILM_FRAMES} frames of the turning scene ...")
-    size = min(FILM_SIZE, views.width)
+    longer = max(views.height, views.width)
+    size = min(FILM_SIZE, longer)
     frames = render_path(
         module.field,
         module.renderer,
         frame,
         orbit_poses(views, frame, FILM_FRAMES),
         film_times(FILM_FRAMES),
-        focal=views.focal * size / views.width,
+        focal=views.focal * size / longer,
         size=size,
         background=scene.background,
     )

@@ -5,7 +5,7 @@ Must stay quick: its caller has yet to import torch, whose OpenMP reads the envi
 
 from collections.abc import Mapping
 
-WAIT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "1000"}
+WAIT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "10000"}
 """A moment awake, then sleep: threads that spin on waste the cores of a shared machine."""
 
 

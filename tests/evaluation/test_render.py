@@ -1,6 +1,7 @@
 """Films: the paths they follow and the files they end in."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +76,16 @@ def test_a_webp_is_the_default(trained: TrainedRun):
         assert picture.info["duration"] == 100
 
 
+def test_a_film_of_upright_pictures_shows_all_of_their_height(trained: TrainedRun, tmp_path: Path):
+    train = trained.scene.splits["train"]
+    upright = replace(train, images=train.images[:, :, : train.width // 2])
+    scene = replace(trained.scene, splits=trained.scene.splits | {"train": upright})
+    options = FilmOptions(frames=1, time="0.5")
+    narrow = film(replace(trained, scene=scene), options, str(tmp_path / "narrow.png"))
+    whole = film(trained, options, str(tmp_path / "whole.png"))
+    assert narrow.read_bytes() == whole.read_bytes()
+
+
 def test_a_folder_takes_a_png_per_frame_and_no_others(trained: TrainedRun, tmp_path: Path):
     options = FilmOptions(frames=2, size=16)
     folder = film(trained, options, f"{tmp_path}/frames/")
@@ -96,7 +107,7 @@ def test_an_mp4_keeps_its_frames(tmp_path: Path):
 
 def test_an_mp4_without_the_extra_names_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(MissingExtraError, match=r"xplanes\[video\]"):
+    with pytest.raises(MissingExtraError, match=r'-e "\.\[video\]"'):
         check_out("film.mp4", FilmOptions())
 
 
@@ -116,6 +127,7 @@ def test_other_files_are_refused(out: str, words: str):
         (FilmOptions(frames=0), "--frames 0"),
         (FilmOptions(fps=0), "--fps 0"),
         (FilmOptions(size=-4), "--size -4"),
+        (FilmOptions(size=0), "--size 0"),
         (FilmOptions(elevation=100), "--elevation 100"),
     ],
 )

@@ -153,6 +153,7 @@ def test_seeds_are_averaged(tmp_path):
         make(tmp_path / f"{seed}", seed=seed, psnr=psnr)
     make(tmp_path / "3", seed=0, resolution=32, psnr=10.0, overrides=("model.resolution=32",))
     make(tmp_path / "4", seed=3, psnr=None, status="failed", reason="x")
+    make(tmp_path / "5", seed=4, psnr=99.0, status="interrupted")  # Scores of a shorter training.
     text = write_tables(tmp_path)
     assert "Mean and standard deviation over seeds" in text
     assert "23.00 ± 3.61" in text  # Of the sample: sqrt((9 + 1 + 16) / 2).

@@ -89,21 +89,38 @@ def test_kplanes_film_in_their_own_cube(tmp_path: Path, monkeypatch):
 @pytest.mark.parametrize("count", [1, 4, 9])
 def test_frames_are_picked_evenly(count):
     video = ball_views(33, 0.5)
-    picked = pick_frames(video, count)
-    expected = torch.linspace(0, 1, count) if count > 1 else torch.zeros(1)
+    expected = torch.linspace(0, 1, count) if count > 1 else torch.tensor([0.4])
+    picked = pick_frames(video, expected)
     assert (picked.times - expected).abs().max() <= 0.5 / 32 + 1e-6
     assert len(picked) == count
 
 
+def test_of_a_scene_of_one_moment_the_frame_of_that_moment_is_picked(tmp_path: Path):
+    still = ball_scene(moving=False)
+    views = still.splits["train"]
+    views = replace(views, times=torch.full_like(views.times, 0.5))
+    scene = replace(still, splits=still.splits | {"train": views}, video=ball_views(5, 0.5))
+    made, _ = film(settings(tmp_path), scene, tmp_path / "cache")
+    assert made.views.times.tolist() == [0.5]
+
+
 def test_a_video_of_few_frames_repeats_them():
-    assert pick_frames(ball_views(3, 0.5), 7).times.tolist() == [0, 0, 0.5, 0.5, 0.5, 1, 1]
+    assert pick_frames(ball_views(3, 0.5), torch.linspace(0, 1, 7)).times.tolist() == [
+        0,
+        0,
+        0.5,
+        0.5,
+        0.5,
+        1,
+        1,
+    ]
 
 
 @pytest.mark.parametrize("times", [[0.0, 0.1, 0.2, 0.3], [0.6, 0.8, 1.0], [0, 0.05, 0.95, 1]])
 def test_a_video_that_leaves_out_moments_is_refused(times):
     video = ball_views(len(times), 0.5, times=torch.tensor(times))
     with pytest.raises(SceneError, match=r"no frame near time .*preparation\.fixed_view=train"):
-        pick_frames(video, 50)
+        pick_frames(video, torch.linspace(0, 1, 50))
 
 
 @pytest.mark.parametrize("name", VIEWS)
@@ -198,10 +215,9 @@ def test_an_interrupted_field_goes_on_where_it_stopped(tmp_path: Path, monkeypat
     assert list(cache.glob("fixed_view-*/checkpoints/last.ckpt"))
     steps = []
     monkeypatch.setattr(module, "_film", original)
-    draw = module.RayDataModule.draw
     monkeypatch.setattr(
-        module.RayDataModule, "draw", lambda self, step: steps.append(step) or draw(self, step)
+        module.RadianceModule, "training_step", lambda self, *_: steps.append(self.global_step)
     )
     film(config, scene, cache)
-    assert steps == [0]  # the warm-up alone: all steps were done
+    assert steps == []  # all were done
     assert not list(cache.glob("fixed_view-*/"))

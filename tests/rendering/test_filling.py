@@ -4,6 +4,7 @@ import torch
 
 from tests.rendering.test_carving import allowed_at
 from tests.synthetic import ball_views, inside_ball, swinging
+from xplanes.rendering import filling
 from xplanes.rendering.filling import fill
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.frame import cube_frame
@@ -49,6 +50,15 @@ def test_a_field_that_shows_all_leaves_its_own_cells_and_few_around():
     for time in (0.1, 0.4, 0.6, 0.9):
         assert occupied_at(grid, points, time).all()
     assert grid.occupied_fraction < 0.15
+
+
+def test_rays_may_march_in_groups(monkeypatch):
+    views = ball_views(6, 0.5, size=24)
+    whole = filled(views, ball_field(0.3, still))
+    monkeypatch.setattr(filling, "RAYS", 50)
+    grouped = filled(views, ball_field(0.3, still))
+    assert torch.equal(grouped.occupied, whole.occupied)
+    assert torch.equal(grouped.density, whole.density)
 
 
 def test_a_field_that_shows_nothing_leaves_every_foreground_ray_open():

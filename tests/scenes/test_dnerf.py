@@ -216,6 +216,22 @@ def test_no_times_at_all_is_a_static_scene(scene):
     assert scene.read().splits["train"].times.tolist() == [0] * 5
 
 
+@pytest.mark.parametrize("split", ["test", "video"])
+def test_frames_without_times_do_not_pass_for_those_of_time_zero(scene, split):
+    scene.add(split, 3, fixed=split == "video")
+    for frame in scene.contents[split]["frames"]:
+        del frame["time"]
+    scene.write(split)
+    splits = ["train", "test"] if split == "test" else ["train"]
+    message = scene.error(splits=splits)
+    assert f"transforms_{split}.json" in message
+    assert "Give every frame its time" in message
+    for frame in scene.contents["train"]["frames"]:
+        del frame["time"]
+    scene.write()
+    assert scene.read(splits=splits).splits["train"].is_still
+
+
 def test_video_is_read_when_there_is_one(scene):
     scene.add("video", 3, fixed=True)
     video = scene.read(resolution=6).video
@@ -321,7 +337,7 @@ def test_missing_test_split_points_to_val(scene):
 def test_missing_split_without_val(scene):
     message = scene.error(splits=["test"])
     assert "transforms_test.json" in message
-    assert "Splits of this scene: train." in message
+    assert "Splits of this scene: train. Move some of its frames" in message
     assert "data.eval_split" not in message
 
 

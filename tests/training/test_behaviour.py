@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from tests.training.runs import small_config
+from xplanes import pipeline
 from xplanes.config import ConfigError
 from xplanes.pipeline import run
-from xplanes.training import warming
+from xplanes.training import scorer, warming
 from xplanes.training.clock import TrainingClock
 from xplanes.training.module import RadianceModule, TrainingError
 from xplanes.training.sampling.occupancy import OccupancySampling
@@ -140,6 +141,127 @@ def test_interrupt_saves_the_step_it_stopped_at(
     assert state["global_step"] == 17
 
 
+def test_a_second_interrupt_saves_no_half_of_a_step(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import signal
+
+    original = RadianceModule.manual_backward
+
+    def press_twice(self, loss, *rest, **options) -> None:
+        original(self, loss, *rest, **options)
+        if self.global_step == 17:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(RadianceModule, "manual_backward", press_twice)
+    folder = tmp_path / "stopped"
+    with pytest.raises(KeyboardInterrupt):
+        run(small_config(scenes), folder, [], resume=False)
+    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    assert (state["global_step"], state["progress"]["batches"]) == (10, 10)
+
+
+def test_an_interrupt_waits_for_the_update_of_its_batches(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import signal
+
+    original = TrainingClock.on_train_batch_end
+
+    def press_ctrl_c(self, trainer, module, *rest) -> None:
+        original(self, trainer, module, *rest)
+        if module.batches == 7:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(TrainingClock, "on_train_batch_end", press_ctrl_c)
+    folder = tmp_path / "stopped"
+    with pytest.raises(KeyboardInterrupt):
+        run(small_config(scenes, "trainer.accumulate=3"), folder, [], resume=False)
+    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    assert (state["global_step"], state["progress"]["batches"]) == (3, 9)
+
+
+def test_an_evaluation_that_was_stopped_is_done_again(
+    trained: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import signal
+
+    original = scorer.score_view
+
+    def press_ctrl_c(*parts):
+        if parts[1] is not None and steps and steps[-1] == 20:
+            signal.raise_signal(signal.SIGINT)
+        return original(*parts)
+
+    steps: list[int] = []
+    update = TrainingClock.on_train_batch_end
+    monkeypatch.setattr(
+        TrainingClock,
+        "on_train_batch_end",
+        lambda self, trainer, *rest: (
+            steps.append(trainer.global_step) or update(self, trainer, *rest)
+        ),
+    )
+    monkeypatch.setattr(scorer, "score_view", press_ctrl_c)
+    folder = tmp_path / "stopped"
+    with pytest.raises(KeyboardInterrupt):
+        run(small_config(scenes), folder, [], resume=False)
+    assert [row["step"] for row in curve(folder)] == ["0"]
+    monkeypatch.undo()
+    run(small_config(scenes), folder, [], resume=True)
+    assert [row["step"] for row in curve(folder)] == ["0", "21", "40"]
+    assert exact(folder) == exact(trained)
+
+
+def test_scoring_uses_the_device_that_trained(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moves: list[str] = []
+    away, back = RadianceModule.cpu, RadianceModule.to
+    monkeypatch.setattr(
+        RadianceModule, "cpu", lambda self: moves.append("away to the CPU") or away(self)
+    )
+    monkeypatch.setattr(
+        RadianceModule, "to", lambda self, place: moves.append(f"to {place}") or back(self, place)
+    )
+    finish = scorer.Scorer.finish
+    monkeypatch.setattr(
+        scorer.Scorer, "finish", lambda self, *rest: moves.append("scored") or finish(self, *rest)
+    )
+    run(small_config(scenes, "trainer.max_steps=2"), tmp_path / "run", [], resume=False)
+    assert moves[-3:] == ["away to the CPU", "to cpu", "scored"]
+
+
+def test_only_the_pictures_that_are_shown_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import weakref
+
+    made: list[weakref.ref] = []
+    original = scorer.score_view
+
+    def watched(*parts):
+        score, images = original(*parts)
+        made.append(weakref.ref(images.colour))
+        return score, images
+
+    monkeypatch.setattr(scorer, "score_view", watched)
+    config = small_config(tmp_path / "scenes", "trainer.max_steps=2", "data.test_views=7")
+    run(config, tmp_path / "run", [], resume=False)
+    assert len(made) == 3 * 7
+    assert not any(colour() is not None for colour in made)
+    assert len(list((tmp_path / "run" / "media" / "step000002").glob("*.png"))) == scorer.SHOWN
+
+
+def test_digits_cannot_be_kept_on_a_gpu(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "training_device", lambda _: torch.device("cuda"))
+    with pytest.raises(ConfigError, match=r"trainer\.deterministic=true.*trainer=cpu"):
+        run(small_config(scenes, "trainer.deterministic=true"), tmp_path / "run", [], resume=False)
+
+
 def test_folder_with_a_run_is_refused_without_resume(trained: Path, scenes: Path) -> None:
     before = (trained / "metrics.json").read_bytes()
     with pytest.raises(ConfigError, match="holds a run already"):
@@ -207,6 +329,35 @@ def test_one_bad_batch_costs_one_step(
     run(config, tmp_path / "one", [], resume=False)
     content = metrics(tmp_path / "one")
     assert (content["steps_skipped"], content["step"]) == (1, 6)
+
+
+def test_a_bad_batch_takes_those_of_its_update_along(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from xplanes.scenes.batches import RayBatches
+
+    original = RayBatches.draw
+
+    def spoil(self, step: int):
+        batch = original(self, step)
+        if step == 3:
+            batch["target"][0] = float("nan")
+        return batch
+
+    left: list[bool] = []
+    refuse = RadianceModule._refuse
+
+    def watched(self, *rest) -> None:
+        left.append(any(p.grad is not None and bool(p.grad.any()) for p in self.parameters()))
+        refuse(self, *rest)
+
+    monkeypatch.setattr(RayBatches, "draw", spoil)
+    monkeypatch.setattr(RadianceModule, "_refuse", watched)
+    config = small_config(
+        scenes, "trainer.accumulate=2", "trainer.max_steps=3", "trainer.evaluate_at=[]"
+    )
+    run(config, tmp_path / "run", [], resume=False)
+    assert left == [False]
 
 
 def test_scene_of_one_moment_trains_without_planes_of_time(scenes: Path, tmp_path: Path) -> None:

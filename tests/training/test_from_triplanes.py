@@ -25,6 +25,7 @@ from xplanes.scenes.frame import Frame
 from xplanes.training.builder import build_frame, build_module, build_scene
 from xplanes.training.clock import TrainingClock
 from xplanes.training.methods.xplanes import XPlanesMethod
+from xplanes.training.module import TrainingError
 
 OPTIONS = {
     "width": 16,
@@ -135,6 +136,21 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     assert all(torch.equal(ours[key], theirs[key]) for key in ours)
     for key in ("test", "views", "step", "skipped", "samples_per_ray", "decomposition"):
         assert metrics(folder)[key] == metrics(trained)[key]
+
+
+def test_planes_do_not_go_on_in_another_frame(tmp_path: Path) -> None:
+    def save(scale: float) -> None:
+        frame = Frame(scale, torch.eye(3), torch.zeros(3))
+        sequence = TriplaneSequence(moving_sequence(), frame=frame)
+        save_triplanes(tmp_path / "triplanes.pt", sequence)
+
+    save(0.5)
+    run(settings(tmp_path, "trainer.max_steps=10"), tmp_path / "run", [], resume=False)
+    before = (tmp_path / "run" / "checkpoints" / "last.ckpt").read_bytes()
+    save(0.6)
+    with pytest.raises(TrainingError, match=r"frame is not the checkpoint's \(scale .*0\.5.*0\.6"):
+        run(settings(tmp_path, "trainer.max_steps=20"), tmp_path / "run", [], resume=True)
+    assert (tmp_path / "run" / "checkpoints" / "last.ckpt").read_bytes() == before
 
 
 def test_the_loss_changes_the_run(trained: Path, place: Path, tmp_path: Path) -> None:

@@ -111,6 +111,16 @@ def test_a_run_that_was_stopped_ends_at_the_same_step(scenes, tmp_path, soon, mo
     assert all(torch.equal(whole[name], halved[name]) for name in whole)
 
 
+def test_a_finished_run_stays_finished(scenes, tmp_path, soon):
+    config = small_config(scenes, "trainer.plateau=1000")
+    run(config, tmp_path / "run", [], resume=False)
+    before = weights(tmp_path / "run")
+    run(config, tmp_path / "run", [], resume=True)
+    assert outcome(tmp_path / "run")["step"] == 10
+    after = weights(tmp_path / "run")
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
 def test_a_finished_run_goes_on_without_the_rule(scenes, tmp_path, soon):
     run(small_config(scenes, "trainer.plateau=1000"), tmp_path / "run", [], resume=False)
     run(small_config(scenes), tmp_path / "run", [], resume=True)

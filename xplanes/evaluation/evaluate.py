@@ -8,7 +8,7 @@ from xplanes.evaluation.perceptual import Metric, UnavailableError, lpips
 from xplanes.evaluation.progress import progress
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.files import write_json
-from xplanes.training.scoring import ViewScore, mean, score_view
+from xplanes.training.scoring import ViewImages, ViewScore, mean, score_view
 
 DEFAULT_NETWORK = "vgg"
 
@@ -30,7 +30,7 @@ def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
     began = time.perf_counter()
     rows = []
     for index in progress(range(len(views)), len(views), "views"):
-        score = score_view(
+        score, images = score_view(
             module.field,
             module.renderer,
             trained.frame,
@@ -38,7 +38,7 @@ def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
             index,
             trained.scene.background,
         )
-        rows.append(_row(score, tag, metric))
+        rows.append(_row(score, images, tag, metric))
     names = [name for name in rows[0] if name not in ("file", "time")] if rows else []
     return {
         "split": trained.split,
@@ -65,9 +65,9 @@ def _lpips(trained: TrainedRun, network: str | None) -> tuple[str, Metric | None
         return tag, None, {tag: str(reason)}
 
 
-def _row(score: ViewScore, tag: str, metric: Metric | None) -> dict[str, Any]:
+def _row(score: ViewScore, images: ViewImages, tag: str, metric: Metric | None) -> dict[str, Any]:
     row = {"file": score.file, "time": score.time, "psnr": score.psnr, "ssim": score.ssim}
-    return row if metric is None else {**row, tag: metric(score.colour, score.truth)}
+    return row if metric is None else {**row, tag: metric(images.colour, images.truth)}
 
 
 def write_scores(run: Path, scores: dict[str, Any]) -> Path:

@@ -59,11 +59,12 @@ def beside(rows: Sequence[RunRow]) -> str | None:
             lines.append([*own, *(entry.get(name, "") for name in names)])
             own = [*key, "", "", ""]
     used = [row for runs in groups.values() for row in runs]
+    scenes, split = _values(used, "data.scene"), _values(used, "data.eval_split")
+    pixels, views = _values(used, "data.resolution", "native"), _values(used, "data.views", "all")
     return (
-        f"Means of these runs ({_values(used, 'data.scene')}; {_values(used, 'data.eval_split')} "
-        f"split, {_values(used, 'data.resolution')} px) beside published figures (test split, "
-        f"400 px), comparable only where scenes, split, pixels and budget are the same:\n\n"
-        f"{markdown(HEADER, lines)}"
+        f"Means of these runs ({scenes}; {split} split, {pixels} px, views: {views}) beside "
+        "published figures (test split, 400 px, all views), comparable only where scenes, split, "
+        f"pixels, views and budget are the same:\n\n{markdown(HEADER, lines)}"
     )
 
 
@@ -71,5 +72,6 @@ def _mean(runs: Sequence[RunRow], name: str, form: str) -> str:
     return format(math.fsum(row.scores[name] for row in runs) / len(runs), form)
 
 
-def _values(rows: Sequence[RunRow], name: str) -> str:
-    return ", ".join(sorted({str(row.settings.get(name)) for row in rows}))
+def _values(rows: Sequence[RunRow], name: str, unset: str = "none") -> str:
+    values = {row.settings.get(name) for row in rows}
+    return ", ".join(sorted(unset if value is None else str(value) for value in values))

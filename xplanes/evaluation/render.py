@@ -19,6 +19,7 @@ from xplanes.evaluation.media import (
 )
 from xplanes.evaluation.progress import progress
 from xplanes.evaluation.runs import TrainedRun
+from xplanes.files import require_writable
 from xplanes.scenes.views import Views
 
 FRAMES = 48
@@ -68,7 +69,7 @@ class FilmOptions:
         for name, value, most in (
             ("frames", self.count, 100_000),
             ("fps", self.fps, 240),
-            ("size", self.size or 1, LARGEST),
+            ("size", 1 if self.size is None else self.size, LARGEST),
         ):
             if not 1 <= value <= most:
                 raise ConfigError(f"--{name} {value}: must lie between 1 and {most}")
@@ -97,15 +98,17 @@ def film(trained: TrainedRun, options: FilmOptions, out: str | None = None) -> P
     options.check()
     check_out(out, options)
     target, folder = destination(trained.path, options, out, trained.checkpoint)
+    require_writable(target.parent)
     views = trained.scene.splits["train"]
-    size = options.size or views.width
+    longer = max(views.height, views.width)
+    size = longer if options.size is None else options.size
     frames = render_path(
         trained.module.field,
         trained.module.renderer,
         trained.frame,
         poses(trained, options),
         times(options.time, options.count),
-        focal=views.focal * size / views.width,
+        focal=views.focal * size / longer,
         size=size,
         background=trained.scene.background,
         what=options.what,

@@ -42,7 +42,7 @@ def header(
         budget += f" or {config.trainer.max_seconds:g} s, whichever comes first"
     lines = {
         "xplanes": f"{__version__} · torch {torch.__version__} · {device} · "
-        f"{torch.get_num_threads()} threads · decoder {module.field.precision} · "
+        f"up to {torch.get_num_threads()} threads · decoder {module.field.precision} · "
         f"{backend.name(device)}",
         "run": str(run),
         "data": f"{config.data.name} {scene.name} · {counts} views · "
@@ -88,6 +88,7 @@ def summary(
         },
         "converged": None if module.ending is None else module.ending[0],
         "steps_skipped": module.unusable,
+        "threads": module.threads,
         "parameters": sum(p.numel() for p in module.parameters()),
         "peak_memory_bytes": device_memory(module.device),
     }

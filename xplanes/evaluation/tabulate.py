@@ -91,7 +91,7 @@ def seed_groups(rows: Sequence[RunRow]) -> list[list[RunRow]]:
     """Finished runs that differ in nothing but their seed, if there are two such runs at all."""
     groups: dict[str, list[RunRow]] = {}
     for row in rows:
-        if row.settings and {"psnr", "ssim"} <= row.scores.keys():
+        if row.status == "finished" and row.settings and {"psnr", "ssim"} <= row.scores.keys():
             rest = {k: v for k, v in row.settings.items() if k not in (SEED, *UNLISTED)}
             groups.setdefault(json.dumps(rest, sort_keys=True, default=str), []).append(row)
     several = any(len(group) > 1 for group in groups.values())

@@ -117,20 +117,21 @@ def fixed_view(
             f"preparation.fixed_view=video: {scene.name} has no video of a fixed camera "
             "(transforms_video.json); set preparation.fixed_view=train"
         )
+    times = scene.splits["train"].times
     count = 1 if scene.splits["train"].is_still else options.frames
     if scene.video is not None and options.fixed_view != "train":
-        views = pick_frames(scene.video, count)
+        views = pick_frames(scene.video, torch.linspace(0, 1, count) if count > 1 else times[:1])
         return FixedView(views, frame.centre, 0.0, f"{len(views)} frames of the scene's video")
     return _rendered(config, scene, frame, view, size, count, cache, say)
 
 
-def pick_frames(video: Views, count: int) -> Views:
-    """The frames nearest to ``count`` evenly spread moments.
+def pick_frames(video: Views, moments: Tensor) -> Views:
+    """The frames nearest to moments that are spread evenly, or to the only one. [T]
 
     Raises:
         SceneError: If the video leaves out so much that a moment has no frame near it.
     """
-    moments = torch.linspace(0, 1, count) if count > 1 else video.times[:1]
+    count = len(moments)
     gaps = (video.times[None] - moments[:, None]).abs()
     nearest, chosen = gaps.min(dim=1)
     # A video of few frames may stand for each of them for a while.

@@ -1,6 +1,7 @@
 """From a scene to a triplane sequence: film it, show each frame to the model, place the result."""
 
 import hashlib
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -32,6 +33,8 @@ from xplanes.preparation.sequence import TriplaneSequence
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene
 from xplanes.training.builder import training_device
+
+logger = logging.getLogger(__name__)
 
 SOLID = 128
 """Alpha from which a pixel belongs to the object that is cropped."""
@@ -137,6 +140,12 @@ def reconstruct(
     alignment = place(film, model, options)
     device = training_device(config.trainer.accelerator)
     frames = film.views.images
+    if bool((frames[..., 3] == 255).all()):
+        logger.warning(
+            "the frames of the fixed view have no transparency: %s takes the background for a "
+            "thing; cut them out (RGBA), or set lrm=none",
+            options.name,
+        )
     say(f"lrm: {len(frames)} frames to triplanes")
     encoded = encode(
         model,

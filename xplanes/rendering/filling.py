@@ -12,6 +12,9 @@ from xplanes.scenes.views import Views
 SOLID = 128
 """Alpha from which a pixel must show something."""
 
+RAYS = 65536
+"""Rays that march together: all pixels of a large picture would fill the memory."""
+
 
 def fill(
     grid: OccupancyGrid,
@@ -45,11 +48,12 @@ def fill(
         origins, directions = frame.rays(origins, directions)
         origins, directions = origins.to(kept.device), directions.to(kept.device)
         time = views.times[index].to(kept.device)
-        met = torch.zeros(len(origins), dtype=torch.bool, device=kept.device)
-        met[_samples(grid, origins, directions, time, step).ray] = True
-        grid.occupied.copy_(occupied)
-        missing[_samples(grid, origins[~met], directions[~met], time, step).cells] = True
-        grid.occupied.copy_(kept)
+        for some, there in zip(origins.split(RAYS), directions.split(RAYS), strict=True):
+            met = torch.zeros(len(some), dtype=torch.bool, device=kept.device)
+            met[_samples(grid, some, there, time, step).ray] = True
+            grid.occupied.copy_(occupied)
+            missing[_samples(grid, some[~met], there[~met], time, step).cells] = True
+            grid.occupied.copy_(kept)
     missing &= ~kept
     grid.density[missing] = density[missing]
     grid.occupied |= missing

@@ -39,16 +39,19 @@ class RayDataModule(LightningDataModule):
     def __init__(self, scene: Scene, frame: Frame, batches: Callable[[int], RayBatches]) -> None:
         super().__init__()
         self.scene, self.frame = scene, frame
-        self._batches = batches
+        self._build = batches
+        self._built: dict[int, RayBatches] = {}
         self._first = 0
 
-    def draw(self, step: int) -> Batch:
-        """The batch of a step, as the first process sees it."""
-        return self._batches(0).draw(step)
+    def batches(self, rank: int) -> RayBatches:
+        """The batches of a process."""
+        if rank not in self._built:
+            self._built[rank] = self._build(rank)
+        return self._built[rank]
 
     def train_dataloader(self) -> DataLoader:
         rank = self.trainer.global_rank if self.trainer else 0
-        return DataLoader(_Endless(self._batches(rank), self._first), batch_size=None)
+        return DataLoader(_Endless(self.batches(rank), self._first), batch_size=None)
 
     def state_dict(self) -> dict[str, Any]:
         assert self.trainer is not None

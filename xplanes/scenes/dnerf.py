@@ -1,7 +1,7 @@
 """Scenes on disk in the format of D-NeRF and Blender: transforms_train.json and its images."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from torch import Tensor
@@ -53,8 +53,28 @@ def read_scene(
             listed[split] = _spread(
                 transforms, count, f"data.{key}", f"the {split} split of {folder}"
             )
-    scene_views = {split: _load(transforms, resolution) for split, transforms in listed.items()}
-    return Scene(folder.resolve().name, scene_views, video=_read_video(folder, resolution))
+    video = _list_video(folder)
+    others = listed if video is None else {**listed, "video": video}
+    _require_times(folder, listed.get("train"), others)
+    return Scene(
+        folder.resolve().name,
+        {split: _load(transforms, resolution) for split, transforms in listed.items()},
+        video=None if video is None else _load(video, resolution),
+    )
+
+
+def _require_times(
+    folder: Path, train: Transforms | None, others: Mapping[str, Transforms]
+) -> None:
+    """Refuse frames of a moving scene that do not tell their times."""
+    if train is None or len(train.times.unique()) == 1:
+        return
+    for split, transforms in others.items():
+        if not transforms.timed:
+            raise SceneError(
+                f'No frame of {folder / f"transforms_{split}.json"} has a "time", but those of '
+                "transforms_train.json have several. Give every frame its time."
+            )
 
 
 def _check_folder(folder: Path) -> None:
@@ -78,7 +98,11 @@ def _transforms_path(folder: Path, split: str) -> Path:
         names = _scenes_in(folder)
         inside = f" Scenes inside it: {', '.join(names)}." if names else ""
         raise SceneError(f"{folder} holds no transforms_{split}.json.{inside} {GET_DATA}")
-    way_out = "Name one of these, or add the file."
+    way_out = "Add the file."
+    if split == "test" and found == ["train"]:
+        way_out = (
+            "Move some of its frames into a file of that name: they are scored, not trained on."
+        )
     if split != "train" and "val" in found:
         way_out = "Evaluate on the validation views with data.eval_split=val, or add the file."
     raise SceneError(f"{path} does not exist. Splits of this scene: {', '.join(found)}. {way_out}")
@@ -101,7 +125,7 @@ def _spread(transforms: Transforms, count: int, key: str, split: str) -> Transfo
     return transforms.subset(sorted(by_time[rank] for rank in ranks))
 
 
-def _read_video(folder: Path, resolution: int | None) -> Views | None:
+def _list_video(folder: Path) -> Transforms | None:
     path = folder / "transforms_video.json"
     if not path.is_file():
         return None
@@ -112,7 +136,7 @@ def _read_video(folder: Path, resolution: int | None) -> Views | None:
             f"{path} holds a camera that moves. It must hold the frames of one fixed camera: "
             f"correct it, or rename the file and it is not read."
         )
-    return _load(transforms, resolution)
+    return transforms
 
 
 def _load(transforms: Transforms, resolution: int | None) -> Views:

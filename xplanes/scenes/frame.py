@@ -1,5 +1,6 @@
 """The field's frame: the cube [-1, 1]^3 and how the world maps into it."""
 
+import logging
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -9,6 +10,8 @@ from torch import Tensor
 
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.views import Views
+
+logger = logging.getLogger(__name__)
 
 MARGIN = 1.03
 """Room around the farthest thing that any view shows."""
@@ -136,7 +139,18 @@ def scene_frame(views: Views, half_side: float | None = None) -> Frame:
         )
     spread = _spread(views)
     reach = MARGIN * _reach(views, centre) / spread if spread > 0 else math.inf
-    return cube_frame(min(half, reach), centre)
+    half = min(half, reach)
+    aside = (offset - distance[:, None] * views.camera_to_world[:, :3, 2]).norm(dim=-1)
+    astray = int(((distance <= half) | (aside > half)).sum())
+    if 4 * astray > len(views):
+        logger.warning(
+            "%d of %d cameras do not look at the scene's cube, %.3g world units wide: all must "
+            "look at one thing, from around it",
+            astray,
+            len(views),
+            2 * half,
+        )
+    return cube_frame(half, centre)
 
 
 def _spread(views: Views) -> float:

@@ -81,8 +81,8 @@ def check_resolution(path: Path, width: int, height: int, resolution: int) -> No
     if width != height:
         raise SceneError(
             f"{path} has {width}x{height} pixels, and data.resolution={resolution} stands for a "
-            f"square. Set data.resolution=null to keep the images as they are, or crop them "
-            f"(and correct the camera)."
+            f"square. Set data.resolution=null to keep the images as they are; shrinking the files "
+            f"leaves camera_angle_x as it is, cropping them does not."
         )
     if resolution > width:
         raise SceneError(

@@ -15,8 +15,13 @@ MOST_VIEWS = 5
 
 def foreground(views: Views, margin: int) -> Tensor:
     """Pixels with alpha above 0, or within ``margin`` pixels of such. bool [V, H, W]"""
-    alpha = (views.images[..., 3] > 0).float()[:, None]
-    return F.max_pool2d(alpha, 2 * margin + 1, stride=1, padding=margin)[:, 0] > 0
+    near = views.images[..., 3] > 0
+    side = 2 * margin + 1
+    for mask in near:
+        # Rows, then columns: the square's pixels number many more.
+        rows = F.max_pool2d(mask.float()[None], (side, 1), stride=1, padding=(margin, 0))
+        mask[:] = F.max_pool2d(rows, (1, side), stride=1, padding=(0, margin))[0] > 0
+    return near
 
 
 def may_hold(views: Views, points: Tensor, *, radius: float) -> Tensor:

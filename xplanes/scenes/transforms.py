@@ -30,6 +30,7 @@ class Transforms:
         camera_to_world: Rigid camera poses. [V, 4, 4]
         times: Time of each image, from 0 to 1; all 0 for a static scene. [V]
         focal_per_width: Focal length in image widths.
+        timed: Whether the file tells the times.
     """
 
     paths: tuple[Path, ...]
@@ -37,6 +38,7 @@ class Transforms:
     camera_to_world: Tensor
     times: Tensor
     focal_per_width: float
+    timed: bool
 
     def subset(self, indices: Sequence[int]) -> "Transforms":
         """The frames at ``indices``, in that order. [K]"""
@@ -47,6 +49,7 @@ class Transforms:
             self.camera_to_world[chosen],
             self.times[chosen],
             self.focal_per_width,
+            self.timed,
         )
 
 
@@ -90,6 +93,7 @@ def read_transforms(path: Path) -> Transforms:
         camera_to_world=torch.from_numpy(poses).float(),
         times=torch.tensor(times or [0.0] * len(frames), dtype=torch.float32),
         focal_per_width=_focal_per_width(path, content, frames),
+        timed=bool(times),
     )
 
 

@@ -13,6 +13,7 @@ from lightning.pytorch.callbacks import Callback
 from xplanes.config import ConfigError
 from xplanes.files import replacing
 from xplanes.training.clock import TrainingClock
+from xplanes.training.interrupt import Stopped
 from xplanes.training.module import RadianceModule
 
 logger = logging.getLogger(__name__)
@@ -53,7 +54,8 @@ class Checkpoints(Callback):
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
-        if isinstance(exception, KeyboardInterrupt) and trainer.global_step:
+        # Any other interrupt may have come in the middle of a step.
+        if isinstance(exception, Stopped) and trainer.global_step:
             self._save_last(trainer, pl_module)
 
     def finish(self, trainer: Trainer, module: LightningModule) -> None:
@@ -67,6 +69,8 @@ class Checkpoints(Callback):
         if trainer.strategy.broadcast(module.improved):
             self.save(trainer, BEST)
         module.improved = False
+        if trainer.world_size > 1:
+            self.clock.pause()  # The others have waited while the first scored.
 
     def _save_last(self, trainer: Trainer, module: LightningModule) -> None:
         assert isinstance(module, RadianceModule)

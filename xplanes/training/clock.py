@@ -42,7 +42,8 @@ class TrainingClock(Callback):
             spent = float(trainer.strategy.reduce(shared, reduce_op="mean"))
         pl_module.clock += spent
         self._mark = now
-        if self.max_seconds is not None and pl_module.clock >= self.max_seconds:
+        over = self.max_seconds is not None and pl_module.clock >= self.max_seconds
+        if over and pl_module.between_updates:
             trainer.should_stop = True
 
     def pause(self) -> None:

@@ -20,6 +20,7 @@ from xplanes.training.module import RadianceModule
 from xplanes.training.plateau import PlateauStop
 from xplanes.training.scalars import Scalars
 from xplanes.training.scorer import Scorer
+from xplanes.training.step_threads import StepThreads
 from xplanes.training.warming import warming_up
 
 
@@ -65,8 +66,10 @@ def fit(
         devices=options.devices,
         strategy=options.strategy,
         max_steps=options.max_steps,
+        default_root_dir=run,
         callbacks=[
             clock,
+            StepThreads(options, training_device(options.accelerator)),
             *plateau,
             Scalars(options.log_every),
             scorer,
@@ -91,6 +94,8 @@ def fit(
             ckpt_path=None if last is None else str(last),
             weights_only=True,
         )
+        # Lightning leaves the module on the CPU.
+        module.to(trainer.strategy.root_device)
         scorer.finish(trainer, module)
         checkpoints.finish(trainer, module)
     return scorer
@@ -103,8 +108,8 @@ def _warm_up(module: RadianceModule, data: RayDataModule, device: torch.device) 
         module.to(device)
     elif not cpu_loops(next(module.field.parameters())):
         return
+    rays = {name: value[:8].to(device) for name, value in data.batches(0).draw(0).items()}
     with warming_up():
-        rays = {name: value[:8].to(device) for name, value in data.draw(0).items()}
         rendering = module.sampling.render(module.field, rays, module.moment)
         rendering.colour.sum().backward()
         module.sampling.pass_on(rendering, module.moment)

@@ -11,6 +11,10 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
 
+class Stopped(KeyboardInterrupt):
+    """Training was asked to stop, and did so where its state is whole."""
+
+
 class Interrupt(Callback):
     """Turns the first SIGINT or SIGTERM into a stop after the step; a second one is at once."""
 
@@ -21,15 +25,20 @@ class Interrupt(Callback):
         """Stop here if asked to; call it where the state is whole.
 
         Raises:
-            KeyboardInterrupt: If a signal came.
+            Stopped: If a signal came.
         """
         if self.asked:
-            raise KeyboardInterrupt
+            raise Stopped
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        self.check()
+        if trainer.world_size > 1:
+            # Saving takes all processes: they must stop after the same step.
+            self.asked = trainer.strategy.reduce_boolean_decision(self.asked, all=False)
+        # Modules that gather batches for an update say where one is whole.
+        if getattr(pl_module, "between_updates", True):
+            self.check()
 
     @contextmanager
     def listening(self) -> Iterator[None]:

@@ -58,6 +58,7 @@ class RadianceModule(LightningModule):
         self.options, self.seed, self.origin = trainer, seed, origin
         self.batches = 0
         self.clock = 0.0
+        self.threads = torch.get_num_threads()
         self.rays = sampling.first_rays(trainer.rays_per_batch)
         self.counts = dict.fromkeys(COUNTS, 0)
         self.unusable = 0
@@ -84,6 +85,11 @@ class RadianceModule(LightningModule):
         begin, done, end = self.ending
         share = (self.global_step - begin) / (end - begin)
         return min(1.0, max(self.spent, done + (1 - done) * share))
+
+    @property
+    def between_updates(self) -> bool:
+        """Whether no gradients of batches wait for others (``trainer.accumulate``)."""
+        return self.batches % self.options.accumulate == 0
 
     def end_after(self, steps: int) -> None:
         """Let training run out over ``steps``, or with its budget if that comes first."""
@@ -128,6 +134,7 @@ class RadianceModule(LightningModule):
         # All ranks must skip a step together: one that waits for the others' gradients would hang.
         usable = self.trainer.strategy.reduce_boolean_decision(math.isfinite(value), all=True)
         if not usable:
+            optimizer.zero_grad()  # Of the batches before it, for the same update.
             self._refuse(f"the loss was {value}", not_finite(self.named_parameters()), rendering)
             return
         self.manual_backward(loss / self.options.accumulate)
@@ -136,7 +143,7 @@ class RadianceModule(LightningModule):
         self._count(rendering.samples, len(rays["times"]))
         error = value if error is loss else float(error.detach())
         self.last = {"loss": value, "psnr": -10 * math.log10(max(error, 1e-10))}
-        if self.batches % self.options.accumulate == 0:
+        if self.between_updates:
             self._update(optimizer, moment, rendering)
 
     def _update(self, optimizer: LightningOptimizer, moment: Moment, rendering: Rendering) -> None:
@@ -205,6 +212,19 @@ class RadianceModule(LightningModule):
         precision = "" if self.field.precision == "32" else ", or set trainer.precision=32"
         return f"{self.method.advice}{precision}; resume= goes on from the last checkpoint"
 
+    def _require_frame(self, trained: dict[str, Any] | None) -> None:
+        """Refuse planes that were trained in another frame than the start lies in now."""
+        if trained is None or self.origin is None:
+            return
+        for name, now in self.origin["frame"].items():
+            before = torch.as_tensor(trained["frame"][name])
+            if not torch.allclose(before, torch.as_tensor(now), rtol=1e-4, atol=1e-5):
+                raise TrainingError(
+                    f"the start was made anew, and its frame is not the checkpoint's ({name} "
+                    f"{before.tolist()}, now {torch.as_tensor(now).tolist()}): what "
+                    "preparation.cache kept is gone. Bring it back, or train anew in another folder"
+                )
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["progress"] = {
             "batches": self.batches,
@@ -218,6 +238,7 @@ class RadianceModule(LightningModule):
             checkpoint["origin"] = self.origin
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self._require_frame(checkpoint.get("origin"))
         progress = checkpoint["progress"]
         self.batches, self.clock = progress["batches"], progress["clock"]
         self.rays, self.counts = progress["rays"], dict(progress["counts"])

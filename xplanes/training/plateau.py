@@ -34,6 +34,11 @@ class PlateauStop(Callback):
         self._errors: list[float] = []
         self._block: list[float] = []
 
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, RadianceModule)
+        if pl_module.ending is not None and pl_module.progress >= 1:
+            trainer.should_stop = True
+
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:

@@ -9,6 +9,7 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
+from xplanes.backend import threads
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.pictures import plane_sheet, strip, write_png
 from xplanes.scenes.frame import Frame
@@ -58,12 +59,15 @@ class Scorer(Callback):
         self.latest: list[ViewScore] = []
         self.best = float("-inf")
         self.seconds = 0.0
-        self._next = 0
+        self.threads = torch.get_num_threads()
+        self._next: int | None = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, RadianceModule)
         fresh = trainer.global_step == 0
-        self._next = sum(share <= pl_module.progress for share in self.at)
+        passed = sum(share <= pl_module.progress for share in self.at)
+        # Stopped while it scored, a run scores again; with more of a budget, less of it is passed.
+        self._next = passed if self._next is None else min(self._next, passed)
         if fresh and self.at and self.at[0] == 0:
             self._score(trainer, pl_module, self.indices, pl_module.renderer_now)
         self.clock.pause()
@@ -73,9 +77,10 @@ class Scorer(Callback):
     ) -> None:
         assert isinstance(pl_module, RadianceModule)
         due = sum(share <= pl_module.progress for share in self.at)
+        assert self._next is not None
         if due > self._next and pl_module.progress < 1 and not trainer.should_stop:
-            self._next = due
             self._score(trainer, pl_module, self.indices, pl_module.renderer_now)
+            self._next = due
             self.clock.pause()
 
     def finish(self, trainer: Trainer, module: RadianceModule) -> None:
@@ -91,13 +96,8 @@ class Scorer(Callback):
             self.curve = Curve(self.run / "curve.csv", until=trainer.global_step)
         began = time.perf_counter()
         module.eval()
-        latest = []
-        for index in indices:
-            self.interrupt.check()
-            latest.append(
-                score_view(module.field, renderer, self.frame, self.views, index, self.background)
-            )
-        self.latest = latest
+        with threads(self.threads):
+            self.latest, pictures = self._compare(module, indices, renderer, trainer)
         module.train()
         step = trainer.global_step
         self.curve.add(module.clock, step, self.split, self.latest)
@@ -106,23 +106,45 @@ class Scorer(Callback):
             f"{self.split}/ssim": mean([s.ssim for s in self.latest]),
         }
         module.last.update(scores)
-        self._log(trainer, module, scores, step)
+        self._log(trainer, module, scores, pictures, step)
         if scores[f"{self.split}/psnr"] > self.best:
             self.best = scores[f"{self.split}/psnr"]
             module.improved = True
         self.seconds += time.perf_counter() - began
 
+    def _compare(
+        self, module: RadianceModule, indices: list[int], renderer: RayRenderer, trainer: Trainer
+    ) -> tuple[list[ViewScore], dict[str, Tensor]]:
+        """Scores of views, and the pictures of those that are shown, by the images' names."""
+        shown = {indices[place] for place in spread(SHOWN, len(indices))}
+        scores, pictures = [], {}
+        for index in indices:
+            if trainer.world_size == 1:  # Else all processes must stop together, after a step.
+                self.interrupt.check()
+            score, images = score_view(
+                module.field, renderer, self.frame, self.views, index, self.background
+            )
+            scores.append(score)
+            if index in shown:
+                pictures[score.file] = strip(
+                    images.truth, images.colour, images.depth, images.opacity
+                )
+        return scores, pictures
+
     def _log(
-        self, trainer: Trainer, module: RadianceModule, scores: dict[str, float], step: int
+        self,
+        trainer: Trainer,
+        module: RadianceModule,
+        scores: dict[str, float],
+        pictures: dict[str, Tensor],
+        step: int,
     ) -> None:
         sheet = plane_sheet(module.field.planes)
         write_png(self.run / "media" / "planes.png", sheet)
-        for place in spread(SHOWN, len(self.latest)):
-            score = self.latest[place]
-            picture = strip(score.truth, score.colour, score.depth, score.opacity)
-            name = f"{self.split}_{score.file.replace('/', '_').removesuffix('.png')}"
+        for file, picture in pictures.items():
+            name = f"{self.split}_{file.replace('/', '_').removesuffix('.png')}"
             write_png(self.run / "media" / f"step{step:06d}" / f"{name}.png", picture)
-            self._image(trainer, f"{self.split}/{score.file}", picture, step)
+            self._image(trainer, f"{self.split}/{file}", picture, step)
         self._image(trainer, "planes", sheet, step)
         if trainer.logger is not None:
             trainer.logger.log_metrics({**scores, "time/train_s": module.clock}, step)
@@ -134,10 +156,11 @@ class Scorer(Callback):
             writer.add_image(tag, picture.clamp(0, 1), step, dataformats="HWC")
 
     def state_dict(self) -> dict[str, Any]:
-        return {"best": self.best, "seconds": self.seconds}
+        return {"best": self.best, "seconds": self.seconds, "next": self._next}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.best, self.seconds = state_dict["best"], state_dict["seconds"]
+        self._next = state_dict["next"]
 
 
 def device_memory(device: torch.device) -> int:

@@ -21,23 +21,32 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Scores and picture of one view.
+    """Scores of one view.
 
     Attributes:
         file: Name of the true image.
         time: Its time, from 0 to 1.
         psnr: In dB.
         ssim: Structural similarity.
-        truth: True colours. [H, W, 3]
-        colour: Rendered colours. [H, W, 3]
-        depth: Rendered depth in the field's frame. [H, W]
-        opacity: Rendered opacity. [H, W]
     """
 
     file: str
     time: float
     psnr: float
     ssim: float
+
+
+@dataclass(frozen=True)
+class ViewImages:
+    """What was compared.
+
+    Attributes:
+        truth: True colours. [H, W, 3]
+        colour: Rendered colours. [H, W, 3]
+        depth: Rendered depth in the field's frame. [H, W]
+        opacity: Rendered opacity. [H, W]
+    """
+
     truth: Tensor
     colour: Tensor
     depth: Tensor
@@ -68,21 +77,18 @@ def score_view(
     views: Views,
     index: int,
     background: Tensor,
-) -> ViewScore:
+) -> tuple[ViewScore, ViewImages]:
     """Render one view and compare it with the true image in front of ``background``."""
     image = render_view(field, renderer, frame, views, index, background)
     truth = views.composite(index, background)
     colour = image["colour"].float().clamp(0, 1)
-    return ViewScore(
+    score = ViewScore(
         file=views.files[index],
         time=float(views.times[index]),
         psnr=psnr(colour, truth),
         ssim=ssim(colour, truth),
-        truth=truth,
-        colour=colour,
-        depth=image["depth"].float(),
-        opacity=image["opacity"].float(),
     )
+    return score, ViewImages(truth, colour, image["depth"].float(), image["opacity"].float())
 
 
 def spread(count: int, total: int) -> list[int]:

@@ -11,6 +11,7 @@ from xplanes.scenes.demo.still import still
 from xplanes.scenes.demo.variation import Variation
 from xplanes.scenes.demo.walker import walker
 from xplanes.scenes.demo.windmill import windmill
+from xplanes.scenes.errors import SceneError
 
 
 @dataclass(frozen=True)
@@ -40,13 +41,16 @@ def demo_scene(name: str) -> DemoScene:
     """The scene called ``name``.
 
     Raises:
-        ValueError: No scene has that name; the message lists those there are.
+        SceneError: No scene has that name; the message lists those there are.
     """
     if name in DEMO_SCENES:
         return DEMO_SCENES[name]
     close = difflib.get_close_matches(name, DEMO_SCENES, n=1)
     hint = f" Did you mean {close[0]!r}?" if close else ""
-    raise ValueError(f"no demo scene {name!r}; there are {', '.join(DEMO_SCENES)}.{hint}")
+    raise SceneError(
+        f"no demo scene {name!r}; there are {', '.join(DEMO_SCENES)}.{hint} Scenes on disk need "
+        "data=dnerf."
+    )
 
 
 def build_demo_scene(name: str, seed: int = 0) -> Assembly:

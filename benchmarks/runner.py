@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from hydra import compose, initialize_config_dir
 
+from xplanes.backend import fast_bf16
 from xplanes.config import CONF, register_schemas, to_plain
 from xplanes.files import read_rows
 from xplanes.pipeline import run
@@ -50,7 +51,8 @@ def machine() -> str:
                 break
     cores, threads = os.cpu_count(), torch.get_num_threads()
     used = f"{cores} cores" if threads == cores else f"{threads} of {cores} cores"
-    return f"{used}, {name}, torch {torch.__version__}"
+    products = "with" if fast_bf16(torch.device("cpu")) else "without"
+    return f"{used}, {name}, {products} bfloat16 products, torch {torch.__version__}"
 
 
 def markdown(columns: tuple[str, ...], rows: list[tuple]) -> str:

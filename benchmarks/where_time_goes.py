@@ -40,6 +40,7 @@ STAGES = (
     ("compositing", "xplanes.rendering.renderer", "composite"),
     ("rest of forward", "xplanes.rendering.renderer", "Renderer.render"),
     ("rest of backward", "xplanes.training.module", "RadianceModule.manual_backward"),
+    ("rest of backward", "xplanes.rendering.thinning", "Cut.pass_on"),
     ("optimiser", "torch.optim", "Adam.step"),
     ("regularisers", "xplanes.training.methods.xplanes", "XPlanesMethod.regularise"),
     ("occupancy grid", "xplanes.training.sampling.occupancy", "OccupancySampling.keep_up"),

@@ -1,7 +1,5 @@
 """The same numbers from any number of threads, and the same bits from the same seed."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numba
@@ -12,25 +10,13 @@ from tests.stress.models import MODELS, SLOW, settings, trained
 from tests.stress.references import worst
 from tests.stress.scenes import write_scene
 from tests.stress.test_fields import field_of, seen
+from xplanes.backend import threads
 
 pytestmark = pytest.mark.stress
 
 needs_two = pytest.mark.skipif(
     numba.config.NUMBA_NUM_THREADS < 2, reason="one core only: nothing to compare"
 )
-
-
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    """So many threads for torch and the compiled loops."""
-    before = torch.get_num_threads(), numba.get_num_threads()
-    torch.set_num_threads(count)
-    numba.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before[0])
-        numba.set_num_threads(before[1])
 
 
 @needs_two

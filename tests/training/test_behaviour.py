@@ -2,7 +2,9 @@
 
 import csv
 import json
+import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -120,19 +122,24 @@ def test_resumed_run_equals_an_uninterrupted_one(
     ]
 
 
-def test_interrupt_saves_the_step_it_stopped_at(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def interrupt_where(
+    when: Callable[[RadianceModule], bool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Press Ctrl-C at the end of a batch."""
     original = TrainingClock.on_train_batch_end
 
     def press_ctrl_c(self, trainer, module, *rest) -> None:
-        import signal
-
         original(self, trainer, module, *rest)
-        if trainer.global_step == 17:
+        if when(module):
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(TrainingClock, "on_train_batch_end", press_ctrl_c)
+
+
+def test_interrupt_saves_the_step_it_stopped_at(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupt_where(lambda module: module.global_step == 17, monkeypatch)
     folder = tmp_path / "stopped"
     with pytest.raises(KeyboardInterrupt):
         run(small_config(scenes), folder, [], resume=False)
@@ -144,8 +151,6 @@ def test_interrupt_saves_the_step_it_stopped_at(
 def test_a_second_interrupt_saves_no_half_of_a_step(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import signal
-
     original = RadianceModule.manual_backward
 
     def press_twice(self, loss, *rest, **options) -> None:
@@ -165,16 +170,7 @@ def test_a_second_interrupt_saves_no_half_of_a_step(
 def test_an_interrupt_waits_for_the_update_of_its_batches(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import signal
-
-    original = TrainingClock.on_train_batch_end
-
-    def press_ctrl_c(self, trainer, module, *rest) -> None:
-        original(self, trainer, module, *rest)
-        if module.batches == 7:
-            signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(TrainingClock, "on_train_batch_end", press_ctrl_c)
+    interrupt_where(lambda module: module.batches == 7, monkeypatch)
     folder = tmp_path / "stopped"
     with pytest.raises(KeyboardInterrupt):
         run(small_config(scenes, "trainer.accumulate=3"), folder, [], resume=False)
@@ -185,25 +181,8 @@ def test_an_interrupt_waits_for_the_update_of_its_batches(
 def test_an_evaluation_that_was_stopped_is_done_again(
     trained: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import signal
-
-    original = scorer.score_view
-
-    def press_ctrl_c(*parts):
-        if parts[1] is not None and steps and steps[-1] == 20:
-            signal.raise_signal(signal.SIGINT)
-        return original(*parts)
-
-    steps: list[int] = []
-    update = TrainingClock.on_train_batch_end
-    monkeypatch.setattr(
-        TrainingClock,
-        "on_train_batch_end",
-        lambda self, trainer, *rest: (
-            steps.append(trainer.global_step) or update(self, trainer, *rest)
-        ),
-    )
-    monkeypatch.setattr(scorer, "score_view", press_ctrl_c)
+    # The evaluation at step 20 finds that it was asked to stop.
+    interrupt_where(lambda module: module.global_step == 20, monkeypatch)
     folder = tmp_path / "stopped"
     with pytest.raises(KeyboardInterrupt):
         run(small_config(scenes), folder, [], resume=False)

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from tests.training.runs import small_config
-from xplanes.checks import parse
 from xplanes.config import TrainerConfig
 from xplanes.files import read_json
 from xplanes.pipeline import run
@@ -107,12 +106,12 @@ def test_one_thread_leaves_no_choice(two_threads):
 
 def test_a_run_reports_its_number_and_leaves_torchs_alone(tmp_path, two_threads):
     config = small_config(tmp_path, "trainer.max_seconds=1.5", "trainer.max_steps=100000")
-    assert parse(config).trainer.max_seconds == 1.5
     run(config, tmp_path / "run", [], resume=False)
     assert torch.get_num_threads() == 2
     metrics, log = read_json(tmp_path / "run" / "metrics.json"), (tmp_path / "run" / "train.log")
     assert metrics["threads"] in (1, 2)
-    assert ("threads: 1 from here on" in log.read_text()) >= (metrics["threads"] == 1)
+    if metrics["threads"] == 1:  # It began with two.
+        assert "threads: 1 from here on" in log.read_text()
 
 
 def test_a_run_that_fails_leaves_torchs_number_alone(tmp_path, two_threads, monkeypatch):

@@ -13,10 +13,10 @@ from pathlib import Path
 from time import time as now
 from typing import Any
 
-import torch
 from PIL import Image
 from torch import Tensor
 
+from xplanes.backend import threads
 from xplanes.scenes.demo.assembly import Assembly
 from xplanes.scenes.demo.film import CAMERA_ANGLE_X, camera_at, film, hemisphere_cameras
 from xplanes.scenes.demo.scenes import build_demo_scene, demo_scene
@@ -142,13 +142,8 @@ def _write_split(
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """Keep PyTorch to one thread: to share out these many small operations costs more."""
-    with _RENDERING:
-        before = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            yield
-        finally:
-            torch.set_num_threads(before)
+    with _RENDERING, threads(1):
+        yield
 
 
 def _record(

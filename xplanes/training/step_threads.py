@@ -115,8 +115,8 @@ class StepThreads(Callback):
     """Sets torch's and the loops' threads before each step. Must come right after the clock.
 
     Sums may come out otherwise with another number of threads, in their last digits. Where these
-    are to be kept, by ``deterministic`` or a budget of steps alone, all threads work, as on GPUs and
-    in several processes.
+    are to be kept, by ``deterministic`` or a budget of steps alone, all threads work, as on GPUs
+    and in several processes.
 
     Args:
         options: Of the trainer.

@@ -71,6 +71,13 @@ class Hub(http.server.BaseHTTPRequestHandler):
         pass
 
 
+@pytest.fixture(autouse=True)
+def online(monkeypatch):
+    """Downloads are allowed, whatever the environment says; the hub reads it when imported."""
+    monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+
+
 @pytest.fixture
 def hub(monkeypatch):
     """Address of a hub on this machine, and what it was asked for."""

@@ -171,7 +171,8 @@ def test_weights_of_another_size_are_refused_before_any_scene_is_read(tmp_path: 
 
 
 def test_missing_weights_name_the_way_out(tmp_path: Path, monkeypatch):
-    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    pytest.importorskip("huggingface_hub")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     from xplanes.preparation import find_source
 
     with pytest.raises(LRMError, match=r"446 MB.*CC-BY-NC-4\.0.*lrm\.weights=FILE"):

@@ -339,10 +339,10 @@ def test_a_bad_batch_takes_those_of_its_update_along(
     assert left == [False]
 
 
-def test_scene_of_one_moment_trains_without_planes_of_time(scenes: Path, tmp_path: Path) -> None:
-    config = small_config(scenes, "trainer.max_steps=2", "trainer.evaluate_at=[]")
+def test_scene_of_one_moment_trains_without_planes_of_time(tmp_path: Path) -> None:
+    config = small_config(tmp_path / "scenes", "trainer.max_steps=2", "trainer.evaluate_at=[]")
     run(config, tmp_path / "moving", [], resume=False)
-    (folder,) = [p for p in scenes.iterdir() if p.is_dir()]
+    (folder,) = [p for p in (tmp_path / "scenes").iterdir() if p.is_dir()]
     for path in folder.glob("transforms_*.json"):
         content = json.loads(path.read_text())
         for frame in content["frames"]:

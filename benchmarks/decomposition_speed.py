@@ -1,39 +1,40 @@
-"""Run time against error of robust PCA: measures one method on one matrix and appends to the table.
+"""Run time against error of robust PCA, method by method.
 
-    python benchmarks/decomposition_speed.py --frames 50 --weight 0.009 --part reference
-    python benchmarks/decomposition_speed.py --frames 50 --weight 0.009 --part adaptive
-    python benchmarks/decomposition_speed.py --frames 50 --weight 0.009 --part clock
-    python benchmarks/decomposition_speed_report.py
+    python benchmarks/decomposition_speed.py [--frames 50 ...] [--weight 0.009 ...] [--part svd ...]
+        [--budget SECONDS]
 
-Parts: reference (first, once per matrix: long, float64), then svd (the paper's ADMM with a full
-singular value decomposition), gram (the same with the Gram matrix), and the package's adaptive,
-growing and admm: errors after so many iterations, tolerance 1e-5. Then clock: all methods in turn,
-several rounds, the least time of each, because other work on the machine only ever adds to it.
+Writes results/decomposition_speed.md, .png and two .csv beside this file; what is not measured this
+time keeps its rows. Parts: reference (first, once per matrix: long, float64), then svd (the paper's
+ADMM with a full singular value decomposition), gram (the same with the Gram matrix), and the
+package's adaptive, growing and admm: errors after so many iterations, tolerance 1e-5. Then clock:
+all methods in turn, several rounds, the least time of each, because other work on the machine only
+ever adds to it.
 """
 
 import argparse
-import csv
 import math
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
 from decomposition_data import feature_matrix
+from decomposition_speed_report import CLOCK, TABLE, report
 from torch import Tensor
 
 from xplanes.decomposition import RobustPCA, robust_pca
 from xplanes.decomposition.passes import Step, Workspace, iterate, start
 from xplanes.decomposition.svt import shrinkage_from_gram
+from xplanes.files import read_rows, write_rows
 
-TABLE = Path(__file__).parent / "results" / "decomposition_speed.csv"
-CLOCK = Path(__file__).parent / "results" / "decomposition_speed_clock.csv"
+PARTS = ("reference", "svd", "gram", "adaptive", "growing", "admm", "clock")
 CLOCKED = {"svd": (1, 3), "gram": (1, 3), "admm": (8, 24), "growing": (8, 24), "adaptive": (8, 24)}
 FIELDS = (
     *("frames", "weight", "part", "iterations", "seconds"),
     *("residual", "objective", "low_rank", "sparse", "rank"),
 )
+CLOCK_FIELDS = ("frames", "weight", "part", "iterations", "seconds")
 STOPS = (
     *(2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 23, 26, 29, 32, 36, 40, 45, 50, 56, 64),
     *(72, 84, 96, 112, 128, 150, 180, 220),
@@ -151,36 +152,40 @@ def package(matrix: Tensor, weight: float, method: str, budget: float) -> Iterat
             return
 
 
-def measure(options: argparse.Namespace, matrix: Tensor, weight: float, path: Path) -> None:
+def keep(path: Path, fields: Sequence[str], case: Sequence[str], rows: list[list[str]]) -> None:
+    """Write rows into a table, in place of those whose first fields are the same."""
+    old = [list(row.values()) for row in read_rows(path)] if path.exists() else []
+    write_rows(path, fields, [row for row in old if row[: len(case)] != list(case)] + rows)
+
+
+def measure(
+    matrix: Tensor, weight: float, case: Sequence[str], part: str, budget: float, path: Path
+) -> None:
     truth = torch.load(path)
-    plainly = options.part in ("svd", "gram")
     points = (
-        plain(matrix, weight, options.part == "svd", options.budget)
-        if plainly
-        else package(matrix, weight, options.part, options.budget)
+        plain(matrix, weight, part == "svd", budget)
+        if part in ("svd", "gram")
+        else package(matrix, weight, part, budget)
     )
-    fresh = not TABLE.exists()
-    with TABLE.open("a", newline="") as file:
-        writer = csv.writer(file)
-        if fresh:
-            writer.writerow(FIELDS)
-        for iterations, seconds, low_rank, sparse, rank in points:
-            gap = squared(low_rank, sparse, matrix, signs=(1, 1, -1)) / squared(matrix)
-            errors = [math.sqrt(gap), objective(low_rank, matrix, weight) / truth["objective"] - 1]
-            for part, name in ((low_rank, "low_rank"), (sparse, "sparse")):
-                far = squared(part, truth[name], signs=(1, -1)) / squared(truth[name])
-                errors.append(math.sqrt(far))
-            row = [options.frames, options.weight, options.part, iterations, f"{seconds:.3f}"]
-            row += [*(f"{error:.2e}" for error in errors), rank]
-            writer.writerow(row)
-            print(*row, flush=True)
+    rows = []
+    for iterations, seconds, low_rank, sparse, rank in points:
+        gap = squared(low_rank, sparse, matrix, signs=(1, 1, -1)) / squared(matrix)
+        errors = [math.sqrt(gap), objective(low_rank, matrix, weight) / truth["objective"] - 1]
+        for mine, name in ((low_rank, "low_rank"), (sparse, "sparse")):
+            errors.append(
+                math.sqrt(squared(mine, truth[name], signs=(1, -1)) / squared(truth[name]))
+            )
+        row = [*case, part, str(iterations), f"{seconds:.3f}"]
+        rows.append([*row, *(f"{error:.2e}" for error in errors), str(rank)])
+        print(*rows[-1], flush=True)
+    keep(TABLE, FIELDS, [*case, part], rows)
 
 
-def clock(options: argparse.Namespace, matrix: Tensor, weight: float) -> None:
+def clock(matrix: Tensor, weight: float, case: Sequence[str], budget: float) -> None:
     """Seconds after two iteration counts, results included: a line through them is the clock."""
     best: dict[tuple[str, int], float] = {}
     begin = time.time()
-    while time.time() - begin < options.budget:
+    while time.time() - begin < budget:
         for part, counts in CLOCKED.items():
             for count in counts:
                 if part in ("svd", "gram"):
@@ -188,32 +193,36 @@ def clock(options: argparse.Namespace, matrix: Tensor, weight: float) -> None:
                 else:
                     spent = package_run(matrix, weight, part, count)[0]
                 best[part, count] = min(spent, best.get((part, count), math.inf))
-    with CLOCK.open("a", newline="") as file:
-        writer = csv.writer(file)
-        for (part, count), seconds in best.items():
-            writer.writerow((options.frames, options.weight, part, count, f"{seconds:.4f}"))
-            print(part, count, seconds, flush=True)
+    rows = [[*case, part, str(count), f"{spent:.4f}"] for (part, count), spent in best.items()]
+    for row in rows:
+        print(*row, flush=True)
+    keep(CLOCK, CLOCK_FIELDS, case, rows)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--frames", type=int, default=50)
-    parser.add_argument("--weight", default="0.009", help="a number or auto")
-    parser.add_argument("--part", default="adaptive")
-    parser.add_argument("--budget", type=float, default=100, help="seconds of measured time")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--frames", type=int, nargs="+", default=[50, 150])
+    parser.add_argument("--weight", nargs="+", default=["0.009", "auto"], help="a number or auto")
+    parser.add_argument("--part", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--budget", type=float, default=100, help="seconds for each part")
     parser.add_argument("--work", type=Path, default=Path("build/decomposition_speed"))
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     options.work.mkdir(parents=True, exist_ok=True)
-    matrix = feature_matrix(options.frames)
-    weight = len(matrix) ** -0.5 if options.weight == "auto" else float(options.weight)
-    path = options.work / f"reference_{options.frames}_{options.weight}.pt"
-    if options.part == "reference":
-        make_reference(matrix, weight, options.budget, path)
-    elif options.part == "clock":
-        clock(options, matrix, weight)
-    else:
-        measure(options, matrix, weight, path)
+    for frames in options.frames:
+        matrix = feature_matrix(frames)
+        for name in options.weight:
+            weight = len(matrix) ** -0.5 if name == "auto" else float(name)
+            path = options.work / f"reference_{frames}_{name}.pt"
+            case = (str(frames), name)
+            for part in options.part:
+                if part == "reference":
+                    make_reference(matrix, weight, options.budget, path)
+                elif part == "clock":
+                    clock(matrix, weight, case, options.budget)
+                else:
+                    measure(matrix, weight, case, part, options.budget, path)
+    report()
 
 
 if __name__ == "__main__":

@@ -1,17 +1,15 @@
-"""Table and plot of the run times that decomposition_speed.py measured.
-
-python benchmarks/decomposition_speed_report.py
-"""
-
-import csv
-from pathlib import Path
+"""Table and plot of the run times that decomposition_speed.py measured."""
 
 import matplotlib
+from runner import RESULTS, machine
+
+from xplanes.files import read_rows, replacing, write_text
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-RESULTS = Path(__file__).parent / "results"
+TABLE = RESULTS / "decomposition_speed.csv"
+CLOCK = RESULTS / "decomposition_speed_clock.csv"
 NAMES = {
     "svd": "(a) paper's ADMM, full SVD",
     "gram": "(b) paper's ADMM, Gram matrix",
@@ -27,23 +25,22 @@ TARGETS = (
 )
 HEAD = """# Robust PCA: run time against error
 
-163,840 rows (64 x 64 cells of 40 features), float32, two cores of an AMD EPYC, torch 2.13. Seconds
+163,840 rows (64 x 64 cells of 40 features), float32; {machine}. Seconds
 until an error falls below a bound and stays there. Residual: |L + S - Y| / |Y|. Errors against a
 long float64 run: objective of the feasible pair (L, Y - L), relative difference of L and of S.
-`-`: not reached within the iterations given (last column; ours end at tolerance 1e-5). The machine
-was shared, so seconds are iterations times the least time per iteration over interleaved rounds,
-plus what starting and finishing take. Scripts: `decomposition_speed.py` and
-`decomposition_speed_report.py` in benchmarks; points: `decomposition_speed.csv` (its own column of
-seconds is raw), times: `decomposition_speed_clock.csv`.
+`-`: not reached within the iterations given (last column; ours end at tolerance 1e-5). Seconds are
+iterations times the least time per iteration over interleaved rounds, plus what starting and
+finishing take. Script: `benchmarks/decomposition_speed.py`; points: `decomposition_speed.csv` (its
+own column of seconds is raw), times: `decomposition_speed_clock.csv`.
 """
 
 
 def clocks() -> dict[tuple[str, ...], tuple[float, float]]:
     """Start and slope of the line through the two clocked counts, by frames, weight and part."""
     points: dict[tuple[str, ...], list[tuple[int, float]]] = {}
-    with (RESULTS / "decomposition_speed_clock.csv").open(newline="") as file:
-        for frames, weight, part, count, seconds in csv.reader(file):
-            points.setdefault((weight, frames, part), []).append((int(count), float(seconds)))
+    for row in read_rows(CLOCK):
+        key = (row["weight"], row["frames"], row["part"])
+        points.setdefault(key, []).append((int(row["iterations"]), float(row["seconds"])))
     lines = {}
     for key, values in points.items():
         (few, short), (many, long) = min(values), max(values)
@@ -62,15 +59,14 @@ def reached(rows: list[dict[str, str]], name: str, bound: float) -> float | None
     return answer
 
 
-def main() -> None:
-    with (RESULTS / "decomposition_speed.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    clock = clocks()
+def report() -> None:
+    """Write the page and the plot."""
+    rows, clock = read_rows(TABLE), clocks()
     cases = sorted({(row["weight"], int(row["frames"])) for row in rows})
     figure, axes = plt.subplots(len(cases), 3, figsize=(13, 3.2 * len(cases)), squeeze=False)
     colours = dict(zip(NAMES, plt.rcParams["axes.prop_cycle"].by_key()["color"], strict=False))
     bounds = [(name, bound) for name, values in TARGETS for bound in values]
-    lines = [HEAD]
+    lines = [HEAD.format(machine=machine())]
     for line, (weight, frames) in zip(axes, cases, strict=True):
         heads = " | ".join(f"{name} {bound:.0e}" for name, bound in bounds)
         lines.append(f"\n## {frames} frames, sparsity weight {weight}\n")
@@ -105,9 +101,6 @@ def main() -> None:
             lines.append(f"| (a) over the default | | {gains} | |")
     axes[0][0].legend(fontsize=7)
     figure.tight_layout()
-    figure.savefig(RESULTS / "decomposition_speed.png", dpi=75)
-    (RESULTS / "decomposition_speed.md").write_text("\n".join(lines) + "\n")
-
-
-if __name__ == "__main__":
-    main()
+    with replacing(RESULTS / "decomposition_speed.png") as temporary:
+        figure.savefig(temporary, dpi=75, format="png")
+    write_text(RESULTS / "decomposition_speed.md", "\n".join(lines) + "\n")

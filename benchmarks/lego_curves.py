@@ -16,7 +16,7 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from runner import RESULTS, lego, machine, markdown, measure
+from runner import RESULTS, command, lego, machine, markdown, measure
 
 from xplanes.files import replacing, write_rows, write_text
 
@@ -97,7 +97,7 @@ def main() -> None:
     write_rows(RESULTS / "lego.csv", header, points)
     page = f"""# lego, val split, planes at random
 
-Default settings, {machine()}. Script: `benchmarks/lego_curves.py`.
+Default settings, {machine()}. `{command()}`
 
 {markdown(COLUMNS, rows)}
 

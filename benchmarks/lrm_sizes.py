@@ -102,7 +102,7 @@ def main() -> None:
 Random weights in float32, saved as safetensors without tensors that the model never uses
 (OpenLRM 1.0 and TripoSR are published as pickles), one picture of 512 pixels;
 {machine()}. The file is mapped into memory, so that it is
-read while the picture is encoded. Script: `benchmarks/lrm_sizes.py`.
+read while the picture is encoded. `{command()}`
 
 {markdown(COLUMNS, rows)}
 """

@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from runner import RESULTS, lego, machine, markdown, run_apart
+from runner import RESULTS, command, lego, machine, markdown, run_apart
 
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.files import write_rows, write_text
@@ -95,8 +95,8 @@ def main() -> None:
 
 {name}, six planes at random trained for {args.seconds:g} s at
 {run.scene.splits["train"].width} px with 128 samples along the cube's diagonal; median of {FRAMES}
-views, PSNR their mean, blank where the scene has no images of that size; {machine()}. Script:
-`benchmarks/rendering.py`.
+views, PSNR their mean, blank where the scene has no images of that size; {machine()}.
+`{command()}`
 
 {markdown(COLUMNS, rows)}
 """

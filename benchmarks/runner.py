@@ -55,6 +55,15 @@ def machine() -> str:
     return f"{used}, {name}, {products} bfloat16 products, torch {torch.__version__}"
 
 
+def command() -> str:
+    """This process as a command line, with what the environment says of threads."""
+    named = (name for name in ("OMP_NUM_THREADS", "XPLANES_CPU_LOOPS") if name in os.environ)
+    given = [f"{name}={os.environ[name]}" for name in named]
+    script = f"benchmarks/{Path(sys.argv[0]).name}"
+    words = ["FOLDER" if Path(word).is_absolute() else word for word in sys.argv[1:]]
+    return " ".join([*given, "python", script, *words])
+
+
 def markdown(columns: tuple[str, ...], rows: list[tuple]) -> str:
     """A table."""
     lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]

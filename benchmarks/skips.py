@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from statistics import fmean
 
-from runner import RESULTS, Measured, lego, machine, markdown, measure
+from runner import RESULTS, Measured, command, lego, machine, markdown, measure
 
 from xplanes.files import write_rows, write_text
 
@@ -42,6 +42,25 @@ SWITCHES = {
 }
 
 KINDS = ("empty", "occluded", "background", "gradients")
+
+PAIRS = {
+    "planes of time of a still scene": (("data.scene=still",), ("data.still=false",), 1),
+    "grid in bins of time": (("data.scene=balls",), ("sampler.time_bins=1",), 1),
+    "grid filled from the start": (
+        ("data.scene=excavator", "lrm=tiny"),
+        ("sampler.fill=false",),
+        1,
+    ),
+    "steps after convergence": (
+        ("data.scene=excavator", "trainer.plateau=0.3"),
+        ("trainer.plateau=null",),
+        4,
+    ),
+}
+"""Savings beside those of single samples: a scene, what switches it off there, and for how many
+times the steps."""
+
+PAIR_COLUMNS = ("saving", "scene", "seconds", "without it", "psnr", "without it", "steps")
 
 FIGURES: dict[str, Callable[[dict], float]] = {
     "seconds": lambda run: run["seconds"]["train"],
@@ -70,8 +89,8 @@ COLUMNS = (
 def train(scene: list[str], switches: tuple[str, ...], seed: int, work: Path, args) -> Measured:
     """One run with equal rays at equal steps."""
     overrides = [
+        *([] if any(line.startswith("lrm=") for line in scene) else ["lrm=none"]),
         *scene,
-        "lrm=none",
         f"seed={seed}",
         f"data.resolution={args.resolution}",
         f"trainer.max_steps={args.steps}",
@@ -87,6 +106,48 @@ def train(scene: list[str], switches: tuple[str, ...], seed: int, work: Path, ar
     return measure(overrides, work)
 
 
+def pair(name: str, work: Path, args) -> tuple:
+    """A row of the second table."""
+    scene, off, longer = PAIRS[name]
+    scene = list(scene)
+    several = argparse.Namespace(**(vars(args) | {"steps": longer * args.steps}))
+    cells = []
+    for switches in ((), off):
+        runs = [train(scene, switches, seed, work, several).metrics for seed in range(args.seeds)]
+        cells.append(
+            (
+                fmean(run["seconds"]["train"] for run in runs),
+                fmean(run["test"]["psnr"] for run in runs),
+                fmean(run["step"] for run in runs),
+            )
+        )
+    (seconds, psnr, steps), (slower, other, more) = cells
+    return (
+        name,
+        scene[0].split("=")[1],
+        *(f"{seconds:.1f}", f"{slower:.1f}", f"{psnr:.2f}", f"{other:.2f}"),
+        f"{steps:.0f} / {more:.0f}",
+    )
+
+
+def preparation(work: Path) -> list[tuple]:
+    """Seconds of the preparation with 16 frames: different ones, equal ones, and kept stages."""
+    cases = {
+        "16 different frames": ("data.scene=excavator", "preparation.cache=null"),
+        "16 equal frames": ("data.scene=still", "data.still=false", "preparation.cache=null"),
+        "stages kept": ("data.scene=excavator", f"preparation.cache={work / 'cache'}"),
+    }
+    rows = []
+    for name, overrides in cases.items():
+        lines = [*overrides, "trainer.max_steps=1", "trainer.evaluate_at=[]", "trainer.media=false"]
+        for _ in range(2):  # Whatever is made once, the second finds.
+            metrics = measure([*lines, "trainer.accelerator=cpu"], work).metrics
+        # Not the stages' own seconds: of what was kept these are the ones that it once took.
+        waited = metrics["seconds"]["total"] - metrics["seconds"]["evaluate"]
+        rows.append((name, f"{waited:.1f}", f"{100 * metrics['skipped']['frames']:.0f}%"))
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--lego", type=Path, default=Path("data/dnerf/lego"))
@@ -94,6 +155,7 @@ def main() -> None:
     parser.add_argument("--resolution", type=int, default=100)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--only", nargs="+", choices=SWITCHES, default=list(SWITCHES))
+    parser.add_argument("--pairs", nargs="*", choices=PAIRS, default=list(PAIRS))
     parser.add_argument("--name", default="skips")
     args = parser.parse_args()
     scenes = {
@@ -127,11 +189,13 @@ def main() -> None:
                     )
                 )
                 print(*rows[-1], flush=True)
+        pairs = [pair(name, Path(work), args) for name in args.pairs]
+        prepared = preparation(Path(work)) if args.pairs else []
     write_rows(RESULTS / f"{args.name}.csv", COLUMNS, rows)
     page = f"""# Savings, one switched off at a time
 
 {args.steps} steps of 512 rays, {args.resolution} px, six planes at random,
-means of {args.seeds} seeds; {machine()}. Script: `benchmarks/skips.py`.
+means of {args.seeds} seeds; {machine()}. `{command()}`
 
 empty and occluded: shares of the samples in the box; background: share of the pixels; gradients:
 share of the samples left that needed none.
@@ -140,6 +204,24 @@ All runs see equally many rays. Without the saving of the background they are sp
 picture, where most meet nothing and cost little: it shows in PSNR, not in seconds.
 
 {markdown(COLUMNS, rows)}
+"""
+    if pairs:
+        page += f"""
+## Savings beside those of single samples
+
+Seconds of training and PSNR with a saving and without it, steps with / without.
+
+{markdown(PAIR_COLUMNS, pairs)}
+
+## Preparation
+
+Seconds of a run of one step with `lrm=tiny`, without scoring; frames: share that did not pass
+through the model, as it equals another.
+
+{markdown(("video", "seconds", "frames"), prepared)}
+
+Singular directions: [robust PCA](decomposition_speed.md). Static cells of a moving scene are not
+skipped: [concepts](../../docs/concepts.md) say why.
 """
     write_text(RESULTS / f"{args.name}.md", page)
 

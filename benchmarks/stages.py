@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import torch
 from decomposition_data import feature_matrix
-from runner import RESULTS, machine, markdown
+from runner import RESULTS, command, machine, markdown
 from torch import Tensor
 
 from xplanes.decomposition import decompose
@@ -154,7 +154,7 @@ def main() -> None:
     write_rows(RESULTS / "stages.csv", COLUMNS, rows)
     page = f"""# Stages against the size of their problem
 
-Least of {ROUNDS} calls; {machine()}. Script: `benchmarks/stages.py`. Sequences have 30 frames, 32
+Least of {ROUNDS} calls; {machine()}. `{command()}`. Sequences have 30 frames, 32
 channels and 32 texels a side, planes 64 texels and 32 channels, lookups 8,000 points, where nothing
 else is said. "growth": the exponent fitted over all sizes of a stage.
 

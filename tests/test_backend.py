@@ -1,9 +1,14 @@
-"""The compiled loops and torch agree on how many threads there are."""
+"""The compiled loops agree with torch on the number of threads, and may be absent."""
 
+import os
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 import pytest
+
+from xplanes.backend import WarmUp
 
 COUNT = """
 import sys, numba, torch
@@ -23,3 +28,40 @@ def test_the_first_loop_leaves_the_number_of_threads_alone(count: int) -> None:
     torchs, loops, cores = map(int, result.stdout.split())
     assert torchs == count
     assert loops == min(count, cores)
+
+
+FALLBACK = """
+import torch
+from xplanes import backend
+from xplanes.rendering.compositing import composite
+nothing = torch.zeros(4, dtype=torch.long)
+total, _ = composite(torch.rand(4), torch.rand(4, 3), torch.rand(4), nothing, nothing[:1])
+assert total.isfinite().all()
+print(backend.name(torch.device("cpu")))
+"""
+
+
+def test_a_numba_that_does_not_load_is_done_without(tmp_path: Path) -> None:
+    (tmp_path / "numba").mkdir()
+    (tmp_path / "numba" / "__init__.py").write_text("raise ImportError('Numba needs NumPy 0.1')")
+    root = Path(__file__).parents[1]
+    result = subprocess.run(
+        [sys.executable, "-c", FALLBACK],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{root}"},
+    )
+    assert result.stdout.split() == ["torch"]
+    assert "numba cannot be imported (Numba needs NumPy 0.1)" in result.stderr
+    assert "pip install --upgrade numba" in result.stderr
+
+
+def test_warming_up_inside_warming_up_counts_once() -> None:
+    clock = WarmUp()
+    with clock.timed(), clock.timed():
+        time.sleep(0.05)
+    assert 0.05 <= clock.seconds < 0.1
+    with clock.timed():
+        time.sleep(0.01)
+    assert clock.seconds >= 0.06

@@ -27,15 +27,20 @@ class WarmUp:
     """
 
     seconds: float = 0.0
+    _inside: bool = False
 
     @contextmanager
     def timed(self) -> Iterator[None]:
-        """Counts what is done inside."""
-        began = time.perf_counter()
+        """Counts what is done inside, once."""
+        if self._inside:
+            yield
+            return
+        began, self._inside = time.perf_counter(), True
         try:
             yield
         finally:
             self.seconds += time.perf_counter() - began
+            self._inside = False
 
 
 warm_up = WarmUp()
@@ -43,11 +48,19 @@ warm_up = WarmUp()
 
 @functools.cache
 def _found(package: str, consequence: str) -> bool:
-    """Whether a package is installed; says once what follows where it is not."""
-    if importlib.util.find_spec(package) is not None:
-        return True
-    logger.warning("%s is not installed: %s", package, consequence)
-    return False
+    """Whether a package can be imported; says once what follows where it cannot."""
+    if importlib.util.find_spec(package) is None:
+        logger.warning("%s is not installed: %s", package, consequence)
+        return False
+    try:
+        with warm_up.timed():
+            importlib.import_module(package)
+    except Exception as error:
+        # A package that is there may still refuse, another one being too new or too old for it.
+        reason = str(error).strip().split("\n")[0]
+        logger.warning("%s cannot be imported (%s): %s", package, reason, consequence)
+        return False
+    return True
 
 
 def numba_found() -> bool:
@@ -55,7 +68,7 @@ def numba_found() -> bool:
     return _found(
         "numba",
         "the CPU takes the plain torch path, several times slower. "
-        "Install it with `pip install numba`.",
+        "`pip install --upgrade numba` brings what is needed.",
     )
 
 
@@ -74,7 +87,7 @@ def triton_found() -> bool:
     return _found(
         "triton",
         "the GPU takes the plain torch path, which is slower. "
-        "`pip install triton` brings it (torch for CUDA on Linux comes with it).",
+        "`pip install --upgrade triton` brings it (torch for CUDA on Linux comes with it).",
     )
 
 
@@ -96,6 +109,10 @@ def waves(device: torch.device, *shape: int) -> Tensor:
     """Numbers from -1 to 1 for a trial, which must leave all random generators alone."""
     count = torch.arange(torch.Size(shape).numel(), device=device, dtype=torch.float32)
     return count.mul(0.7).sin().view(shape)
+
+
+_refused: set[str] = set()
+"""Work whose Triton kernels did not stand their trial."""
 
 
 def proven(
@@ -134,6 +151,7 @@ def proven(
             type(error).__name__,
             str(error).strip().split("\n")[0] or "no reason given",
         )
+        _refused.add(what)
         return False
     return True
 
@@ -185,8 +203,9 @@ def threads(count: int) -> Iterator[None]:
 
 
 def name(device: torch.device) -> str:
-    """Name of the inner loops on a device, for the header of a run."""
+    """Name of the inner loops on a device; once they have run, with what failed its trial."""
     probe = torch.empty(0, device=device)
     if gpu_kernels(probe):
-        return "Triton kernels"
+        failed = f" (torch for {', '.join(sorted(_refused))})" if _refused else ""
+        return f"Triton kernels{failed}"
     return "compiled loops" if cpu_loops(probe) else "torch"

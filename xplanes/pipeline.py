@@ -161,6 +161,7 @@ def train(
     }
     skipped = data.batches(0).skipped
     metrics = summary(module, scorer.latest, config.data.eval_split, seconds, skipped)
+    metrics["skipped"] |= start.skipped
     metrics["decomposition"] = start.report
     metrics["lrm"] = start.lrm
     if config.trainer.media:

@@ -6,7 +6,14 @@ import pytest
 import torch
 
 from tests.baselines.checks import check_learns, check_reload, check_resume
-from tests.baselines.runs import KPLANES, OCCUPANCY, PROPOSAL, baseline_config
+from tests.baselines.runs import (
+    KPLANES,
+    OCCUPANCY,
+    PROPOSAL,
+    TENSOR4D,
+    TINEUVOX,
+    baseline_config,
+)
 from tests.synthetic import ball_scene, ball_views
 from xplanes.checks import parse
 from xplanes.config import ConfigError
@@ -43,6 +50,14 @@ def test_hybrid_run_learns_goes_on_and_is_loaded(scenes, tmp_path, monkeypatch):
         ),
         ("model=kplanes", "sampler=occupancy", *KPLANES, *OCCUPANCY),
         ("sampler=proposal", "model.resolution=16", "model.channels=4", *PROPOSAL),
+        (
+            "model=tineuvox_s",
+            "sampler=proposal",
+            "model.half_side=1.5",
+            *[o for o in TINEUVOX if not o.startswith("sampler")],
+            *PROPOSAL,
+        ),
+        ("model=tensor4d_density", "sampler=proposal", *TENSOR4D, *PROPOSAL),
     ],
 )
 def test_others_learn(scenes, tmp_path, overrides):

@@ -18,6 +18,40 @@ PUBLISHED = {
 }
 
 
+SETTINGS = yaml.safe_load("""
+kplanes:
+  model: {half_side: 1.3, resolution: 64, scales: [1, 2, 4, 8], time_resolution: null, channels: 32,
+    space_low: 0.1, space_high: 0.5, width: 64, learning_rate: 0.01, warmup_steps: 512}
+  loss: {background: one, variation: coded, total_variation: 0.0001, time_smoothness: 0.01,
+    time_identity: 0.0001}
+  sampler: {near: 2, far: 6, proposal_samples: [256, 128], samples: 48, resolutions: [64, 128],
+    time_resolution: 50, channels: 8, width: 64, linear: false, space_low: 0.1, space_high: 0.15,
+    padding: 0.01, anneal_steps: 1000, anneal_slope: 10, update_every: 5, update_warmup: 5000,
+    histogram: 1, variation: coded, total_variation: 0.0001, time_smoothness: 0.001,
+    time_identity: 0.0001, learning_rate: 0.01}
+kplanes_explicit:
+  model: {width: 128}
+  sampler: {linear: true}
+tineuvox_s:
+  model: {near: 2, far: 6, margin: 1.05, resolution: 100, channels: 4, width: 64,
+    alpha_start: 0.01, point_octaves: 10, time_octaves: 8, direction_octaves: 4,
+    feature_octaves: 2, grow_at: [2000, 4000, 6000], grid_learning_rate: 0.08,
+    deformation_learning_rate: 0.0006, network_learning_rate: 0.0008, decay_steps: 20000}
+  loss: {background: white, entropy: 0.001, sample_colour: 0.01}
+  sampler: {near: 2, far: 6, step: 0.5, threshold: 0.0001}
+tineuvox_b:
+  model: {resolution: 160, channels: 6, width: 256, alpha_start: 0.001}
+tensor4d:
+  model: {resolution: 128, fine_resolution: 512, time_resolution: 128, channels: 32,
+    fine_channels: 16, width: 256, point_octaves: 8, time_octaves: 6, direction_octaves: 3,
+    fine_from: 5000, blur_until: 7500, blur_resolution: 64, learning_rate: 0.0005,
+    plane_learning_rate: 0.0025, warmup_steps: 2000, final_rate: 0.1, radius: 0.5, sharpness: 0.3}
+  loss: {masked: true, eikonal: 0.2, opacity: 0.3, smoothness: 0.01, smoothness_distance: 0.001}
+  sampler: {samples: 64, more_samples: 65, coarse_sharpness: 64}
+""")
+"""Settings of the released code."""
+
+
 def composed(*overrides):
     register_schemas()
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -35,6 +69,13 @@ def test_a_baseline_brings_its_published_steps(model, experiment):
     assert config.lrm.name == "none"
     assert not config.data.skip_background
     assert (config.trainer.max_seconds is None) == bool(experiment)
+
+
+@pytest.mark.parametrize("model", SETTINGS)
+def test_a_baseline_has_its_published_settings(model):
+    config = composed(f"model={model}")
+    for group, settings in SETTINGS[model].items():
+        assert {key: config[group][key] for key in settings} == settings
 
 
 def test_without_its_recipe_a_baseline_trains_on_the_rays_of_others():

@@ -19,6 +19,7 @@ from xplanes.preparation.cache import StageCache
 from xplanes.preparation.encode import straight_alpha
 from xplanes.preparation.fixed_view import FixedView
 from xplanes.preparation.reconstruct import load_lrm, picture_crop, place, reconstruct
+from xplanes.preparation.start import prepare
 from xplanes.scenes.frame import scene_frame
 
 CHOICES = {
@@ -140,6 +141,19 @@ def test_the_report_is_whole(tmp_path: Path):
     assert made.seconds["lrm"] > lrm.seconds > 0
     assert made.picture.shape == (160, 3 * 160, 3)
     assert made.picture.std() > 0.01
+
+
+def test_equal_frames_count_as_skipped(tmp_path: Path):
+    config = settings(tmp_path, "openlrm-1.1", "preparation.frames=4", "preparation.cache=null")
+    scene = filmed()
+    images = scene.video.images.clone()
+    images[1:4] = images[0]
+    scene = replace(scene, video=replace(scene.video, images=images))
+    lrm = load_lrm(config.lrm, say=lambda _: None)
+    frame = scene_frame(scene.splits["train"])
+    start = prepare(config, scene, frame, lrm, say=lambda _: None)
+    assert start.lrm["frames"] == 4
+    assert start.skipped["frames"] == 1 - start.lrm["distinct"] / 4 > 0
 
 
 def test_one_crop_holds_the_object_at_all_times(tmp_path: Path):

@@ -68,7 +68,9 @@ def check(tally, module, names, moment) -> None:
     loss, error = module.method.loss(rendering, rays, moment)
     extra = module.sampling.loss(rendering)
     (loss if extra is None else loss + extra).backward()
+    module.sampling.pass_on(rendering, moment)
     gradients = [p.grad for p in module.parameters() if p.grad is not None]
+    assert gradients or len(names) == 1, "the rays together must reach the parameters"
     tally.finite(rendering.colour, rendering.opacity, rendering.depth, loss, error, *gradients)
     module.zero_grad(set_to_none=True)
     for name, opacity, colour in zip(

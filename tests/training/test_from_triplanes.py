@@ -85,6 +85,10 @@ def test_the_run_tells_how_it_started(trained: Path, place: Path) -> None:
     assert set(prepare) == {"fixed_view", "lrm", "decomposition", "convert"}
     assert prepare["decomposition"] > 0
     assert prepare["convert"] > 0
+    ranks = [content["decomposition"][name]["rank"] for name in ("xy", "xz", "yz")]
+    assert content["skipped"]["directions"] == pytest.approx(1 - sum(ranks) / (3 * 8))
+    assert 0 < content["skipped"]["directions"] < 1
+    assert content["skipped"]["frames"] == 0
 
 
 def test_the_parts_are_a_picture_and_the_loss_a_curve(trained: Path) -> None:

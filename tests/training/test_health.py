@@ -13,7 +13,13 @@ from xplanes.config import ConfigError
 from xplanes.pipeline import run
 from xplanes.training.checkpoints import find_resumable
 from xplanes.training.clock import TrainingClock
-from xplanes.training.health import all_usable, not_finite, unusable_gradients, usable
+from xplanes.training.health import (
+    all_usable,
+    not_finite,
+    unusable_gradients,
+    usable,
+    usable_together,
+)
 from xplanes.training.methods.xplanes import XPlanesMethod
 from xplanes.training.module import RadianceModule, TrainingError
 
@@ -38,6 +44,8 @@ def test_a_gradient_is_usable_if_adam_can_square_it(value, expected, layout) -> 
     gradient = torch.zeros(1, 4, 3, 5).to(memory_format=layout)
     gradient[0, 2, 1, 3] = value
     assert usable(gradient) is expected
+    assert usable_together([gradient]) is expected
+    assert usable_together([torch.ones(7), gradient, torch.zeros(2, 2)]) is expected
 
 
 def test_names_are_those_of_the_broken() -> None:

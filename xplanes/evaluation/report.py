@@ -89,6 +89,7 @@ def summary(
         "converged": None if module.ending is None else module.ending[0],
         "steps_skipped": module.unusable,
         "threads": module.threads,
+        "loops": backend.name(module.device),
         "parameters": sum(p.numel() for p in module.parameters()),
         "peak_memory_bytes": device_memory(module.device),
     }

@@ -65,7 +65,7 @@ class ExplicitDecoder(nn.Module):
     def colour(self, geometry: Tensor, directions: Tensor) -> Tensor:
         """[N, F], [N, 3] -> [N, 3]"""
         basis = self.basis(directions).view(len(directions), 3, -1)
-        return (basis @ geometry[:, :, None])[..., 0].sigmoid()
+        return (basis * geometry[:, None]).sum(dim=-1).sigmoid()
 
 
 class KPlanes(ViewDependentField):

@@ -156,31 +156,35 @@ class Tensor4D(RadianceField):
         found = self.surface(octaves(places, self.octaves[0]), self.features(places))
         return found[:, 0], found[:, 1:]
 
-    def distance_and_slope(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The distance, its gradient in canonical space, and features; all can be trained.
+    def distance_and_slope(
+        self, points: Tensor, times: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The distance at a moment and its gradient there, through the flow; all can be trained.
 
         Args:
-            places: In canonical space. [N, 3]
+            points: [N, 3]
+            times: [N]
 
         Returns:
-            [N], [N, 3], [N, width]
+            Distance [N], gradient by the points [N, 3], features for the colour [N, width], and the
+            points in canonical space [N, 3].
         """
         trained = torch.is_grad_enabled()
         with torch.enable_grad():
-            if not places.requires_grad:
-                places = places.detach().requires_grad_()
+            points = points.detach().requires_grad_()
+            places = self.canonical(points, times)
             distance, features = self.distance(places)
-            (slope,) = torch.autograd.grad(distance.sum(), places, create_graph=trained)
+            (slope,) = torch.autograd.grad(distance.sum(), points, create_graph=trained)
         if not trained:
-            return distance.detach(), slope, features.detach()
-        return distance, slope, features
+            return distance.detach(), slope, features.detach(), places.detach()
+        return distance, slope, features, places
 
     def colour(
-        self, places: Tensor, slopes: Tensor, features: Tensor, directions: Tensor
+        self, points: Tensor, slopes: Tensor, features: Tensor, directions: Tensor
     ) -> Tensor:
-        """Colour at canonical places. [N, 3], [N, 3], [N, width], [N, 3] -> [N, 3]"""
+        """Colour at points of a moment. [N, 3], [N, 3], [N, width], [N, 3] -> [N, 3]"""
         seen = octaves(directions, self.octaves[2])
-        return self.tint(torch.cat([places, seen, slopes, features], dim=1))
+        return self.tint(torch.cat([points, seen, slopes, features], dim=1))
 
 
 class Tensor4DDensity(ViewDependentField):

@@ -36,6 +36,10 @@ def _no_time() -> dict[str, float]:
     return dict.fromkeys(STAGES, 0.0)
 
 
+def _nothing_skipped() -> dict[str, float]:
+    return {"frames": 0.0, "directions": 0.0}
+
+
 @dataclass(frozen=True)
 class Start:
     """What a field starts from.
@@ -55,6 +59,8 @@ class Start:
         pictures: By name, colours from 0 to 1: the two parts at a few moments, and what the model
             was shown. [H, W, 3] each
         lrm: What the model made of the scene, for metrics.json.
+        skipped: For metrics.json: shares of the ``frames`` that equal others and did not pass
+            through the model, and of the singular ``directions`` that were not formed.
     """
 
     model: ModelConfig
@@ -67,6 +73,7 @@ class Start:
     words: str = "planes at random"
     pictures: dict[str, Tensor] = field(default_factory=dict)
     lrm: dict[str, Any] = field(default_factory=dict)
+    skipped: dict[str, float] = field(default_factory=_nothing_skipped)
 
 
 Source = Path | LoadedLRM | None
@@ -125,7 +132,13 @@ def prepare(
             made.sequence, config, scene, frame, source=made.words, seconds=made.seconds
         )
         shown = {} if made.picture is None else {"fixed_view": made.picture}
-        return replace(start, pictures=shown | start.pictures, lrm=made.report)
+        twins = 1 - made.report["distinct"] / made.report["frames"]
+        return replace(
+            start,
+            pictures=shown | start.pictures,
+            lrm=made.report,
+            skipped=start.skipped | {"frames": twins},
+        )
     began = time.perf_counter()
     sequence = load_triplanes(source)
     seconds = {"lrm": time.perf_counter() - began}
@@ -183,7 +196,16 @@ def start_from(
         | {"decomposition": parts.seconds, "convert": planes.seconds},
         words=_words(sequence, config, parts, planes.unexplained, source),
         pictures={} if parts.picture is None else {"decomposition": parts.picture},
+        skipped=_nothing_skipped() | {"directions": _left_out(parts)},
     )
+
+
+def _left_out(parts: Parts) -> float:
+    """Share of the singular directions below the threshold, over all orientations."""
+    if not parts.report:
+        return 0.0
+    kept = sum(report["rank"] for report in parts.report.values())
+    return 1 - kept / (len(parts.report) * len(parts.low_rank))
 
 
 def _settled(

@@ -20,7 +20,7 @@ class SurfaceRendering(Rendering):
 
     Attributes:
         places: The samples in canonical space. [N, 3]
-        slopes: Gradient of the distance there. [N, 3]
+        slopes: Gradient of the distance by the samples' points, through the flow. [N, 3]
         weights: Share of its ray's light that each sample sends, without gradient. [N]
         inside: Which samples lie in the field's cube. [N]
     """
@@ -97,13 +97,14 @@ class NeusRenderer(RayRenderer):
         shape = distances.shape
         samples = dense_samples(_points(origins, directions, distances), distances)
         facing = directions[samples.ray]
-        places = field.canonical(samples.points, times[samples.ray])
-        distance, slopes, features = field.distance_and_slope(places)
+        distance, slopes, features, places = field.distance_and_slope(
+            samples.points, times[samples.ray]
+        )
         change = -(-(facing * slopes).sum(dim=1)).relu()
         inside = (samples.points.abs() <= 1).all(dim=1)
         opacity = section_opacity(distance, change, lengths.flatten(), field.sharpness) * inside
         weights = weights_of(opacity.view(shape))
-        colours = field.colour(places, slopes, features, facing).view(*shape, 3)
+        colours = field.colour(samples.points, slopes, features, facing).view(*shape, 3)
         total = weights.sum(dim=1)
         return SurfaceRendering(
             colour=(weights[..., None] * colours).sum(dim=1) + (1 - total)[:, None] * background,

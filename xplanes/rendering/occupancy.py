@@ -85,7 +85,7 @@ class OccupancyGrid(nn.Module):
         self.occupied[cells] = self.density[cells] > self.empty_density
 
     @torch.no_grad()
-    def sweep(self, field: Field, generator: torch.Generator, chunk: int = 2**15) -> None:
+    def sweep(self, field: Field, generator: torch.Generator, chunk: int | None = None) -> None:
         """Look into every occupied cell once and empty those that show nothing.
 
         A cell stays if it or a neighbour in space shows density at one random point and time, so
@@ -94,9 +94,10 @@ class OccupancyGrid(nn.Module):
         Args:
             field: From points [N, 3] and times [N] to colour [N, 3] and density [N].
             generator: Source of randomness.
-            chunk: Points per call of the field.
+            chunk: Points per call of the field; as many as suit the device when None.
         """
         device = self.density.device
+        chunk = chunk or (2**15 if device.type == "cpu" else 2**19)
         cells = self.occupied.nonzero()[:, 0]
         seen = torch.zeros_like(self.density)
         for part in cells.split(chunk):

@@ -66,6 +66,13 @@ class ProposalRenderer(RayRenderer):
     ) -> None:
         self.proposals, self.counts, self.samples = proposals, tuple(counts), samples
         self.near, self.far, self.padding = near, far, padding
+        # With the density fields it goes into checkpoints, and to their device.
+        proposals.register_buffer("exponent", torch.ones(()))
+
+    @property
+    def exponent(self) -> Tensor:
+        """Exponent of the weights before samples are drawn; training sets it. []"""
+        return self.proposals.get_buffer("exponent")
 
     @property
     def device(self) -> torch.device:
@@ -80,7 +87,6 @@ class ProposalRenderer(RayRenderer):
         background: Tensor,
         jitter: torch.Generator | None = None,
         *,
-        anneal: float = 1.0,
         learn: bool = False,
     ) -> ProposalRendering:
         """Render rays.
@@ -93,7 +99,6 @@ class ProposalRenderer(RayRenderer):
             times: Time of each ray, from 0 to 1. [R]
             background: Colour behind the scene. [3] or [R, 3]
             jitter: Moves all samples; None leaves them where they are.
-            anneal: Exponent of the weights before samples are drawn.
             learn: Whether gradients reach the density fields.
 
         Returns:
@@ -104,12 +109,12 @@ class ProposalRenderer(RayRenderer):
         levels = []
         with torch.set_grad_enabled(learn and torch.is_grad_enabled()):
             for proposal, count in zip(self.proposals, self.counts, strict=True):
-                edges = self._edges(levels, count, place, jitter, anneal)
+                edges = self._edges(levels, count, place, jitter)
                 distances, lengths, points = place.samples(edges)
                 density = proposal(points, times.repeat_interleave(count))
                 weights = ray_weights(density.view_as(distances) * lengths)
                 levels.append(Level(edges, weights))
-        edges = self._edges(levels, self.samples, place, jitter, anneal)
+        edges = self._edges(levels, self.samples, place, jitter)
         distances, lengths, points = place.samples(edges)
         samples = dense_samples(points, distances)
         colour, density = shade(field, points, times, directions, samples.ray)
@@ -139,7 +144,6 @@ class ProposalRenderer(RayRenderer):
         count: int,
         rays: "_Rays",
         jitter: torch.Generator | None,
-        anneal: float,
     ) -> Tensor:
         uniform, device = None, rays.near.device
         if jitter is not None:
@@ -147,7 +151,8 @@ class ProposalRenderer(RayRenderer):
         if not levels:
             return uniform_edges(len(rays.near), count, uniform, device)
         last = levels[-1]
-        return resample(last.edges, last.weights.detach() ** anneal, count, uniform, self.padding)
+        weights = last.weights.detach() ** self.exponent
+        return resample(last.edges, weights, count, uniform, self.padding)
 
 
 @dataclass(frozen=True)

@@ -267,9 +267,14 @@ def _occupancy_sampling(config: TrainConfig, site: Site, field: RadianceField) -
     if config.sampler.silhouettes:
         carve(renderer.grid, site.views, site.frame)
     if site.begun and config.sampler.fill:
+        device = training_device(config.trainer.accelerator)
+        for part in (field, renderer.grid):
+            part.to(device)
         render_one_ray(field, renderer)
         generator = step_generator(config.seed, 0, FILL_STREAM)
         fill(renderer.grid, field, site.views, site.frame, step=renderer.step, generator=generator)
+        for part in (field, renderer.grid):
+            part.to("cpu")
     return OccupancySampling(renderer, config.sampler)
 
 

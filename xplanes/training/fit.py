@@ -118,7 +118,11 @@ def _warm_up(module: RadianceModule, data: RayDataModule, device: torch.device) 
 
 def quiet_lightning() -> None:
     """Hide, by name, what Lightning says that a user of this program cannot act on."""
-    for name in ("utilities.rank_zero", "trainer.connectors.checkpoint_connector"):
+    for name in (
+        "utilities.rank_zero",
+        "trainer.connectors.checkpoint_connector",
+        "accelerators.cuda",
+    ):
         logging.getLogger(f"lightning.pytorch.{name}").setLevel(logging.WARNING)
     for message in (
         ".*does not have many workers.*",

@@ -21,8 +21,17 @@ def usable(gradient: Tensor) -> bool:
 
 
 def all_usable(parameters: Iterable[nn.Parameter]) -> bool:
-    """Whether all gradients are `usable`; one pass over each."""
-    return all(usable(p.grad) for p in parameters if p.grad is not None)
+    """Whether all gradients are `usable`; one pass over each, and one wait for the device."""
+    gradients = [p.grad for p in parameters if p.grad is not None]
+    if not gradients or gradients[0].device.type == "cpu":
+        return all(usable(gradient) for gradient in gradients)
+    return usable_together(gradients)
+
+
+def usable_together(gradients: Iterable[Tensor]) -> bool:
+    """Whether all of some gradients, at least one, are `usable`, with one wait for the device."""
+    norms = [torch.linalg.vector_norm(gradient, dtype=torch.float32) for gradient in gradients]
+    return bool(torch.stack(norms).square().isfinite().all())
 
 
 def unusable_gradients(named: Iterable[tuple[str, nn.Parameter]]) -> list[str]:

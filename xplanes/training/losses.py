@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from xplanes.rendering.proposal import Level
@@ -78,17 +77,21 @@ def silhouette_error(opacity: Tensor, mask: Tensor) -> Tensor:
 
     Source: NeuS and Tensor4D, released code.
     """
-    return F.binary_cross_entropy(opacity.clamp(1e-3, 1 - 1e-3), mask)
+    # Written out: torch's own stops the program at a NaN, where training leaves out the step.
+    light = opacity.clamp(1e-3, 1 - 1e-3)
+    return -(mask * light.log() + (1 - mask) * (1 - light).log()).mean()
 
 
 def eikonal_error(slopes: Tensor, inside: Tensor) -> Tensor:
-    """Mean squared distance of gradients from length 1, over samples in the cube. [N, 3], [N] -> []
+    """Mean squared distance of gradients from length 1. [N, 3], [N] -> []
 
-    Source: NeuS; IGR.
+    The mean is over all samples; those outside the cube count as right.
+
+    Source: NeuS; IGR; Tensor4D, released code.
     """
     # A gradient of zero has no direction in which its length could grow.
     lengths = (slopes.square().sum(dim=1) + 1e-12).sqrt()
-    return ((lengths - 1).square() * inside).sum() / (inside.sum() + 1e-5)
+    return ((lengths - 1).square() * inside).mean()
 
 
 def feature_change(here: Tensor, nearby: Tensor, weights: Tensor, rays: int) -> Tensor:

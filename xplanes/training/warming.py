@@ -31,6 +31,8 @@ def warming_up() -> Iterator[None]:
 def render_one_ray(field: Field, renderer: Renderer) -> None:
     """Render a ray from the middle of the cube, as a first call of all that pictures need."""
     with warming_up():
+        device = renderer.device
+        origin, direction = torch.zeros(1, 3, device=device), torch.eye(3, device=device)[:1]
         renderer.render(
-            field, torch.zeros(1, 3), torch.eye(3)[:1], torch.zeros(1), background=torch.ones(3)
+            field, origin, direction, origin[:, 0], background=torch.ones(3, device=device)
         )

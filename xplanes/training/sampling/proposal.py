@@ -60,6 +60,8 @@ class ProposalSampling(Sampling):
         return slope * share / ((slope - 1) * share + 1)
 
     def render(self, field: Any, rays: Batch, moment: Moment) -> ProposalRendering:
+        # It stays in force for the pictures after this step.
+        self._renderer.exponent.fill_(self.anneal(moment.step))
         return self._renderer.render(
             field,
             rays["origins"],
@@ -67,7 +69,6 @@ class ProposalSampling(Sampling):
             rays["times"],
             rays["background"],
             moment.generator(rays["times"].device),
-            anneal=self.anneal(moment.step),
             learn=self.schedule.learns(moment.step),
         )
 

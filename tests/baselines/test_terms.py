@@ -1,0 +1,193 @@
+"""What a baseline's loss adds up, with which weights, and how its schedules run."""
+
+import math
+
+import pytest
+import torch
+
+from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX, baseline_config
+from tests.synthetic import ball_scene
+from xplanes.checks import parse
+from xplanes.training.builder import build_frame, build_module
+from xplanes.training.losses import (
+    eikonal_error,
+    histogram_loss,
+    light_entropy,
+    masked_colour_error,
+    sample_colour_error,
+    silhouette_error,
+)
+from xplanes.training.methods.base import warm_cosine
+from xplanes.training.plane_terms import PlaneTerms
+from xplanes.training.sampling.base import Moment
+
+FIRST = Moment(seed=0, step=0, batch=0, rank=0)
+
+
+def module_of(tmp_path, *overrides):
+    config = parse(baseline_config(tmp_path, *overrides))
+    scene = ball_scene()
+    return build_module(config, scene, build_frame(config, scene.splits["train"]))
+
+
+def rays_of(count=24):
+    generator = torch.Generator().manual_seed(3)
+    aim = 0.3 * torch.randn(count, 3, generator=generator)
+    origins = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1) * 4
+    return {
+        "origins": origins,
+        "directions": torch.nn.functional.normalize(aim - origins, dim=1),
+        "times": torch.linspace(0, 1, count),
+        "background": torch.ones(count, 3),
+        "target": torch.rand(count, 3, generator=generator),
+        "alpha": (torch.arange(count) % 2).float(),
+        "jitter": torch.rand(count, generator=generator),
+    }
+
+
+def error_of(rendering, rays):
+    return (rendering.colour - rays["target"]).square().mean()
+
+
+def check_planes(products, weights, add):
+    """What ``add`` leaves in the gradients is autograd's of the weighted terms."""
+    values = PlaneTerms(1.0, "coded", 1.0, 1.0).values(products)
+    names = ("total_variation", "time_smoothness", "time_identity")
+    planes = [plane for _, plane in products.planes()]
+    total = sum(weight * values[name] for weight, name in zip(weights, names, strict=True))
+    expected = torch.autograd.grad(total, planes)
+    add()
+    for plane, wanted in zip(planes, expected, strict=True):
+        assert wanted.abs().sum() > 0
+        torch.testing.assert_close(plane.grad, wanted, atol=1e-7, rtol=1e-4)
+
+
+def test_kplanes_regularises_its_planes_and_those_of_the_density_fields(tmp_path):
+    module = module_of(
+        tmp_path,
+        "model=kplanes",
+        *KPLANES,
+        *PROPOSAL,
+        *("loss.total_variation=0.3", "loss.time_smoothness=0.7", "loss.time_identity=0.2"),
+        *(
+            "sampler.total_variation=0.5",
+            "sampler.time_smoothness=0.1",
+            "sampler.time_identity=0.4",
+        ),
+    )
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    planes = module.field.products
+    check_planes(planes, (0.3, 0.7, 0.2), lambda: module.method.regularise(FIRST))
+    proposals = module.sampling.renderer.proposals
+    assert len(proposals) == 2
+    for proposal in proposals:
+        module.zero_grad()
+        check_planes(proposal.products, (0.5, 0.1, 0.4), module.sampling.regularise)
+
+
+def test_density_fields_learn_by_the_weighted_histogram_term(tmp_path):
+    module = module_of(tmp_path, "model=kplanes", *KPLANES, *PROPOSAL, "sampler.histogram=0.3")
+    rays = rays_of()
+    rendering = module.sampling.render(module.field, rays, FIRST)
+    found = module.sampling.loss(rendering).detach()
+    assert float(found) == pytest.approx(0.3 * histogram_loss(rendering.levels).item(), rel=1e-6)
+    assert float(found) > 0
+    total, error = module.method.loss(rendering, rays, FIRST)
+    assert total is error
+    assert float(total) == pytest.approx(float(error_of(rendering, rays)), rel=1e-6)
+    late = next(s for s in range(6000, 6006) if not module.sampling.schedule.learns(s))
+    still = module.sampling.render(module.field, rays, Moment(seed=0, step=late, batch=0, rank=0))
+    assert module.sampling.loss(still) is None
+
+
+def test_annealing_rises_as_published_and_stays_for_pictures(tmp_path):
+    small = [override for override in PROPOSAL if "anneal" not in override]
+    module = module_of(tmp_path, "model=kplanes", *KPLANES, *small)
+    sampling, rays = module.sampling, rays_of()
+    for step in (0, 1, 100, 500, 999, 1000, 30000):
+        share = min(step / 1000, 1)
+        expected = 10 * share / (9 * share + 1)
+        assert sampling.anneal(step) == pytest.approx(expected)
+        sampling.render(module.field, rays, Moment(seed=0, step=step, batch=0, rank=0))
+        assert float(sampling.renderer.exponent) == pytest.approx(expected)
+    # With an exponent of 0 all bins weigh the same, whatever the density fields hold.
+    sampling.render(module.field, rays, FIRST)
+    keys = ("origins", "directions", "times", "background")
+    flat = sampling.renderer.render(module.field, *(rays[key] for key in keys))
+    gaps = [level.edges.diff(dim=1) for level in flat.levels]
+    for gap in gaps:
+        torch.testing.assert_close(gap, gap.mean().expand_as(gap), atol=1e-5, rtol=1e-4)
+    assert "proposals.exponent" in module.state_dict()
+
+
+@pytest.mark.parametrize("warmup", [1, 512, 2000])
+def test_rates_rise_and_fall_as_published(tmp_path, warmup):
+    for final in (0.0, 0.1):
+        for step in (0, warmup // 2, warmup - 1, warmup, 10 * warmup):
+            for progress in (0.0, 0.25, 0.5, 1.0):
+                down = final + (1 - final) * (1 + math.cos(math.pi * progress)) / 2
+                expected = down * min(1, (step + 1) / warmup)
+                found = warm_cosine(step, progress, warmup=warmup, final=final)
+                assert found == pytest.approx(expected, abs=1e-12)
+    kplanes = module_of(tmp_path, "model=kplanes", *KPLANES, *PROPOSAL, "model.warmup_steps=512")
+    assert kplanes.method.rate(255, 0.5) == pytest.approx(0.25)
+    assert kplanes.method.rate(10**4, 1.0) == pytest.approx(0)
+
+
+def test_tineuvox_adds_up_colours_decided_rays_and_single_samples(tmp_path):
+    rays, totals = rays_of(), {}
+    for entropy, spread in ((0.0, 0.0), (0.3, 0.0), (0.0, 0.7), (0.001, 0.01)):
+        module = module_of(
+            tmp_path,
+            "model=tineuvox_s",
+            *TINEUVOX,
+            *(f"loss.entropy={entropy}", f"loss.sample_colour={spread}", "sampler.threshold=1e-30"),
+        )
+        seen = module.sampling.render(module.field, rays, FIRST)
+        total, error = module.method.loss(seen, rays, FIRST)
+        assert float(error) == pytest.approx(float(error_of(seen, rays)), rel=1e-6)
+        single = sample_colour_error(seen.colours, rays["target"], seen.weights, seen.ray)
+        terms = entropy * light_entropy(seen.opacity) + spread * single
+        assert float(total) == pytest.approx(float(error + terms), rel=1e-5)
+        totals[entropy, spread] = float(total)
+    assert len(set(totals.values())) == 4
+
+
+@pytest.mark.parametrize(
+    "weights",
+    [(0, 0, 0, True), (0.2, 0, 0, True), (0, 0.3, 0, True), (0, 0, 5, True), (0, 0, 0, False)],
+)
+def test_tensor4d_adds_up_its_terms(tmp_path, monkeypatch, weights):
+    eikonal, opacity, smoothness, masked = weights
+    distance = 0.02
+    module = module_of(
+        tmp_path,
+        "model=tensor4d",
+        *TENSOR4D,
+        *NEUS,
+        f"loss.eikonal={eikonal}",
+        f"loss.opacity={opacity}",
+        f"loss.smoothness={smoothness}",
+        f"loss.smoothness_distance={distance}",
+        f"loss.masked={str(masked).lower()}",
+    )
+    # Features that change by 3 per unit of length, whichever way.
+    monkeypatch.setattr(module.field, "features", lambda places: 3 * places)
+    monkeypatch.setattr(
+        module.field, "distance", lambda places: (places.norm(dim=1) - 0.5, places.repeat(1, 8))
+    )
+    rays = rays_of()
+    seen = module.sampling.render(module.field, rays, FIRST)
+    total, error = module.method.loss(seen, rays, FIRST)
+    assert float(error) == pytest.approx(float(error_of(seen, rays)), rel=1e-6)
+    mask = rays["alpha"]
+    expected = masked_colour_error(
+        seen.colour, rays["target"], mask if masked else torch.ones_like(mask)
+    )
+    expected = expected + eikonal * eikonal_error(seen.slopes, seen.inside)
+    expected = expected + opacity * silhouette_error(seen.opacity, mask)
+    change = (3 * distance) ** 2 / 3 * float(seen.weights.sum()) / len(mask)
+    assert float(total) == pytest.approx(float(expected) + smoothness * change, rel=1e-4)
+    assert change > 0

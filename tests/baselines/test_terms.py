@@ -27,16 +27,20 @@ FIRST = Moment(seed=0, step=0, batch=0, rank=0)
 def module_of(tmp_path, *overrides):
     config = parse(baseline_config(tmp_path, *overrides))
     scene = ball_scene()
-    return build_module(config, scene, build_frame(config, scene.splits["train"]))
+    frame = build_frame(config, scene.splits["train"])
+    return build_module(config, scene, frame), rays_of(frame)
 
 
-def rays_of(count=24):
+def rays_of(frame, count=24):
+    """Rays from 4 away at the ball around the origin, in the field's frame."""
     generator = torch.Generator().manual_seed(3)
     aim = 0.3 * torch.randn(count, 3, generator=generator)
     origins = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1) * 4
+    directions = torch.nn.functional.normalize(aim - origins, dim=1)
+    origins, directions = frame.rays(origins, directions)
     return {
         "origins": origins,
-        "directions": torch.nn.functional.normalize(aim - origins, dim=1),
+        "directions": directions,
         "times": torch.linspace(0, 1, count),
         "background": torch.ones(count, 3),
         "target": torch.rand(count, 3, generator=generator),
@@ -63,7 +67,7 @@ def check_planes(products, weights, add):
 
 
 def test_kplanes_regularises_its_planes_and_those_of_the_density_fields(tmp_path):
-    module = module_of(
+    module, _ = module_of(
         tmp_path,
         "model=kplanes",
         *KPLANES,
@@ -88,8 +92,9 @@ def test_kplanes_regularises_its_planes_and_those_of_the_density_fields(tmp_path
 
 
 def test_density_fields_learn_by_the_weighted_histogram_term(tmp_path):
-    module = module_of(tmp_path, "model=kplanes", *KPLANES, *PROPOSAL, "sampler.histogram=0.3")
-    rays = rays_of()
+    module, rays = module_of(
+        tmp_path, "model=kplanes", *KPLANES, *PROPOSAL, "sampler.histogram=0.3"
+    )
     rendering = module.sampling.render(module.field, rays, FIRST)
     found = module.sampling.loss(rendering).detach()
     assert float(found) == pytest.approx(0.3 * histogram_loss(rendering.levels).item(), rel=1e-6)
@@ -104,8 +109,8 @@ def test_density_fields_learn_by_the_weighted_histogram_term(tmp_path):
 
 def test_annealing_rises_as_published_and_stays_for_pictures(tmp_path):
     small = [override for override in PROPOSAL if "anneal" not in override]
-    module = module_of(tmp_path, "model=kplanes", *KPLANES, *small)
-    sampling, rays = module.sampling, rays_of()
+    module, rays = module_of(tmp_path, "model=kplanes", *KPLANES, *small)
+    sampling = module.sampling
     for step in (0, 1, 100, 500, 999, 1000, 30000):
         share = min(step / 1000, 1)
         expected = 10 * share / (9 * share + 1)
@@ -131,15 +136,15 @@ def test_rates_rise_and_fall_as_published(tmp_path, warmup):
                 expected = down * min(1, (step + 1) / warmup)
                 found = warm_cosine(step, progress, warmup=warmup, final=final)
                 assert found == pytest.approx(expected, abs=1e-12)
-    kplanes = module_of(tmp_path, "model=kplanes", *KPLANES, *PROPOSAL, "model.warmup_steps=512")
+    kplanes, _ = module_of(tmp_path, "model=kplanes", *KPLANES, *PROPOSAL, "model.warmup_steps=512")
     assert kplanes.method.rate(255, 0.5) == pytest.approx(0.25)
     assert kplanes.method.rate(10**4, 1.0) == pytest.approx(0)
 
 
 def test_tineuvox_adds_up_colours_decided_rays_and_single_samples(tmp_path):
-    rays, totals = rays_of(), {}
+    totals = {}
     for entropy, spread in ((0.0, 0.0), (0.3, 0.0), (0.0, 0.7), (0.001, 0.01)):
-        module = module_of(
+        module, rays = module_of(
             tmp_path,
             "model=tineuvox_s",
             *TINEUVOX,
@@ -162,7 +167,7 @@ def test_tineuvox_adds_up_colours_decided_rays_and_single_samples(tmp_path):
 def test_tensor4d_adds_up_its_terms(tmp_path, monkeypatch, weights):
     eikonal, opacity, smoothness, masked = weights
     distance = 0.02
-    module = module_of(
+    module, rays = module_of(
         tmp_path,
         "model=tensor4d",
         *TENSOR4D,
@@ -178,7 +183,6 @@ def test_tensor4d_adds_up_its_terms(tmp_path, monkeypatch, weights):
     monkeypatch.setattr(
         module.field, "distance", lambda places: (places.norm(dim=1) - 0.5, places.repeat(1, 8))
     )
-    rays = rays_of()
     seen = module.sampling.render(module.field, rays, FIRST)
     total, error = module.method.loss(seen, rays, FIRST)
     assert float(error) == pytest.approx(float(error_of(seen, rays)), rel=1e-6)

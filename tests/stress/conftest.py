@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from xplanes.config import ConfigError
+from xplanes.lrm import LRMError
 from xplanes.scenes.errors import SceneError
 from xplanes.training.module import TrainingError
 
@@ -48,14 +49,17 @@ class Tally:
         """
         try:
             state = train()
+        except LRMError as problem:
+            words, what, ways_out = str(problem), "empty", ("lrm.crop=false",)
         except (TrainingError, ConfigError, SceneError) as problem:
-            words = str(problem)
+            words, what = str(problem), "finite"
+            ways_out = ("resume=", "must be", "set lrm=none")
         else:
             self.finite(*(value for value in state.values() if value.is_floating_point()))
             return state
         self.content["cases"] += 1
-        assert "finite" in words
-        assert any(way_out in words for way_out in ("resume=", "must be", "set lrm=none"))
+        assert what in words
+        assert any(way_out in words for way_out in ways_out)
         self.content["diagnosed"] += 1
         return None
 

@@ -56,7 +56,7 @@ RATES = {
 """Learning rates by model."""
 
 
-def settings(model: str, scene: Path, *overrides: str) -> dict[str, Any]:
+def settings(model: str, scene: Path, *overrides: str, lrm: str = "none") -> dict[str, Any]:
     """The configuration of a small run."""
     steps = 15 if model in SLOW else 50
     return compose_plain(
@@ -67,7 +67,7 @@ def settings(model: str, scene: Path, *overrides: str) -> dict[str, Any]:
             f"data.scene={scene.name}",
             "data.resolution=null",
             f"model={model}",
-            "lrm=none",
+            f"lrm={lrm}",
             *MODELS[model],
             "trainer.accelerator=cpu",
             "trainer.precision=32",

@@ -23,6 +23,21 @@ def test_scenes_without_content(tally, root, tmp_path, model, kind) -> None:
     assert tally.trained(lambda: trained(config, tmp_path / "run")) is not None
 
 
+@pytest.mark.parametrize("crop", ["true", "false"])
+@pytest.mark.parametrize("precision", ["32", "bf16"])
+@pytest.mark.parametrize("kind", SCENES)
+def test_a_start_from_scenes_without_content(tally, root, tmp_path, kind, precision, crop) -> None:
+    """The same scenes filmed and started from lrm=tiny, decoder in float32 and bfloat16"""
+    changed = (
+        f"trainer.precision={precision}",
+        f"lrm.crop={crop}",
+        "preparation.frames=4",
+        "preparation.fixed_view_steps=30",
+    )
+    config = settings("six_planes", write_scene(root, kind), *changed, lrm="tiny")
+    tally.trained(lambda: trained(config, tmp_path / "run"))
+
+
 @pytest.mark.parametrize("factor", [3, 10])
 @pytest.mark.parametrize("model", MODELS)
 def test_high_learning_rates(tally, root, tmp_path, model, factor) -> None:

@@ -57,7 +57,14 @@ def test_hybrid_run_learns_goes_on_and_is_loaded(scenes, tmp_path, monkeypatch):
             *[o for o in TINEUVOX if not o.startswith("sampler")],
             *PROPOSAL,
         ),
-        ("model=tensor4d_density", "sampler=proposal", *TENSOR4D, *PROPOSAL),
+        (
+            "model=tensor4d_density",
+            "sampler=proposal",
+            *TENSOR4D,
+            *PROPOSAL,
+            "trainer.rays_per_batch=64",
+            "trainer.max_steps=60",
+        ),
     ],
 )
 def test_others_learn(scenes, tmp_path, overrides):

@@ -166,7 +166,7 @@ def test_every_parameter_of_the_surface_gets_a_gradient():
     image = renderer.render(field, origins, directions, torch.rand(40), torch.ones(3))
     assert image.colour.shape == (40, 3)
     assert len(image.samples) == 40 * 25
-    (image.colour.sum() + eikonal_error(image.slopes, image.inside)).backward()
+    (image.colour.sum() + eikonal_error(image.slopes, len(image.samples))).backward()
     for name, parameter in field.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.abs().sum() > 0, name
@@ -253,6 +253,29 @@ def test_a_ball_is_seen_where_it_is():
     assert image.colour[1].tolist() == pytest.approx([1, 1, 1], abs=0.01)
 
 
+def test_only_what_lies_in_the_cube_is_asked(monkeypatch):
+    ball, asked = Ball(), []
+    original = ball.distance_and_slope
+    monkeypatch.setattr(
+        ball,
+        "distance_and_slope",
+        lambda points, times: asked.append(points) or original(points, times),
+    )
+    renderer = NeusRenderer(ball, samples=64, more=65, coarse_sharpness=64.0)
+    origins = torch.tensor([[0.0, 0.3, 3.0], [0.0, 0.9, 3.0], [0.0, 1.4, 3.0]])
+    directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)
+    image = renderer.render(ball, origins, directions, torch.zeros(3), torch.ones(3))
+    (points,) = asked
+    assert 0 < len(points) < len(image.samples)
+    assert (points.abs() <= 1).all()
+    assert len(image.weights) == len(points)
+    assert image.opacity[2] == 0
+    past = renderer.render(
+        ball, origins[2:], directions[2:], torch.zeros(1), torch.full((3,), 0.25)
+    )
+    assert past.colour.tolist() == [[0.25] * 3]
+
+
 def test_samples_ascend_and_gather_at_the_surface():
     renderer = NeusRenderer(Ball(), samples=64, more=65, coarse_sharpness=64.0)
     rays = torch.tensor([[0.0, 0.0, 3.0]]), torch.tensor([[0.0, 0.0, -1.0]]), torch.zeros(1)
@@ -278,12 +301,13 @@ def test_losses_equal_loops():
         total -= math.log(o) if m else math.log(1 - o)
     assert silhouette_error(opacity, mask).item() == pytest.approx(total / 5)
 
-    slopes, inside = torch.randn(7, 3).double(), torch.tensor([1, 1, 0, 1, 0, 1, 1]).bool()
+    slopes = torch.randn(5, 3).double()
     lengths = [math.sqrt(sum(x * x for x in row)) for row in slopes.tolist()]
-    kept = [(v - 1) ** 2 for v, ok in zip(lengths, inside.tolist(), strict=True) if ok]
-    assert eikonal_error(slopes, inside).item() == pytest.approx(sum(kept) / 7)
+    expected = sum((length - 1) ** 2 for length in lengths) / 7
+    assert eikonal_error(slopes, 7).item() == pytest.approx(expected)
+    assert eikonal_error(slopes[:0], 0).item() == 0
     zero = torch.zeros(2, 3, requires_grad=True)
-    eikonal_error(zero, torch.ones(2, dtype=torch.bool)).backward()
+    eikonal_error(zero, 2).backward()
     assert zero.grad.isfinite().all()
 
     here, nearby, weights = torch.rand(6, 4).double(), torch.rand(6, 4).double(), torch.rand(6)

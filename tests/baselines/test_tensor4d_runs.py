@@ -33,8 +33,8 @@ def test_density_run_learns_and_is_loaded(scenes, tmp_path):
         "model=tensor4d_density",
         *TENSOR4D,
         *OCCUPANCY,
-        "trainer.rays_per_batch=256",
-        "trainer.samples_per_batch=2048",
+        "trainer.rays_per_batch=128",
+        "trainer.samples_per_batch=1024",
         "trainer.max_steps=100",
     )
     check_reload(check_learns(config, tmp_path / "run", gain=1.5))

@@ -101,7 +101,7 @@ def test_density_fields_learn_by_the_weighted_histogram_term(tmp_path):
     assert float(found) > 0
     total, error = module.method.loss(rendering, rays, FIRST)
     assert total is error
-    assert float(total) == pytest.approx(float(error_of(rendering, rays)), rel=1e-6)
+    assert total.item() == pytest.approx(error_of(rendering, rays).item(), rel=1e-6)
     late = next(s for s in range(6000, 6006) if not module.sampling.schedule.learns(s))
     still = module.sampling.render(module.field, rays, Moment(seed=0, step=late, batch=0, rank=0))
     assert module.sampling.loss(still) is None
@@ -190,7 +190,7 @@ def test_tensor4d_adds_up_its_terms(tmp_path, monkeypatch, weights):
     expected = masked_colour_error(
         seen.colour, rays["target"], mask if masked else torch.ones_like(mask)
     )
-    expected = expected + eikonal * eikonal_error(seen.slopes, seen.inside)
+    expected = expected + eikonal * eikonal_error(seen.slopes, len(seen.samples))
     expected = expected + opacity * silhouette_error(seen.opacity, mask)
     change = (3 * distance) ** 2 / 3 * float(seen.weights.sum()) / len(mask)
     assert float(total) == pytest.approx(float(expected) + smoothness * change, rel=1e-4)

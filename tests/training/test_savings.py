@@ -21,7 +21,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedRun:
     folder = tmp_path_factory.mktemp("savings")
     # Where silhouettes forbid to look the field is what it was at the start.
     config = small_config(
-        folder, "trainer.max_steps=200", "sampler.silhouettes=false", "trainer.evaluate_at=[]"
+        folder, "trainer.max_steps=400", "sampler.silhouettes=false", "trainer.evaluate_at=[]"
     )
     run(config, folder / "run", [], resume=False)
     return load_run(folder / "run", device="cpu")
@@ -64,7 +64,7 @@ def test_rays_of_a_step_follow_its_samples(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(RadianceModule, "_count", watched)
     config = small_config(
         tmp_path,
-        "trainer.max_steps=200",
+        "trainer.max_steps=120",
         "trainer.rays_per_batch=2048",
         "trainer.samples_per_batch=6000",
         "trainer.evaluate_at=[]",

@@ -16,19 +16,17 @@ TINY = 1e-5
 
 @dataclass(frozen=True)
 class SurfaceRendering(Rendering):
-    """What rays see, and the surface's samples.
+    """What rays see, and the M of its N samples that lie in the field's cube.
 
     Attributes:
-        places: The samples in canonical space. [N, 3]
-        slopes: Gradient of the distance by the samples' points, through the flow. [N, 3]
-        weights: Share of its ray's light that each sample sends, without gradient. [N]
-        inside: Which samples lie in the field's cube. [N]
+        places: Where these are in canonical space. [M, 3]
+        slopes: Gradient of the distance by their points, through the flow. [M, 3]
+        weights: Share of its ray's light that each of them sends, without gradient. [M]
     """
 
     places: Tensor
     slopes: Tensor
     weights: Tensor
-    inside: Tensor
 
 
 def section_opacity(
@@ -96,15 +94,17 @@ class NeusRenderer(RayRenderer):
         distances = ends + lengths / 2
         shape = distances.shape
         samples = dense_samples(_points(origins, directions, distances), distances)
-        facing = directions[samples.ray]
-        distance, slopes, features, places = field.distance_and_slope(
-            samples.points, times[samples.ray]
-        )
+        # Outside the cube nothing is seen, and nothing need be asked.
+        inside = (samples.points.abs() <= 1).all(dim=1).nonzero()[:, 0]
+        points, ray = samples.points[inside], samples.ray[inside]
+        facing = directions[ray]
+        distance, slopes, features, places = field.distance_and_slope(points, times[ray])
         change = -(-(facing * slopes).sum(dim=1)).relu()
-        inside = (samples.points.abs() <= 1).all(dim=1)
-        opacity = section_opacity(distance, change, lengths.flatten(), field.sharpness) * inside
+        opacity = section_opacity(distance, change, lengths.flatten()[inside], field.sharpness)
+        opacity = torch.zeros_like(samples.distances).index_put((inside,), opacity)
         weights = weights_of(opacity.view(shape))
-        colours = field.colour(samples.points, slopes, features, facing).view(*shape, 3)
+        colours = field.colour(points, slopes, features, facing)
+        colours = torch.zeros_like(samples.points).index_put((inside,), colours).view(*shape, 3)
         total = weights.sum(dim=1)
         return SurfaceRendering(
             colour=(weights[..., None] * colours).sum(dim=1) + (1 - total)[:, None] * background,
@@ -114,8 +114,7 @@ class NeusRenderer(RayRenderer):
             samples=samples,
             places=places,
             slopes=slopes,
-            weights=weights.detach().flatten(),
-            inside=inside,
+            weights=weights.detach().flatten()[inside],
         )
 
     @torch.no_grad()

@@ -82,16 +82,18 @@ def silhouette_error(opacity: Tensor, mask: Tensor) -> Tensor:
     return -(mask * light.log() + (1 - mask) * (1 - light).log()).mean()
 
 
-def eikonal_error(slopes: Tensor, inside: Tensor) -> Tensor:
-    """Mean squared distance of gradients from length 1. [N, 3], [N] -> []
+def eikonal_error(slopes: Tensor, samples: int) -> Tensor:
+    """Mean squared distance of gradients from length 1. [M, 3] -> []
 
-    The mean is over all samples; those outside the cube count as right.
+    Args:
+        slopes: Gradients of the samples in the field's cube. [M, 3]
+        samples: Number of all samples: those outside the cube count as right.
 
     Source: NeuS; IGR; Tensor4D, released code.
     """
     # A gradient of zero has no direction in which its length could grow.
     lengths = (slopes.square().sum(dim=1) + 1e-12).sqrt()
-    return ((lengths - 1).square() * inside).mean()
+    return (lengths - 1).square().sum() / max(1, samples)
 
 
 def feature_change(here: Tensor, nearby: Tensor, weights: Tensor, rays: int) -> Tensor:

@@ -104,7 +104,7 @@ class Tensor4DMethod(Tensor4DDensityMethod):
         mask = (rays["alpha"] > 0.5).to(rays["target"].dtype)
         compared = mask if weights.masked else torch.ones_like(mask)
         total = masked_colour_error(rendering.colour, rays["target"], compared)
-        total = total + weights.eikonal * eikonal_error(rendering.slopes, rendering.inside)
+        total = total + weights.eikonal * eikonal_error(rendering.slopes, len(rendering.samples))
         total = total + weights.opacity * silhouette_error(rendering.opacity, mask)
         if weights.smoothness:
             change = self._change(rendering, len(mask), moment)

@@ -1,4 +1,4 @@
-"""All benchmarks, one after the other: some four hours on two cores.
+"""All benchmarks, one after the other: some hours on two cores.
 
     python benchmarks/all.py [--lego FOLDER] [--only NAME ...]
 
@@ -16,42 +16,44 @@ from pathlib import Path
 from runner import lego
 
 HERE = Path(__file__).resolve().parent
-SCRIPTS = {
-    "where_time_goes": False,
-    "lego_curves": True,
-    "skips": True,
-    "rendering": True,
-    "stages": False,
-    "pareto": True,
-    "lrm_sizes": False,
-    "decomposition_speed": False,
-    "decomposition_stress": False,
-    "conversion_options": False,
-    "stability": False,
-    "faults": False,
-}
-"""Name of each script, and whether it takes the folder of lego."""
+
+
+def scripts(folder: Path) -> dict[str, list[list[str]]]:
+    """The arguments of each script's runs, by its name; ``folder`` is that of lego."""
+    given = ["--lego", str(folder)]
+    return {
+        "where_time_goes": [[], ["--name", "lego", *lego(folder.resolve())]],
+        "lego_curves": [given],
+        "skips": [given],
+        "rendering": [given],
+        "stages": [[]],
+        "pareto": [given],
+        "lrm_sizes": [[]],
+        "decomposition_speed": [[]],
+        "decomposition_stress": [[]],
+        "conversion_options": [[]],
+        "stability": [[]],
+        "faults": [[]],
+    }
 
 
 def main() -> int:
+    names = list(scripts(Path()))
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--lego", default="data/dnerf/lego")
-    parser.add_argument("--only", nargs="+", choices=list(SCRIPTS), default=list(SCRIPTS))
+    parser.add_argument("--lego", type=Path, default=Path("data/dnerf/lego"))
+    parser.add_argument("--only", nargs="+", choices=names, default=names)
     args = parser.parse_args()
-    wanted = any(SCRIPTS[name] or name == "where_time_goes" for name in args.only)
-    if wanted and not Path(args.lego).is_dir():
+    chosen = {name: runs for name, runs in scripts(args.lego).items() if name in args.only}
+    if any(any(runs) for runs in chosen.values()) and not args.lego.is_dir():
         parser.error(
             f"--lego {args.lego}: there is no such folder; python -m xplanes download dnerf"
         )
     failed = []
-    for name in args.only:
-        options = [["--lego", args.lego] if SCRIPTS[name] else []]
-        if name == "where_time_goes":
-            options.append(["--name", "lego", *lego(Path(args.lego).resolve())])
+    for name, runs in chosen.items():
         began = time.perf_counter()
         script = [sys.executable, str(HERE / f"{name}.py")]
-        codes = [subprocess.run([*script, *line], check=False).returncode for line in options]
-        print(f"{name}: {time.perf_counter() - began:.0f} s, exit {max(codes)}", flush=True)
+        codes = [subprocess.run([*script, *line], check=False).returncode for line in runs]
+        print(f"{name}: {time.perf_counter() - began:.0f} s, exit codes {codes}", flush=True)
         if any(codes):
             failed.append(name)
     if failed:

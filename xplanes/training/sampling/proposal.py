@@ -28,6 +28,7 @@ class ProposalSampling(Sampling):
 
     def __init__(self, renderer: ProposalRenderer, config: ProposalConfig) -> None:
         self._renderer, self.config = renderer, config
+        renderer.exponent.fill_(self.anneal(0))
         self.schedule = UpdateSchedule(config.update_every, config.update_warmup)
         self.terms = PlaneTerms(
             config.total_variation,

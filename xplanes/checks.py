@@ -65,7 +65,7 @@ _POSITIVE = (
 data.val_views model.resolution model.time_resolution model.channels model.decoder.width
 model.decoder.density_scale sampler.samples sampler.render_samples sampler.grid_resolution
 sampler.time_bins sampler.threshold sampler.sweep_every sampler.update_every sampler.update_cells
-loss.every loss.sparse_frames decomposition.penalty decomposition.tolerance
+loss.every loss.sparse_frames loss.start_steps decomposition.penalty decomposition.tolerance
 decomposition.max_iterations preparation.frames preparation.fixed_view_seconds
 preparation.fixed_view_steps lrm.megabytes lrm.batch trainer.devices
 trainer.max_steps trainer.max_seconds trainer.plateau trainer.rays_per_batch

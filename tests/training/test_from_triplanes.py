@@ -26,6 +26,7 @@ from xplanes.training.builder import build_frame, build_module, build_scene
 from xplanes.training.clock import TrainingClock
 from xplanes.training.methods.xplanes import XPlanesMethod
 from xplanes.training.module import TrainingError
+from xplanes.training.sampling.base import Moment
 
 OPTIONS = {
     "width": 16,
@@ -173,6 +174,35 @@ def test_a_start_holds_the_planes(place: Path, tmp_path: Path) -> None:
     start = planes("start", "trainer.max_steps=1")
     free, held = (planes(w, f"loss.start_weight={w}") for w in ("0", "1000"))
     assert float((held - start).norm()) < 0.5 * float((free - start).norm())
+
+
+def test_what_ties_the_planes_to_their_start_fades(place: Path) -> None:
+    """Without other terms, a gradient is what it would be without fading times what is left."""
+    quiet = ["loss.total_variation=0", "loss.time_smoothness=0", "loss.time_magnitude=0"]
+
+    def gradients(step: int, fading: str) -> list[torch.Tensor]:
+        config = parse(settings(place, *quiet, f"loss.start_steps={fading}", "data.views=3"))
+        scene = build_scene(config.data)
+        frame = build_frame(config, scene.splits["train"])
+        start = prepare(config, scene, frame, find_source(config.lrm, say=print), say=print)
+        config = replace(config, model=start.model)
+        module = build_module(config, scene, frame, planes=start.planes, sparse=start.sparse)
+        assert isinstance(module.method, XPlanesMethod)
+        field = module.method.field
+        assert field.time is not None
+        with torch.no_grad():
+            field.space.add_(1.0)
+            field.time.add_(1.0)
+        for plane in (field.space, field.time):
+            plane.grad = torch.zeros_like(plane)
+        module.method.regularise(Moment(seed=step, step=step, batch=step, rank=0))
+        return [plane.grad for plane in (field.space, field.time) if plane.grad is not None]
+
+    whole, left = gradients(24, "null"), gradients(24, "288")
+    assert all(float(gradient.abs().max()) > 0 for gradient in whole)
+    for gradient, all_of_it in zip(left, whole, strict=True):
+        torch.testing.assert_close(gradient, 0.75 * all_of_it)
+    assert not any(gradient.any() for gradient in gradients(96, "288") + gradients(104, "288"))
 
 
 @pytest.mark.parametrize("lrm", ["file", "none"])

@@ -25,7 +25,8 @@ from xplanes.preparation.sequence import TriplaneSequence, load_triplanes
 from xplanes.preparation.stages import Parts, convert_stage, decompose_stage
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene, Views
-from xplanes.training.builder import time_rows, training_device
+from xplanes.training.assembly import time_rows
+from xplanes.training.builder import training_device
 
 logger = logging.getLogger(__name__)
 

@@ -1,6 +1,5 @@
 """From settings to objects: the only place that turns names into classes."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -33,7 +32,7 @@ from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, frame_content
 from xplanes.scenes.still import at_one_moment, stands_still
 from xplanes.scenes.views import Scene, Views, joined
-from xplanes.training.assembly import PLANS, SAMPLINGS, Site, scene_cube
+from xplanes.training.assembly import PLANS, SAMPLINGS, Site, scene_cube, time_rows
 from xplanes.training.methods.xplanes import XPlanesMethod
 from xplanes.training.module import RadianceModule
 from xplanes.training.product import SparseProduct
@@ -113,11 +112,6 @@ def decoder_precision(trainer: TrainerConfig) -> Precision:
     if trainer.precision == "auto":
         return "bf16" if fast_bf16(training_device(trainer.accelerator)) else "32"
     return "bf16" if trainer.precision == "bf16" else "32"
-
-
-def time_rows(times: Tensor) -> int:
-    """Rows of time where the settings leave them open: one for two distinct times. [V]"""
-    return max(2, math.ceil(len(times.unique()) / 2))
 
 
 def build_field(
@@ -256,9 +250,14 @@ def _xplanes_method(
     product = None
     if sparse is not None and field.time is not None and config.loss.sparse_weight:
         product = SparseProduct(sparse, field.rows, config.loss.sparse_frames)
-    hold = config.loss.start_weight / len(site.views) ** 2 if site.begun else 0.0
+    loss, views = config.loss, len(site.views)
     return XPlanesMethod(
-        field, loss=config.loss, trainer=config.trainer, product=product, hold=hold
+        field,
+        loss=loss,
+        trainer=config.trainer,
+        product=product,
+        hold=loss.start_weight / views**2 if site.begun else 0.0,
+        fade=None if loss.start_steps is None else loss.start_steps / views,
     )
 
 

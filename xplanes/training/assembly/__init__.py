@@ -5,7 +5,7 @@ from xplanes.schemas.samplers import FixedStepConfig, NeusConfig, ProposalConfig
 from xplanes.schemas.tensor4d import Tensor4DConfig, Tensor4DDensityConfig
 from xplanes.schemas.tineuvox import TiNeuVoxConfig
 from xplanes.training.assembly.kplanes import kplanes_frame, kplanes_method, proposal_sampling
-from xplanes.training.assembly.site import Plan, SamplingBuilder, Site, scene_cube
+from xplanes.training.assembly.site import Plan, SamplingBuilder, Site, scene_cube, time_rows
 from xplanes.training.assembly.tensor4d import (
     neus_sampling,
     tensor4d_density_method,
@@ -17,7 +17,7 @@ from xplanes.training.assembly.tineuvox import (
     tineuvox_method,
 )
 
-__all__ = ["PLANS", "SAMPLINGS", "Site", "scene_cube"]
+__all__ = ["PLANS", "SAMPLINGS", "Site", "scene_cube", "time_rows"]
 
 PLANS: dict[type, Plan] = {
     KPlanesConfig: Plan(kplanes_frame, kplanes_method),

@@ -1,7 +1,5 @@
 """K-Planes, and the proposal sampler, from settings."""
 
-import math
-
 from torch import nn
 
 from xplanes.config import TrainConfig
@@ -21,6 +19,7 @@ from xplanes.training.assembly.site import (
     origin_cube,
     scene_cube,
     start_values,
+    time_rows,
 )
 from xplanes.training.methods.base import Method
 from xplanes.training.methods.kplanes import KPlanesMethod
@@ -38,7 +37,7 @@ def kplanes_frame(config: TrainConfig, views: Views) -> Frame:
 def kplanes_method(config: TrainConfig, site: Site) -> Method:
     """K-Planes, hybrid or explicit."""
     model: KPlanesConfig = config.model
-    rows = model.time_resolution or max(2, math.ceil(site.moments / 2))
+    rows = model.time_resolution or time_rows(site.views.times)
     decoder = {"hybrid": HybridDecoder, "explicit": ExplicitDecoder}[model.variant]
     with start_values(config.seed, FIELD_STREAM):
         products = PlaneProducts(

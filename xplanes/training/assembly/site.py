@@ -1,11 +1,13 @@
 """What all baselines are built from: views, a frame, and streams of start values."""
 
 import logging
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from xplanes.config import ConfigError, TrainConfig
 from xplanes.fields.base import RadianceField
@@ -47,6 +49,11 @@ class Site:
     def moments(self) -> int:
         """Number of distinct times; 1 for a scene that stands still."""
         return len(self.views.times.unique())
+
+
+def time_rows(times: Tensor) -> int:
+    """Rows of time where the settings leave them open: one for two distinct times. [V]"""
+    return max(2, math.ceil(len(times.unique()) / 2))
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ class XPlanesMethod(Method):
         trainer: Learning rates.
         product: What the products of time planes are tied to (L_r); None leaves the term out.
         hold: Weight of the planes' mean squared distances from their start.
+        fade: Steps over which that and L_r fade away; None keeps them.
     """
 
     def __init__(
@@ -40,9 +41,10 @@ class XPlanesMethod(Method):
         trainer: TrainerConfig,
         product: SparseProduct | None = None,
         hold: float = 0.0,
+        fade: float | None = None,
     ) -> None:
         self._field, self.weights, self.options, self.product = field, loss, trainer, product
-        self.hold = hold
+        self.hold, self.fade = hold, fade
         self._starts = [plane.detach().clone() for plane in self._planes] if hold else []
         self.advice = (
             f"Lower trainer.plane_lr={trainer.plane_lr} or trainer.decoder_lr={trainer.decoder_lr}"
@@ -76,12 +78,13 @@ class XPlanesMethod(Method):
         every, field = self.weights.every, self._field
         if moment.step % every or field.space.grad is None:
             return
-        if self.hold:
+        tie = self._tie(moment.step)
+        if self.hold and tie:
             # The field may have moved to another device since.
             self._starts = [start.to(field.space.device) for start in self._starts]
             for plane, start in zip(self._planes, self._starts, strict=True):
                 if plane.grad is not None:
-                    add_distance_gradient(plane.grad, plane, start, self.hold * every)
+                    add_distance_gradient(plane.grad, plane, start, tie * self.hold * every)
         if weight := self.weights.total_variation * every:
             add_total_variation_gradient(field.space.grad, field.space, (1, 2), weight)
         if field.time is None or field.time.grad is None:
@@ -93,11 +96,15 @@ class XPlanesMethod(Method):
         if weight := self.weights.time_magnitude * every:
             scale = 2 * weight / field.time.numel()
             field.time.grad.add_(field.time.detach(), alpha=scale)
-        if self.product is not None:
-            weight = self.weights.sparse_weight * every
+        if self.product is not None and tie:
+            weight = tie * self.weights.sparse_weight * every
             # The same frames on all ranks: their planes must stay equal.
             generator = step_generator(moment.seed, moment.step, FRAME_STREAM)
             self.product.add_gradient(field.time.grad, field.time, weight, generator)
+
+    def _tie(self, step: int) -> float:
+        """Share of the weights that is left of what ties the field to its start."""
+        return 1.0 if self.fade is None else max(0.0, 1 - step / self.fade)
 
     @torch.no_grad()
     def scalars(self) -> dict[str, float]:

@@ -391,6 +391,7 @@ def test_a_slow_warm_up_says_what_it_does(
         return render(*args)
 
     monkeypatch.setattr(warming, "PATIENCE", 0.05)
+    warming.say_why.cache_clear()
     monkeypatch.setattr(OccupancySampling, "render", slow)
     run(small_config(scenes, "trainer.max_steps=1"), tmp_path / "run", [], resume=False)
     assert capsys.readouterr().out.count("compiling the inner loops") == 1

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 
 import torch
 
@@ -14,11 +15,16 @@ PATIENCE = 3.0
 """Seconds of warming up after which the user is told what takes so long."""
 
 
+@cache
+def say_why() -> None:
+    """Once in a process, though loops are warmed up at several places."""
+    print("compiling the inner loops, once after installation: about 20 s ...", flush=True)
+
+
 @contextmanager
 def warming_up() -> Iterator[None]:
     """Count what is done inside as warming up, and say so where it takes long."""
-    words = "compiling the inner loops, once after installation: about 20 s ..."
-    notice = threading.Timer(PATIENCE, print, [words], {"flush": True})
+    notice = threading.Timer(PATIENCE, say_why)
     notice.start()
     try:
         with warm_up.timed():

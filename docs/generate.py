@@ -113,6 +113,12 @@ def document() -> str:
     parts += ["", "## `recipe`", "", RECIPE, "", "| recipe | key | value |", "|---|---|---|"]
     for path in sorted((ROOT / "conf" / "recipe").glob("*.yaml")):
         parts += [f"| `recipe={path.stem}` | `{key}` | {value} |" for key, value in settings(path)]
+    for group, words in SETS.items():
+        parts += ["", f"## `{group}`", "", words, "", f"| {group} | what it is |", "|---|---|"]
+        for path in sorted((ROOT / "conf" / group).glob("*.yaml")):
+            parts.append(f"| `{group}={path.stem}` | {head(path)} |")
+    parts += ["", "## Environment", "", "| variable | meaning |", "|---|---|"]
+    parts += [f"| `{name}` | {meaning} |" for name, meaning in ENVIRONMENT.items()]
     return "\n".join([*parts, *pretraining()]) + "\n"
 
 
@@ -137,6 +143,26 @@ RECIPE = (
     "What a published baseline sets in other groups. Its model chooses it; `recipe=none` trains "
     "it on the same rays and batches as X-Planes."
 )
+
+
+SETS = {
+    "experiment": "Settings for a purpose; most are sweeps.",
+    "entry": "One model with its start, as a row of a table: `entry=six_planes_tiny,kplanes`.",
+}
+"""Groups whose files set keys of other groups."""
+
+ENVIRONMENT = {
+    "OMP_NUM_THREADS": "The most threads that torch and the compiled loops use.",
+    "OMP_WAIT_POLICY, GOMP_SPINCOUNT": "How threads wait; set unless one of them is.",
+    "XPLANES_CPU_LOOPS=0": "Plain torch instead of compiled loops on the CPU.",
+    "XPLANES_GPU_KERNELS=0": "Plain torch instead of Triton kernels on a GPU.",
+}
+
+
+def head(path: Path) -> str:
+    """The first sentence of the comment in a file that says what it is."""
+    lines = [line[2:] for line in path.read_text().splitlines() if line.startswith("# ")]
+    return next(line for line in lines if not line.startswith("@")).split(". ")[0].rstrip(".") + "."
 
 
 def settings(path: Path) -> list[tuple[str, Any]]:

@@ -160,7 +160,7 @@ class LossConfig:
     sparse_weight: float = MISSING  # Weight of L_r: time planes' products near what moves.
     sparse_frames: int = MISSING  # Random frames per application of L_r.
     start_weight: float = MISSING  # Pull to a start's planes, over the number of views squared.
-    start_steps: int | None = MISSING  # Both fade over this / views steps; null: they stay.
+    start_steps: int | None = MISSING  # Steps times views until L_r and the pull end; null: never.
     every: int = MISSING  # Steps between applications of these, at as many times the weight.
 
 

@@ -22,14 +22,16 @@ def test_configuration_page_is_what_the_generator_writes() -> None:
 
 
 def test_links_between_pages_lead_somewhere() -> None:
-    for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]:
+    folders = [ROOT / "docs", ROOT / "benchmarks" / "results"]
+    pages = [page for folder in folders for page in folder.rglob("*.md")]
+    for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *pages]:
         for link in re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text(encoding="utf-8")):
             assert (page.parent / link).exists(), f"{page.name}: {link}"
 
 
 def commands(program: str) -> list[list[str]]:
     """Arguments of every line of the pages that calls ``program``."""
-    pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     return [
         shlex.split(line, comments=True)[len(program.split()) :]
         for page in pages
@@ -41,7 +43,9 @@ def commands(program: str) -> list[list[str]]:
 @pytest.mark.parametrize("arguments", commands("python train.py"), ids=" ".join)
 def test_training_commands_of_the_pages_compose(arguments: list[str]) -> None:
     check_keys(arguments)
-    chosen = [a.split(",")[0] for a in arguments if "=" in a and not a.startswith("hydra")]
+    settings = [a for a in arguments if "=" in a and not a.startswith("hydra")]
+    # Of what a sweep goes through, the first; a list is one value.
+    chosen = [a if "[" in a else a.split(",")[0] for a in settings]
     register_schemas()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         assert compose("train", chosen).model.name

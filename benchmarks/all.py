@@ -2,7 +2,7 @@
 
     python benchmarks/all.py [--lego FOLDER] [--only NAME ...]
 
-Needs the extra `plots` and D-NeRF's lego (`python -m xplanes download dnerf`). Each script writes
+Needs the extra `dev` and D-NeRF's lego (`python -m xplanes download dnerf`). Each script writes
 its own page anew, in benchmarks/results or docs/results; one that fails does not stop the others.
 Nothing else should run.
 """

@@ -105,16 +105,20 @@ def plot(scenes: dict[str, dict[str, list[tuple[float, float]]]]) -> None:
     figure, panels = pyplot.subplots(
         1, len(scenes), figsize=(5.2 * len(scenes), 4.6), squeeze=False
     )
+    best = {scene: [n for n in curves if on_front(n, curves)] for scene, curves in scenes.items()}
+    names = dict.fromkeys(name for found in best.values() for name in found)
+    colours = {name: f"C{place}" for place, name in enumerate(names)}
     for axes, (scene, curves) in zip(panels[0], scenes.items(), strict=True):
         for name, curve in curves.items():
             seen = [point for point in curve if point[0] > 0]
-            best = on_front(name, curves)
+            front = name in best[scene]
             axes.plot(
                 *zip(*seen, strict=True),
                 marker="o",
                 markersize=3,
-                label=name if best or name == next(iter(curves)) else None,
-                **({} if best else {"color": "0.75", "linewidth": 0.8, "zorder": 0}),
+                label=name if front or name == next(iter(curves)) else None,
+                color=colours[name] if front else "0.75",
+                **({} if front else {"linewidth": 0.8, "zorder": 0}),
             )
         axes.set_xscale("log")
         axes.set(title=scene, xlabel="seconds, preparation included", ylabel="PSNR in dB")

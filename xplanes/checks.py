@@ -114,6 +114,8 @@ def check(config: TrainConfig) -> None:
             raise ConfigError(f"{key}={value}: must not be negative")
         if key in _SHARE and not 0 <= value <= 1:
             raise ConfigError(f"{key}={value}: must lie between 0 and 1")
+        if key == "seed" and value >= 2**32:
+            raise ConfigError(f"{key}={value}: must be below 4294967296 (2^32)")
         if key in _CHOICES and value not in _CHOICES[key]:
             raise ConfigError(f"{key}={value}: must be one of {', '.join(_CHOICES[key])}")
     if (problem := families.conflict(config)) is not None:

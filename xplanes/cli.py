@@ -198,7 +198,8 @@ def _render(options: argparse.Namespace) -> None:
     wanted.check()
     check_out(options.out, wanted)
     trained = _load(options)
-    size = options.size or trained.scene.splits["train"].width
+    views = trained.scene.splits["train"]
+    size = options.size or max(views.height, views.width)
     camera = f"{options.path} camera, time {options.time}"
     _say(f"frames      {wanted.count} of {size}x{size} px, {options.what}, {camera}\n")
     _say(f"wrote {film(trained, wanted, options.out)}")

@@ -19,7 +19,15 @@ from xplanes.checks import parse
 from xplanes.config import ConfigError, TrainConfig
 from xplanes.evaluation.media import film_times, orbit_poses, render_path, write_film
 from xplanes.evaluation.report import closing, header, summary, write_hparams, write_start
-from xplanes.files import StorageError, clear_unfinished, storage_error, write_json, write_text
+from xplanes.evaluation.runs import read_config
+from xplanes.files import (
+    StorageError,
+    clear_unfinished,
+    replacing,
+    storage_error,
+    write_json,
+    write_text,
+)
 from xplanes.locks import alone_in
 from xplanes.lrm import LRMError
 from xplanes.optional import MissingExtraError
@@ -35,9 +43,11 @@ from xplanes.training.builder import (
     build_scene,
     training_device,
 )
+from xplanes.training.checkpoints import LAST
 from xplanes.training.fit import fit
 from xplanes.training.module import RadianceModule, TrainingError
 from xplanes.training.record import RunRecord, claim
+from xplanes.training.resuming import require_same_settings, require_same_views
 
 logger = logging.getLogger(__name__)
 
@@ -71,14 +81,44 @@ def run(config: dict[str, Any], folder: Path, overrides: list[str], *, resume: b
     try:
         with alone_in(folder):
             claim(folder, resume=resume)
+            if _has_checkpoint(folder):
+                _require_same(folder, config)
             clear_unfinished(folder)
-            write_text(folder / "config.yaml", yaml.safe_dump(config, sort_keys=False))
-            write_text(folder / "overrides.txt", "".join(f"{line}\n" for line in overrides))
-            return _recorded(typed, folder, overrides, resume=resume)
+            with _settings(folder, config, overrides):
+                return _recorded(typed, folder, overrides, resume=resume)
     except OSError as problem:
         if (words := storage_error(problem)) is None:
             raise
         raise words from problem
+
+
+def _has_checkpoint(folder: Path) -> bool:
+    return (folder / "checkpoints" / LAST).is_file()
+
+
+@contextmanager
+def _settings(folder: Path, config: dict[str, Any], overrides: list[str]) -> Iterator[None]:
+    """Write down the settings; those of before come back if they turn out to be impossible."""
+    paths = (folder / "config.yaml", folder / "overrides.txt")
+    before = {path: path.read_bytes() for path in paths if path.is_file()}
+    write_text(paths[0], yaml.safe_dump(config, sort_keys=False))
+    write_text(paths[1], "".join(f"{line}\n" for line in overrides))
+    try:
+        yield
+    except (ConfigError, SceneError, LRMError):
+        for path, content in before.items():
+            with replacing(path) as temporary:
+                temporary.write_bytes(content)
+        raise
+
+
+def _require_same(folder: Path, config: dict[str, Any]) -> None:
+    """Refuse to go on as another run than that of the checkpoint."""
+    try:
+        before = read_config(folder)
+    except ConfigError:
+        return  # Damaged: it is written anew, and what does not fit is refused later.
+    require_same_settings(folder, before, config)
 
 
 def _recorded(config: TrainConfig, folder: Path, overrides: list[str], *, resume: bool) -> float:
@@ -122,6 +162,8 @@ def train(
     warm = warm_up.seconds
     started = time.monotonic()
     scene = build_scene(config.data)
+    if record is not None and _has_checkpoint(folder):
+        require_same_views(folder, record.content, scene.splits["train"])
     frame = build_frame(config, scene.splits["train"])
     loaded = time.monotonic() - started
     start = prepare(config, scene, frame, source, say=say)
@@ -177,10 +219,17 @@ def train(
 
 def _check_device(config: TrainConfig) -> None:
     """Refuse what the device cannot do, before anything slow begins."""
-    if config.trainer.deterministic and training_device(config.trainer.accelerator).type == "cuda":
+    if training_device(config.trainer.accelerator).type != "cuda":
+        return
+    if config.trainer.deterministic:
         raise ConfigError(
             "trainer.deterministic=true: sums on a GPU come out in any order; set trainer=cpu, or "
             "do without"
+        )
+    if config.trainer.devices > (found := torch.cuda.device_count()):
+        raise ConfigError(
+            f"trainer.devices={config.trainer.devices}: {found} GPUs found; set "
+            f"trainer.devices={found}, or trainer.accelerator=cpu"
         )
 
 

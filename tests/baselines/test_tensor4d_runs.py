@@ -53,6 +53,8 @@ def test_planes_of_the_flow_are_trained_unless_left_out_as_released(scenes):
         left_out = {name for name, p in made.field.named_parameters() if id(p) not in trained}
         assert all(name.startswith("flow_planes.") for name in left_out)
         assert (len(left_out) == 0) == train
+        # What is left out gathers no gradients, which nothing would clear.
+        assert {n for n, p in made.field.named_parameters() if not p.requires_grad} == left_out
 
 
 def test_fine_level_joins_and_planes_get_sharp_at_their_steps(scenes):

@@ -296,6 +296,19 @@ def test_means_stand_beside_what_was_published(tmp_path: Path) -> None:
     assert set(lines[-1][6:]) == {""}
 
 
+def test_means_keep_runs_with_other_settings_apart(tmp_path: Path) -> None:
+    for weight, psnr in ((0.0, 26.0), (0.5, 24.0)):
+        run = dnerf(tmp_path / f"{weight}", "lego", psnr)
+        config = yaml.safe_load((run / "config.yaml").read_text())
+        config["loss"] = {"start_weight": weight}
+        (run / "config.yaml").write_text(yaml.safe_dump(config))
+    found = [line[3:6] for line in published_lines(tmp_path) if line[4]]
+    assert sorted(found) == [
+        ["loss.start_weight=0.0", "1", "26.00"],
+        ["loss.start_weight=0.5", "1", "24.00"],
+    ]
+
+
 def test_nothing_is_set_beside_other_data(tmp_path: Path) -> None:
     make(tmp_path / "a", model="kplanes")
     assert "published" not in write_tables(tmp_path)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from xplanes.backend import warm_up
+from xplanes.files import StorageError
 from xplanes.preparation import cache as cache_module
 from xplanes.preparation.cache import StageCache, fingerprint
 
@@ -146,7 +147,18 @@ def test_a_folder_that_cannot_be_written_costs_the_cache_alone(tmp_path: Path, c
     with caplog.at_level(logging.WARNING):
         stage = StageCache(tmp_path / "file").stage("parts", INPUTS, Maker())
     assert stage.content["report"]["rank"] == 2
+    assert "cannot be written: stages are not kept" in caplog.text
+
+
+def test_an_entry_that_cannot_be_written_is_not_kept(tmp_path: Path, caplog, monkeypatch):
+    def refuse(*_args) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", refuse)
+    stage = StageCache(tmp_path).stage("parts", INPUTS, Maker())
+    assert stage.content["report"]["rank"] == 2
     assert "could not be written" in caplog.text
+    assert not list(tmp_path.iterdir())
 
 
 def test_files_are_no_code(tmp_path: Path):
@@ -171,3 +183,22 @@ def test_fingerprints_do_not_depend_on_layout():
     tensor = torch.randn(4, 6)
     assert fingerprint(tensor.mT) == fingerprint(tensor.mT.contiguous())
     assert fingerprint(tensor.bfloat16()) == fingerprint(tensor.bfloat16().clone())
+
+
+def test_a_folder_that_takes_no_files_is_read_and_not_written(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog
+):
+    def refuse(place: Path) -> None:
+        raise StorageError(f"{place} cannot be written: Read-only file system")
+
+    before = sorted(folder.iterdir())
+    monkeypatch.setattr(cache_module, "require_writable", refuse)
+    cache, make = StageCache(folder), Maker()
+    assert "cannot be written: stages are not kept" in caplog.text
+    assert cache.stage("parts", INPUTS, make, alone=True).cached
+    assert not cache.stage("others", INPUTS, make, alone=True).cached
+    cache.keep("more", INPUTS, make(), 1.0)
+    with cache.workshop("others", INPUTS) as work:
+        assert work.is_dir()
+        assert folder not in work.parents
+    assert sorted(folder.iterdir()) == before

@@ -241,6 +241,15 @@ def test_digits_cannot_be_kept_on_a_gpu(
         run(small_config(scenes, "trainer.deterministic=true"), tmp_path / "run", [], resume=False)
 
 
+def test_more_gpus_than_there_are_are_refused_at_once(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "training_device", lambda _: torch.device("cuda"))
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    with pytest.raises(ConfigError, match=r"trainer\.devices=2: 1 GPUs found"):
+        run(small_config(scenes, "trainer=ddp"), tmp_path / "run", [], resume=False)
+
+
 def test_folder_with_a_run_is_refused_without_resume(trained: Path, scenes: Path) -> None:
     before = (trained / "metrics.json").read_bytes()
     with pytest.raises(ConfigError, match="holds a run already"):

@@ -27,10 +27,10 @@ def orbit_poses(views: Views, frame: Frame, count: int, elevation: float = ELEVA
     return orbit(count, radius=float(distance), elevation=elevation, target=frame.centre)
 
 
-def film_times(frames: int, turns: float = 1.0) -> Tensor:
+def film_times(frames: int) -> Tensor:
     """Times that run forth and back once, so that a repeated film does not jump. [frames]"""
-    phase = torch.arange(frames) * (turns / max(frames, 1))
-    return 1 - (2 * (phase % 1) - 1).abs()
+    phase = torch.arange(frames) / max(frames, 1)
+    return 1 - (2 * phase - 1).abs()
 
 
 def render_path(

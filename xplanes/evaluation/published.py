@@ -6,14 +6,16 @@ from collections.abc import Sequence
 from importlib import resources
 
 from xplanes.evaluation.sweep import RunRow
-from xplanes.evaluation.tabulate import markdown
+from xplanes.evaluation.tabulate import differing, markdown
 
 FILE = "published.csv"
 KEYS = {"model": "model.name", "lrm": "lrm.name", "sampler": "sampler.name"}
 """Columns of the file that a run must agree with, and its settings of that meaning."""
 
+MEANT = ("data.scene", "seed", "entry")
+"""Settings that the means go over."""
+
 HEADER = [
-    *KEYS,
     "runs",
     "psnr",
     "ssim",
@@ -41,30 +43,35 @@ def beside(rows: Sequence[RunRow]) -> str | None:
         Words and a table in markdown; None where nothing was published of these models.
     """
     groups: dict[tuple[str, ...], list[RunRow]] = {}
+    others = [name for name in differing(rows) if name not in (*KEYS.values(), *MEANT)]
     for row in rows:
         done = row.status == "finished" and {"psnr", "ssim"} <= row.scores.keys()
         if done and row.settings.get("data.name") == "dnerf":
-            key = tuple(str(row.settings.get(name)) for name in KEYS.values())
+            rest = " ".join(f"{n}={row.settings[n]}" for n in others if n in row.settings)
+            key = (*(str(row.settings.get(name)) for name in KEYS.values()), rest)
             groups.setdefault(key, []).append(row)
     published: dict[tuple[str, ...], list[dict[str, str]]] = {}
     for entry in read_published():
         published.setdefault(tuple(entry[name] for name in KEYS), []).append(entry)
-    if not groups.keys() & published.keys():
+    if not {key[:-1] for key in groups} & published.keys():
         return None
     lines = []
-    for key, runs in groups.items():
+    for (*known, rest), runs in groups.items():
+        key = [*known, rest] if others else known
         own = [*key, str(len(runs)), _mean(runs, "psnr", ".2f"), _mean(runs, "ssim", ".4f")]
-        for entry in published.get(key, [{}]):
+        for entry in published.get(tuple(known), [{}]):
             names = ("psnr", "ssim", "minutes", "scenes", "source")
             lines.append([*own, *(entry.get(name, "") for name in names)])
             own = [*key, "", "", ""]
     used = [row for runs in groups.values() for row in runs]
     scenes, split = _values(used, "data.scene"), _values(used, "data.eval_split")
     pixels, views = _values(used, "data.resolution", "native"), _values(used, "data.views", "all")
+    scored = _values(used, "data.eval_views", "all")
+    header = [*KEYS, *(["settings"] if others else []), *HEADER]
     return (
-        f"Means of these runs ({scenes}; {split} split, {pixels} px, views: {views}) beside "
-        "published figures (test split, 400 px, all views), comparable only where scenes, split, "
-        f"pixels, views and budget are the same:\n\n{markdown(HEADER, lines)}"
+        f"Means of these runs ({scenes}; {split} split, {pixels} px, views: {views}, scored: "
+        f"{scored}) beside published figures (test split, 400 px, all views), comparable only "
+        f"where scenes, split, pixels, views and budget are the same:\n\n{markdown(header, lines)}"
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 
 from xplanes.checks import parse
@@ -16,6 +17,7 @@ from xplanes.scenes.views import Scene, Views
 from xplanes.training.builder import build_frame, build_module, build_scene, training_device
 from xplanes.training.checkpoints import load_checkpoint
 from xplanes.training.module import RadianceModule
+from xplanes.training.resuming import require_same_views
 
 OUTPUTS = Path("outputs")
 LISTED = 5
@@ -137,7 +139,9 @@ def load_run(
     """
     config = _parsed(run)
     name = split or config.data.eval_split
-    if config.trainer.accelerator == "gpu":
+    if device is not None:
+        config.trainer.accelerator = "cpu" if torch.device(device).type == "cpu" else "gpu"
+    elif config.trainer.accelerator == "gpu":
         config.trainer.accelerator = "auto"  # Trained on a GPU, looked at where there may be none.
     device = device or str(training_device(config.trainer.accelerator))
     state = load_checkpoint(run / "checkpoints" / f"{checkpoint}.ckpt")
@@ -149,7 +153,7 @@ def load_run(
         announce(f"checkpoint  {checkpoint}.ckpt, step {step}, on {device}")
     config.data.root = _data_root(run, config.data.root)
     scene = build_scene(config.data, ("train", name))
-    _check_views(run, scene.splits["train"])
+    require_same_views(run, _record(run), scene.splits["train"])
     frame = build_frame(config, scene.splits["train"])
     if (origin := state.get("origin")) is not None:
         # Planes and decoder were shaped by a source that need not be there any more.
@@ -203,14 +207,3 @@ def _data_root(run: Path, root: str) -> str:
         return root
     there = Path(started) / root
     return str(there) if there.exists() else root
-
-
-def _check_views(run: Path, views: Views) -> None:
-    """Refuse other training views than the run's: the frame and the field's size depend on them."""
-    files = _record(run).get("files")
-    recorded = files.get("train") if isinstance(files, dict) else None
-    if isinstance(recorded, list) and recorded != list(views.files):
-        raise ConfigError(
-            f"{run} was trained on {len(recorded)} views, but the scene now lists "
-            f"{len(views.files)} others or in another order: restore the scene's files"
-        )

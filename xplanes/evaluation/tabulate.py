@@ -9,7 +9,13 @@ from typing import Any
 from xplanes.evaluation.sweep import MEASURES, RunRow
 
 SEED = "seed"
-UNLISTED = ("resume", "trainer.evaluate_at", "trainer.media", "trainer.log_every")
+UNLISTED = (
+    "resume",
+    "trainer.evaluate_at",
+    "trainer.evaluate_views",
+    "trainer.media",
+    "trainer.log_every",
+)
 """Settings that say nothing about a result."""
 
 LABELS = {

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from xplanes.backend import warm_up
-from xplanes.files import clear_unfinished, replacing
+from xplanes.files import StorageError, clear_unfinished, replacing, require_writable
 from xplanes.locks import in_turn
 
 logger = logging.getLogger(__name__)
@@ -58,6 +58,9 @@ class StageCache:
 
     def __init__(self, folder: Path | None) -> None:
         self.folder = folder
+        self.writable = folder is not None and _takes_files(folder)
+        if folder is not None and not self.writable:
+            logger.warning("preparation.cache=%s cannot be written: stages are not kept", folder)
 
     def stage(
         self,
@@ -79,15 +82,16 @@ class StageCache:
         """
         path, key = self._path(name, inputs)
         path = path if keep else None
+        lock = path.with_suffix(".lock") if path and alone and self.writable else None
         if (found := _find(path, key)) is not None:
             return found
-        with in_turn(path.with_suffix(".lock") if path and alone else None) as waited:
+        with in_turn(lock) as waited:
             if waited and (found := _find(path, key)) is not None:
                 return found
             began = time.perf_counter() - warm_up.seconds
             content = make()
             seconds = time.perf_counter() - warm_up.seconds - began
-            if path is not None:
+            if path is not None and self.writable:
                 _write(path, key, content, seconds)
         return Stage(content, seconds, False, key)
 
@@ -98,7 +102,7 @@ class StageCache:
     def keep(self, name: str, inputs: Any, content: dict[str, Any], seconds: float) -> None:
         """Keep a stage that was just made."""
         path, key = self._path(name, inputs)
-        if path is not None:
+        if path is not None and self.writable:
             _write(path, key, content, seconds)
 
     @contextmanager
@@ -108,7 +112,7 @@ class StageCache:
         It is removed when the block ends well.
         """
         path, _ = self._path(name, inputs)
-        if path is None:
+        if path is None or not self.writable:
             with tempfile.TemporaryDirectory(prefix="xplanes_") as folder:
                 yield Path(folder)
             return
@@ -120,6 +124,14 @@ class StageCache:
             return None, ""
         key = fingerprint([VERSION, name, inputs])
         return self.folder / f"{name}-{key[:32]}.pt", key
+
+
+def _takes_files(folder: Path) -> bool:
+    try:
+        require_writable(folder)
+    except (StorageError, OSError):
+        return False
+    return True
 
 
 def _find(path: Path | None, key: str) -> Stage | None:

@@ -60,7 +60,6 @@ def filming_settings(config: TrainConfig) -> TrainConfig:
             accelerator=own.accelerator,
             precision=own.precision,
             deterministic=own.deterministic,
-            log_every=own.log_every,
             max_seconds=options.fixed_view_seconds,
             max_steps=options.fixed_view_steps,
             checkpoint_every=CHECKPOINT_EVERY,

@@ -22,6 +22,8 @@ class SurfaceRendering(Rendering):
         places: Where these are in canonical space. [M, 3]
         slopes: Gradient of the distance by their points, through the flow. [M, 3]
         weights: Share of its ray's light that each of them sends, without gradient. [M]
+
+    ``density`` is the depth of these below the surface, minus their distance. [M]
     """
 
     places: Tensor

@@ -86,6 +86,8 @@ def occupancy_conflict(sampler: SamplerConfig) -> str | None:
             f"sampler.occlusion={sampler.occlusion}: must be below 1, or no light counts as "
             "seen; 1e-5 is the default, sampler.skip_occluded=false skips nothing"
         )
+    if sampler.threshold >= 1:
+        return f"sampler.threshold={sampler.threshold}: must be below 1, or nothing is seen"
     if sampler.grid_resolution**3 * sampler.time_bins > 2**28:
         return (
             f"sampler.grid_resolution={sampler.grid_resolution} with sampler.time_bins="

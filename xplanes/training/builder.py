@@ -1,5 +1,6 @@
 """From settings to objects: the only place that turns names into classes."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -97,6 +98,8 @@ def build_scene(config: DataConfig, splits: tuple[str, ...] | None = None) -> Sc
 def training_device(name: str) -> torch.device:
     """The device of ``trainer.accelerator``: a CUDA GPU where there is one, else the CPU.
 
+    Of several processes each has the GPU of its own number.
+
     Raises:
         ConfigError: If a GPU is asked for and none is found.
     """
@@ -104,7 +107,10 @@ def training_device(name: str) -> torch.device:
         raise ConfigError(
             "trainer.accelerator=gpu: no GPU found; set trainer.accelerator=cpu or auto"
         )
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+    if name == "cpu" or not torch.cuda.is_available():
+        return torch.device("cpu")
+    rank = int(os.environ.get("LOCAL_RANK", "0"))
+    return torch.device("cuda", rank) if rank else torch.device("cuda")
 
 
 def decoder_precision(trainer: TrainerConfig) -> Precision:

@@ -43,8 +43,11 @@ class Checkpoints(Callback):
         # The best comes first: a run that is killed in between scores the model again, but would
         # not write it again if the last one said that it was written.
         self._save_best(trainer, pl_module)
+        assert isinstance(pl_module, RadianceModule)
         step = trainer.global_step
-        if step and step % self.every == 0 and step != self._written:
+        due = step and step % self.every == 0 and step != self._written
+        # Gradients of batches that wait for others are in no checkpoint.
+        if due and pl_module.between_updates:
             self._save_last(trainer, pl_module)
             self._written = step
 
@@ -66,7 +69,7 @@ class Checkpoints(Callback):
         """Keep the model if its score is the best so far."""
         assert isinstance(module, RadianceModule)
         # All ranks take part in saving, but only the first knows the scores.
-        if trainer.strategy.broadcast(module.improved):
+        if trainer.strategy.reduce_boolean_decision(module.improved, all=False):
             self.save(trainer, BEST)
         module.improved = False
         if trainer.world_size > 1:

@@ -50,6 +50,7 @@ class Interrupt(Callback):
         before = {number: signal.signal(number, self._note) for number in signals}
         try:
             yield
+            self.check()  # For a signal that came after the last step.
         except SystemExit:
             # Lightning ends the process after an interrupt; the run record must be written first.
             if not self.asked:

@@ -7,7 +7,7 @@ import torch
 from lightning import LightningModule
 from lightning.pytorch.core.optimizer import LightningOptimizer
 
-from xplanes.config import TrainerConfig
+from xplanes.config import ConfigError, TrainerConfig
 from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.scenes.batches import Batch
 from xplanes.training.health import all_usable, not_finite, unusable_gradients
@@ -238,6 +238,14 @@ class RadianceModule(LightningModule):
             checkpoint["origin"] = self.origin
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        try:
+            self.load_state_dict(checkpoint["state_dict"])
+        except RuntimeError as error:
+            problem = str(error).splitlines()[-1].strip().rstrip(".")
+            raise ConfigError(
+                f"the checkpoint does not fit these settings ({problem}): go on with those that "
+                "the run began with, or train anew in another folder"
+            ) from error
         self._require_frame(checkpoint.get("origin"))
         progress = checkpoint["progress"]
         self.batches, self.clock = progress["batches"], progress["clock"]

@@ -29,6 +29,9 @@ _PACKAGES = (
     "triton",
 )
 
+NOTED = ("device", "precision", "files")
+"""Facts that are noted once the scene is read."""
+
 
 class RunRecord:
     """Keeps run.json true from the start of a run to its end.
@@ -57,6 +60,7 @@ class RunRecord:
             "versions": {name: _version(name) for name in _PACKAGES},
             "platform": platform.platform(),
             "cpus": os.cpu_count(),
+            **{name: earlier[name] for name in NOTED if name in earlier},
         }
         write_json(self.path, self.content)
 

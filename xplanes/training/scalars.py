@@ -28,7 +28,9 @@ class Scalars(Callback):
     ) -> None:
         assert isinstance(pl_module, RadianceModule)
         step = trainer.global_step
-        if step % self.every or trainer.logger is None or "loss" not in pl_module.last:
+        if step % self.every or trainer.logger is None or not pl_module.between_updates:
+            return
+        if "loss" not in pl_module.last:
             return
         now = self._state(pl_module)
         seconds, rays, samples = (a - b for a, b in zip(now, self._seen, strict=True))

@@ -107,9 +107,11 @@ class Scorer(Callback):
         }
         module.last.update(scores)
         self._log(trainer, module, scores, pictures, step)
-        if scores[f"{self.split}/psnr"] > self.best:
-            self.best = scores[f"{self.split}/psnr"]
-            module.improved = True
+        # Of the same views as on the way.
+        pairs = zip(indices, self.latest, strict=True)
+        compared = mean([score.psnr for index, score in pairs if index in self.indices])
+        if compared > self.best:
+            self.best, module.improved = compared, True
         self.seconds += time.perf_counter() - began
 
     def _compare(

@@ -56,7 +56,8 @@ class Tensor4DDensityMethod(Method):
         for name, part in field.named_children():
             planes = isinstance(part, HierarchicalPlanes)
             rate = config.plane_learning_rate if planes else config.learning_rate
-            groups.append({"params": list(part.parameters()), "lr": rate, "name": name})
+            if parameters := [p for p in part.parameters() if p.requires_grad]:
+                groups.append({"params": parameters, "lr": rate, "name": name})
         return groups
 
     def optimizer(self, groups: list[Group]) -> torch.optim.Optimizer:
@@ -87,15 +88,12 @@ class Tensor4DMethod(Tensor4DDensityMethod):
     def __init__(self, field: Tensor4D, config: Tensor4DConfig, loss: Tensor4DLossConfig) -> None:
         super().__init__(field, config)
         self._field, self.weights = field, loss
-        self.flow_planes = config.flow_planes
+        if field.flow_planes is not None:
+            field.flow_planes.requires_grad_(config.flow_planes)
 
     @property
     def field(self) -> Tensor4D:
         return self._field
-
-    def groups(self) -> list[Group]:
-        left_out = () if self.flow_planes else ("flow_planes",)
-        return [group for group in super().groups() if group["name"] not in left_out]
 
     def loss(
         self, rendering: SurfaceRendering, rays: Batch, moment: Moment

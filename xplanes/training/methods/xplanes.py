@@ -79,7 +79,9 @@ class XPlanesMethod(Method):
         if moment.step % every or field.space.grad is None:
             return
         tie = self._tie(moment.step)
-        if self.hold and tie:
+        if not tie:
+            self._starts, self.product = [], None  # Large, and of no more use.
+        elif self.hold:
             # The field may have moved to another device since.
             self._starts = [start.to(field.space.device) for start in self._starts]
             for plane, start in zip(self._planes, self._starts, strict=True):
@@ -96,7 +98,7 @@ class XPlanesMethod(Method):
         if weight := self.weights.time_magnitude * every:
             scale = 2 * weight / field.time.numel()
             field.time.grad.add_(field.time.detach(), alpha=scale)
-        if self.product is not None and tie:
+        if self.product is not None:
             weight = tie * self.weights.sparse_weight * every
             # The same frames on all ranks: their planes must stay equal.
             generator = step_generator(moment.seed, moment.step, FRAME_STREAM)

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
-from torch import nn
+from torch import distributed, nn
 
 from xplanes.config import SamplerConfig
 from xplanes.rendering.base import Rendering
@@ -72,12 +72,22 @@ class OccupancySampling(Sampling):
         self.grid.observe(rendering.samples.cells, rendering.density)
 
     def keep_up(self, field: Any, moment: Moment) -> None:
-        step = moment.step
+        step, config = moment.step, self.config
+        sweeping = step in config.sweep_at or (step > 0 and step % config.sweep_every == 0)
+        if not sweeping and step % config.update_every:
+            return
+        self._agree()
         generator = step_generator(moment.seed, step, GRID_STREAM)
-        if step in self.config.sweep_at or (step and step % self.config.sweep_every == 0):
+        if sweeping:
             self.grid.sweep(field, generator)
-        elif step % self.config.update_every == 0:
-            self.grid.update(field, self.config.update_cells, generator)
+        else:
+            self.grid.update(field, config.update_cells, generator)
+
+    def _agree(self) -> None:
+        """Go on with the first process's grid: each has seen the samples of its own rays."""
+        if distributed.is_available() and distributed.is_initialized():
+            for part in (self.grid.density, self.grid.occupied):
+                distributed.broadcast(part, src=0)
 
     def scalars(self) -> dict[str, float]:
         return {"sampler/occupied": self.grid.occupied_fraction}

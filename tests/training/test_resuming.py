@@ -1,0 +1,141 @@
+"""What a run that goes on must have in common with what it began as."""
+
+import json
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+from lightning import Trainer
+
+from tests.training.runs import small_config
+from xplanes.config import ConfigError
+from xplanes.pipeline import run
+from xplanes.training import scorer
+from xplanes.training.checkpoints import Checkpoints
+
+FEW = ("trainer.max_steps=6", "trainer.evaluate_at=[]")
+PAGES = ("config.yaml", "overrides.txt", "metrics.json")
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("scenes")
+
+
+@pytest.fixture(scope="module")
+def trained(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    run(small_config(scenes, *FEW), folder, ["seed=0"], resume=False)
+    return folder
+
+
+@pytest.fixture
+def folder(trained: Path, tmp_path: Path) -> Path:
+    """A finished run of one's own."""
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("model=nine_planes", r"model\.name=nine_planes: .* trained with model\.name=six_planes"),
+        ("data.scene=balls", r"data\.scene=balls: .*data\.scene=excavator"),
+        ("data.views=5", r"data\.views=5: .*data\.views=None"),
+        ("data.resolution=24", r"data\.resolution=24: .*data\.resolution=32"),
+        ("lrm=tiny", r"lrm\.name=tiny: .*lrm\.name=none"),
+        ("model.resolution=16", r"does not fit .*size mismatch for .* the run began with"),
+        ("model.channels=16", r"does not fit .*size mismatch"),
+        ("sampler.grid_resolution=16", r"does not fit .*size mismatch for grid"),
+    ],
+)
+def test_a_run_does_not_go_on_as_another(
+    scenes: Path, folder: Path, override: str, words: str
+) -> None:
+    before = {name: (folder / name).read_bytes() for name in PAGES}
+    changed = small_config(scenes, *FEW, override)
+    with pytest.raises(ConfigError, match=words):
+        run(changed, folder, ["seed=0", override], resume=True)
+    assert {name: (folder / name).read_bytes() for name in PAGES} == before
+    # The refusal leaves a run that goes on as ever.
+    run(small_config(scenes, *FEW, "trainer.max_steps=8"), folder, ["seed=0"], resume=True)
+    assert json.loads((folder / "metrics.json").read_text())["step"] == 8
+
+
+def test_a_run_does_not_go_on_with_other_pictures(scenes: Path, folder: Path) -> None:
+    record = json.loads((folder / "run.json").read_text())
+    record["files"]["train"].reverse()
+    (folder / "run.json").write_text(json.dumps(record))
+    for _ in range(2):  # The first refusal forgets nothing.
+        with pytest.raises(ConfigError, match=r"trained on 10 views, .* restore the scene's files"):
+            run(small_config(scenes, *FEW), folder, [], resume=True)
+
+
+def test_what_may_change_does(scenes: Path, folder: Path) -> None:
+    more = small_config(scenes, "trainer.max_steps=8", "trainer.plane_lr=0.01", "data.eval_views=2")
+    run(more, folder, ["trainer.plane_lr=0.01"], resume=True)
+    assert (folder / "overrides.txt").read_text() == "trainer.plane_lr=0.01\n"
+    assert len(json.loads((folder / "metrics.json").read_text())["views"]) == 2
+
+
+def test_the_best_is_chosen_by_the_same_views_throughout(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One view is scored on the way, and the others are harder by 10 dB."""
+    original, improved = scorer.score_view, []
+
+    def score(field, renderer, frame, views, index, background):
+        found, images = original(field, renderer, frame, views, index, background)
+        object.__setattr__(found, "psnr", found.psnr - 10 * (index not in scored))
+        return found, images
+
+    save = Checkpoints.save
+
+    def note(self: Checkpoints, trainer: Trainer, name: str) -> None:
+        improved.append((trainer.global_step, name))
+        save(self, trainer, name)
+
+    scored = scorer.spread(1, 3)
+    monkeypatch.setattr(scorer, "score_view", score)
+    monkeypatch.setattr(Checkpoints, "save", note)
+    few = ("trainer.evaluate_views=1", "trainer.evaluate_at=[0,0.5]", "trainer.checkpoint_every=99")
+    run(small_config(scenes, *few), tmp_path / "run", [], resume=False)
+    assert [step for step, name in improved if name == "best.ckpt"] == [0, 20, 40]
+
+
+def test_no_checkpoint_between_the_batches_of_an_update(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run that goes on from a checkpoint's step has written none for it yet."""
+    batches = []
+    save = Checkpoints.save
+
+    def note(self: Checkpoints, trainer: Trainer, name: str) -> None:
+        batches.append(trainer.lightning_module.batches)
+        save(self, trainer, name)
+
+    every = (*FEW, "trainer.accumulate=4", "trainer.checkpoint_every=2")
+    folder = tmp_path / "run"
+    run(small_config(scenes, *every, "trainer.max_steps=2"), folder, [], resume=False)
+    monkeypatch.setattr(Checkpoints, "save", note)
+    run(small_config(scenes, *every, "trainer.max_steps=3"), folder, [], resume=True)
+    assert batches[-1] == 12
+    assert all(count % 4 == 0 for count in batches)
+
+
+def test_a_signal_after_the_last_step_is_heard(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish = scorer.Scorer.finish
+
+    def press_ctrl_c(self, *rest) -> None:
+        finish(self, *rest)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(scorer.Scorer, "finish", press_ctrl_c)
+    with pytest.raises(KeyboardInterrupt):
+        run(small_config(scenes, *FEW), tmp_path / "run", [], resume=False)
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "interrupted"
+    monkeypatch.undo()
+    run(small_config(scenes, *FEW), tmp_path / "run", [], resume=True)
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["step"] == 6

@@ -195,7 +195,7 @@ def main() -> None:
     page = f"""# Savings, one switched off at a time
 
 {args.steps} steps of 512 rays, {args.resolution} px, six planes at random,
-means of {args.seeds} seeds; {machine()}. `{command()}`
+{"one seed" if args.seeds == 1 else f"means of {args.seeds} seeds"}; {machine()}. `{command()}`
 
 empty and occluded: shares of the samples in the box; background: share of the pixels; gradients:
 share of the samples left that needed none.
@@ -209,7 +209,8 @@ picture, where most meet nothing and cost little: it shows in PSNR, not in secon
         page += f"""
 ## Savings beside those of single samples
 
-Seconds of training and PSNR with a saving and without it, steps with / without.
+Seconds of training and PSNR with a saving and without it, steps with / without. Where the steps after
+convergence are as many in both, the rule found that the run still gained.
 
 {markdown(PAIR_COLUMNS, pairs)}
 

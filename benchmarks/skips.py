@@ -209,8 +209,8 @@ picture, where most meet nothing and cost little: it shows in PSNR, not in secon
         page += f"""
 ## Savings beside those of single samples
 
-Seconds of training and PSNR with a saving and without it, steps with / without. Where the steps after
-convergence are as many in both, the rule found that the run still gained.
+Seconds of training and PSNR with a saving and without it, steps with / without. Where the steps
+after convergence are as many in both, the rule found that the run still gained.
 
 {markdown(PAIR_COLUMNS, pairs)}
 

@@ -71,8 +71,9 @@ def _has(row: RunRow, name: str) -> bool:
 
 
 def _follows(rows: Sequence[RunRow], name: str, group: str) -> bool:
-    """Whether the group's name decides the setting."""
-    pairs = {(_text(row.settings.get(group)), _text(row.settings.get(name))) for row in rows}
+    """Whether the group's name decides the setting, where there is one."""
+    having = [row.settings for row in rows if name in row.settings]
+    pairs = {(_text(settings.get(group)), _text(settings[name])) for settings in having}
     return len(pairs) == len({choice for choice, _ in pairs})
 
 

@@ -7,6 +7,7 @@ from tests.baselines.runs import NEUS, OCCUPANCY, TENSOR4D, baseline_config
 from tests.synthetic import ball_views
 from xplanes.checks import parse
 from xplanes.config import ConfigError
+from xplanes.pipeline import run
 from xplanes.training.assembly.site import Site, scene_cube
 from xplanes.training.assembly.tensor4d import tensor4d_method
 from xplanes.training.sampling.base import Moment
@@ -17,12 +18,17 @@ def scenes(tmp_path_factory):
     return tmp_path_factory.mktemp("scenes")
 
 
-def test_surface_run_learns_goes_on_and_is_loaded(scenes, tmp_path, monkeypatch):
+def test_surface_run_goes_on(scenes, tmp_path, monkeypatch):
+    """When it stops the fine level has joined, and planes are still averaged down."""
+    short = ("trainer.max_steps=28", "trainer.evaluate_at=[]", "data.eval_views=1")
+    config = baseline_config(scenes, "model=tensor4d", *TENSOR4D, *NEUS, *short)
+    run(config, tmp_path / "whole", [], resume=False)
+    check_resume(config, tmp_path / "whole", tmp_path / "broken", monkeypatch, stop=23)
+
+
+def test_surface_run_learns_and_is_loaded(scenes, tmp_path):
     config = baseline_config(scenes, "model=tensor4d", *TENSOR4D, *NEUS, "trainer.max_steps=100")
-    folder = check_learns(config, tmp_path / "whole", gain=1.5)
-    # The fine level has joined by then, and planes are still averaged down.
-    check_resume(config, folder, tmp_path / "broken", monkeypatch, stop=23)
-    trained = check_reload(folder)
+    trained = check_reload(check_learns(config, tmp_path / "whole", gain=1.5))
     assert bool(trained.module.field.canonical_planes.fine)
     assert not bool(trained.module.field.canonical_planes.blurred)
 

@@ -114,10 +114,13 @@ def _settings(folder: Path, config: dict[str, Any], overrides: list[str]) -> Ite
 
 def _require_same(folder: Path, config: dict[str, Any]) -> None:
     """Refuse to go on as another run than that of the checkpoint."""
+    path = folder / "config.yaml"
+    if not path.is_file() or not path.read_bytes().endswith(b"\n"):
+        return  # Cut short: it is written anew, and what does not fit is refused later.
     try:
         before = read_config(folder)
     except ConfigError:
-        return  # Damaged: it is written anew, and what does not fit is refused later.
+        return
     require_same_settings(folder, before, config)
 
 

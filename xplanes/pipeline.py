@@ -81,7 +81,7 @@ def run(config: dict[str, Any], folder: Path, overrides: list[str], *, resume: b
     try:
         with alone_in(folder):
             claim(folder, resume=resume)
-            if _has_checkpoint(folder):
+            if resume and _has_checkpoint(folder):
                 _require_same(folder, config)
             clear_unfinished(folder)
             with _settings(folder, config, overrides):
@@ -114,13 +114,10 @@ def _settings(folder: Path, config: dict[str, Any], overrides: list[str]) -> Ite
 
 def _require_same(folder: Path, config: dict[str, Any]) -> None:
     """Refuse to go on as another run than that of the checkpoint."""
-    path = folder / "config.yaml"
-    if not path.is_file() or not path.read_bytes().endswith(b"\n"):
-        return  # Cut short: it is written anew, and what does not fit is refused later.
     try:
         before = read_config(folder)
     except ConfigError:
-        return
+        return  # Damaged: it is written anew, and what does not fit is refused later.
     require_same_settings(folder, before, config)
 
 
@@ -165,7 +162,7 @@ def train(
     warm = warm_up.seconds
     started = time.monotonic()
     scene = build_scene(config.data)
-    if record is not None and _has_checkpoint(folder):
+    if resume and record is not None and _has_checkpoint(folder):
         require_same_views(folder, record.content, scene.splits["train"])
     frame = build_frame(config, scene.splits["train"])
     loaded = time.monotonic() - started

@@ -298,3 +298,12 @@ def test_choices_are_those_of_the_decomposition():
     assert set(CHOICES["decomposition.static"]) == set(STATIC)
     assert set(CHOICES["decomposition.dynamic"]) == set(DYNAMIC)
     assert decomposition.ORIENTATIONS == ("xy", "xz", "yz")
+
+
+def test_processes_do_not_share_a_start_through_a_folder_that_takes_no_files(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "file").write_text("")
+    overrides = ["trainer=ddp", f"preparation.cache={tmp_path / 'file' / 'cache'}"]
+    with pytest.raises(ConfigError, match=r"cannot be written, and the 2 processes share"):
+        start(tmp_path, SEQUENCE, *overrides)

@@ -109,11 +109,12 @@ def read_config(run: Path) -> dict[str, Any]:
     if not path.is_file():
         raise ConfigError(f"{run} is not a run directory: no config.yaml in it")
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        content = yaml.safe_load(text)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is damaged: {error}") from error
-    if not isinstance(content, dict):
-        raise ConfigError(f"{path} is damaged: not a mapping")
+    if not isinstance(content, dict) or not text.endswith("\n"):
+        raise ConfigError(f"{path} is damaged: not a mapping, or cut short")
     return content
 
 
@@ -159,13 +160,8 @@ def load_run(
         # Planes and decoder were shaped by a source that need not be there any more.
         config.model, frame = _origin(origin, f"{run}/checkpoints/{checkpoint}.ckpt")
     module = build_module(config, scene, frame)
-    try:
-        module.load_state_dict(state["state_dict"])
-    except RuntimeError as error:
-        raise ConfigError(
-            f"{run}/checkpoints/{checkpoint}.ckpt does not fit {run}/config.yaml: {error}"
-        ) from error
     module.on_load_checkpoint(state)
+    module.load_state_dict(state["state_dict"])
     module.to(device).eval()
     return TrainedRun(run, config, scene, name, frame, module, checkpoint, step)
 

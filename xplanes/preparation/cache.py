@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from xplanes.backend import warm_up
-from xplanes.files import StorageError, clear_unfinished, replacing, require_writable
+from xplanes.files import clear_unfinished, replacing, require_writable
 from xplanes.locks import in_turn
 
 logger = logging.getLogger(__name__)
@@ -91,8 +91,7 @@ class StageCache:
             began = time.perf_counter() - warm_up.seconds
             content = make()
             seconds = time.perf_counter() - warm_up.seconds - began
-            if path is not None and self.writable:
-                _write(path, key, content, seconds)
+            self._put(path, key, content, seconds)
         return Stage(content, seconds, False, key)
 
     def find(self, name: str, inputs: Any) -> Stage | None:
@@ -102,6 +101,9 @@ class StageCache:
     def keep(self, name: str, inputs: Any, content: dict[str, Any], seconds: float) -> None:
         """Keep a stage that was just made."""
         path, key = self._path(name, inputs)
+        self._put(path, key, content, seconds)
+
+    def _put(self, path: Path | None, key: str, content: dict[str, Any], seconds: float) -> None:
         if path is not None and self.writable:
             _write(path, key, content, seconds)
 
@@ -129,7 +131,7 @@ class StageCache:
 def _takes_files(folder: Path) -> bool:
     try:
         require_writable(folder)
-    except (StorageError, OSError):
+    except OSError:
         return False
     return True
 

@@ -126,11 +126,11 @@ def prepare(
     """
     if source is None:
         return Start(config.model, frame)
+    cache = _cache(config)
     if isinstance(source, LoadedLRM):
-        cache = _cache(config)
         made = reconstruct(config, scene, frame, source, cache, say=say)
         start = start_from(
-            made.sequence, config, scene, frame, source=made.words, seconds=made.seconds
+            made.sequence, config, scene, frame, cache, source=made.words, seconds=made.seconds
         )
         shown = {} if made.picture is None else {"fixed_view": made.picture}
         twins = 1 - made.report["distinct"] / made.report["frames"]
@@ -143,12 +143,18 @@ def prepare(
     began = time.perf_counter()
     sequence = load_triplanes(source)
     seconds = {"lrm": time.perf_counter() - began}
-    return start_from(sequence, config, scene, frame, source=str(source), seconds=seconds)
+    return start_from(sequence, config, scene, frame, cache, source=str(source), seconds=seconds)
 
 
 def _cache(config: TrainConfig) -> StageCache:
     folder = config.preparation.cache
-    return StageCache(None if folder is None else Path(folder))
+    cache = StageCache(None if folder is None else Path(folder))
+    if config.trainer.devices > 1 and cache.folder is not None and not cache.writable:
+        raise ConfigError(
+            f"preparation.cache={folder} cannot be written, and the {config.trainer.devices} "
+            "processes share the start through it: name another folder"
+        )
+    return cache
 
 
 def start_from(
@@ -156,6 +162,7 @@ def start_from(
     config: TrainConfig,
     scene: Scene,
     frame: Frame,
+    cache: StageCache,
     *,
     source: str,
     seconds: Mapping[str, float],
@@ -167,6 +174,7 @@ def start_from(
         config: The run's settings.
         scene: The scene.
         frame: The frame of the scene, for a sequence that brings none.
+        cache: Where finished stages are kept.
         source: What messages call the sequence.
         seconds: Seconds of the stages that made it.
     """
@@ -179,7 +187,6 @@ def start_from(
             "as a still one",
             source,
         )
-    cache = _cache(config)
     device = training_device(config.trainer.accelerator)
     parts = decompose_stage(sequence.triplanes, config.decomposition, cache, device)
     _warn(parts, config)

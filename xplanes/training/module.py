@@ -1,6 +1,7 @@
 """The LightningModule: one field, trained on rays."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -225,6 +226,23 @@ class RadianceModule(LightningModule):
                     "preparation.cache kept is gone. Bring it back, or train anew in another folder"
                 )
 
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
+        """As torch does, with words for a state of other settings.
+
+        Raises:
+            ConfigError: If it does not fit.
+        """
+        try:
+            return super().load_state_dict(state_dict, strict=strict, assign=assign)
+        except RuntimeError as error:
+            problem = str(error).splitlines()[-1].strip().rstrip(".")
+            raise ConfigError(
+                f"the checkpoint does not fit these settings ({problem}): go on with those that "
+                "the run began with, or train anew in another folder"
+            ) from error
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["progress"] = {
             "batches": self.batches,
@@ -238,14 +256,6 @@ class RadianceModule(LightningModule):
             checkpoint["origin"] = self.origin
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        try:
-            self.load_state_dict(checkpoint["state_dict"])
-        except RuntimeError as error:
-            problem = str(error).splitlines()[-1].strip().rstrip(".")
-            raise ConfigError(
-                f"the checkpoint does not fit these settings ({problem}): go on with those that "
-                "the run began with, or train anew in another folder"
-            ) from error
         self._require_frame(checkpoint.get("origin"))
         progress = checkpoint["progress"]
         self.batches, self.clock = progress["batches"], progress["clock"]

@@ -13,6 +13,7 @@ from tests.lrm.reference import (
     OPENLRM_AXES,
     TRIPOSR_AXES,
     VERSIONS,
+    WEIGHTS,
     arrays,
     compare,
     config,
@@ -21,8 +22,8 @@ from tests.lrm.reference import (
 from xplanes.fields.lookup import plane_features
 
 
-def load(package: ModuleType, folder: str, file: str = "model.safetensors"):
-    return package.load(config(folder), FOLDER / folder / file)
+def load(package: ModuleType, folder: str):
+    return package.load(config(folder), FOLDER / folder / WEIGHTS[folder])
 
 
 def field_points(triplane, decoder, points):

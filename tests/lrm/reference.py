@@ -5,19 +5,19 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 import torch.nn.functional as F
 
-pytest.importorskip("safetensors", reason="needs the extra lrm")
-
-FOLDER = Path(__file__).parents[3] / "shared" / "lrm_fixtures"
-
-needs_reference = pytest.mark.skipif(
-    not FOLDER.is_dir(), reason=f"no reference outputs of the published code in {FOLDER}"
-)
+FOLDER = Path(__file__).parents[1] / "data" / "lrm"
 
 VERSIONS = {"1.0": "openlrm_1.0_tiny", "1.1": "openlrm_1.1_tiny"}
+
+WEIGHTS = {
+    "openlrm_1.0_tiny": "model.pth",
+    "openlrm_1.1_tiny": "model.safetensors",
+    "triposr_tiny": "model.ckpt",
+}
+"""The weights in the form in which each model is published."""
 
 
 @cache

@@ -8,7 +8,7 @@ import torch
 import xplanes.lrm
 from tests.lrm import openlrm_oracle, triposr_oracle
 from tests.lrm.checks import load
-from tests.lrm.reference import VERSIONS, arrays, compare, needs_reference
+from tests.lrm.reference import VERSIONS, arrays, compare
 from tests.lrm.test_oracles import FILL, openlrm_query, triposr_query
 from xplanes.fields import XPlanes
 from xplanes.lrm import LRMError
@@ -131,7 +131,6 @@ def test_wrong_cameras_are_refused():
         )
 
 
-@needs_reference
 @pytest.mark.parametrize(("kind", "distance"), [("auto", 2.3), ("dist2", 2.0)])
 def test_published_normalisation_of_poses_is_a_special_case(kind, distance):
     truth = arrays("cameras/openlrm.npz")
@@ -174,7 +173,6 @@ def field_image(model, triplane, alignment, rays, samples=2000):
     return renderer.image(field, origins, directions, 0.5, torch.ones(3))["colour"]
 
 
-@needs_reference
 @pytest.mark.parametrize("version", VERSIONS)
 def test_openlrm_picture_through_our_field(version):
     folder = VERSIONS[version]
@@ -202,7 +200,6 @@ def test_openlrm_picture_through_our_field(version):
     compare(found, expected, rtol=0, atol=1.5e-3)
 
 
-@needs_reference
 def test_triposr_picture_through_our_field(monkeypatch):
     model = load(xplanes.lrm, "triposr_tiny")
     triplane = arrays("triposr_tiny/render.npz")["scene_code"]
@@ -255,7 +252,6 @@ def world_query(model, triplane, alignment):
     return query
 
 
-@needs_reference
 def test_recorded_triposr_picture_by_way_of_the_world():
     model = load(xplanes.lrm, "triposr_tiny")
     truth = arrays("triposr_tiny/render_canonical.npz")
@@ -271,7 +267,6 @@ def test_recorded_triposr_picture_by_way_of_the_world():
     compare(found, truth["images"].view(-1, 3))
 
 
-@needs_reference
 def test_recorded_openlrm_pictures_by_way_of_the_world():
     folder = VERSIONS["1.1"]
     model, truth = load(xplanes.lrm, folder), arrays(f"{folder}/render.npz")

@@ -9,9 +9,6 @@ import pytest
 
 import xplanes.lrm
 from tests.lrm.checks import CHECKS
-from tests.lrm.reference import needs_reference
-
-pytestmark = needs_reference
 
 SOURCES = Path(xplanes.lrm.__file__).parent
 

@@ -12,11 +12,8 @@ from tests.lrm.reference import (
     VERSIONS,
     arrays,
     compare,
-    needs_reference,
     own_features,
 )
-
-pytestmark = needs_reference
 
 FILL = {"1.0": -openlrm_oracle.LOWEST / 3, "1.1": -openlrm_oracle.LOWEST / 8}
 

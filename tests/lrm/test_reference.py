@@ -4,9 +4,6 @@ import pytest
 
 import xplanes.lrm
 from tests.lrm.checks import CHECKS
-from tests.lrm.reference import needs_reference
-
-pytestmark = needs_reference
 
 
 @pytest.mark.parametrize("check", [check for _, check in CHECKS], ids=[name for name, _ in CHECKS])

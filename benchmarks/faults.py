@@ -7,7 +7,7 @@ Writes docs/results/faults.md. Some minutes; a few tests mount a small disk and 
 
 import os
 
-from xplanes.threads import waiting
+from xplanes.process import waiting
 
 os.environ.update(waiting(os.environ))
 os.environ.setdefault("OMP_NUM_THREADS", "1")

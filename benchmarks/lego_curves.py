@@ -8,7 +8,7 @@ one process with nothing else running.
 
 import os
 
-from xplanes.threads import waiting
+from xplanes.process import waiting
 
 os.environ.update(waiting(os.environ))
 

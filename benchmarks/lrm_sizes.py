@@ -8,7 +8,7 @@ published names, then loaded strictly and shown one picture, in a process of its
 
 import os
 
-from xplanes.threads import waiting
+from xplanes.process import waiting
 
 os.environ.update(waiting(os.environ))
 

@@ -8,7 +8,7 @@ is a process of its own, with nothing else running; runs kept in the work folder
 
 import os
 
-from xplanes.threads import waiting
+from xplanes.process import waiting
 
 os.environ.update(waiting(os.environ))
 

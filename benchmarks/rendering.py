@@ -7,7 +7,7 @@ Writes results/rendering.md and rendering.csv beside this file.
 
 import os
 
-from xplanes.threads import waiting
+from xplanes.process import waiting
 
 os.environ.update(waiting(os.environ))
 

@@ -9,7 +9,7 @@ one process with nothing else running; compare them within one scene only.
 
 import os
 
-from xplanes.threads import waiting
+from xplanes.process import waiting
 
 os.environ.update(waiting(os.environ))
 

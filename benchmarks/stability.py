@@ -7,7 +7,7 @@ Writes docs/results/stability.md. One process, one thread, some minutes.
 
 import os
 
-from xplanes.threads import waiting
+from xplanes.process import waiting
 
 os.environ.update(waiting(os.environ))
 os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -10,7 +10,7 @@ both as logarithms.
 
 import os
 
-from xplanes.threads import waiting
+from xplanes.process import waiting
 
 os.environ.update(waiting(os.environ))
 

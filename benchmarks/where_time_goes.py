@@ -9,7 +9,7 @@ called, without what they call in other stages; what no stage claims is shown to
 import os
 import time
 
-from xplanes.threads import waiting
+from xplanes.process import waiting
 
 os.environ.update(waiting(os.environ))
 

@@ -1,11 +1,6 @@
-"""`python -m xplanes`: everything after training."""
+"""`python -m xplanes`, the same as `xplanes`."""
 
-import os
 import sys
-
-from xplanes.threads import waiting
-
-os.environ.update(waiting(os.environ))  # before torch is loaded
 
 from xplanes.cli import main
 

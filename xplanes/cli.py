@@ -1,15 +1,17 @@
-"""The commands after training: `python -m xplanes COMMAND ...`.
+"""The command line: `xplanes COMMAND ...`.
 
 Must stay quick: what is heavy is imported by the command that needs it.
 """
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xplanes import __version__
+from xplanes.process import train_command, waiting
 
 if TYPE_CHECKING:
     from xplanes.evaluation.runs import TrainedRun
@@ -19,12 +21,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
 
     Args:
-        arguments: What follows ``python -m xplanes``; taken from the command line when None.
+        arguments: What follows ``xplanes``; taken from the command line when None.
 
     Returns:
         The exit code: 0, 1 after an error that was explained in words, 130 if interrupted.
     """
-    options = build_parser().parse_args(arguments)
+    os.environ.update(waiting(os.environ))  # before torch is loaded
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if words[:1] == ["train"]:
+        from xplanes.launch import train
+
+        # Hydra has a command line of its own, with options that argparse must not see.
+        train(words[1:], words[:1] if sys.argv[1:] == words else ())
+        return 0
+    options = build_parser().parse_args(words)
     try:
         options.command(options)
         sys.stdout.flush()
@@ -57,11 +67,12 @@ def _known_errors() -> tuple[type[Exception], ...]:
 def build_parser() -> argparse.ArgumentParser:
     """All commands and their options."""
     parser = argparse.ArgumentParser(
-        prog="python -m xplanes",
-        description="What comes after training, which is `python train.py key=value ...`.",
+        prog="xplanes",
+        description="Dynamic radiance fields initialised from Large Reconstruction Models.",
     )
     parser.add_argument("--version", action="version", version=f"xplanes {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    commands.add_parser("train", help="train a field: key=value ..., and the options of Hydra")
     verbs = (_add_download, _add_triplanes, _add_evaluate, _add_render, _add_view, _add_table)
     for add in (*verbs, _add_pretrain, _add_score):
         add(commands)
@@ -81,7 +92,7 @@ def _download(options: argparse.Namespace) -> None:
     from xplanes.scenes.download import download_dnerf
 
     root = download_dnerf(options.root)
-    print(f"train with: python train.py data=dnerf data.root={root} data.scene=lego")
+    print(f"train with: {train_command()} data=dnerf data.root={root} data.scene=lego")
 
 
 def _add_triplanes(commands: "argparse._SubParsersAction") -> None:

@@ -240,8 +240,9 @@ def register_schemas() -> None:
         store.store(group=group, name=name, node=schema)
 
 
-CONF = Path(__file__).resolve().parent.parent / "conf"
-"""The configuration files."""
+_PACKAGE = Path(__file__).resolve().parent
+CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
+"""The configuration files: inside an installed package, beside it in a checkout."""
 
 
 def compose_plain(name: str, overrides: Sequence[str], conf: Path = CONF) -> dict[str, Any]:

@@ -1,28 +1,92 @@
-"""The command line of train.py before Hydra sees it: typing errors and resumed runs.
+"""Training from the command line: checks, resumed runs, and the job that Hydra runs.
 
-Must stay quick: it imports neither torch nor lightning.
+Must stay quick: it imports neither torch nor lightning before the job begins.
 """
 
 import difflib
 import re
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import hydra
 import yaml
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig
 
 from xplanes.checks import parse
-from xplanes.config import CONF, ConfigError, TrainConfig, compose_plain, register_schemas
-from xplanes.files import read_json, require_writable
+from xplanes.config import (
+    CONF,
+    ConfigError,
+    TrainConfig,
+    compose_plain,
+    register_schemas,
+    to_plain,
+)
+from xplanes.files import StorageError, read_json, require_writable
 from xplanes.schemas.families import XPLANES_RATES
 
 _OVERRIDE = re.compile(r"^(?P<mark>\+\+?|~)?(?P<key>[\w./@-]+)=(?P<value>.*)$", re.DOTALL)
+
+
+def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
+    """Run one job of training, or a multirun.
+
+    Args:
+        arguments: Overrides and options of Hydra.
+        words: What stands before them on the command line, after the program.
+
+    Raises:
+        SystemExit: With a message after an error that was explained, or 130 after Ctrl-C.
+    """
+    register_schemas()
+    try:
+        prepared = prepare(list(arguments))
+    except (ConfigError, StorageError) as error:
+        sys.exit(f"error: {error}")
+    program = sys.argv[0]
+
+    def job(config: DictConfig) -> float:
+        # Lightning starts the other processes of a distributed run with this command line.
+        sys.argv = [program, *words, *prepared]
+        return _job(config)
+
+    sys.argv = [program, *prepared]
+    hydra.main(config_path=str(CONF), config_name="train", version_base="1.3")(job)()
+
+
+def _job(config: DictConfig) -> float:
+    """Run one job; the score goes to sweepers."""
+    from xplanes.pipeline import KNOWN_ERRORS, run
+
+    settings = HydraConfig.get()
+    sweep = settings.mode == RunMode.MULTIRUN
+    folder = Path(settings.runtime.output_dir)
+    try:
+        plain = to_plain(config)
+        if sweep and plain["trainer"]["devices"] > 1:
+            raise ConfigError(
+                "trainer.devices > 1 in a multirun: helper processes would start the whole sweep "
+                "again. Use one device per job, with hydra/launcher=joblib for several at a time"
+            )
+        auto = plain["resume"] == "auto" and (folder / "run.json").is_file()
+        resume = auto or plain["resume"] not in (None, "auto")
+        return run(plain, folder, list(settings.overrides.task), resume=resume)
+    except KNOWN_ERRORS as error:
+        if sweep:
+            raise
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)
 
 
 def prepare(arguments: list[str], conf: Path = CONF) -> list[str]:
     """Check overrides and turn ``resume=`` into the overrides of the run that goes on.
 
     Args:
-        arguments: What follows ``train.py`` on the command line.
+        arguments: Overrides and options of Hydra.
         conf: The configuration folder.
 
     Returns:

@@ -18,5 +18,6 @@ def require(module: str, *, extra: str) -> ModuleType:
         return importlib.import_module(module)
     except ImportError as error:
         raise MissingExtraError(
-            f'{module.split(".")[0]} is not installed: pip install -e ".[{extra}]"'
+            f'{module.split(".")[0]} is not installed: pip install "xplanes[{extra}]"; '
+            f'in a checkout: pip install -e ".[{extra}]"'
         ) from error

@@ -32,6 +32,7 @@ from xplanes.locks import alone_in
 from xplanes.lrm import LRMError
 from xplanes.optional import MissingExtraError
 from xplanes.preparation import find_source, prepare
+from xplanes.process import train_command
 from xplanes.scenes.datamodule import RayDataModule
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame
@@ -130,7 +131,7 @@ def _recorded(config: TrainConfig, folder: Path, overrides: list[str], *, resume
             record.end("finished")
         except KeyboardInterrupt:
             record.end("interrupted")
-            say(f"\nstopped. Go on with: python train.py resume={folder}")
+            say(f"\nstopped. Go on with: {train_command()} resume={folder}")
             raise
         except BaseException as error:
             logger.error("failed\n%s", traceback.format_exc())
@@ -138,7 +139,7 @@ def _recorded(config: TrainConfig, folder: Path, overrides: list[str], *, resume
             with suppress(StorageError):
                 record.end("failed", f"{type(error).__name__}: {error}")
             if isinstance(error, OSError | TrainingError):
-                say(f"\nstopped. When that is mended: python train.py resume={folder}")
+                say(f"\nstopped. Once that is fixed: {train_command()} resume={folder}")
             raise
     return metrics["test"]["psnr"]
 

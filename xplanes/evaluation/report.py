@@ -9,6 +9,7 @@ from torch import Tensor
 
 from xplanes import __version__, backend
 from xplanes.config import TrainConfig
+from xplanes.process import train_command
 from xplanes.rendering.pictures import write_png
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene
@@ -164,7 +165,7 @@ def closing(run: Path, config: TrainConfig, metrics: dict[str, Any]) -> str:
             f"wrote    {run}",
             f"         metrics.json  curve.csv  checkpoints/last.ckpt  {metrics.get('media', '')}",
             f"next     tensorboard --logdir {run}",
-            f"         python -m xplanes render {run}",
-            f"         python train.py resume={run} {more}",
+            f"         xplanes render {run}",
+            f"         {train_command()} resume={run} {more}",
         ]
     )

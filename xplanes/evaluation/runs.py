@@ -12,6 +12,7 @@ import yaml
 from xplanes.checks import parse
 from xplanes.config import ConfigError, ModelConfig, TrainConfig, build
 from xplanes.files import read_json
+from xplanes.process import train_command
 from xplanes.scenes.frame import Frame, read_frame
 from xplanes.scenes.views import Scene, Views
 from xplanes.training.builder import build_frame, build_module, build_scene, training_device
@@ -74,7 +75,9 @@ def find_run(path: Path, outputs: Path = OUTPUTS) -> Path:
     problem = "is not a run directory" if path.exists() else "does not exist"
     runs = {run.resolve(): run for folder in (outputs, path.parent) for run in find_runs(folder)}
     if not runs:
-        raise ConfigError(f"{path} {problem}, and there are no runs in {outputs}: python train.py")
+        raise ConfigError(
+            f"{path} {problem}, and there are no runs in {outputs}: {train_command()}"
+        )
     names = difflib.get_close_matches(path.name, {run.name for run in runs}, n=LISTED)
     near = [run for name in names for run in runs.values() if run.name == name]
     if near:

@@ -126,7 +126,7 @@ class SweepTable(Callback):
         except Exception:
             # The runs are there and whole; only their table is not.
             traceback.print_exc()
-            _say(f"no table: python -m xplanes table {folder}")
+            _say(f"no table: xplanes table {folder}")
 
 
 def choose_gpu(job: int, environment: MutableMapping[str, str]) -> str | None:

@@ -1,4 +1,4 @@
-"""Triplanes of pictures, and a film that goes round them: `python -m xplanes triplanes`."""
+"""Triplanes of pictures, and a film that goes round them: `xplanes triplanes`."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence

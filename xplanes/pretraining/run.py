@@ -1,4 +1,4 @@
-"""The whole job of `python -m xplanes pretrain-lrm`: pool, training, weights."""
+"""The whole job of `xplanes pretrain-lrm`: pool, training, weights."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""Every setting of `python -m xplanes pretrain-lrm`, typed. The values live in conf/."""
+"""Every setting of `xplanes pretrain-lrm`, typed. The values live in conf/."""
 
 import math
 from dataclasses import dataclass, field, fields, is_dataclass

@@ -15,7 +15,7 @@ __all__ = ["SceneError", "read_scene"]
 
 GET_DATA = (
     "Set data.root and data.scene to a folder that holds transforms_train.json, get the D-NeRF "
-    "scenes with `python -m xplanes download dnerf`, or take the built-in scene with data=demo."
+    "scenes with `xplanes download dnerf`, or take the built-in scene with data=demo."
 )
 
 

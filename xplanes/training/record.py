@@ -13,6 +13,7 @@ from typing import Any, Literal
 from xplanes import __version__
 from xplanes.config import ConfigError
 from xplanes.files import read_json, write_json
+from xplanes.process import train_command
 
 logger = logging.getLogger(__name__)
 
@@ -103,7 +104,7 @@ def claim(run: Path, *, resume: bool) -> None:
     status = run_status(run)
     if status is not None and not resume:
         raise ConfigError(
-            f"{run} holds a run already ({status}). Go on with it: python train.py resume={run}; "
+            f"{run} holds a run already ({status}). Go on with it: {train_command()} resume={run}; "
             "or choose another hydra.run.dir"
         )
     if status is None and resume:

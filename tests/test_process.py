@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from xplanes.threads import WAIT, waiting
+from xplanes.process import WAIT, waiting
 
 ROOT = Path(__file__).parents[1]
 

@@ -2,7 +2,7 @@
 
     python benchmarks/all.py [--lego FOLDER] [--only NAME ...]
 
-Needs the extra `dev` and D-NeRF's lego (`python -m xplanes download dnerf`). Each script writes
+Needs the extra `dev` and D-NeRF's lego (`xplanes download dnerf`). Each script writes
 its own page anew, in benchmarks/results or docs/results; one that fails does not stop the others.
 Nothing else should run.
 """
@@ -46,7 +46,7 @@ def main() -> int:
     chosen = {name: runs for name, runs in scripts(args.lego).items() if name in args.only}
     if any(any(runs) for runs in chosen.values()) and not args.lego.is_dir():
         parser.error(
-            f"--lego {args.lego}: there is no such folder; python -m xplanes download dnerf"
+            f"--lego {args.lego}: there is no such folder; xplanes download dnerf"
         )
     failed = []
     for name, runs in chosen.items():

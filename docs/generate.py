@@ -129,7 +129,7 @@ def pretraining() -> list[str]:
     options = {name: {**shared, "model": values("pretrain", name)} for name in ("tiny", "mini")}
     return [
         "",
-        "## `python -m xplanes pretrain-lrm`, with `pretrain=tiny`, `pretrain=mini`",
+        "## `xplanes pretrain-lrm`, with `pretrain=tiny`, `pretrain=mini`",
         "",
         "Training of a small LRM: cards of [tiny](lrm_tiny.md) and [mini](lrm_mini.md).",
         "",

@@ -13,7 +13,9 @@ HOLD = """
 import sys, time
 from pathlib import Path
 from xplanes.locks import alone_in
+from xplanes.training.record import RunRecord
 with alone_in(Path(sys.argv[1])):
+    RunRecord(Path(sys.argv[1]), seed=0)
     print("held", flush=True)
     time.sleep(60)
 """

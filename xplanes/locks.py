@@ -1,17 +1,14 @@
 """Keeping processes out of one another's way; the system frees a lock however a process ends."""
 
 import logging
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from xplanes.config import ConfigError
+from filelock import FileLock, Timeout
 
-try:
-    import fcntl
-except ImportError:  # Not on Windows; two processes are then not kept apart.
-    fcntl = None
+from xplanes.config import ConfigError
+from xplanes.files import read_json
 
 logger = logging.getLogger(__name__)
 
@@ -29,19 +26,22 @@ def in_turn(path: Path | None) -> Iterator[bool]:
     Returns:
         Whether this process had to wait.
     """
-    if path is None or fcntl is None:
+    if path is None:
         yield False
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            waited = False
-        except BlockingIOError:
-            logger.warning("%s: another process is making it; waiting", path.with_suffix(""))
-            fcntl.flock(file, fcntl.LOCK_EX)
-            waited = True
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=0)
+        waited = False
+    except Timeout:
+        logger.warning("%s: another process is making it; waiting", path.with_suffix(""))
+        lock.acquire()
+        waited = True
+    try:
         yield waited
+    finally:
+        lock.release()
 
 
 @contextmanager
@@ -52,21 +52,20 @@ def alone_in(run: Path) -> Iterator[None]:
         ConfigError: If another process holds it.
     """
     run.mkdir(parents=True, exist_ok=True)
-    if fcntl is None:
+    lock = FileLock(run / RUN_LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        process = "another process"
+        with suppress(OSError, ValueError, KeyError):
+            process = f"process {read_json(run / 'run.json')['process']}"
+        raise ConfigError(
+            f"{run} is in use by {process}: wait for it to end, stop it, or choose another "
+            "hydra.run.dir"
+        ) from None
+    except (OSError, NotImplementedError) as problem:
+        logger.warning("%s cannot be locked (%s): start no second process in it", run, problem)
+    try:
         yield
-        return
-    with (run / RUN_LOCK).open("a+", encoding="utf-8") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            raise ConfigError(
-                f"{run} is in use by process {file.read().strip() or '(unknown)'}: wait for it to "
-                "end, stop it, or choose another hydra.run.dir"
-            ) from None
-        except OSError as problem:
-            logger.warning("%s cannot be locked (%s): start no second process in it", run, problem)
-        file.truncate(0)
-        file.write(f"{os.getpid()}\n")
-        file.flush()
-        yield
+    finally:
+        lock.release()

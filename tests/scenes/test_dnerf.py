@@ -305,7 +305,7 @@ def test_missing_folder_names_its_neighbours_and_the_ways_out(scene):
     assert str(scene.path) in message
     assert "does not exist" in message
     assert "ball" in message
-    assert "python -m xplanes download dnerf" in message
+    assert "xplanes download dnerf" in message
     assert "data=demo" in message
 
 

@@ -54,6 +54,7 @@ class RunRecord:
             "total_seconds": self._before,
             "resumed": earlier.get("resumed", 0) + bool(earlier),
             "seed": seed,
+            "process": os.getpid(),
             "directory": str(Path.cwd()),  # Where relative paths of the settings start.
             "xplanes": __version__,
             "commit": _commit(),

@@ -1,5 +1,6 @@
 """The callback that scores views while training goes on."""
 
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -169,6 +170,11 @@ def device_memory(device: torch.device) -> int:
     """Most bytes held so far: on the device if it is a GPU, else by this process."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
+    if sys.platform == "win32":
+        from psutil import Process
+
+        return Process().memory_info().peak_wset
     import resource
 
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else most * 1024  # Only macOS counts in bytes.

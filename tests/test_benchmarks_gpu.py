@@ -1,0 +1,209 @@
+"""The GPU benchmark without a GPU: what it measures, leaves out, survives and writes."""
+
+import csv
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
+
+pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="for machines without a GPU")
+
+
+@pytest.fixture
+def gpu(monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")  # So that importing changes no variables.
+    module = importlib.import_module("gpu")
+    yield module
+    for name in ("gpu", "runner"):
+        sys.modules.pop(name, None)
+
+
+def rows(folder):
+    with (folder / "gpu.csv").open(encoding="utf-8") as file:
+        return {(row["part"], row["name"]): row for row in csv.DictReader(file)}
+
+
+@pytest.fixture
+def faked(gpu, monkeypatch):
+    """Parts that find something at once; ``faked.fail`` and ``faked.begun`` are part names."""
+    state = SimpleNamespace(fail={}, begun=[], psnr={"GPU": 22.0, "CPU": 22.1}, seconds=0.0)
+
+    def run_part(part, args, *, gpu: bool, left: float):
+        state.begun.append(part.name)
+        record = module.Record(args.work / "record.json", device="A GPU, 80 GiB")
+        if part.section == "kernels":
+            cells = {
+                "kernels: values": (1e-6, "relative"),
+                "kernels: gradients": (2e-6, "relative"),
+            }
+            record.add("accuracy", part.row, cells)
+            for label, gain in (("forward", 3.0), ("backward", 4.0)):
+                cells = {"kernels": (10.0, "us"), "times faster": (gain, "times")}
+                row = f"{part.row}, {module.POINTS[-1]} points, {label}"
+                record.add("kernel time", row, cells)
+        else:
+            psnr = state.psnr[part.row.split(", ")[1]] if part.section == "training" else 30.0
+            known = {"PSNR": (psnr, "dB"), "SSIM": (0.9, ""), "steps/s": (50.0, "steps/s")}
+            names = module.COLUMNS[part.section]
+            record.add(part.section, part.row, {n: c for n, c in known.items() if n in names})
+        record.error = state.fail.get(part.name, "")
+        clock.now += state.seconds
+        return module.Outcome(part, module.Record.load(record.path) if not record.error else record)
+
+    module, clock = gpu, SimpleNamespace(now=gpu.BEGAN)
+    monkeypatch.setattr(gpu.time, "monotonic", lambda: clock.now)
+    monkeypatch.setattr(gpu, "run_part", run_part)
+    return state
+
+
+@pytest.fixture
+def found_gpu(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+
+
+@pytest.fixture
+def lego(tmp_path):
+    folder = tmp_path / "lego"
+    folder.mkdir()
+    (folder / "transforms_train.json").touch()
+    return folder
+
+
+def test_with_a_gpu_all_parts_run_and_the_page_compares(gpu, faked, found_gpu, lego, tmp_path):
+    assert gpu.main(["--out", str(tmp_path), "--lego", str(lego)]) == 0
+    page = (tmp_path / "gpu.md").read_text(encoding="utf-8")
+    assert faked.begun == [part.name for part in gpu.PARTS]
+    assert "A GPU, 80 GiB" in page
+    assert "22.00 dB on the GPU, 22.10 dB on the CPU" in page
+    assert "difference of -0.10 dB is within 0.3 dB" in page
+    assert "forward: 3.0 to 3.0 times as fast as torch" in page
+    assert "lego at 400 px, 60 s: 30.00 dB, SSIM 0.9000" in page
+    assert "Left out" not in page
+    assert "Failed" not in page
+    figures = rows(tmp_path)
+    assert figures["training", "random, GPU: PSNR"]["value"] == "22"
+    assert figures["difference", "random: PSNR, GPU minus CPU"]["value"] == "-0.1"
+    assert {row["unit"] for row in figures.values()} <= set(gpu.FORMATS)
+
+
+def test_devices_that_disagree_are_said_to(gpu, faked, found_gpu, tmp_path):
+    faked.psnr["GPU"] = 20.0
+    assert gpu.main(["--out", str(tmp_path), "--only", "training"]) == 0
+    page = (tmp_path / "gpu.md").read_text(encoding="utf-8")
+    assert "difference of -2.10 dB is not within 0.3 dB" in page
+
+
+def test_a_part_that_fails_stops_no_other_and_sets_the_exit_code(gpu, faked, found_gpu, tmp_path):
+    faked.fail["training (random, GPU)"] = "RuntimeError: no memory"
+    assert gpu.main(["--out", str(tmp_path)]) == 1
+    page = (tmp_path / "gpu.md").read_text(encoding="utf-8")
+    assert "* training (random, GPU): RuntimeError: no memory\n" in page
+    assert faked.begun[-1] == gpu.PARTS[-1].name
+    assert "python -m xplanes download dnerf" in page  # There is no lego.
+
+
+def test_parts_that_do_not_fit_into_the_minutes_are_left_out(gpu, faked, found_gpu, tmp_path):
+    faked.seconds = 60.0
+    assert gpu.main(["--out", str(tmp_path), "--minutes", "4"]) == 0
+    page = (tmp_path / "gpu.md").read_text(encoding="utf-8")
+    # Of 225 seconds three parts leave 45: enough for one that needs 40, not for one that needs 60.
+    assert len(faked.begun) == 4, faked.begun
+    assert "Too little was left of the minutes: training (random, CPU); " in page
+
+
+def test_without_a_gpu_the_page_says_what_is_missing(gpu, faked, tmp_path):
+    assert gpu.main(["--out", str(tmp_path)]) == 0
+    page = (tmp_path / "gpu.md").read_text(encoding="utf-8")
+    begun = {part.name for part in gpu.PARTS if not part.needs_gpu}
+    assert set(faked.begun) == begun
+    assert "No CUDA GPU was found: training (random, GPU); " in page
+    assert "Triton's interpreter" in page
+
+
+def test_errors_of_kernels_are_seen(gpu, tmp_path):
+    pytest.importorskip("triton", reason="triton is not installed")
+    record = gpu.Record(tmp_path / "record.json")
+    sizes = gpu.Sizes(gpu.RAY, 2, 8, 4, torch.device("cpu"), reach=1.2)
+    gpu.compare(record, "nine planes", lambda sizes: gpu.lookup_case("nine", sizes), sizes)
+    gpu.compare(record, "products", gpu.product_case, sizes)
+    assert not record.error
+    assert all(0 <= figure.value < gpu.TOLERANCE for figure in record.figures)
+
+    def broken(sizes):
+        case = gpu.product_case(sizes)
+        return gpu.Case(case.planes, lambda planes: 1.01 * case.twin(planes), case.twin, case.least)
+
+    gpu.compare(record, "products", broken, sizes)
+    assert "products, 2 channels, 8 texels" in record.error
+    assert gpu.Record.load(record.path) == record
+
+
+def test_a_kernel_that_gives_nan_is_wrong(gpu, tmp_path):
+    def broken(sizes):
+        case = gpu.product_case(sizes)
+        empty = case.planes[0].new_tensor(torch.nan)
+        return gpu.Case(case.planes, lambda planes: empty * case.twin(planes), case.twin, (1, 1))
+
+    record = gpu.Record(tmp_path / "record.json")
+    gpu.compare(record, "products", broken, gpu.Sizes(gpu.RAY, 2, 8, 4, torch.device("cpu")))
+    assert "nan" in record.error
+
+
+def test_steps_per_second_leave_the_beginning_out(gpu):
+    metrics = {"step": 100, "seconds": {"train": 10.0}}
+    first, last = {"step": "40", "seconds": "7.0"}, {"step": "100", "seconds": "10.0"}
+    assert gpu.steps_per_second(gpu.Measured(metrics, [first, last])) == 20
+    assert gpu.steps_per_second(gpu.Measured(metrics, [last])) == 10
+
+
+def test_a_process_that_ends_early_leaves_one_line(gpu, monkeypatch, tmp_path, capsys):
+    part = gpu.PARTS[0]
+    args = SimpleNamespace(work=tmp_path, lego=Path("lego"))
+    real = subprocess.run
+
+    def ends(command, **options):
+        program = "print('first'); print('out of memory'); raise SystemExit(3)"
+        return real([sys.executable, "-c", program], **options)
+
+    monkeypatch.setattr(subprocess, "run", ends)
+    outcome = gpu.run_part(part, args, gpu=True, left=100)
+    assert outcome.record.error == "ended with code 3, last line: out of memory"
+    assert "first" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("limit", "failed"), [(1.0, True), (50.0, False)])
+def test_a_part_that_takes_too_long_is_stopped(gpu, monkeypatch, tmp_path, limit, failed):
+    part = gpu.Part("kernels", "slow", limit=limit)
+    monkeypatch.setattr(gpu, "PARTS", (part,))
+    real = subprocess.run
+
+    def sleeps(command, **options):
+        return real([sys.executable, "-c", "import time; time.sleep(60)"], **options)
+
+    monkeypatch.setattr(subprocess, "run", sleeps)
+    args = SimpleNamespace(work=tmp_path, lego=Path("lego"))
+    outcome = gpu.run_part(part, args, gpu=True, left=1.0)
+    assert outcome.record.error == ("stopped after 1 s" if failed else "")
+    assert outcome.left_out == ("" if failed else "The minutes ran out 1 s after it had begun")
+
+
+@pytest.mark.slow
+def test_the_script_runs_without_a_gpu(tmp_path):
+    pytest.importorskip("triton", reason="triton is not installed")
+    script = [sys.executable, str(FOLDER / "gpu.py"), "--out", str(tmp_path)]
+    done = subprocess.run(script, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "gpu.md").read_text(encoding="utf-8")
+    assert page in done.stdout
+    figures = rows(tmp_path)
+    assert float(figures["training", "random, CPU: PSNR"]["value"]) > 20
+    errors = [float(row["value"]) for (part, _), row in figures.items() if part == "accuracy"]
+    assert len(errors) == 12
+    assert max(errors) < 1e-4

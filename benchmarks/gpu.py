@@ -526,7 +526,7 @@ def reason_to_leave_out(part: Part, args: argparse.Namespace, *, gpu: bool, left
     if part.section == "lego" and not (args.lego / "transforms_train.json").is_file():
         return (
             "No scene in the folder of --lego (default data/dnerf/lego; "
-            "`python -m xplanes download dnerf` gets it)"
+            "`xplanes download dnerf` gets it)"
         )
     if left < part.need:
         return "Too little was left of the minutes"

@@ -5,12 +5,9 @@ import runpy
 import shlex
 from pathlib import Path
 
-import pytest
-from hydra import compose, initialize_config_dir
-
+from tests.training.runs import changed, composing_once
 from xplanes.cli import build_parser
-from xplanes.config import register_schemas
-from xplanes.launch import CONF, check_keys
+from xplanes.launch import check_keys
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -29,28 +26,36 @@ def test_links_between_pages_lead_somewhere() -> None:
             assert (page.parent / link).exists(), f"{page.name}: {link}"
 
 
-def commands(program: str) -> list[list[str]]:
-    """Arguments of every line of the pages that calls ``program``."""
+CALL = re.compile(
+    r"^    (?:(?P<train>python train\.py)|(?:python -m )?xplanes)(?: (?P<rest>.*))?$", re.MULTILINE
+)
+"""A line of a page that calls the program, by any of its names."""
+
+
+def commands() -> list[list[str]]:
+    """Arguments of the program in every such line."""
     pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     return [
-        shlex.split(line, comments=True)[len(program.split()) :]
+        [*(["train"] if call["train"] else []), *shlex.split(call["rest"] or "", comments=True)]
         for page in pages
-        for line in page.read_text(encoding="utf-8").splitlines()
-        if line.startswith(f"    {program} ")
+        for call in CALL.finditer(page.read_text(encoding="utf-8"))
     ]
 
 
-@pytest.mark.parametrize("arguments", commands("python train.py"), ids=" ".join)
-def test_training_commands_of_the_pages_compose(arguments: list[str]) -> None:
-    check_keys(arguments)
-    settings = [a for a in arguments if "=" in a and not a.startswith("hydra")]
-    # Of what a sweep goes through, the first; a list is one value.
-    chosen = [a if "[" in a else a.split(",")[0] for a in settings]
-    register_schemas()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        assert compose("train", chosen).model.name
+def test_training_commands_of_the_pages_compose() -> None:
+    training = [words[1:] for words in commands() if words[:1] == ["train"]]
+    assert len(training) > 20
+    with composing_once():
+        for arguments in training:
+            check_keys(arguments)
+            settings = [a for a in arguments if "=" in a and not a.startswith("hydra")]
+            # Of what a sweep goes through, the first; a list is one value.
+            chosen = [a if "[" in a else a.split(",")[0] for a in settings]
+            assert changed((), *chosen)["model"]["name"], arguments
 
 
-@pytest.mark.parametrize("arguments", commands("python -m xplanes"), ids=" ".join)
-def test_other_commands_of_the_pages_parse(arguments: list[str]) -> None:
-    assert build_parser().parse_args(arguments)
+def test_other_commands_of_the_pages_parse() -> None:
+    others = [words for words in commands() if words[:1] != ["train"]]
+    assert len(others) > 20
+    for arguments in others:
+        assert build_parser().parse_args(arguments), arguments

@@ -16,10 +16,10 @@ from xplanes.launch import prepare
 from xplanes.pipeline import run
 from xplanes.preparation.cache import DAY, StageCache
 from xplanes.pretraining.pool import RECORD, SHARD, ensure_pool
-from xplanes.scenes.demo import ensure_demo_scene
+from xplanes.scenes.demo import ensure_demo_scene, write
 from xplanes.scenes.errors import SceneError
 from xplanes.training.builder import build_scene
-from xplanes.training.checkpoints import LAST, Checkpoints
+from xplanes.training.checkpoints import LAST
 from xplanes.training.scoring import Curve
 
 
@@ -38,22 +38,25 @@ def test_the_cache_clears_what_is_a_day_old(tmp_path: Path) -> None:
     assert (old.exists(), new.exists()) == (False, True)
 
 
-def test_rendering_a_scene_clears_what_is_a_day_old(tmp_path: Path) -> None:
+def test_rendering_a_scene_clears_what_is_a_day_old(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(write, "VIDEO_FRAMES", 2)
     small = {"resolution": 8, "train_views": 1, "val_views": 1, "test_views": 1}
-    folder = ensure_demo_scene(tmp_path, "still", **small)
+    folder = ensure_demo_scene(tmp_path, "balls", **small)
     shutil.rmtree(folder)
     old, new = (tmp_path / f".{folder.name}.{number}.0a" for number in (1, 2))
     old.mkdir()
     new.mkdir()
     aged(old)
-    ensure_demo_scene(tmp_path, "still", **small)
+    ensure_demo_scene(tmp_path, "balls", **small)
     assert (old.exists(), new.exists(), folder.exists()) == (False, True, True)
 
 
-def test_a_damaged_demo_scene_says_to_delete_it(tmp_path: Path) -> None:
-    data = parse(small_config(tmp_path)).data
+def test_a_damaged_demo_scene_says_to_delete_it(trained_run: Path, tmp_path: Path) -> None:
+    config = small_config(tmp_path / "scenes")
+    shutil.copytree(trained_run.parents[1] / "scenes", tmp_path / "scenes")
+    data = parse(config).data
     build_scene(data)
-    (picture,) = tmp_path.glob("*/train/r_003.png")
+    (picture,) = (tmp_path / "scenes").glob("excavator*/train/r_003.png")
     picture.write_bytes(picture.read_bytes()[:50])
     with pytest.raises(SceneError, match=r"r_003\.png.*demo scene: delete .* rendered again"):
         build_scene(data)
@@ -88,21 +91,9 @@ def test_overrides_that_were_cut_short_are_not_taken_for_whole(tmp_path: Path) -
     assert "trainer.max_steps=400" in prepare([f"resume={tmp_path}"])
 
 
-def test_the_best_is_written_before_the_last(tmp_path: Path, monkeypatch) -> None:
-    """Killed in between, a run whose last checkpoint knows of a best one would never write it."""
-    original, written = Checkpoints.save, []
-
-    def note(self, trainer, name) -> None:
-        written.append((trainer.global_step, name))
-        original(self, trainer, name)
-
-    monkeypatch.setattr(Checkpoints, "save", note)
-    run(small_config(tmp_path / "scenes"), tmp_path / "run", [], resume=False)
-    both = [name for step, name in written if step == 20]
-    assert both == ["best.ckpt", "last.ckpt"]
-
-
-def test_a_disk_that_fills_up_ends_a_run_in_words(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_a_disk_that_fills_up_ends_a_run_in_words(
+    trained_run: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:
     from lightning import Trainer
 
     original = Trainer.save_checkpoint
@@ -114,8 +105,9 @@ def test_a_disk_that_fills_up_ends_a_run_in_words(tmp_path: Path, monkeypatch, c
 
     monkeypatch.setattr(Trainer, "save_checkpoint", fill_up)
     folder = tmp_path / "run"
+    config = small_config(trained_run.parents[1] / "scenes", "trainer.evaluate_at=[]")
     with pytest.raises(StorageError, match=r"last\.ckpt cannot be written.*Free some space"):
-        run(small_config(tmp_path / "scenes"), folder, [], resume=False)
+        run(config, folder, [], resume=False)
     assert f"resume={folder}" in capsys.readouterr().out
     state = torch.load(folder / "checkpoints" / LAST, weights_only=True)
     assert state["global_step"] == 20

@@ -7,11 +7,24 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.baselines.runs import baseline_config
+from tests.refusals import assert_refused
+from xplanes.checks import parse
+from xplanes.config import ConfigError
 from xplanes.evaluation.evaluate import evaluate
 from xplanes.evaluation.render import FilmOptions, film
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.pipeline import run
 from xplanes.training.clock import TrainingClock
+
+
+def check_refused(root: Path, words: str, *overrides: str) -> str:
+    """These overrides make a configuration that is refused. Returns the message."""
+
+    def call() -> None:
+        parse(baseline_config(root, *overrides))
+
+    return assert_refused(ConfigError, words, call, overrides)
 
 
 def metrics(folder: Path) -> dict:

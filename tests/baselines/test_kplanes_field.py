@@ -30,19 +30,39 @@ def count(*modules):
     return sum(p.numel() for module in modules for p in module.parameters())
 
 
-@pytest.mark.parametrize("time", [3, None])
-def test_products_of_planes_equal_loops_inside_and_outside_the_cube(time):
-    planes = products(time).double()
-    points, times = torch.randn(40, 3).double(), torch.rand(40).double()
-    arrays = [(name, plane.detach()[0].numpy()) for name, plane in planes.planes()]
-    expected = product_features(arrays, 2, points.numpy(), times.numpy())
-    np.testing.assert_allclose(planes(points, times).detach().numpy(), expected, atol=1e-12)
+def expected_of(planes, points, times):
+    """Features of planes at points by the oracle's loops."""
+    arrays = [(name, plane.detach()[0].double().numpy()) for name, plane in planes.planes()]
+    places = points.double().numpy(), times.double().numpy()
+    return product_features(arrays, planes.channels, *places)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("time", [3, None])
-def test_compiled_loops_equal_their_readable_twin(dtype, time):
+def test_products_of_planes_equal_loops_inside_and_outside_the_cube(monkeypatch):
+    monkeypatch.setenv("XPLANES_CPU_LOOPS", "0")
+    for time in (3, None):
+        planes = products(time).double()
+        points, times = torch.randn(40, 3).double(), torch.rand(40).double()
+        found = planes(points, times).detach().numpy()
+        expected = expected_of(planes, points, times)
+        np.testing.assert_allclose(found, expected, atol=1e-12, err_msg=f"time={time}")
+
+
+@pytest.mark.parametrize(
+    ("dtype", "time"),
+    [
+        (torch.float32, 3),  # As in training. The others are compiled anew, for seconds.
+        pytest.param(torch.float32, None, marks=pytest.mark.slow),
+        pytest.param(torch.float64, 3, marks=pytest.mark.slow),
+        pytest.param(torch.float64, None, marks=pytest.mark.slow),
+    ],
+)
+def test_compiled_loops_equal_the_oracle_and_their_readable_twin(dtype, time):
+    single = dtype == torch.float32
     planes = products(time, channels=5).to(dtype)
+    points, times = torch.randn(40, 3, dtype=dtype), torch.rand(40, dtype=dtype)
+    found = planes(points, times).detach().numpy()
+    expected = expected_of(planes, points, times)
+    np.testing.assert_allclose(found, expected, atol=5e-6 if single else 1e-12)
     with torch.no_grad():
         for _, plane in planes.planes():
             plane[..., 1, 1] = 0  # A product of zeros has gradients all the same.
@@ -58,7 +78,7 @@ def test_compiled_loops_equal_their_readable_twin(dtype, time):
             value = function(tensors, places, planes.names)
             gradients = torch.autograd.grad((value * upstream).sum(), tensors)
             results.append((value, *gradients))
-        tolerance = {"atol": 2e-4, "rtol": 1e-4} if dtype == torch.float32 else {}
+        tolerance = {"atol": 2e-4, "rtol": 1e-4} if single else {}
         for fast, plain in zip(*results, strict=True):
             torch.testing.assert_close(fast, plain, **tolerance)
 
@@ -75,17 +95,16 @@ def test_planes_start_as_published():
 
 
 def test_parameters_number_as_published_for_lego():
-    def planes():
-        return PlaneProducts(32, 64, [1, 2, 4, 8], 25, low=0.1, high=0.5)
-
-    proposals = [
-        DensityField(PlaneProducts(8, size, [1], 50, low=0.1, high=0.15)) for size in (64, 128)
-    ]
-    assert count(KPlanes(planes(), HybridDecoder(128)), *proposals) == 36_467_008
-    explicit = count(ExplicitDecoder(128))
+    with torch.device("meta"):  # Shapes alone.
+        planes = PlaneProducts(32, 64, [1, 2, 4, 8], 25, low=0.1, high=0.5)
+        proposals = [
+            DensityField(PlaneProducts(8, size, [1], 50, low=0.1, high=0.15)) for size in (64, 128)
+        ]
+        hybrid, explicit = HybridDecoder(128), count(ExplicitDecoder(128))
+    assert count(KPlanes(planes, hybrid), *proposals) == 36_467_008
     # One linear map to density; 3 inputs and 13 ones, four hidden layers, three bases of 128.
     assert explicit == 128 + 16 * 128 + 3 * 128 * 128 + 128 * 384
-    assert count(planes()) == 35_727_360
+    assert count(planes) == 35_727_360
 
 
 def test_padding_acts_as_columns_of_ones():
@@ -152,18 +171,19 @@ def test_octaves_hold_values_sines_and_cosines():
     torch.testing.assert_close(octaves(values, 3), torch.tensor([expected]))
 
 
-@pytest.mark.parametrize("decoder", [HybridDecoder, ExplicitDecoder])
-def test_every_parameter_gets_a_gradient_and_shapes_fit(decoder):
-    planes = products(channels=8)
-    field = KPlanes(planes, decoder(16, 16), unit=1.3)
-    points, times = 2 * torch.rand(200, 3) - 1, torch.rand(200)
-    directions = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
-    colour, density = field(points, times, directions)
-    assert (colour.shape, density.shape) == ((200, 3), (200,))
-    assert ((colour > 0) & (colour < 1)).all()
-    assert (density > 0).all()
-    (colour.sum() + density.sum()).backward()
-    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in field.parameters())
+def test_every_parameter_gets_a_gradient_and_shapes_fit():
+    for decoder in [HybridDecoder, ExplicitDecoder]:
+        case = decoder.__name__
+        planes = products(channels=8)
+        field = KPlanes(planes, decoder(16, 16), unit=1.3)
+        points, times = 2 * torch.rand(200, 3) - 1, torch.rand(200)
+        directions = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
+        colour, density = field(points, times, directions)
+        assert (colour.shape, density.shape) == ((200, 3), (200,)), case
+        assert ((colour > 0) & (colour < 1)).all(), case
+        assert (density > 0).all(), case
+        (colour.sum() + density.sum()).backward()
+        assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in field.parameters()), case
 
 
 def test_density_is_per_unit_of_the_frame():

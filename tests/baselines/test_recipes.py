@@ -1,6 +1,8 @@
 """What the choice of a baseline brings along, and who has the last word."""
 
-import pytest
+import functools
+import itertools
+
 import yaml
 from hydra import compose, initialize_config_dir
 
@@ -52,30 +54,31 @@ tensor4d:
 """Settings of the released code."""
 
 
+@functools.cache
 def composed(*overrides):
     register_schemas()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return to_plain(compose("train", list(overrides)))
 
 
-@pytest.mark.parametrize("model", PUBLISHED)
-@pytest.mark.parametrize("experiment", [[], ["experiment=published"]])
-def test_a_baseline_brings_its_published_steps(model, experiment):
-    config = parse(composed(f"model={model}", *experiment))
-    sampler, rays, steps = PUBLISHED[model]
-    assert config.sampler.name == sampler
-    assert config.trainer.rays_per_batch == rays
-    assert config.trainer.max_steps == steps
-    assert config.lrm.name == "none"
-    assert not config.data.skip_background
-    assert (config.trainer.max_seconds is None) == bool(experiment)
+def test_a_baseline_brings_its_published_steps():
+    for model, experiment in itertools.product(PUBLISHED, ([], ["experiment=published"])):
+        case = model, *experiment
+        config = parse(composed(f"model={model}", *experiment))
+        trainer = config.trainer
+        found = config.sampler.name, trainer.rays_per_batch, trainer.max_steps
+        assert found == PUBLISHED[model], case
+        assert config.lrm.name == "none", case
+        assert not config.data.skip_background, case
+        assert (trainer.max_seconds is None) == bool(experiment), case
 
 
-@pytest.mark.parametrize("model", SETTINGS)
-def test_a_baseline_has_its_published_settings(model):
-    config = composed(f"model={model}")
-    for group, settings in SETTINGS[model].items():
-        assert {key: config[group][key] for key in settings} == settings
+def test_a_baseline_has_its_published_settings():
+    for model, groups in SETTINGS.items():
+        config = composed(f"model={model}")
+        for group, settings in groups.items():
+            found = {key: config[group][key] for key in settings}
+            assert found == settings, (model, group)
 
 
 def test_without_its_recipe_a_baseline_trains_on_the_rays_of_others():
@@ -85,14 +88,11 @@ def test_without_its_recipe_a_baseline_trains_on_the_rays_of_others():
     assert plain["loss"]["background"] == "white"
 
 
-def test_the_command_line_has_the_last_word():
+def test_the_command_line_has_the_last_word_and_no_recipe_is_left():
     config = composed("model=kplanes", "trainer.rays_per_batch=7", "loss.background=white")
     assert config["trainer"]["rays_per_batch"] == 7
     assert config["loss"]["background"] == "white"
-
-
-def test_no_recipe_is_left_in_the_configuration():
-    assert "recipe" not in composed("model=kplanes")
+    assert "recipe" not in config
 
 
 def row(config, *overridden):
@@ -119,25 +119,30 @@ def test_tables_leave_out_what_follows_from_the_model():
 ENTRIES = sorted(path.stem for path in (CONF / "entry").glob("*.yaml"))
 
 
-@pytest.mark.parametrize("entry", ENTRIES)
-def test_entries_of_comparisons_are_what_they_are_called(entry):
-    config = parse(composed(f"entry={entry}"))
-    start = "none" if config.lrm.name == "none" else config.lrm.name
+def check_name(entry, config):
+    """An entry of a comparison is what it is called."""
     extra = "_occupancy" if entry.endswith("_occupancy") else ""
-    planes = f"_{start}" if config.model.name in ("six_planes", "nine_planes") else ""
+    planes = f"_{config.lrm.name}" if config.model.name in ("six_planes", "nine_planes") else ""
     assert entry == f"{config.model.name}{extra}{planes}"
-    assert (config.sampler.name == "occupancy") >= bool(extra)
+    assert (config.sampler.name == "occupancy") >= bool(extra), entry
 
 
-@pytest.mark.parametrize("name", ["table1", "lego_models"])
-def test_comparisons_give_all_models_the_same(name):
-    text = yaml.safe_load((CONF / "experiment" / f"{name}.yaml").read_text())
-    entries = text["hydra"]["sweeper"]["params"]["entry"].split(",")
-    assert set(entries) <= set(ENTRIES)
-    lines = [f"experiment={name}", "data.scene=lego"]
-    found = [parse(composed(*lines, f"entry={entry}")) for entry in entries]
-    assert {c.trainer.max_seconds for c in found} == {text["trainer"]["max_seconds"]}
-    assert {c.trainer.max_steps for c in found} == {text["trainer"]["max_steps"]}
-    assert {(c.data.resolution, c.data.eval_split) for c in found} == {
-        (text["data"]["resolution"], text["data"]["eval_split"])
-    }
+def test_comparisons_give_all_models_the_same_and_name_them_right():
+    left = set(ENTRIES)
+    for name in ("table1", "lego_models"):
+        text = yaml.safe_load((CONF / "experiment" / f"{name}.yaml").read_text())
+        entries = text["hydra"]["sweeper"]["params"]["entry"].split(",")
+        assert set(entries) <= set(ENTRIES), name
+        for entry in entries:
+            config = parse(composed(f"experiment={name}", "data.scene=lego", f"entry={entry}"))
+            check_name(entry, config)
+            for group, keys in (
+                ("trainer", ("max_seconds", "max_steps")),
+                ("data", ("resolution", "eval_split")),
+            ):
+                for key in keys:
+                    found = getattr(getattr(config, group), key)
+                    assert found == text[group][key], (name, entry, key)
+        left -= set(entries)
+    for entry in left:
+        check_name(entry, parse(composed(f"entry={entry}")))

@@ -1,5 +1,7 @@
 """Placing samples by what earlier samples found, against loops."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -21,17 +23,17 @@ def bins(rays, count, seed=0):
     return torch.cat([ends[0], inner, ends[1]], dim=1), mass / count
 
 
-@pytest.mark.parametrize("padding", [0.01, 1e-6])
-@pytest.mark.parametrize("jittered", [True, False])
-def test_resampling_equals_loops(padding, jittered):
-    edges, mass = bins(6, 9)
-    uniform = torch.rand(6, 8, dtype=torch.float64) if jittered else None
-    found = resample(edges, mass, 7, uniform, padding)
-    for r in range(6):
-        moved = uniform[r].tolist() if uniform is not None else [0.5] * 8
-        places = [(i + u) / 8 for i, u in enumerate(moved)]
-        expected = oracles.resample(edges[r].tolist(), mass[r].tolist(), places, padding)
-        np.testing.assert_allclose(found[r].numpy(), expected, atol=1e-9)
+def test_resampling_equals_loops():
+    for padding, jittered in itertools.product([0.01, 1e-6], [True, False]):
+        case = f"padding={padding}, jittered={jittered}"
+        edges, mass = bins(6, 9)
+        uniform = torch.rand(6, 8, dtype=torch.float64) if jittered else None
+        found = resample(edges, mass, 7, uniform, padding)
+        for r in range(6):
+            moved = uniform[r].tolist() if uniform is not None else [0.5] * 8
+            places = [(i + u) / 8 for i, u in enumerate(moved)]
+            expected = oracles.resample(edges[r].tolist(), mass[r].tolist(), places, padding)
+            np.testing.assert_allclose(found[r].numpy(), expected, atol=1e-9, err_msg=case)
 
 
 def test_resampling_ascends_stays_inside_and_carries_no_gradient():

@@ -59,27 +59,28 @@ def test_reading_a_plane_has_right_first_and_second_derivatives():
     assert torch.autograd.gradgradcheck(bilinear, (plane, columns, rows))
 
 
-@pytest.mark.parametrize("groups", [STILL, MOVING])
-def test_features_are_all_planes_side_by_side(groups):
-    made = planes(groups).double()
-    points, times = 2 * torch.rand(9, 3).double() - 1, torch.rand(9).double()
-    found = made(points, times)
-    for n in range(9):
-        place = dict(zip("xyz", points[n].tolist(), strict=True))
-        place["t"] = 0.95 * (2 * float(times[n]) - 1)
-        for group, features in zip(groups, found, strict=True):
-            expected = [
-                oracles.plane_value(
-                    made.planes[f"{level}_{group[0]}_{name}"].detach().numpy(),
-                    place[name[0]],
-                    place[name[1]],
+def test_features_are_all_planes_side_by_side():
+    for groups in [STILL, MOVING]:
+        case = f"{len(groups)} groups"
+        made = planes(groups).double()
+        points, times = 2 * torch.rand(9, 3).double() - 1, torch.rand(9).double()
+        found = made(points, times)
+        for n in range(9):
+            place = dict(zip("xyz", points[n].tolist(), strict=True))
+            place["t"] = 0.95 * (2 * float(times[n]) - 1)
+            for group, features in zip(groups, found, strict=True):
+                expected = [
+                    oracles.plane_value(
+                        made.planes[f"{level}_{group[0]}_{name}"].detach().numpy(),
+                        place[name[0]],
+                        place[name[1]],
+                    )
+                    for level in range(2)
+                    for name in group
+                ]
+                np.testing.assert_allclose(
+                    features[n].detach().numpy(), np.concatenate(expected), atol=1e-12, err_msg=case
                 )
-                for level in range(2)
-                for name in group
-            ]
-            np.testing.assert_allclose(
-                features[n].detach().numpy(), np.concatenate(expected), atol=1e-12
-            )
 
 
 def test_planes_are_read_coarsely_at_first():
@@ -172,15 +173,16 @@ def test_every_parameter_of_the_surface_gets_a_gradient():
         assert parameter.grad.abs().sum() > 0, name
 
 
-@pytest.mark.parametrize("groups", [STILL, MOVING])
-def test_every_parameter_of_the_density_gets_a_gradient(groups):
-    field = Tensor4DDensity(planes(groups), 16, octaves=(4, 3, 2))
-    directions = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
-    colour, density = field(2 * torch.rand(200, 3) - 1, torch.rand(200), directions)
-    assert (colour.shape, density.shape) == ((200, 3), (200,))
-    (colour.sum() + density.sum()).backward()
-    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in field.parameters())
-    assert field.moves == (groups is MOVING)
+def test_every_parameter_of_the_density_gets_a_gradient():
+    for groups in [STILL, MOVING]:
+        case = f"{len(groups)} groups"
+        field = Tensor4DDensity(planes(groups), 16, octaves=(4, 3, 2))
+        directions = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
+        colour, density = field(2 * torch.rand(200, 3) - 1, torch.rand(200), directions)
+        assert (colour.shape, density.shape) == ((200, 3), (200,)), case
+        (colour.sum() + density.sum()).backward()
+        assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in field.parameters()), case
+        assert field.moves == (groups is MOVING), case
 
 
 def test_opacities_and_weights_equal_loops():

@@ -2,33 +2,22 @@
 
 import pytest
 
-from tests.baselines.checks import check_learns, check_reload, check_resume
+from tests.baselines.checks import check_learns, check_refused, check_reload, check_resume
 from tests.baselines.runs import NEUS, OCCUPANCY, TENSOR4D, baseline_config
 from tests.synthetic import ball_views
 from xplanes.checks import parse
-from xplanes.config import ConfigError
-from xplanes.pipeline import run
 from xplanes.training.assembly.site import Site, scene_cube
 from xplanes.training.assembly.tensor4d import tensor4d_method
 from xplanes.training.sampling.base import Moment
 
 
-@pytest.fixture(scope="module")
-def scenes(tmp_path_factory):
-    return tmp_path_factory.mktemp("scenes")
-
-
-def test_surface_run_goes_on(scenes, tmp_path, monkeypatch):
-    """When it stops the fine level has joined, and planes are still averaged down."""
-    short = ("trainer.max_steps=28", "trainer.evaluate_at=[]", "data.eval_views=1")
-    config = baseline_config(scenes, "model=tensor4d", *TENSOR4D, *NEUS, *short)
-    run(config, tmp_path / "whole", [], resume=False)
-    check_resume(config, tmp_path / "whole", tmp_path / "broken", monkeypatch, stop=23)
-
-
-def test_surface_run_learns_and_is_loaded(scenes, tmp_path):
-    config = baseline_config(scenes, "model=tensor4d", *TENSOR4D, *NEUS, "trainer.max_steps=100")
-    trained = check_reload(check_learns(config, tmp_path / "whole", gain=1.5))
+def test_surface_run_learns_goes_on_and_is_loaded(scenes, tmp_path, monkeypatch):
+    schedule = ("model.fine_from=6", "model.blur_until=15", "trainer.max_steps=20")
+    config = baseline_config(scenes, "model=tensor4d", *TENSOR4D, *NEUS, *schedule)
+    whole = check_learns(config, tmp_path / "whole", gain=1.5)
+    # When it stops the fine level has joined, and planes are still averaged down.
+    check_resume(config, whole, tmp_path / "broken", monkeypatch, stop=13)
+    trained = check_reload(whole)
     assert bool(trained.module.field.canonical_planes.fine)
     assert not bool(trained.module.field.canonical_planes.blurred)
 
@@ -41,7 +30,7 @@ def test_density_run_learns_and_is_loaded(scenes, tmp_path):
         *OCCUPANCY,
         "trainer.rays_per_batch=128",
         "trainer.samples_per_batch=1024",
-        "trainer.max_steps=100",
+        "trainer.max_steps=20",
     )
     check_reload(check_learns(config, tmp_path / "run", gain=1.5))
 
@@ -82,17 +71,12 @@ def test_learning_rates_are_the_published_ones(scenes):
     assert made.rate(10**6, 1.0) == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize("sampler", ["occupancy", "proposal", "fixed_step"])
-def test_a_surface_needs_its_own_sampler(scenes, sampler):
-    with pytest.raises(ConfigError, match=f"sampler={sampler} with model=tensor4d: .* neus"):
-        parse(baseline_config(scenes, "model=tensor4d", f"sampler={sampler}"))
-
-
-def test_triplanes_are_refused(scenes):
-    with pytest.raises(ConfigError, match="lrm=file with model=tensor4d"):
-        parse(baseline_config(scenes, "model=tensor4d", "lrm=file"))
-
-
-def test_a_loss_that_lacks_terms_is_refused(scenes):
-    with pytest.raises(ConfigError, match=r"loss\.eikonal .* set loss=tensor4d"):
-        parse(baseline_config(scenes, "model=tensor4d", "loss=tensor4d_density"))
+def test_other_samplers_triplanes_and_losses_that_lack_terms_are_refused(scenes):
+    for override, words in (
+        ("sampler=occupancy", "sampler=occupancy with model=tensor4d: .* neus"),
+        ("sampler=proposal", "sampler=proposal with model=tensor4d: .* neus"),
+        ("sampler=fixed_step", "sampler=fixed_step with model=tensor4d: .* neus"),
+        ("lrm=file", "lrm=file with model=tensor4d"),
+        ("loss=tensor4d_density", r"loss\.eikonal .* set loss=tensor4d"),
+    ):
+        check_refused(scenes, words, "model=tensor4d", override)

@@ -27,23 +27,24 @@ def inside(count):
     return BOX[0] + (BOX[1] - BOX[0]) * torch.rand(count, 3)
 
 
-@pytest.mark.parametrize(("resolution", "channels", "width"), [(100, 4, 64), (160, 6, 256)])
-def test_size_is_the_published_one(resolution, channels, width):
-    cube = torch.tensor([[-5.0] * 3, [5.0] * 3])
-    made = TiNeuVox(cube, resolution, channels, width)
-    megabytes = 2 * sum(p.numel() for p in made.parameters()) / 1e6
-    assert megabytes == pytest.approx({100: 8, 160: 48}[resolution], rel=0.05)
-    networks = sum(p.numel() for p in made.parameters()) - made.grid.numel()
-    moment, lookup = 5 * channels, 15 * channels
-    expected = (
-        (17 * width + width + width * moment + moment)
-        + ((63 + moment) * width + width + width * width + width + 3 * width + 3)
-        + ((lookup + moment + 63) * width + width)
-        + (width + 1)
-        + (width * width + width)
-        + ((width + 27) * (width // 2) + width // 2 + 3 * (width // 2) + 3)
-    )
-    assert networks == expected
+def test_size_is_the_published_one():
+    for resolution, channels, width in [(100, 4, 64), (160, 6, 256)]:
+        case = f"resolution={resolution}, channels={channels}, width={width}"
+        cube = torch.tensor([[-5.0] * 3, [5.0] * 3])
+        made = TiNeuVox(cube, resolution, channels, width)
+        megabytes = 2 * sum(p.numel() for p in made.parameters()) / 1e6
+        assert megabytes == pytest.approx({100: 8, 160: 48}[resolution], rel=0.05), case
+        networks = sum(p.numel() for p in made.parameters()) - made.grid.numel()
+        moment, lookup = 5 * channels, 15 * channels
+        expected = (
+            (17 * width + width + width * moment + moment)
+            + ((63 + moment) * width + width + width * width + width + 3 * width + 3)
+            + ((lookup + moment + 63) * width + width)
+            + (width + 1)
+            + (width * width + width)
+            + ((width + 27) * (width // 2) + width // 2 + 3 * (width // 2) + 3)
+        )
+        assert networks == expected, case
 
 
 def test_grid_is_read_as_loops_read_it():
@@ -82,26 +83,26 @@ def test_grown_grid_is_loaded_into_a_fresh_field():
     assert int(fresh.voxels) == 8**3
 
 
-@pytest.mark.parametrize("alpha", [1e-2, 1e-3])
-def test_opacity_of_a_cell_at_the_start(alpha):
-    made = field(alpha=alpha, unit=2.0)
-    with torch.no_grad():
-        made.density.weight.zero_()
-        made.density.bias.zero_()
-    density = made.geometry(torch.zeros(1, 3), torch.zeros(1))[0]
-    # Published: 1 - exp(-softplus(shift)) over a full cell, half a cell is one step.
-    assert 1 - math.exp(-density.item() * made.cell) == pytest.approx(alpha, rel=1e-4)
+def test_opacity_of_a_cell_at_the_start():
+    for alpha in [1e-2, 1e-3]:
+        made = field(alpha=alpha, unit=2.0)
+        with torch.no_grad():
+            made.density.weight.zero_()
+            made.density.bias.zero_()
+        density = made.geometry(torch.zeros(1, 3), torch.zeros(1))[0]
+        # Published: 1 - exp(-softplus(shift)) over a full cell, half a cell is one step.
+        assert 1 - math.exp(-density.item() * made.cell) == pytest.approx(alpha, rel=1e-4), alpha
 
 
-@pytest.mark.parametrize("moves", [True, False])
-def test_every_parameter_gets_a_gradient_and_shapes_fit(moves):
-    made = field(moves=moves)
-    directions = torch.nn.functional.normalize(torch.randn(300, 3), dim=1)
-    colour, density = made(inside(300), torch.rand(300), directions)
-    assert (colour.shape, density.shape) == ((300, 3), (300,))
-    (colour.sum() + density.sum()).backward()
-    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in made.parameters())
-    assert made.moves == moves
+def test_every_parameter_gets_a_gradient_and_shapes_fit():
+    for moves in [True, False]:
+        made = field(moves=moves)
+        directions = torch.nn.functional.normalize(torch.randn(300, 3), dim=1)
+        colour, density = made(inside(300), torch.rand(300), directions)
+        assert (colour.shape, density.shape) == ((300, 3), (300,)), moves
+        (colour.sum() + density.sum()).backward()
+        assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in made.parameters()), moves
+        assert made.moves == moves, moves
 
 
 def test_samples_lie_in_the_box_at_equal_steps():
@@ -168,22 +169,24 @@ def test_sample_colour_error_equals_loops():
     assert found.item() == pytest.approx(total / 4, rel=1e-9)
 
 
-@pytest.mark.parametrize("masked", [True, False])
-def test_adam_equals_a_loop_over_entries(masked):
-    torch.manual_seed(0)
-    parameter = torch.nn.Parameter(torch.randn(2, 5).double())
-    optimizer = MaskedAdam([{"params": [parameter], "lr": 0.1, "masked": masked}])
-    values = parameter.detach().flatten().tolist()
-    moments = [[0.0, 0.0] for _ in values]
-    for step in range(1, 6):
-        gradient = torch.randn(2, 5).double() * (torch.rand(2, 5) > 0.4)
-        parameter.grad = gradient
-        optimizer.step()
-        size = 0.1 * math.sqrt(1 - 0.99**step) / (1 - 0.9**step)
-        for i, g in enumerate(gradient.flatten().tolist()):
-            if masked and g == 0:
-                continue
-            moments[i][0] = 0.9 * moments[i][0] + 0.1 * g
-            moments[i][1] = 0.99 * moments[i][1] + 0.01 * g * g
-            values[i] -= size * moments[i][0] / (math.sqrt(moments[i][1]) + 1e-8)
-        np.testing.assert_allclose(parameter.detach().flatten(), values, atol=1e-9)
+def test_adam_equals_a_loop_over_entries():
+    for masked in [True, False]:
+        torch.manual_seed(0)
+        parameter = torch.nn.Parameter(torch.randn(2, 5).double())
+        optimizer = MaskedAdam([{"params": [parameter], "lr": 0.1, "masked": masked}])
+        values = parameter.detach().flatten().tolist()
+        moments = [[0.0, 0.0] for _ in values]
+        for step in range(1, 6):
+            gradient = torch.randn(2, 5).double() * (torch.rand(2, 5) > 0.4)
+            parameter.grad = gradient
+            optimizer.step()
+            size = 0.1 * math.sqrt(1 - 0.99**step) / (1 - 0.9**step)
+            for i, g in enumerate(gradient.flatten().tolist()):
+                if masked and g == 0:
+                    continue
+                moments[i][0] = 0.9 * moments[i][0] + 0.1 * g
+                moments[i][1] = 0.99 * moments[i][1] + 0.01 * g * g
+                values[i] -= size * moments[i][0] / (math.sqrt(moments[i][1]) + 1e-8)
+            np.testing.assert_allclose(
+                parameter.detach().flatten(), values, atol=1e-9, err_msg=str(masked)
+            )

@@ -1,7 +1,11 @@
+import functools
+import itertools
+
 import pytest
 import torch
 from torch.nn.functional import grid_sample
 
+from tests.refusals import assert_refused
 from xplanes.decomposition import TIME_PLANES, TIME_ROWS, space_planes, time_planes
 from xplanes.decomposition.conversion import frame_profiles
 
@@ -11,28 +15,28 @@ def triplanes(frames=5, channels=3, size=8, seed=0):
     return torch.randn(frames, 3, channels, size, size, generator=generator, dtype=torch.float64)
 
 
-@pytest.mark.parametrize("frames", [1, 4, 5])
-def test_static_choices(frames):
-    low = triplanes(frames)
-    for static, expected in (
-        ("middle", low[frames // 2]),
-        ("mean", low.mean(0)),
-        ("median", low.quantile(0.5, dim=0)),
-    ):
-        planes = space_planes(low, static=static)
-        assert torch.allclose(planes, expected.permute(0, 2, 3, 1))
-        assert planes.is_contiguous()
+def test_static_choices():
+    for frames in [1, 4, 5]:
+        low = triplanes(frames)
+        for static, expected in (
+            ("middle", low[frames // 2]),
+            ("mean", low.mean(0)),
+            ("median", low.quantile(0.5, dim=0)),
+        ):
+            planes = space_planes(low, static=static)
+            assert torch.allclose(planes, expected.permute(0, 2, 3, 1)), (frames, static)
+            assert planes.is_contiguous(), (frames, static)
 
 
-@pytest.mark.parametrize("resolution", [4, 12, 16])
-def test_another_resolution_samples_the_same_function(resolution):
-    low = triplanes(1)
-    planes = space_planes(low, resolution=resolution)
-    centres = (torch.arange(resolution, dtype=torch.float64) + 0.5) / resolution * 2 - 1
-    rows, columns = torch.meshgrid(centres, centres, indexing="ij")
-    grid = torch.stack([columns, rows], -1).expand(3, -1, -1, -1)
-    expected = grid_sample(low[0], grid, padding_mode="zeros", align_corners=False)
-    assert torch.allclose(planes, expected.permute(0, 2, 3, 1))
+def test_another_resolution_samples_the_same_function():
+    for resolution in [4, 12, 16]:
+        low = triplanes(1)
+        planes = space_planes(low, resolution=resolution)
+        centres = (torch.arange(resolution, dtype=torch.float64) + 0.5) / resolution * 2 - 1
+        rows, columns = torch.meshgrid(centres, centres, indexing="ij")
+        grid = torch.stack([columns, rows], -1).expand(3, -1, -1, -1)
+        expected = grid_sample(low[0], grid, padding_mode="zeros", align_corners=False)
+        assert torch.allclose(planes, expected.permute(0, 2, 3, 1)), resolution
 
 
 def test_oblong_triplanes_become_square_planes():
@@ -49,22 +53,28 @@ def test_storage_order_and_rows_agree():
             assert (names[pair[0]], names[pair[1]]) == expected
 
 
-@pytest.mark.parametrize("dynamic", ["random", "rank1"])
-@pytest.mark.parametrize(("plane_set", "count"), [("six", 3), ("nine", 6)])
-def test_shapes_noise_and_seed(dynamic, plane_set, count):
-    sparse = triplanes().float()
-    options = {"plane_set": plane_set, "dynamic": dynamic, "resolution": 16, "time_resolution": 9}
-
-    def make(noise, seed=3):
-        generator = torch.Generator().manual_seed(seed)
-        return time_planes(sparse, noise=noise, generator=generator, **options)
-
-    planes = make(0.01)
-    assert planes.shape == (count, 9, 16, 3)
-    assert torch.equal(planes, make(0.01))
-    assert (planes - make(0.0)).std() == pytest.approx(0.01, rel=0.1)
-    if dynamic == "random":
-        assert not make(0.0).any()
+def test_shapes_noise_and_seed():
+    for dynamic, (plane_set, count) in itertools.product(
+        ["random", "rank1"], [("six", 3), ("nine", 6)]
+    ):
+        case = plane_set, dynamic
+        planes, again, plain = (
+            time_planes(
+                triplanes().float(),
+                plane_set=plane_set,
+                dynamic=dynamic,
+                noise=noise,
+                generator=torch.Generator().manual_seed(3),
+                resolution=16,
+                time_resolution=9,
+            )
+            for noise in (0.01, 0.01, 0.0)
+        )
+        assert planes.shape == (count, 9, 16, 3), case
+        assert torch.equal(planes, again), case
+        assert (planes - plain).std() == pytest.approx(0.01, rel=0.1), case
+        if dynamic == "random":
+            assert not plain.any(), case
 
 
 def test_frames_own_rows_and_other_row_counts_interpolate():
@@ -90,21 +100,15 @@ def test_profiles_follow_grid_sample():
     assert torch.allclose(values, expected.permute(0, 2, 3, 1))
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
+def test_refuses_options_out_of_range():
+    for options, words in [
         ({"plane_set": "four"}, "six, nine"),
         ({"plane_set": "six", "dynamic": "svd"}, "random, rank1"),
         ({"plane_set": "six", "noise": -1.0}, "noise"),
         ({"plane_set": "six", "resolution": 0}, "resolution"),
         ({"plane_set": "six", "time_resolution": 0}, "time_resolution"),
-    ],
-)
-def test_refuses_options_out_of_range(options, words):
-    with pytest.raises(ValueError, match=words):
-        time_planes(triplanes(), **options)
-
-
-def test_refuses_another_static_choice():
+    ]:
+        call = functools.partial(time_planes, triplanes(), **options)
+        assert_refused(ValueError, words, call, options)
     with pytest.raises(ValueError, match="middle, median, mean"):
         space_planes(triplanes(), static="first")

@@ -1,3 +1,5 @@
+import functools
+import itertools
 import warnings
 
 import numpy as np
@@ -5,6 +7,7 @@ import pytest
 import torch
 from rpca_oracle import objective, oracle, relative
 
+from tests.refusals import assert_refused
 from xplanes.decomposition import robust_pca
 
 
@@ -16,26 +19,35 @@ def mixture(rows=400, columns=12, rank=2, noise=0.01, share=0.05, seed=0, dtype=
     return (low + hit * 3 * draw(rows, columns) + noise * draw(rows, columns)).to(dtype)
 
 
-@pytest.mark.parametrize(
-    ("weight", "method"),
-    [(0.02, "adaptive"), (0.05, "adaptive"), (0.2, "adaptive"), (0.2, "admm"), (0.2, "exact")],
-)
-def test_agrees_with_the_oracle(weight, method):
+@functools.cache
+def solved(weight):
+    """A matrix, and its low-rank and its sparse part as the oracle finds them."""
     matrix = mixture()
-    low, sparse = oracle(matrix, weight)
-    result = robust_pca(
-        matrix, sparsity_weight=weight, tolerance=1e-7, max_iterations=3000, method=method
-    )
-    assert result.converged
-    assert relative(result.low_rank, low) < 1e-4
-    assert relative(result.sparse, sparse) < 1e-3
-    best = objective(low, matrix, weight)
-    assert abs(objective(result.low_rank, matrix, weight) / best - 1) < 1e-5
+    return matrix, *oracle(matrix, weight)
+
+
+def test_agrees_with_the_oracle():
+    for weight, method in [
+        (0.02, "adaptive"),
+        (0.05, "adaptive"),
+        (0.2, "adaptive"),
+        (0.2, "admm"),
+        (0.2, "exact"),
+    ]:
+        case = f"weight={weight}, method={method}"
+        matrix, low, sparse = solved(weight)
+        result = robust_pca(
+            matrix, sparsity_weight=weight, tolerance=1e-7, max_iterations=3000, method=method
+        )
+        assert result.converged, case
+        assert relative(result.low_rank, low) < 1e-4, case
+        assert relative(result.sparse, sparse) < 1e-3, case
+        best = objective(low, matrix, weight)
+        assert abs(objective(result.low_rank, matrix, weight) / best - 1) < 1e-5, case
 
 
 def test_growing_penalty_is_feasible_soon_and_near_the_optimum():
-    matrix = mixture()
-    low, _ = oracle(matrix, 0.05)
+    matrix, low, _ = solved(0.05)
     result = robust_pca(matrix, sparsity_weight=0.05, tolerance=1e-7, method="growing")
     assert result.converged
     best = objective(low, matrix, 0.05)
@@ -54,44 +66,46 @@ def test_the_fused_passes_repeat_the_plain_iteration():
     assert plain.rank == fused.rank
 
 
-@pytest.mark.parametrize("columns", [30, 120])
-def test_several_blocks_and_both_layouts_give_the_same(columns, monkeypatch):
-    matrix = mixture(rows=1000, columns=columns)
-    whole = robust_pca(matrix, sparsity_weight="auto")
-    monkeypatch.setattr("xplanes.decomposition.passes.block_rows", lambda _: 96)
-    blocks = robust_pca(matrix, sparsity_weight="auto")
-    frames_first = robust_pca(matrix.mT.contiguous().mT, sparsity_weight="auto")
-    for other in (blocks, frames_first):
-        assert torch.allclose(whole.low_rank, other.low_rank, atol=1e-7)
-        assert torch.allclose(whole.sparse, other.sparse, atol=1e-7)
+def test_several_blocks_and_both_layouts_give_the_same(monkeypatch):
+    for columns in [30, 120]:
+        matrix = mixture(rows=300, columns=columns)
+        whole = robust_pca(matrix, sparsity_weight="auto")
+        with monkeypatch.context() as patch:
+            patch.setattr("xplanes.decomposition.passes.block_rows", lambda _: 96)
+            blocks = robust_pca(matrix, sparsity_weight="auto")
+            frames_first = robust_pca(matrix.mT.contiguous().mT, sparsity_weight="auto")
+        for other in (blocks, frames_first):
+            assert torch.allclose(whole.low_rank, other.low_rank, atol=1e-7), columns
+            assert torch.allclose(whole.sparse, other.sparse, atol=1e-7), columns
 
 
-@pytest.mark.parametrize("rank", [1, 5, 10])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_recovers_low_rank_plus_sparse(rank, dtype):
-    generator = torch.Generator().manual_seed(rank)
-    low = torch.randn(4000, rank, generator=generator) @ torch.randn(rank, 200, generator=generator)
-    hit = torch.rand(4000, 200, generator=generator) < 0.05
-    sparse = hit * 10.0 * torch.randn(4000, 200, generator=generator).sign()
-    result = robust_pca((low + sparse).to(dtype), sparsity_weight="auto", tolerance=1e-5)
-    assert result.converged
-    assert result.rank == rank
-    assert relative(result.low_rank, low.double().numpy()) < 1e-4
-    assert relative(result.sparse, sparse.double().numpy()) < 1e-4
+def test_recovers_low_rank_plus_sparse():
+    for rank, dtype in itertools.product([1, 5, 10], [torch.float32, torch.float64]):
+        case = f"rank={rank}, dtype={dtype}"
+        generator = torch.Generator().manual_seed(rank)
+        shape = (1500, 120)
+        low = torch.randn(shape[0], rank, generator=generator)
+        low = low @ torch.randn(rank, shape[1], generator=generator)
+        hit = torch.rand(shape, generator=generator) < 0.05
+        sparse = hit * 10.0 * torch.randn(shape, generator=generator).sign()
+        result = robust_pca((low + sparse).to(dtype), sparsity_weight="auto", tolerance=1e-5)
+        assert result.converged, case
+        assert result.rank == rank, case
+        assert relative(result.low_rank, low.double().numpy()) < 1e-4, case
+        assert relative(result.sparse, sparse.double().numpy()) < 1e-4, case
 
 
-@pytest.mark.parametrize("exponent", [-25, -6, -3, 0, 3, 6, 25])
-def test_every_scale_has_the_same_answer(exponent):
+def test_every_scale_has_the_same_answer():
     matrix = mixture(dtype=torch.float32)
     unit = robust_pca(matrix, sparsity_weight=0.05)
-    scaled = robust_pca(matrix * 10.0**exponent, sparsity_weight=0.05)
-    assert scaled.iterations == unit.iterations
-    assert scaled.rank == unit.rank
-    assert scaled.converged
-    assert (
-        relative(scaled.low_rank.double() / 10.0**exponent, unit.low_rank.double().numpy()) < 1e-5
-    )
-    assert scaled.unit == pytest.approx(unit.unit * 10.0**exponent, rel=1e-5)
+    for exponent in [-25, -6, -3, 0, 3, 6, 25]:
+        scaled = robust_pca(matrix * 10.0**exponent, sparsity_weight=0.05)
+        assert scaled.iterations == unit.iterations, exponent
+        assert scaled.rank == unit.rank, exponent
+        assert scaled.converged, exponent
+        back = scaled.low_rank.double() / 10.0**exponent
+        assert relative(back, unit.low_rank.double().numpy()) < 1e-5, exponent
+        assert scaled.unit == pytest.approx(unit.unit * 10.0**exponent, rel=1e-5), exponent
 
 
 def test_an_absolute_penalty_depends_on_the_scale():
@@ -108,16 +122,16 @@ def test_an_absolute_penalty_depends_on_the_scale():
     assert relative(small.low_rank * 10, unit.low_rank.numpy()) > 1e-3
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-def test_types(dtype):
-    matrix = mixture(dtype=torch.float32).to(dtype)
-    copy = matrix.clone()
-    result = robust_pca(matrix, sparsity_weight=0.05)
-    truth = robust_pca(matrix.double(), sparsity_weight=0.05)
-    expected = torch.float64 if dtype == torch.float64 else torch.float32
-    assert result.low_rank.dtype == result.sparse.dtype == expected
-    assert relative(result.low_rank, truth.low_rank.numpy()) < 1e-4
-    assert torch.equal(matrix, copy)
+def test_types():
+    for dtype in [torch.float16, torch.bfloat16, torch.float32, torch.float64]:
+        matrix = mixture(dtype=torch.float32).to(dtype)
+        copy = matrix.clone()
+        result = robust_pca(matrix, sparsity_weight=0.05)
+        truth = robust_pca(matrix.double(), sparsity_weight=0.05)
+        expected = torch.float64 if dtype == torch.float64 else torch.float32
+        assert result.low_rank.dtype == result.sparse.dtype == expected, dtype
+        assert relative(result.low_rank, truth.low_rank.numpy()) < 1e-4, dtype
+        assert torch.equal(matrix, copy), dtype
 
 
 def test_strided_and_differentiable_input():
@@ -139,28 +153,29 @@ def test_zeros():
     assert result.drift == result.sparsity == 0
 
 
-@pytest.mark.parametrize("columns", [1, 2, 40])
-def test_a_constant_sequence_stands_still(columns):
-    matrix = torch.randn(500, 1, generator=torch.Generator().manual_seed(0)).repeat(1, columns)
-    result = robust_pca(matrix, sparsity_weight="auto", tolerance=1e-6)
-    low, _ = oracle(matrix, 500**-0.5)
-    assert result.converged
-    assert result.drift < 1e-5
-    assert (result.low_rank - torch.from_numpy(low)).norm() < 1e-4 * matrix.norm()
-    if columns == 40:
-        assert result.rank == 1
-        assert result.sparse.abs().max() < 1e-4
+def test_a_constant_sequence_stands_still():
+    for columns in [1, 2, 40]:
+        matrix = torch.randn(500, 1, generator=torch.Generator().manual_seed(0)).repeat(1, columns)
+        result = robust_pca(matrix, sparsity_weight="auto", tolerance=1e-6)
+        low, _ = oracle(matrix, 500**-0.5)
+        assert result.converged, columns
+        assert result.drift < 1e-5, columns
+        assert (result.low_rank - torch.from_numpy(low)).norm() < 1e-4 * matrix.norm(), columns
+        if columns == 40:
+            assert result.rank == 1, columns
+            assert result.sparse.abs().max() < 1e-4, columns
 
 
-@pytest.mark.parametrize(("weight", "kept"), [(0.03, 0.0), (0.09, 1.0)])
-def test_a_single_column_goes_where_it_costs_less(weight, kept):
-    # For one column the two norms compete as a whole: all sparse, or all low-rank.
-    matrix = torch.linspace(-1, 1, 400, dtype=torch.float64)[:, None]
-    low, _ = oracle(matrix, weight)
-    result = robust_pca(matrix, sparsity_weight=weight, tolerance=1e-7, max_iterations=3000)
-    assert result.converged
-    assert result.low_rank_energy == pytest.approx(kept, abs=1e-4)
-    assert (result.low_rank - torch.from_numpy(low)).norm() < 1e-4 * matrix.norm()
+def test_a_single_column_goes_where_it_costs_less():
+    for weight, kept in [(0.03, 0.0), (0.09, 1.0)]:
+        case = f"weight={weight}, kept={kept}"
+        # For one column the two norms compete as a whole: all sparse, or all low-rank.
+        matrix = torch.linspace(-1, 1, 400, dtype=torch.float64)[:, None]
+        low, _ = oracle(matrix, weight)
+        result = robust_pca(matrix, sparsity_weight=weight, tolerance=1e-7, max_iterations=3000)
+        assert result.converged, case
+        assert result.low_rank_energy == pytest.approx(kept, abs=1e-4), case
+        assert (result.low_rank - torch.from_numpy(low)).norm() < 1e-4 * matrix.norm(), case
 
 
 def test_a_single_moving_entry_is_sparse():
@@ -184,17 +199,22 @@ def test_a_corrupted_frame_is_split_as_the_oracle_does():
     assert relative(result.sparse, sparse) < 1e-3
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-def test_refuses_what_is_not_finite(bad):
-    matrix = torch.ones(10, 3)
-    matrix[4, 1] = bad
-    with pytest.raises(ValueError, match="NaN or infinity"):
-        robust_pca(matrix)
+def refused(words, matrix, case, error=ValueError, **options):
+    assert_refused(error, words, functools.partial(robust_pca, matrix, **options), case)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
+def test_refuses_matrices_that_are_not_finite_have_another_shape_or_hold_integers():
+    for bad in [float("nan"), float("inf"), -float("inf")]:
+        matrix = torch.ones(10, 3)
+        matrix[4, 1] = bad
+        refused("NaN or infinity", matrix, bad)
+    for shape in [(3,), (2, 3, 4), (0, 3), (3, 0)]:
+        refused("non-empty matrix", torch.ones(shape), shape)
+    refused("int64", torch.ones(3, 3, dtype=torch.int64), "int64", TypeError)
+
+
+def test_refuses_options_out_of_range():
+    for options, words in [
         ({"sparsity_weight": 0}, "sparsity_weight"),
         ({"sparsity_weight": -1.0}, "sparsity_weight"),
         ({"sparsity_weight": float("nan")}, "sparsity_weight"),
@@ -204,31 +224,17 @@ def test_refuses_what_is_not_finite(bad):
         ({"max_iterations": 0}, "max_iterations"),
         ({"method": "pcp"}, "adaptive, growing"),
         ({"scale": "max"}, "rms, none"),
-    ],
-)
-def test_refuses_options_out_of_range(options, words):
-    with pytest.raises(ValueError, match=words):
-        robust_pca(torch.ones(4, 2), **options)
+    ]:
+        refused(words, torch.ones(4, 2), options, **options)
 
 
-@pytest.mark.parametrize("shape", [(3,), (2, 3, 4), (0, 3), (3, 0)])
-def test_refuses_other_shapes(shape):
-    with pytest.raises(ValueError, match="non-empty matrix"):
-        robust_pca(torch.ones(shape))
-
-
-def test_refuses_integers():
-    with pytest.raises(TypeError, match="int64"):
-        robust_pca(torch.ones(3, 3, dtype=torch.int64))
-
-
-@pytest.mark.parametrize("method", ["adaptive", "growing", "admm", "exact"])
-def test_the_limit_is_reported_once(method):
-    with pytest.warns(UserWarning, match="raise max_iterations") as caught:
-        result = robust_pca(mixture(), tolerance=1e-9, max_iterations=3, method=method)
-    assert len(caught) == 1
-    assert not result.converged
-    assert result.iterations == 3
+def test_the_limit_is_reported_once():
+    for method in ["adaptive", "growing", "admm", "exact"]:
+        with pytest.warns(UserWarning, match="raise max_iterations") as caught:
+            result = robust_pca(mixture(), tolerance=1e-9, max_iterations=3, method=method)
+        assert len(caught) == 1, method
+        assert not result.converged, method
+        assert result.iterations == 3, method
 
 
 def test_the_residual_and_the_shares_are_measured_on_the_result():
@@ -267,13 +273,11 @@ def test_reduced_precision_settings_do_not_leak_in_or_out():
     assert torch.equal(plain.low_rank, guarded.low_rank)
 
 
-@pytest.mark.parametrize("progress", [True, False])
-def test_a_short_run_shows_no_bar(progress, capfd):
-    robust_pca(mixture(), sparsity_weight=0.05, progress=progress)
-    assert capfd.readouterr() == ("", "")
+def test_a_long_run_alone_shows_a_bar_unless_told_not_to(capfd, monkeypatch):
+    for progress in [True, False]:
+        robust_pca(mixture(), sparsity_weight=0.05, progress=progress)
+        assert capfd.readouterr() == ("", ""), progress
 
-
-def test_a_long_run_shows_a_bar_unless_told_not_to(capfd, monkeypatch):
     now = [0.0]
 
     def tick():

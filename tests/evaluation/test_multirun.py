@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import pytest
 from hydra.types import RunMode
 
 from tests.training.runs import SMALL
@@ -16,15 +15,16 @@ from xplanes.evaluation.table import SweepTable, choose_gpu
 
 ROOT = Path(__file__).resolve().parents[2]
 
+CHANGED = ("model.channels", "trainer.max_steps", "trainer.evaluate_at")
+
 
 def test_a_failed_job_is_a_row_and_the_others_go_on(trained_run: Path, tmp_path: Path):
     command = [
-        *(sys.executable, str(ROOT / "train.py"), "-m", "model=six_planes,nine_planes"),
-        *(option for option in SMALL if "max_steps" not in option and "evaluate_at" not in option),
-        *("model.channels=4,0", "trainer.max_steps=2", "trainer.evaluate_at=[]"),
+        *(sys.executable, str(ROOT / "train.py"), "-m", "model.channels=0,4"),
+        *(option for option in SMALL if not option.startswith(CHANGED)),
+        *("trainer.max_steps=2", "trainer.evaluate_at=[]"),
         *(f"data.root={trained_run.parents[1] / 'scenes'}", f"hydra.sweep.dir={tmp_path}"),
     ]
-    command.remove("model.channels=8")
     environment = os.environ | {"OMP_WAIT_POLICY": "PASSIVE"}
     done = subprocess.run(
         command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120
@@ -32,18 +32,13 @@ def test_a_failed_job_is_a_row_and_the_others_go_on(trained_run: Path, tmp_path:
     assert done.returncode == 1, done.stderr
     with (tmp_path / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [(row["model.name"], row["model.channels"]) for row in rows] == [
-        ("six_planes", "4"),
-        ("six_planes", "0"),
-        ("nine_planes", "4"),
-        ("nine_planes", "0"),
-    ]
-    assert [row["status"].split(":")[0] for row in rows] == ["finished", "failed"] * 2
-    assert "model.channels=0" in rows[1]["status"]
-    assert float(rows[2]["psnr"]) > 0
+    assert [row["model.channels"] for row in rows] == ["0", "4"]
+    assert [row["status"].split(":")[0] for row in rows] == ["failed", "finished"]
+    assert "model.channels=0" in rows[0]["status"]
+    assert float(rows[1]["psnr"]) > 0
     assert (tmp_path / "table.md").read_text() in done.stdout
-    assert "job 2 finished: psnr" in done.stdout
-    assert "job 3 failed: ConfigError: model.channels=0" in done.stdout
+    assert "job 0 failed: ConfigError: model.channels=0" in done.stdout
+    assert "job 1 finished: psnr" in done.stdout
 
 
 def settings(folder: Path) -> SimpleNamespace:
@@ -75,13 +70,11 @@ def test_the_table_comes_once(tmp_path: Path, capsys):
     assert capsys.readouterr().out.count("failed: x") == 1
 
 
-@pytest.mark.parametrize(
-    ("visible", "job", "gpu"),
-    [("0,1", 0, "0"), ("0,1", 3, "1"), ("4, 6,7", 4, "6"), ("5", 3, None), ("", 1, None)],
-)
-def test_jobs_take_the_gpus_in_turn(visible: str, job: int, gpu: str | None):
-    environment = {"CUDA_VISIBLE_DEVICES": visible}
-    assert choose_gpu(job, environment) == gpu
-    assert environment["CUDA_VISIBLE_DEVICES"] == (gpu or visible)
-    # The next job of the same process stays there.
-    assert choose_gpu(job + 1, environment) is None
+def test_jobs_take_the_gpus_in_turn():
+    cases = [("0,1", 0, "0"), ("0,1", 3, "1"), ("4, 6,7", 4, "6"), ("5", 3, None), ("", 1, None)]
+    for visible, job, gpu in cases:
+        environment = {"CUDA_VISIBLE_DEVICES": visible}
+        assert choose_gpu(job, environment) == gpu, (visible, job)
+        assert environment["CUDA_VISIBLE_DEVICES"] == (gpu or visible), (visible, job)
+        # The next job of the same process stays there.
+        assert choose_gpu(job + 1, environment) is None, (visible, job)

@@ -29,10 +29,10 @@ def test_ways_through_time():
     assert times("0.3", 2).tolist() == pytest.approx([0.3, 0.3])
 
 
-@pytest.mark.parametrize("name", ["1.1", "-0.1", "nan", "soon"])
-def test_other_times_are_refused(name):
-    with pytest.raises(ConfigError, match="from 0 to 1"):
-        times(name, 3)
+def test_other_times_are_refused():
+    for name in ("1.1", "-0.1", "nan", "soon"):
+        with pytest.raises(ConfigError, match=f"--time {name}.*from 0 to 1"):
+            times(name, 3)
 
 
 def test_camera_paths(trained: TrainedRun):
@@ -111,26 +111,22 @@ def test_an_mp4_without_the_extra_names_it(monkeypatch):
         check_out("film.mp4", FilmOptions())
 
 
-@pytest.mark.parametrize(
-    ("out", "words"), [("film.gif", "end in .webp"), ("film", "end in"), ("a.png", "not 48")]
-)
-def test_other_files_are_refused(out: str, words: str):
-    with pytest.raises(ConfigError, match=words):
-        check_out(out, FilmOptions())
+def test_other_files_are_refused():
+    for out, words in {"film.gif": "end in .webp", "film": "end in", "a.png": "not 48"}.items():
+        with pytest.raises(ConfigError, match=words):
+            check_out(out, FilmOptions())
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (FilmOptions(path="spiral"), "--path spiral"),
-        (FilmOptions(time="2"), "--time 2"),
-        (FilmOptions(frames=0), "--frames 0"),
-        (FilmOptions(fps=0), "--fps 0"),
-        (FilmOptions(size=-4), "--size -4"),
-        (FilmOptions(size=0), "--size 0"),
-        (FilmOptions(elevation=100), "--elevation 100"),
-    ],
-)
-def test_options_out_of_range_are_refused(options: FilmOptions, words: str):
-    with pytest.raises(ConfigError, match=words):
-        options.check()
+def test_options_out_of_range_are_refused():
+    refused = {
+        FilmOptions(path="spiral"): "--path spiral",
+        FilmOptions(time="2"): "--time 2",
+        FilmOptions(frames=0): "--frames 0",
+        FilmOptions(fps=0): "--fps 0",
+        FilmOptions(size=-4): "--size -4",
+        FilmOptions(size=0): "--size 0",
+        FilmOptions(elevation=100): "--elevation 100",
+    }
+    for options, words in refused.items():
+        with pytest.raises(ConfigError, match=words):
+            options.check()

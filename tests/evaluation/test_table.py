@@ -1,6 +1,7 @@
 """The table of a sweep: what differs, how runs ended, means over seeds; nothing stops it."""
 
 import csv
+import itertools
 import json
 import shutil
 from pathlib import Path
@@ -81,21 +82,18 @@ def test_columns_are_the_settings_that_differ(tmp_path):
 CURVE = "seconds,step,split,psnr,ssim\n"
 
 
-@pytest.mark.parametrize(
-    ("rows", "start", "reached"),
-    [
-        ("0,0,test,8,0.1\n10,50,test,16,0.2\n20,90,test,24,0.3\n", 8.0, 2 + 15.0),
-        ("0,0,test,21,0.1\n10,50,test,25,0.2\n", 21.0, 2.0),
-        ("0,0,test,8,0.1\n10,50,test,19,0.2\n", 8.0, None),
-        ("10,50,test,19,0.2\n20,90,test,21,0.2\n", None, 2 + 15.0),
-    ],
-)
-def test_the_curve_tells_the_start_and_the_time_to_20(tmp_path, rows, start, reached):
-    (make(tmp_path / "0") / "curve.csv").write_text(CURVE + rows)
-    (row,) = table(tmp_path)
-    assert row["start_psnr"] == ("" if start is None else repr(start))
+def test_the_curve_tells_the_start_and_the_time_to_20(tmp_path):
     # Two seconds of preparation come first.
-    assert row["seconds_to_20"] == ("" if reached is None else repr(reached))
+    cases = [
+        ("0,0,test,8,0.1\n10,50,test,16,0.2\n20,90,test,24,0.3\n", "8.0", repr(2 + 15.0)),
+        ("0,0,test,21,0.1\n10,50,test,25,0.2\n", "21.0", "2.0"),
+        ("0,0,test,8,0.1\n10,50,test,19,0.2\n", "8.0", ""),
+        ("10,50,test,19,0.2\n20,90,test,21,0.2\n", "", repr(2 + 15.0)),
+    ]
+    for number, (rows, _, _) in enumerate(cases):
+        (make(tmp_path / f"{number}") / "curve.csv").write_text(CURVE + rows)
+    found = [(row["start_psnr"], row["seconds_to_20"]) for row in table(tmp_path)]
+    assert found == [(start, reached) for _, start, reached in cases]
 
 
 def test_a_damaged_curve_is_a_status(tmp_path):
@@ -191,20 +189,21 @@ def test_runs_that_did_not_finish_are_rows_with_their_reason(tmp_path):
     assert "failed: TrainingError: a \\| b more " in write_tables(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["run.json", "metrics.json", "config.yaml"])
-@pytest.mark.parametrize("content", [b"{", b"\xff\xfe\x00", b"", b"[1]", b'{"test": 3}'])
-def test_a_damaged_file_is_a_row_not_a_crash(tmp_path, name, content):
-    make(tmp_path / "0", seed=1)
-    damaged = make(tmp_path / "1")
-    (damaged / name).write_bytes(content)
-    rows = table(tmp_path)
-    assert rows[0]["status"] == "finished"
-    assert len(rows) == 2
-    if name == "config.yaml" and content == b'{"test": 3}':
-        return  # Nothing wrong with that, as far as a table goes.
-    assert f"{name} " in rows[1]["status"]
-    assert not rows[1]["status"].startswith("finished")
-    assert rows[1]["psnr"] == ("" if name == "metrics.json" else "20.0")
+def test_a_damaged_file_is_a_row_not_a_crash(tmp_path):
+    names = ("run.json", "metrics.json", "config.yaml")
+    contents = (b"{", b"\xff\xfe\x00", b"", b"[1]", b'{"test": 3}')
+    for number, (name, content) in enumerate(itertools.product(names, contents)):
+        case, sweep = (name, content), tmp_path / f"{number}"
+        make(sweep / "0", seed=1)
+        (make(sweep / "1") / name).write_bytes(content)
+        rows = table(sweep)
+        assert rows[0]["status"] == "finished", case
+        assert len(rows) == 2, case
+        if case == ("config.yaml", b'{"test": 3}'):
+            continue  # Nothing wrong with that, as far as a table goes.
+        assert f"{name} " in rows[1]["status"], case
+        assert not rows[1]["status"].startswith("finished"), case
+        assert rows[1]["psnr"] == ("" if name == "metrics.json" else "20.0"), case
 
 
 def test_jobs_without_a_run_are_rows(tmp_path):
@@ -232,14 +231,16 @@ def test_jobs_without_a_run_are_rows(tmp_path):
     assert "model.plane_set" not in written[0]
 
 
-@pytest.mark.parametrize(
-    "content",
-    ["hydra: 3", "[", "hydra: {sweeper: {_target_: optuna.Sweeper}}", "hydra: {sweeper: null}"],
-)
-def test_an_unknown_sweeper_lists_no_jobs(tmp_path, content):
-    (tmp_path / "multirun.yaml").write_text(content)
+def test_an_unknown_sweeper_lists_no_jobs(tmp_path):
     make(tmp_path / "0")
-    assert len(table(tmp_path)) == 1
+    for content in (
+        "hydra: 3",
+        "[",
+        "hydra: {sweeper: {_target_: optuna.Sweeper}}",
+        "hydra: {sweeper: null}",
+    ):
+        (tmp_path / "multirun.yaml").write_text(content)
+        assert len(table(tmp_path)) == 1, content
 
 
 def test_a_folder_without_runs_says_so(tmp_path):

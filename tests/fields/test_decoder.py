@@ -1,5 +1,6 @@
 """The decoder: shapes, activations and margins, and its behaviour at extreme logits."""
 
+import itertools
 import math
 
 import numpy as np
@@ -35,17 +36,20 @@ DENSITIES = {
 }
 
 
-@pytest.mark.parametrize("hidden", [0, 1, 3])
-@pytest.mark.parametrize("activation", ACTIVATIONS)
-@pytest.mark.parametrize("density", DENSITIES)
-def test_output_is_the_formula_of_the_public_models(hidden, activation, density):
-    decoder = filled(hidden=hidden, activation=activation, density=density, density_scale=7.0)
-    features = torch.randn(30, 6)
-    logits = mlp(decoder, features, ACTIVATIONS[activation])
-    colour, found = (t.detach().numpy() for t in decoder(features))
-    np.testing.assert_allclose(found, 7 * DENSITIES[density](logits[:, 0]), rtol=2e-5)
-    sigmoid = 1 / (1 + np.exp(-logits[:, 1:]))
-    np.testing.assert_allclose(colour, sigmoid * (1 + 2 * 0.001) - 0.001, atol=2e-6)
+def test_output_is_the_formula_of_the_public_models():
+    for hidden, activation, density in itertools.product([0, 1, 3], ACTIVATIONS, DENSITIES):
+        case = f"hidden={hidden}, activation={activation}, density={density}"
+        decoder = filled(hidden=hidden, activation=activation, density=density, density_scale=7.0)
+        features = torch.randn(30, 6)
+        logits = mlp(decoder, features, ACTIVATIONS[activation])
+        colour, found = (t.detach().numpy() for t in decoder(features))
+        np.testing.assert_allclose(
+            found, 7 * DENSITIES[density](logits[:, 0]), rtol=2e-5, err_msg=case
+        )
+        sigmoid = 1 / (1 + np.exp(-logits[:, 1:]))
+        np.testing.assert_allclose(
+            colour, sigmoid * (1 + 2 * 0.001) - 0.001, atol=2e-6, err_msg=case
+        )
 
 
 def test_layers_have_the_asked_sizes():
@@ -53,36 +57,40 @@ def test_layers_have_the_asked_sizes():
     assert sizes == [(11, 15), (11, 11), (4, 11)]
 
 
-@pytest.mark.parametrize("margin", [0.0, 0.001, 0.1])
-def test_margin_widens_the_colours_on_both_sides(margin):
-    decoder = Decoder(2, colour_margin=margin)
-    logits = torch.tensor([[0.0, -200.0, 0.0, 200.0]], dtype=torch.float64)
-    colour = decoder.activate(logits)[0][0]
-    expected = torch.tensor([-margin, 0.5, 1 + margin], dtype=torch.float64)
-    torch.testing.assert_close(colour, expected)
+def test_margin_widens_the_colours_on_both_sides():
+    for margin in [0.0, 0.001, 0.1]:
+        decoder = Decoder(2, colour_margin=margin)
+        logits = torch.tensor([[0.0, -200.0, 0.0, 200.0]], dtype=torch.float64)
+        colour = decoder.activate(logits)[0][0]
+        expected = torch.tensor([-margin, 0.5, 1 + margin], dtype=torch.float64)
+        torch.testing.assert_close(colour, expected, msg=lambda m, c=margin: f"{c}: {m}")
 
 
-@pytest.mark.parametrize("density", DENSITIES)
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-def test_low_precision_logits_are_activated_in_float32(density, dtype):
-    logits = torch.linspace(-6, 6, 40).view(10, 4).to(dtype)
-    colour, found = Decoder(2, density=density).activate(logits)
-    wanted = torch.float64 if dtype == torch.float64 else torch.float32
-    assert colour.dtype == found.dtype == wanted
-    exact = DENSITIES[density](logits[:, 0].double().numpy())
-    np.testing.assert_allclose(found.numpy(), exact, rtol=1e-5)
+def test_low_precision_logits_are_activated_in_float32():
+    for density, dtype in itertools.product(
+        DENSITIES, [torch.float16, torch.bfloat16, torch.float32, torch.float64]
+    ):
+        case = f"density={density}, dtype={dtype}"
+        logits = torch.linspace(-6, 6, 40).view(10, 4).to(dtype)
+        colour, found = Decoder(2, density=density).activate(logits)
+        wanted = torch.float64 if dtype == torch.float64 else torch.float32
+        assert colour.dtype == found.dtype == wanted, case
+        exact = DENSITIES[density](logits[:, 0].double().numpy())
+        np.testing.assert_allclose(found.numpy(), exact, rtol=1e-5, err_msg=case)
 
 
-@pytest.mark.parametrize("density", DENSITIES)
-@pytest.mark.parametrize("logit", [-1e30, -1e4, -90.0, 90.0, 130.0, 1e4, 1e30])
-def test_extreme_logits_give_finite_densities_and_gradients(density, logit):
-    logits = torch.tensor([[logit, logit, -logit, 0.0]], requires_grad=True)
-    colour, found = Decoder(2, density=density, density_scale=25.0).activate(logits)
-    assert colour.isfinite().all()
-    assert found.isfinite().all()
-    assert found >= 0
-    (colour.sum() + found.sum()).backward()
-    assert logits.grad.isfinite().all()
+def test_extreme_logits_give_finite_densities_and_gradients():
+    for density, logit in itertools.product(
+        DENSITIES, [-1e30, -1e4, -90.0, 90.0, 130.0, 1e4, 1e30]
+    ):
+        case = f"density={density}, logit={logit}"
+        logits = torch.tensor([[logit, logit, -logit, 0.0]], requires_grad=True)
+        colour, found = Decoder(2, density=density, density_scale=25.0).activate(logits)
+        assert colour.isfinite().all(), case
+        assert found.isfinite().all(), case
+        assert found >= 0, case
+        (colour.sum() + found.sum()).backward()
+        assert logits.grad.isfinite().all(), case
 
 
 def test_density_rises_with_its_logit_where_anything_can_be_seen():

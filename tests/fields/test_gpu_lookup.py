@@ -43,12 +43,19 @@ def both(plane_set, space, time, points, times, exact=torch.float64):
     return results
 
 
-def compare(found, tolerance):
+def compare(found, tolerance, case):
     ours, theirs = found
     assert len(ours) == len(theirs)
     for a, b in zip(ours, theirs, strict=True):
-        assert b.numel() == 0 or b.abs().max() > 0.1
-        torch.testing.assert_close(a, b, atol=tolerance, rtol=tolerance, check_dtype=False)
+        assert b.numel() == 0 or b.abs().max() > 0.1, case
+        torch.testing.assert_close(
+            a,
+            b,
+            atol=tolerance,
+            rtol=tolerance,
+            check_dtype=False,
+            msg=lambda m: f"{case}: {m}",
+        )
 
 
 def places(dtype):
@@ -61,23 +68,30 @@ def places(dtype):
     return points, times
 
 
-@pytest.mark.parametrize(
-    ("plane_set", "channels"),
-    [*(("six", c) for c in (1, 3, 8, 32, 40)), ("nine", 3), ("nine", 40), ("three", 8)],
-)
-def test_values_and_gradients_are_the_twins(plane_set, channels):
-    space, time = stacks(plane_set, torch.float32, channels=channels)
-    compare(both(plane_set, space, time, *places(torch.float32)), 2e-5)
+def test_values_and_gradients_are_the_twins():
+    for plane_set, channels in [
+        *(("six", c) for c in (1, 3, 8, 40)),
+        ("nine", 3),
+        ("nine", 40),
+        ("three", 8),
+    ]:
+        case = f"plane_set={plane_set}, channels={channels}"
+        space, time = stacks(plane_set, torch.float32, channels=channels)
+        compare(both(plane_set, space, time, *places(torch.float32)), 2e-5, case)
+    # More channels than a program takes.
+    space, time = stacks("three", torch.float32, size=3, channels=131)
+    found = both("three", space, time, *scattered(2, torch.float32, reach=0.9))
+    compare(found, 2e-5, "131 channels")
 
 
-@pytest.mark.parametrize("plane_set", ["six", "nine", "three"])
-def test_values_are_those_of_equation_15(plane_set):
-    space, time = stacks(plane_set)
-    points, times = places(torch.float64)
-    expected = oracle(named(plane_set, space, time), plane_set, points, times)
-    found = both(plane_set, space, time, points, times)
-    np.testing.assert_allclose(found[0][0], expected, atol=1e-12)
-    compare(found, 1e-12)
+def test_values_are_those_of_equation_15():
+    for plane_set in ["six", "nine", "three"]:
+        space, time = stacks(plane_set)
+        points, times = places(torch.float64)
+        expected = oracle(named(plane_set, space, time), plane_set, points, times)
+        found = both(plane_set, space, time, points, times)
+        np.testing.assert_allclose(found[0][0], expected, atol=1e-12, err_msg=str(plane_set))
+        compare(found, 1e-12, plane_set)
 
 
 def test_gradients_are_differences():
@@ -98,37 +112,34 @@ def test_gradients_are_differences():
     torch.testing.assert_close(rise / 2, slope)
 
 
-@pytest.mark.parametrize("count", [0, 1, 16, 17])
-def test_any_number_of_points(count):
-    # 32 channels make blocks of 16 points.
-    space, time = stacks("six", torch.float32, channels=32)
-    ours, theirs = both("six", space, time, *scattered(count, torch.float32, reach=0.9))
-    assert ours[0].shape == (count, 3, 32)
-    for a, b in zip(ours, theirs, strict=True):
-        torch.testing.assert_close(a, b, atol=2e-5, rtol=2e-5, check_dtype=False)
+def test_any_number_of_points():
+    for count in [0, 1, 16, 17]:
+        # 32 channels make blocks of 16 points.
+        space, time = stacks("six", torch.float32, channels=32)
+        ours, theirs = both("six", space, time, *scattered(count, torch.float32, reach=0.9))
+        assert ours[0].shape == (count, 3, 32), count
+        for a, b in zip(ours, theirs, strict=True):
+            torch.testing.assert_close(
+                a, b, atol=2e-5, rtol=2e-5, check_dtype=False, msg=lambda m, c=count: f"{c}: {m}"
+            )
 
 
-def test_more_channels_than_a_program_takes():
-    space, time = stacks("three", torch.float32, size=3, channels=131)
-    compare(both("three", space, time, *scattered(2, torch.float32, reach=0.9)), 2e-5)
+def test_planes_of_one_texel_or_one_row():
+    for rows in [1, 2]:
+        space, time = stacks("six", size=rows, time_rows=rows, time_size=rows)
+        compare(both("six", space, time, *scattered(20)), 1e-12, rows)
 
 
-@pytest.mark.parametrize("rows", [1, 2])
-def test_planes_of_one_texel_or_one_row(rows):
-    space, time = stacks("six", size=rows, time_rows=rows, time_size=rows)
-    compare(both("six", space, time, *scattered(20)), 1e-12)
-
-
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_half_precision_planes_are_added_up_in_float32(dtype):
-    space, time = stacks("six", dtype, channels=4)
-    points, times = scattered(40, torch.float32, reach=0.9)
-    ours, theirs = both("six", space, time, points, times)
-    for a, b in zip(ours, theirs, strict=True):
-        assert a.dtype == dtype
-        # What is left is the rounding of the results themselves.
-        error = (a.double() - b).abs() / b.abs().clamp_min(1)
-        assert error.max() < torch.finfo(dtype).eps
+def test_half_precision_planes_are_added_up_in_float32():
+    for dtype in [torch.bfloat16, torch.float16]:
+        space, time = stacks("six", dtype, channels=4)
+        points, times = scattered(40, torch.float32, reach=0.9)
+        ours, theirs = both("six", space, time, points, times)
+        for a, b in zip(ours, theirs, strict=True):
+            assert a.dtype == dtype, dtype
+            # What is left is the rounding of the results themselves.
+            error = (a.double() - b).abs() / b.abs().clamp_min(1)
+            assert error.max() < torch.finfo(dtype).eps, dtype
 
 
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")  # The interpreter's, on purpose.

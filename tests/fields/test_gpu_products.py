@@ -34,24 +34,32 @@ def both(names, dtype, *, channels, count, sizes=(3, 4, 5), reach=1.3):
     return results
 
 
-@pytest.mark.parametrize(
-    ("names", "channels", "count"),
-    [(MOVING, 1, 9), (MOVING, 8, 70), (MOVING, 40, 13), (STILL, 3, 129), (STILL, 32, 16)],
-)
-def test_values_and_gradients_are_the_twins(names, channels, count):
-    ours, theirs = both(names, torch.float32, channels=channels, count=count)
-    assert len(ours) == len(names) + 1
-    for a, b in zip(ours, theirs, strict=True):
-        assert a.dtype == torch.float32
-        assert b.abs().max() > 0.1
-        torch.testing.assert_close(a, b, atol=5e-5, rtol=5e-5, check_dtype=False)
+def test_values_and_gradients_are_the_twins():
+    for names, channels, count in [
+        (MOVING, 1, 9),
+        (MOVING, 8, 70),
+        (MOVING, 40, 13),
+        (STILL, 3, 129),
+        (STILL, 32, 16),
+    ]:
+        case = f"{len(names)} planes, channels={channels}, count={count}"
+        ours, theirs = both(names, torch.float32, channels=channels, count=count)
+        assert len(ours) == len(names) + 1, case
+        for a, b in zip(ours, theirs, strict=True):
+            assert a.dtype == torch.float32, case
+            assert b.abs().max() > 0.1, case
+            torch.testing.assert_close(
+                a, b, atol=5e-5, rtol=5e-5, check_dtype=False, msg=lambda m, c=case: f"{c}: {m}"
+            )
 
 
-@pytest.mark.parametrize("sizes", [(3, 4, 5), (1, 1, 1)])
-def test_in_float64_nothing_but_rounding_is_left(sizes):
-    ours, theirs = both(MOVING, torch.float64, channels=2, count=7, sizes=sizes)
-    for a, b in zip(ours, theirs, strict=True):
-        torch.testing.assert_close(a, b, atol=1e-12, rtol=1e-12)
+def test_in_float64_nothing_but_rounding_is_left():
+    for sizes in [(3, 4, 5), (1, 1, 1)]:
+        ours, theirs = both(MOVING, torch.float64, channels=2, count=7, sizes=sizes)
+        for a, b in zip(ours, theirs, strict=True):
+            torch.testing.assert_close(
+                a, b, atol=1e-12, rtol=1e-12, msg=lambda m, c=sizes: f"{c}: {m}"
+            )
 
 
 def test_no_point():

@@ -1,6 +1,7 @@
 """Products in bfloat16 whose number of rows seldom changes."""
 
-import pytest
+import itertools
+
 import torch
 
 from xplanes.fields.decoder import Decoder
@@ -14,44 +15,59 @@ NETWORKS = {
 COUNTS = [0, 1, ROWS - 1, ROWS, ROWS + 1, 1000]
 
 
-@pytest.mark.parametrize("count", COUNTS)
-def test_rows_of_zeros_fill_up_the_last_block(count):
-    values = torch.randn(count, 7)
-    rows = half_rows(values)
-    assert rows.dtype == torch.bfloat16
-    assert len(rows) % ROWS == 0
-    assert 0 <= len(rows) - count < ROWS
-    assert torch.equal(rows[:count], values.bfloat16())
-    assert not rows[count:].any()
+def test_rows_of_zeros_fill_up_the_last_block():
+    for count in COUNTS:
+        values = torch.randn(count, 7)
+        rows = half_rows(values)
+        assert rows.dtype == torch.bfloat16, count
+        assert len(rows) % ROWS == 0, count
+        assert 0 <= len(rows) - count < ROWS, count
+        assert torch.equal(rows[:count], values.bfloat16()), count
+        assert not rows[count:].any(), count
 
 
-@pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.parametrize("network", NETWORKS)
-def test_what_is_filled_up_changes_neither_values_nor_gradients(network, count):
-    torch.manual_seed(0)
-    made = NETWORKS[network]()
-    features = torch.randn(1000, 12)
-
-    def outcome(values):
-        made.zero_grad()
-        out = made(values.requires_grad_())
-        if isinstance(out, tuple):
-            out = torch.cat([out[0], out[1][:, None]], dim=1)
-        out[:count].square().sum().backward()
-        return out[:count], values.grad[:count], [p.grad.clone() for p in made.parameters()]
-
-    few, whole = outcome(features[:count].clone()), outcome(features.clone())
-    torch.testing.assert_close(few[0], whole[0], atol=0, rtol=0.01)
-    torch.testing.assert_close(few[1], whole[1], atol=1e-3, rtol=0.02)
-    for own, other in zip(few[2], whole[2], strict=True):
-        torch.testing.assert_close(own, other, atol=0.02 * float(other.abs().max()) + 1e-6, rtol=0)
+def outcome(network, features, count):
+    """The first rows of what a network answers, and their gradients."""
+    network.zero_grad()
+    out = network(features.requires_grad_())
+    if isinstance(out, tuple):
+        out = torch.cat([out[0], out[1][:, None]], dim=1)
+    out[:count].square().sum().backward()
+    return out[:count], features.grad[:count], [p.grad.clone() for p in network.parameters()]
 
 
-@pytest.mark.parametrize("precision", ["32", "bf16"])
-def test_few_sizes_of_products_for_many_numbers_of_samples(precision):
-    decoder = Decoder(4, precision=precision)
-    seen = set()
-    decoder.layers[1].register_forward_hook(lambda _module, rows, _out: seen.add(len(rows[0])))
-    for count in range(900, 1100, 7):
-        assert len(decoder(torch.randn(count, 12))[1]) == count
-    assert len(seen) == (2 if precision == "bf16" else len(range(900, 1100, 7)))
+def test_what_is_filled_up_changes_neither_values_nor_gradients():
+    for count, network in itertools.product(COUNTS, NETWORKS):
+        case = f"count={count}, network={network}"
+        torch.manual_seed(0)
+        made = NETWORKS[network]()
+        features = torch.randn(1000, 12)
+        few, whole = (outcome(made, f.clone(), count) for f in (features[:count], features))
+        torch.testing.assert_close(
+            few[0], whole[0], atol=0, rtol=0.01, msg=lambda m, c=case: f"{c}: {m}"
+        )
+        torch.testing.assert_close(
+            few[1], whole[1], atol=1e-3, rtol=0.02, msg=lambda m, c=case: f"{c}: {m}"
+        )
+        for own, other in zip(few[2], whole[2], strict=True):
+            torch.testing.assert_close(
+                own,
+                other,
+                atol=0.02 * float(other.abs().max()) + 1e-6,
+                rtol=0,
+                msg=lambda m, c=case: f"{c}: {m}",
+            )
+
+
+def test_few_sizes_of_products_for_many_numbers_of_samples():
+    for precision in ["32", "bf16"]:
+        decoder = Decoder(4, precision=precision)
+        sizes = []
+        decoder.layers[1].register_forward_hook(
+            lambda _module, rows, _out, sizes=sizes: sizes.append(len(rows[0]))
+        )
+        for count in range(900, 1100, 7):
+            assert len(decoder(torch.randn(count, 12))[1]) == count, precision
+        assert len(set(sizes)) == (2 if precision == "bf16" else len(range(900, 1100, 7))), (
+            precision
+        )

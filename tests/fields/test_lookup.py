@@ -1,5 +1,7 @@
 """Plane lookup: compiled loops, readable twin and NumPy oracle come to the same numbers."""
 
+import itertools
+
 import numba
 import numpy as np
 import pytest
@@ -50,40 +52,48 @@ def both(plane_set, space, time, points, times):
     return results
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("plane_set", SETS)
-def test_values_are_those_of_equation_15(plane_set, dtype):
-    space, time = stacks(plane_set, dtype)
-    points, times = scattered(40, dtype)
-    expected = oracle(named(plane_set, space, time), plane_set, points, times)
-    for value, *_ in both(plane_set, space, time, points, times):
-        assert value.dtype == dtype
-        np.testing.assert_allclose(value.numpy(), expected, atol=4 * TOLERANCE[dtype])
+def test_values_are_those_of_equation_15():
+    for dtype, plane_set in itertools.product([torch.float32, torch.float64], SETS):
+        case = f"dtype={dtype}, plane_set={plane_set}"
+        space, time = stacks(plane_set, dtype)
+        points, times = scattered(40, dtype)
+        expected = oracle(named(plane_set, space, time), plane_set, points, times)
+        for value, *_ in both(plane_set, space, time, points, times):
+            assert value.dtype == dtype, case
+            np.testing.assert_allclose(
+                value.numpy(), expected, atol=4 * TOLERANCE[dtype], err_msg=case
+            )
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("plane_set", SETS)
-def test_gradients_of_loops_and_twin_agree(plane_set, dtype):
-    space, time = stacks(plane_set, dtype)
-    points, times = scattered(300, dtype)
-    compiled, reference = both(plane_set, space, time, points, times)
-    assert len(compiled) == (2 if plane_set == "three" else 3)
-    for ours, theirs in zip(compiled, reference, strict=True):
-        assert ours.dtype == dtype
-        torch.testing.assert_close(ours, theirs, atol=60 * TOLERANCE[dtype], rtol=1e-5)
-        assert theirs.abs().max() > 0.1
+def test_gradients_of_loops_and_twin_agree():
+    for dtype, plane_set in itertools.product([torch.float32, torch.float64], SETS):
+        case = f"dtype={dtype}, plane_set={plane_set}"
+        space, time = stacks(plane_set, dtype)
+        points, times = scattered(300, dtype)
+        compiled, reference = both(plane_set, space, time, points, times)
+        assert len(compiled) == (2 if plane_set == "three" else 3), case
+        for ours, theirs in zip(compiled, reference, strict=True):
+            assert ours.dtype == dtype, case
+            torch.testing.assert_close(
+                ours,
+                theirs,
+                atol=60 * TOLERANCE[dtype],
+                rtol=1e-5,
+                msg=lambda m, c=case: f"{c}: {m}",
+            )
+            assert theirs.abs().max() > 0.1, case
 
 
-@pytest.mark.parametrize("plane_set", SETS)
-def test_gradients_are_finite_differences(plane_set):
-    space, time = stacks(plane_set, size=3, time_rows=3, time_size=2, channels=2)
-    points, times = scattered(7)
-    planes = [p.requires_grad_() for p in (space, time) if p is not None]
+def test_gradients_are_finite_differences():
+    for plane_set in SETS:
+        space, time = stacks(plane_set, size=3, time_rows=3, time_size=2, channels=2)
+        points, times = scattered(7)
+        planes = [p.requires_grad_() for p in (space, time) if p is not None]
 
-    def features(space, time=None):
-        return plane_features(space, time, points, times, PLANE_SETS[plane_set])
+        def features(space, time=None, rest=(points, times, PLANE_SETS[plane_set])):
+            return plane_features(space, time, *rest)
 
-    assert torch.autograd.gradcheck(features, planes)
+        assert torch.autograd.gradcheck(features, planes), plane_set
 
 
 def test_only_the_planes_that_ask_get_gradients():
@@ -99,19 +109,23 @@ def test_only_the_planes_that_ask_get_gradients():
         leaf.requires_grad_(False).grad = None
 
 
-@pytest.mark.parametrize("coordinate", [-1.0, 1.0, -0.8, 0.8, -1.2, 1.2, -1.2000001, 5.0, 1e30])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_borders_and_beyond(coordinate, dtype):
-    # Five texels of width 0.4: centres at -0.8 .. 0.8, the last influence ends at 1.2.
-    space, time = stacks("six", dtype)
-    points = torch.zeros(6, 3, dtype=dtype)
-    points[:3] += coordinate * torch.eye(3, dtype=dtype)
-    points[3:] -= coordinate * torch.eye(3, dtype=dtype)
-    times = torch.linspace(0, 1, 6, dtype=dtype)
-    expected = oracle(named("six", space, time), "six", points, times)
-    for value, *gradients in both("six", space, time, points, times):
-        np.testing.assert_allclose(value.numpy(), expected, atol=4 * TOLERANCE[dtype])
-        assert all(g.isfinite().all() for g in gradients)
+def test_borders_and_beyond():
+    for coordinate, dtype in itertools.product(
+        [-1.0, 1.0, -0.8, 0.8, -1.2, 1.2, -1.2000001, 5.0, 1e30], [torch.float32, torch.float64]
+    ):
+        case = f"coordinate={coordinate}, dtype={dtype}"
+        # Five texels of width 0.4: centres at -0.8 .. 0.8, the last influence ends at 1.2.
+        space, time = stacks("six", dtype)
+        points = torch.zeros(6, 3, dtype=dtype)
+        points[:3] += coordinate * torch.eye(3, dtype=dtype)
+        points[3:] -= coordinate * torch.eye(3, dtype=dtype)
+        times = torch.linspace(0, 1, 6, dtype=dtype)
+        expected = oracle(named("six", space, time), "six", points, times)
+        for value, *gradients in both("six", space, time, points, times):
+            np.testing.assert_allclose(
+                value.numpy(), expected, atol=4 * TOLERANCE[dtype], err_msg=case
+            )
+            assert all(g.isfinite().all() for g in gradients), case
 
 
 def test_texel_centres_return_the_texels():
@@ -129,21 +143,21 @@ def test_texel_centres_return_the_texels():
     torch.testing.assert_close(moving[:, 0], time[0, step, step] * time[1, step, 4 - step])
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_infinite_points_are_outside_and_nan_stays_nan(dtype):
-    space, time = stacks("six", dtype)
-    points = torch.zeros(6, 3, dtype=dtype)
-    for place, bad in enumerate([torch.inf, -torch.inf, torch.nan, 3e38, -3e38]):
-        points[place, 0] = bad
-    times = torch.full((6,), 0.4, dtype=dtype)
-    times[5] = torch.nan
-    for value, *_ in both("six", space, time, points, times):
-        untouched = [0, 1, 3, 4]
-        assert (value[untouched, :2] == 0).all()  # xy and xz see x; yz does not
-        assert value[untouched, 2].isfinite().all()
-        assert value[2, :2].isnan().all()
-        assert value[2, 2].isfinite().all()
-        assert value[5].isnan().all()
+def test_infinite_points_are_outside_and_nan_stays_nan():
+    for dtype in [torch.float32, torch.float64]:
+        space, time = stacks("six", dtype)
+        points = torch.zeros(6, 3, dtype=dtype)
+        for place, bad in enumerate([torch.inf, -torch.inf, torch.nan, 3e38, -3e38]):
+            points[place, 0] = bad
+        times = torch.full((6,), 0.4, dtype=dtype)
+        times[5] = torch.nan
+        for value, *_ in both("six", space, time, points, times):
+            untouched = [0, 1, 3, 4]
+            assert (value[untouched, :2] == 0).all(), dtype  # xy and xz see x; yz does not
+            assert value[untouched, 2].isfinite().all(), dtype
+            assert value[2, :2].isnan().all(), dtype
+            assert value[2, 2].isfinite().all(), dtype
+            assert value[5].isnan().all(), dtype
 
 
 def test_bad_points_leave_the_gradients_of_others_alone():
@@ -167,28 +181,30 @@ def both_sum(space, time, points, times):
     return results
 
 
-@pytest.mark.parametrize("plane_set", SETS)
-@pytest.mark.parametrize("count", [0, 1])
-def test_no_point_and_one_point(plane_set, count):
-    space, time = stacks(plane_set)
-    points, times = scattered(count)
-    compiled, reference = both(plane_set, space, time, points, times)
-    assert compiled[0].shape == (count, 3, 3)
-    for ours, theirs in zip(compiled, reference, strict=True):
-        torch.testing.assert_close(ours, theirs)
-        assert count or (ours == 0).all()
+def test_no_point_and_one_point():
+    for plane_set, count in itertools.product(SETS, [0, 1]):
+        case = f"plane_set={plane_set}, count={count}"
+        space, time = stacks(plane_set)
+        points, times = scattered(count)
+        compiled, reference = both(plane_set, space, time, points, times)
+        assert compiled[0].shape == (count, 3, 3), case
+        for ours, theirs in zip(compiled, reference, strict=True):
+            torch.testing.assert_close(ours, theirs, msg=lambda m, c=case: f"{c}: {m}")
+            assert count or (ours == 0).all(), case
 
 
-@pytest.mark.parametrize("rows", [1, 2])
-@pytest.mark.parametrize("size", [1, 2])
-def test_planes_of_one_texel_or_one_row(rows, size):
-    space, time = stacks("nine", size=size, time_rows=rows, time_size=size)
-    points, times = scattered(30)
-    expected = oracle(named("nine", space, time), "nine", points, times)
-    compiled, reference = both("nine", space, time, points, times)
-    np.testing.assert_allclose(compiled[0], expected, atol=1e-12)
-    for ours, theirs in zip(compiled, reference, strict=True):
-        torch.testing.assert_close(ours, theirs, atol=1e-12, rtol=0)
+def test_planes_of_one_texel_or_one_row():
+    for rows, size in itertools.product([1, 2], [1, 2]):
+        case = f"rows={rows}, size={size}"
+        space, time = stacks("nine", size=size, time_rows=rows, time_size=size)
+        points, times = scattered(30)
+        expected = oracle(named("nine", space, time), "nine", points, times)
+        compiled, reference = both("nine", space, time, points, times)
+        np.testing.assert_allclose(compiled[0], expected, atol=1e-12, err_msg=case)
+        for ours, theirs in zip(compiled, reference, strict=True):
+            torch.testing.assert_close(
+                ours, theirs, atol=1e-12, rtol=0, msg=lambda m, c=case: f"{c}: {m}"
+            )
 
 
 def test_one_row_of_time_is_the_same_at_all_times():
@@ -217,18 +233,26 @@ def test_a_still_scene_ignores_the_rows_of_its_set():
     assert torch.equal(still, plane_features(space, None, points, times, PLANE_SETS["six"]))
 
 
-def test_planes_and_points_need_not_be_contiguous():
-    space, time = stacks("six")
-    points, times = scattered(50)
-    plain = both("six", space, time, points, times)[0]
-    strided = both(
-        "six",
+def strided(space, time, points, times):
+    """The same planes and points, none of them contiguous."""
+    return (
         space.permute(3, 0, 1, 2).contiguous().permute(1, 2, 3, 0),
-        time.flip(1).flip(1).repeat_interleave(2, dim=2)[:, :, ::2],
+        time.repeat_interleave(2, dim=2)[:, :, ::2],
         points.T.contiguous().T,
         times.repeat_interleave(2)[::2],
-    )[0]
-    for a, b in zip(plain, strided, strict=True):
+    )
+
+
+@pytest.mark.parametrize(
+    "planes_too",
+    [False, pytest.param(True, marks=pytest.mark.slow)],  # The loops are compiled for them anew.
+)
+def test_points_and_planes_need_not_be_contiguous(planes_too):
+    given = *stacks("six"), *scattered(50)
+    turned = strided(*given)
+    planes = turned[:2] if planes_too else given[:2]
+    plain, other = (both("six", *inputs)[0] for inputs in (given, (*planes, *turned[2:])))
+    for a, b in zip(plain, other, strict=True):
         assert torch.equal(a, b)
 
 
@@ -260,29 +284,28 @@ def test_half_precision_planes_take_the_torch_path():
     torch.testing.assert_close(value.float(), full, atol=0.4, rtol=0.1)
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_the_number_of_threads_changes_no_bit(threads):
+def test_the_number_of_threads_changes_no_bit():
     space, time = stacks("nine", torch.float32, size=16, channels=8)
     points, times = scattered(5000, torch.float32)
     usual = both("nine", space, time, points, times)[0]
-    before, torch_before = numba.get_num_threads(), torch.get_num_threads()
-    try:
-        numba.set_num_threads(min(threads, before))
-        torch.set_num_threads(threads)
-        again = both("nine", space, time, points, times)[0]
-    finally:
-        numba.set_num_threads(before)
-        torch.set_num_threads(torch_before)
-    for a, b in zip(usual, again, strict=True):
-        assert torch.equal(a, b)
+    for threads in [1, 2]:
+        before, torch_before = numba.get_num_threads(), torch.get_num_threads()
+        try:
+            numba.set_num_threads(min(threads, before))
+            torch.set_num_threads(threads)
+            again = both("nine", space, time, points, times)[0]
+        finally:
+            numba.set_num_threads(before)
+            torch.set_num_threads(torch_before)
+        for a, b in zip(usual, again, strict=True):
+            assert torch.equal(a, b), threads
 
 
-@pytest.mark.parametrize(
-    ("plane_set", "axes"), [("three", []), ("six", [0, 1, 2]), ("nine", [0, 1, 0, 2, 1, 2])]
-)
-def test_axes_of_time_planes_are_those_of_their_names(plane_set, axes):
-    assert time_plane_axes(PLANE_SETS[plane_set]) == axes
-    assert ["xyz".index(name[0]) for name in TIME_PLANES[plane_set]] == axes
+def test_axes_of_time_planes_are_those_of_their_names():
+    for plane_set, axes in [("three", []), ("six", [0, 1, 2]), ("nine", [0, 1, 0, 2, 1, 2])]:
+        case = f"plane_set={plane_set}, axes={axes}"
+        assert time_plane_axes(PLANE_SETS[plane_set]) == axes, case
+        assert ["xyz".index(name[0]) for name in TIME_PLANES[plane_set]] == axes, case
 
 
 @settings(max_examples=40, deadline=None)

@@ -1,9 +1,12 @@
 """The field: names and shapes of planes, gradients to all parameters, start values."""
 
+import functools
+
 import pytest
 import torch
 
 from tests.oracles import plane_features as oracle
+from tests.refusals import assert_refused
 from xplanes.fields import Decoder, XPlanes
 from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES, random_planes
 
@@ -35,22 +38,28 @@ def scattered(count, dtype=torch.float32):
     return points.to(dtype), torch.rand(count, generator=generator).to(dtype)
 
 
-@pytest.mark.parametrize("plane_set", SETS)
-def test_features_come_from_the_planes_of_their_names(plane_set):
-    field = field_of(plane_set, torch.float64)
-    points, times = scattered(20, torch.float64)
-    planes = {name: plane.detach().numpy() for name, plane in field.planes.items()}
-    expected = torch.from_numpy(oracle(planes, plane_set, points, times)).flatten(1)
-    torch.testing.assert_close(field.features(points, times), expected, atol=1e-12, rtol=0)
+def test_features_come_from_the_planes_of_their_names():
+    for plane_set in SETS:
+        field = field_of(plane_set, torch.float64)
+        points, times = scattered(20, torch.float64)
+        planes = {name: plane.detach().numpy() for name, plane in field.planes.items()}
+        expected = torch.from_numpy(oracle(planes, plane_set, points, times)).flatten(1)
+        torch.testing.assert_close(
+            field.features(points, times),
+            expected,
+            atol=1e-12,
+            rtol=0,
+            msg=lambda m, c=plane_set: f"{c}: {m}",
+        )
 
 
-@pytest.mark.parametrize("plane_set", SETS)
-def test_planes_come_back_as_they_were_given(plane_set):
-    given = planes_of(plane_set)
-    field = XPlanes(planes=given, decoder=Decoder(4), plane_set=plane_set)
-    assert list(field.planes) == ["xy", "xz", "yz", *TIME_PLANES[plane_set]]
-    for name, plane in field.planes.items():
-        assert torch.equal(plane, given[name])
+def test_planes_come_back_as_they_were_given():
+    for plane_set in SETS:
+        given = planes_of(plane_set)
+        field = XPlanes(planes=given, decoder=Decoder(4), plane_set=plane_set)
+        assert list(field.planes) == ["xy", "xz", "yz", *TIME_PLANES[plane_set]], plane_set
+        for name, plane in field.planes.items():
+            assert torch.equal(plane, given[name]), (plane_set, name)
 
 
 def test_planes_are_views_of_the_parameters():
@@ -61,28 +70,29 @@ def test_planes_are_views_of_the_parameters():
     assert (field.time[0] != 7).all()
 
 
-@pytest.mark.parametrize("plane_set", SETS)
-def test_gradients_reach_every_parameter(plane_set):
-    field = field_of(plane_set)
-    colour, density = field(*scattered(200))
-    (colour.sum() + density.sum()).backward()
-    for name, parameter in field.named_parameters():
-        assert parameter.grad is not None, name
-        assert parameter.grad.isfinite().all(), name
-        if name in ("space", "time"):
-            assert (parameter.grad.flatten(1).abs().amax(dim=1) > 0).all(), name
-        else:
-            assert parameter.grad.abs().max() > 0, name
+def test_gradients_reach_every_parameter():
+    for plane_set in SETS:
+        field = field_of(plane_set)
+        colour, density = field(*scattered(200))
+        (colour.sum() + density.sum()).backward()
+        for name, parameter in field.named_parameters():
+            case = plane_set, name
+            assert parameter.grad is not None, case
+            assert parameter.grad.isfinite().all(), case
+            if name in ("space", "time"):
+                assert (parameter.grad.flatten(1).abs().amax(dim=1) > 0).all(), case
+            else:
+                assert parameter.grad.abs().max() > 0, case
 
 
-@pytest.mark.parametrize("plane_set", SETS)
-def test_colours_and_densities_are_in_range(plane_set):
-    colour, density = field_of(plane_set)(*scattered(300))
-    assert colour.shape == (300, 3)
-    assert density.shape == (300,)
-    assert colour.min() >= -0.001
-    assert colour.max() <= 1.001
-    assert density.min() > 0
+def test_colours_and_densities_are_in_range():
+    for plane_set in SETS:
+        colour, density = field_of(plane_set)(*scattered(300))
+        assert colour.shape == (300, 3), plane_set
+        assert density.shape == (300,), plane_set
+        assert colour.min() >= -0.001, plane_set
+        assert colour.max() <= 1.001, plane_set
+        assert density.min() > 0, plane_set
 
 
 def test_no_points_give_no_colours():
@@ -117,9 +127,8 @@ def test_the_time_planes_may_have_another_resolution_than_space():
     assert field(*scattered(5))[1].isfinite().all()
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
+def test_planes_that_do_not_fit_are_refused_in_words():
+    for change, words in [
         ({"yz": None}, "needs xy, xz, yz, xt, yt, zt"),
         ({"qt": torch.zeros(4, 3, 6)}, "qt"),
         ({"xy": torch.zeros(4, 6, 5)}, "xy"),
@@ -129,29 +138,27 @@ def test_the_time_planes_may_have_another_resolution_than_space():
         ({name: torch.zeros(5, 3, 6) for name in ("xt", "yt", "zt")}, "channels"),
         ({name: torch.zeros(4, 0, 6) for name in ("xt", "yt", "zt")}, "at least one"),
         ({name: torch.zeros(4, 0, 0) for name in ("xy", "xz", "yz")}, "at least one"),
-    ],
-)
-def test_planes_that_do_not_fit_are_refused_in_words(change, words):
-    planes = {k: v for k, v in {**planes_of("six"), **change}.items() if v is not None}
-    with pytest.raises(ValueError, match=words):
-        XPlanes(planes=planes, decoder=Decoder(4), plane_set="six")
+    ]:
+        planes = {k: v for k, v in {**planes_of("six"), **change}.items() if v is not None}
+        case = {name: plane if plane is None else plane.shape for name, plane in change.items()}
+        refused(words, planes, "six", case)
 
 
-def test_an_unknown_plane_set_is_refused_with_the_choices():
-    with pytest.raises(ValueError, match=r"'seven'.*three, six, nine"):
-        XPlanes(planes=planes_of("six"), decoder=Decoder(4), plane_set="seven")
+def refused(words, planes, plane_set, case):
+    make = functools.partial(XPlanes, planes=planes, decoder=Decoder(4), plane_set=plane_set)
+    assert_refused(ValueError, words, make, case)
 
 
-def test_planes_of_another_set_are_refused():
-    with pytest.raises(ValueError, match="nine"):
-        XPlanes(planes=planes_of("six"), decoder=Decoder(4), plane_set="nine")
+def test_unknown_plane_sets_and_planes_of_another_set_are_refused():
+    refused(r"'seven'.*three, six, nine", planes_of("six"), "seven", "seven")
+    refused("nine", planes_of("six"), "nine", "nine")
 
 
-@pytest.mark.parametrize("plane_set", SETS)
-def test_random_planes_repeat_with_their_seed_and_have_their_scale(plane_set):
-    first, again, other = (planes_of(plane_set, seed, resolution=64) for seed in (0, 0, 1))
-    assert all(torch.equal(first[name], again[name]) for name in first)
-    assert not any(torch.equal(first[name], other[name]) for name in first)
-    assert float(first["xy"].std()) == pytest.approx(0.3, rel=0.05)
-    for name in TIME_PLANES[plane_set]:
-        assert float(first[name].std()) == pytest.approx(0.5, rel=0.15)
+def test_random_planes_repeat_with_their_seed_and_have_their_scale():
+    for plane_set in SETS:
+        first, again, other = (planes_of(plane_set, seed, resolution=64) for seed in (0, 0, 1))
+        assert all(torch.equal(first[name], again[name]) for name in first), plane_set
+        assert not any(torch.equal(first[name], other[name]) for name in first), plane_set
+        assert float(first["xy"].std()) == pytest.approx(0.3, rel=0.05), plane_set
+        for name in TIME_PLANES[plane_set]:
+            assert float(first[name].std()) == pytest.approx(0.5, rel=0.15), (plane_set, name)

@@ -1,13 +1,10 @@
 """Small models with random weights, in the form in which the large ones are published."""
 
-import pytest
 import torch
 
 from xplanes.lrm.checkpoint import build
 from xplanes.lrm.config import parse_config
 from xplanes.lrm.keys import NAMES
-
-pytest.importorskip("safetensors", reason="needs the extra lrm")
 
 OPENLRM = {
     "camera_embed_dim": 24,

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from xplanes.lrm import load
+
 FOLDER = Path(__file__).parents[1] / "data" / "lrm"
 
 VERSIONS = {"1.0": "openlrm_1.0_tiny", "1.1": "openlrm_1.1_tiny"}
@@ -31,8 +33,19 @@ def config(folder):
     return json.loads((FOLDER / folder / "config.json").read_text())
 
 
-def compare(found, expected, rtol=1e-4, atol=1e-4):
-    torch.testing.assert_close(found, expected.to(found.dtype), rtol=rtol, atol=atol)
+def load_reduced(folder):
+    """The model whose weights were recorded in a folder."""
+    return load(config(folder), FOLDER / folder / WEIGHTS[folder])
+
+
+def compare(found, expected, rtol=1e-4, atol=1e-4, case=""):
+    torch.testing.assert_close(
+        found,
+        expected.to(found.dtype),
+        rtol=rtol,
+        atol=atol,
+        msg=lambda words: f"{case}: {words}" if case else words,
+    )
 
 
 def sample(plane, columns, rows):

@@ -1,14 +1,13 @@
 """The similarity from a scene to a model's frame."""
 
 from dataclasses import replace
+from itertools import product
 
 import pytest
 import torch
 
-import xplanes.lrm
 from tests.lrm import openlrm_oracle, triposr_oracle
-from tests.lrm.checks import load
-from tests.lrm.reference import VERSIONS, arrays, compare
+from tests.lrm.reference import VERSIONS, arrays, compare, load_reduced
 from tests.lrm.test_oracles import FILL, openlrm_query, triposr_query
 from xplanes.fields import XPlanes
 from xplanes.lrm import LRMError
@@ -40,69 +39,67 @@ def transformed(frame, pose):
     return result
 
 
-@pytest.mark.parametrize("name", VIEWS)
-@pytest.mark.parametrize("seed", range(5))
-def test_source_camera_becomes_the_models_where_focal_lengths_agree(name, seed):
-    view, pose = VIEWS[name], random_pose(seed)
-    target = pose[:3, 3] - 3.3 * pose[:3, 2]
-    alignment = align(pose, focal=view.focal * 400, height=400, width=400, target=target, view=view)
-    compare(transformed(alignment.frame, pose), view.camera_to_world(), atol=2e-6)
-    assert alignment.frame.scale == pytest.approx(view.distance / 3.3, rel=1e-6)
-    assert alignment.density_factor == alignment.frame.scale
-    assert alignment.mismatch.largest < 1e-3
-    compare(alignment.field_frame.points(target[None]), torch.zeros(1, 3), atol=1e-6)
+def test_source_camera_becomes_the_models_where_focal_lengths_agree():
+    for (name, view), seed in product(VIEWS.items(), range(5)):
+        case, pose = f"{name}, seed {seed}", random_pose(seed)
+        target = pose[:3, 3] - 3.3 * pose[:3, 2]
+        focal = view.focal * 400
+        alignment = align(pose, focal=focal, height=400, width=400, target=target, view=view)
+        compare(transformed(alignment.frame, pose), view.camera_to_world(), atol=2e-6, case=case)
+        assert alignment.frame.scale == pytest.approx(view.distance / 3.3, rel=1e-6), case
+        assert alignment.density_factor == alignment.frame.scale, case
+        assert alignment.mismatch.largest < 1e-3, case
+        origin = alignment.field_frame.points(target[None])
+        compare(origin, torch.zeros(1, 3), atol=1e-6, case=case)
 
 
-@pytest.mark.parametrize(
-    ("name", "scale", "distance"),
-    [
-        ("openlrm", 0.9188, 3.704),
-        ("triposr", 0.4765, 1.921),
-    ],
-)
-def test_sizes_agree_at_the_target_where_focal_lengths_differ(name, scale, distance):
-    view, pose = VIEWS[name], random_pose(1, 4.03113)
-    alignment = align(
-        pose, focal=DNERF_FOCAL, height=400, width=400, target=torch.zeros(3), view=view
-    )
-    assert alignment.frame.scale == pytest.approx(scale, rel=1e-3)
-    centre = transformed(alignment.frame, pose)[:3, 3]
-    assert float(centre.norm()) == pytest.approx(distance, rel=1e-3)
-    # A point beside the target is seen at the same place by both cameras.
-    point = 0.3 * pose[:3, 0]
-    source = DNERF_FOCAL / 400 * 0.3 / 4.03113
-    predicted = view.focal * (alignment.frame.points(point).norm()) / view.distance
-    assert float(predicted) == pytest.approx(source, rel=1e-4)
+def test_sizes_agree_at_the_target_where_focal_lengths_differ():
+    for name, scale, distance in (("openlrm", 0.9188, 3.704), ("triposr", 0.4765, 1.921)):
+        view, pose = VIEWS[name], random_pose(1, 4.03113)
+        alignment = align(
+            pose, focal=DNERF_FOCAL, height=400, width=400, target=torch.zeros(3), view=view
+        )
+        assert alignment.frame.scale == pytest.approx(scale, rel=1e-3), name
+        centre = transformed(alignment.frame, pose)[:3, 3]
+        assert float(centre.norm()) == pytest.approx(distance, rel=1e-3), name
+        # A point beside the target is seen at the same place by both cameras.
+        point = 0.3 * pose[:3, 0]
+        source = DNERF_FOCAL / 400 * 0.3 / 4.03113
+        offset = alignment.frame.points(point)
+        right = (view.rotation_matrix().float().T @ offset)[0]
+        for length in (offset.norm(), right):
+            predicted = view.focal * length / view.distance
+            assert float(predicted) == pytest.approx(source, rel=1e-4), name
+        optical_depth = alignment.field_density_factor * alignment.field_frame.scale
+        assert optical_depth == pytest.approx(alignment.density_factor, rel=1e-6), name
 
 
-@pytest.mark.parametrize(
-    ("name", "radius", "largest", "mean"),
-    [
+def test_mismatch_of_dnerf_cameras():
+    for name, radius, largest, mean in (
         ("openlrm", 0.5, 0.015, 0.005),
         ("openlrm", 0.8, 0.047, 0.012),
         ("openlrm", 1.0, 0.088, 0.020),
         ("triposr", 0.3, 0.0002, 0.0001),
         ("triposr", 0.5, 0.0008, 0.0002),
         ("triposr", 0.6, 0.0013, 0.0003),
-    ],
-)
-def test_mismatch_of_dnerf_cameras(name, radius, largest, mean):
-    found = focal_mismatch(VIEWS[name], DNERF_FOCAL / 400, 400, radius=radius)
-    assert found.largest / 400 == pytest.approx(largest, abs=0.0006 if name == "openlrm" else 6e-5)
-    assert found.mean / 400 == pytest.approx(mean, abs=0.0006 if name == "openlrm" else 6e-5)
+    ):
+        found = focal_mismatch(VIEWS[name], DNERF_FOCAL / 400, 400, radius=radius)
+        case, margin = f"{name}, radius {radius}", 0.0006 if name == "openlrm" else 6e-5
+        assert found.largest / 400 == pytest.approx(largest, abs=margin), case
+        assert found.mean / 400 == pytest.approx(mean, abs=margin), case
 
 
-@pytest.mark.parametrize("name", VIEWS)
-def test_padding_makes_the_focal_lengths_agree(name):
-    view, pose = VIEWS[name], random_pose(2)
-    options = {"focal": DNERF_FOCAL, "height": 400, "width": 400, "target": torch.zeros(3)}
-    plain = align(pose, view=view, **options)
-    padded = align(pose, view=view, matching="pad", **options)
-    assert DNERF_FOCAL / padded.crop.side == pytest.approx(view.focal, rel=2e-3)
-    assert padded.crop.top == padded.crop.left == (400 - padded.crop.side) // 2
-    assert padded.mismatch.largest < 0.3
-    assert padded.mismatch.largest < plain.mismatch.largest
-    compare(transformed(padded.frame, pose), view.camera_to_world(), atol=0.01)
+def test_padding_makes_the_focal_lengths_agree():
+    for name, view in VIEWS.items():
+        pose = random_pose(2)
+        options = {"focal": DNERF_FOCAL, "height": 400, "width": 400, "target": torch.zeros(3)}
+        plain = align(pose, view=view, **options)
+        padded = align(pose, view=view, matching="pad", **options)
+        assert DNERF_FOCAL / padded.crop.side == pytest.approx(view.focal, rel=2e-3), name
+        assert padded.crop.top == padded.crop.left == (400 - padded.crop.side) // 2, name
+        assert padded.mismatch.largest < 0.3, name
+        assert padded.mismatch.largest < plain.mismatch.largest, name
+        compare(transformed(padded.frame, pose), view.camera_to_world(), atol=0.01, case=name)
 
 
 def test_crop_moves_the_centre_to_its_middle():
@@ -131,25 +128,25 @@ def test_wrong_cameras_are_refused():
         )
 
 
-@pytest.mark.parametrize(("kind", "distance"), [("auto", 2.3), ("dist2", 2.0)])
-def test_published_normalisation_of_poses_is_a_special_case(kind, distance):
+def test_published_normalisation_of_poses_is_a_special_case():
     truth = arrays("cameras/openlrm.npz")
     poses = torch.eye(4).repeat(4, 1, 1)
     poses[:, :3] = truth["poses"]
-    alignment = align(
-        poses[0],
-        focal=300,
-        height=400,
-        width=400,
-        target=poses[0, :3, 3] - distance * poses[0, :3, 2],
-        view=replace(OPENLRM_VIEW, distance=distance),
-    )
-    assert alignment.frame.scale == pytest.approx(1)
-    for pose, expected in zip(poses, truth[f"normalized_{kind}"], strict=True):
-        compare(transformed(alignment.frame, pose)[:3], expected, atol=2e-6)
+    for kind, distance in (("auto", 2.3), ("dist2", 2.0)):
+        alignment = align(
+            poses[0],
+            focal=300,
+            height=400,
+            width=400,
+            target=poses[0, :3, 3] - distance * poses[0, :3, 2],
+            view=replace(OPENLRM_VIEW, distance=distance),
+        )
+        assert alignment.frame.scale == pytest.approx(1), kind
+        for pose, expected in zip(poses, truth[f"normalized_{kind}"], strict=True):
+            compare(transformed(alignment.frame, pose)[:3], expected, atol=2e-6, case=kind)
 
 
-SIZE = 14
+SIZE = 9
 
 
 def source_rays(view, seed=5, depth=4.03):
@@ -173,35 +170,34 @@ def field_image(model, triplane, alignment, rays, samples=2000):
     return renderer.image(field, origins, directions, 0.5, torch.ones(3))["colour"]
 
 
-@pytest.mark.parametrize("version", VERSIONS)
-def test_openlrm_picture_through_our_field(version):
-    folder = VERSIONS[version]
-    model, truth = load(xplanes.lrm, folder), arrays(f"{folder}/render.npz")
-    own = truth["planes"][:1]
-    alignment, rays = source_rays(model.view)
-    generator = torch.Generator().manual_seed(0)
-    matrix = torch.tensor([0.75, 0, 0.5, 0, 0.75, 0.5, 0, 0, 1])
-    camera = torch.cat([model.view.camera_to_world().flatten().float(), matrix])[None]
-    origins, directions = openlrm_oracle.window_rays(
-        camera, torch.zeros(1, 2), torch.tensor([float(SIZE)]), SIZE
-    )
-    samples, count = 600, SIZE * SIZE
-    expected = openlrm_oracle.render(
-        openlrm_query(model, own),
-        origins,
-        directions,
-        u_coarse=torch.rand(1, count, samples, 1, generator=generator),
-        u_fine=torch.rand(count, samples, generator=generator),
-        background=torch.ones(1, 1, 1),
-        fill=FILL[version],
-    )["rgb"][0]
-    found = field_image(model, turn_third_plane(own)[0], alignment, rays)
-    assert expected.std(dim=0).mean() > 0.01
-    compare(found, expected, rtol=0, atol=1.5e-3)
+def test_openlrm_picture_through_our_field():
+    for version, folder in VERSIONS.items():
+        model, truth = load_reduced(folder), arrays(f"{folder}/render.npz")
+        own = truth["planes"][:1]
+        alignment, rays = source_rays(model.view)
+        generator = torch.Generator().manual_seed(0)
+        matrix = torch.tensor([0.75, 0, 0.5, 0, 0.75, 0.5, 0, 0, 1])
+        camera = torch.cat([model.view.camera_to_world().flatten().float(), matrix])[None]
+        origins, directions = openlrm_oracle.window_rays(
+            camera, torch.zeros(1, 2), torch.tensor([float(SIZE)]), SIZE
+        )
+        samples, count = 600, SIZE * SIZE
+        expected = openlrm_oracle.render(
+            openlrm_query(model, own),
+            origins,
+            directions,
+            u_coarse=torch.rand(1, count, samples, 1, generator=generator),
+            u_fine=torch.rand(count, samples, generator=generator),
+            background=torch.ones(1, 1, 1),
+            fill=FILL[version],
+        )["rgb"][0]
+        found = field_image(model, turn_third_plane(own)[0], alignment, rays)
+        assert expected.std(dim=0).mean() > 0.01, version
+        compare(found, expected, rtol=0, atol=1.5e-3, case=version)
 
 
 def test_triposr_picture_through_our_field(monkeypatch):
-    model = load(xplanes.lrm, "triposr_tiny")
+    model = load_reduced("triposr_tiny")
     triplane = arrays("triposr_tiny/render.npz")["scene_code"]
     alignment, rays = source_rays(model.view)
     pose = model.view.camera_to_world().float()
@@ -253,7 +249,7 @@ def world_query(model, triplane, alignment):
 
 
 def test_recorded_triposr_picture_by_way_of_the_world():
-    model = load(xplanes.lrm, "triposr_tiny")
+    model = load_reduced("triposr_tiny")
     truth = arrays("triposr_tiny/render_canonical.npz")
     alignment, _ = source_rays(model.view)
     query = world_query(model, truth["scene_code"], alignment)
@@ -269,7 +265,7 @@ def test_recorded_triposr_picture_by_way_of_the_world():
 
 def test_recorded_openlrm_pictures_by_way_of_the_world():
     folder = VERSIONS["1.1"]
-    model, truth = load(xplanes.lrm, folder), arrays(f"{folder}/render.npz")
+    model, truth = load_reduced(folder), arrays(f"{folder}/render.npz")
     alignment, _ = source_rays(model.view)
     queries = [
         world_query(model, planes, alignment)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from tests.lrm.reduced import reduced
 from xplanes.lrm import LRMError
@@ -14,8 +15,6 @@ from xplanes.lrm.bundled import CHECKSUM, bundled_models, load_bundled
 
 def ship(folder: Path, name: str, seed: int = 0) -> Path:
     """A reduced model in the form in which the package carries its own."""
-    from safetensors.torch import save_file
-
     config, state = reduced("openlrm-1.1")
     state = {key: (tensor + seed).half() for key, tensor in state.items()}
     path = folder / f"{name}.safetensors"

@@ -2,112 +2,124 @@
 
 import json
 import pickle
+from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from tests.lrm.reduced import CONFIGS, SIDES, published_shapes, random_state, reduced
 from tests.lrm.reference import FOLDER, VERSIONS, compare, config
 from xplanes.lrm import LRM, LRMError, load
-from xplanes.lrm.checkpoint import build, fill, fitting, mismatches
+from xplanes.lrm.checkpoint import build, fill, mismatches
 from xplanes.lrm.config import parse_config
 from xplanes.lrm.published import PUBLISHED, published_config
-
-safetensors = pytest.importorskip("safetensors.torch")
 
 FAMILIES = list(CONFIGS)
 
 
 def save(path, state):
     if path.suffix == ".safetensors":
-        safetensors.save_file(state, path)
+        save_file(state, path)
     else:
         torch.save(state, path)
     return path
 
 
-@pytest.mark.parametrize("file", ["model.safetensors", "pytorch_model.bin", "model.ckpt"])
-@pytest.mark.parametrize("name", FAMILIES)
-def test_every_published_form_of_file_loads(tmp_path, name, file):
-    settings, state = reduced(name)
-    model = load(settings, save(tmp_path / file, state))
-    assert isinstance(model, LRM)
-    assert model.config.architecture == name
-    assert not model.training
-    assert not any(p.is_meta or p.requires_grad for p in model.parameters())
-    assert sum(p.numel() for p in model.parameters()) == sum(t.numel() for t in state.values())
+FILES = ["model.safetensors", "pytorch_model.bin", "model.ckpt"]
 
 
-@pytest.mark.parametrize("name", FAMILIES)
-def test_encode_and_decode(tmp_path, name):
-    settings, state = reduced(name)
-    model = load(settings, save(tmp_path / "model.safetensors", state))
-    images = torch.rand(3, 3, SIDES[name], SIDES[name])
-    triplanes = model.encode(images)
-    assert triplanes.shape == (3, 3, 6, 8, 8)
-    assert triplanes.isfinite().all()
-    assert not triplanes.requires_grad
-    compare(model.encode(images[1:2]), triplanes[1:2], atol=1e-5)
-    rgb, density = model.decoder(torch.randn(10, 18))
-    assert rgb.shape == (10, 3)
-    assert density.shape == (10,)
-    assert (density > 0).all()
-    with torch.autocast("cpu", torch.bfloat16):
-        rough = model.encode(images).float()
-    assert (rough - triplanes).norm() < 0.1 * triplanes.norm()
+@pytest.fixture(scope="module")
+def models():
+    """A reduced model of each family, loaded from a file."""
+    with TemporaryDirectory() as folder:
+        return {
+            name: load(settings, save(Path(folder) / f"{name}.safetensors", state))
+            for name, (settings, state) in ((name, reduced(name)) for name in FAMILIES)
+        }
 
 
-def test_field_decoder_is_trainable_and_counts_in_field_units(tmp_path):
-    settings, state = reduced("triposr")
-    model = load(settings, save(tmp_path / "model.safetensors", state))
+def test_every_published_form_of_file_loads(tmp_path):
+    for name, file in product(FAMILIES, FILES):
+        case = f"{name} from {file}"
+        settings, state = reduced(name)
+        model = load(settings, save(tmp_path / file, state))
+        assert isinstance(model, LRM), case
+        assert model.config.architecture == name, case
+        assert not model.training, case
+        assert not any(p.is_meta or p.requires_grad for p in model.parameters()), case
+        parameters = sum(p.numel() for p in model.parameters())
+        assert parameters == sum(t.numel() for t in state.values()), case
+
+
+def test_encode_and_decode(models):
+    for name, model in models.items():
+        images = torch.rand(3, 3, SIDES[name], SIDES[name])
+        triplanes = model.encode(images)
+        assert triplanes.shape == (3, 3, 6, 8, 8), name
+        assert triplanes.isfinite().all(), name
+        assert not triplanes.requires_grad, name
+        compare(model.encode(images[1:2]), triplanes[1:2], atol=1e-5, case=name)
+        rgb, density = model.decoder(torch.randn(10, 18))
+        assert rgb.shape == (10, 3), name
+        assert density.shape == (10,), name
+        assert (density > 0).all(), name
+        with torch.autocast("cpu", torch.bfloat16):
+            rough = model.encode(images).float()
+        assert (rough - triplanes).norm() < 0.1 * triplanes.norm(), name
+
+
+def test_field_decoder_is_trainable_and_counts_in_field_units(models):
+    model = models["triposr"]
     decoder, features = model.field_decoder(), torch.randn(5, 18)
     assert all(p.requires_grad for p in decoder.parameters())
     compare(decoder(features)[1], model.decoder(features)[1] * 0.87)
     assert not any(p.requires_grad for p in model.decoder.parameters())
 
 
-@pytest.mark.parametrize("name", ["openlrm-1.0", "openlrm-1.1"])
-def test_camera_matters(tmp_path, name):
-    settings, state = reduced(name)
-    model = load(settings, save(tmp_path / "model.safetensors", state))
-    images = torch.rand(1, 3, SIDES[name], SIDES[name])
-    camera = torch.randn(1, 16)
-    assert (model.encode(images) - model.encode(images, camera)).abs().max() > 1e-3
-    with pytest.raises(LRMError, match=r"\[1, 16\]"):
-        model.encode(images, camera[0])
-    with pytest.raises(LRMError, match="multiple of"):
-        model.encode(torch.rand(1, 3, 50, 50))
+def test_camera_matters(models):
+    for name in ("openlrm-1.0", "openlrm-1.1"):
+        model = models[name]
+        images = torch.rand(1, 3, SIDES[name], SIDES[name])
+        camera = torch.randn(1, 16)
+        change = model.encode(images) - model.encode(images, camera)
+        assert change.abs().max() > 1e-3, name
+        with pytest.raises(LRMError, match=r"\[1, 16\]"):
+            model.encode(images, camera[0])
+        with pytest.raises(LRMError, match="multiple of"):
+            model.encode(torch.rand(1, 3, 50, 50))
 
 
-@pytest.mark.parametrize("name", FAMILIES)
-def test_wrong_images_are_refused(name):
-    model = build(parse_config(CONFIGS[name]))
-    with pytest.raises(LRMError, match=r"must be \[N, 3, S, S\]"):
-        model.encode(torch.rand(1, 3, 48, 64))
-    with pytest.raises(LRMError, match="floating point"):
-        model.encode(torch.zeros(1, 3, 48, 48, dtype=torch.uint8))
+def test_wrong_images_are_refused(models):
+    for model in models.values():
+        with pytest.raises(LRMError, match=r"must be \[N, 3, S, S\]"):
+            model.encode(torch.rand(1, 3, 48, 64))
+        with pytest.raises(LRMError, match="floating point"):
+            model.encode(torch.zeros(1, 3, 48, 48, dtype=torch.uint8))
 
 
-def test_triposr_takes_no_camera_and_any_size(tmp_path):
-    settings, state = reduced("triposr")
-    model = load(settings, save(tmp_path / "model.safetensors", state))
+def test_triposr_takes_no_camera_and_any_size(models):
+    model = models["triposr"]
     assert model.encode(torch.rand(1, 3, 50, 50)).shape == (1, 3, 6, 8, 8)
     with pytest.raises(LRMError, match="camera=None"):
         model.encode(torch.rand(1, 3, 64, 64), torch.zeros(1, 16))
 
 
-@pytest.mark.parametrize("name", FAMILIES)
-def test_each_tensor_is_needed_and_none_is_superfluous(name):
-    settings, state = reduced(name)
-    model = build(parse_config(settings))
-    assert mismatches(model, state) == []
-    for key in state:
-        rest = {other: tensor for other, tensor in state.items() if other != key}
-        assert "lacks" in mismatches(model, rest)[0]
-    assert "unknown" in mismatches(model, {**state, "encoder.model.mask_token": torch.zeros(1)})[0]
-    for key, tensor in state.items():
-        problem = mismatches(model, {**state, key: tensor.new_zeros(*tensor.shape, 1)})[0]
-        assert problem.startswith(f"{key} is [")
+def test_each_tensor_is_needed_and_none_is_superfluous():
+    for name in FAMILIES:
+        settings, state = reduced(name)
+        model = build(parse_config(settings))
+        assert mismatches(model, state) == [], name
+        for key in state:
+            rest = {other: tensor for other, tensor in state.items() if other != key}
+            assert "lacks" in mismatches(model, rest)[0], f"{name}: {key}"
+        strange = {**state, "encoder.model.mask_token": torch.zeros(1)}
+        assert "unknown" in mismatches(model, strange)[0], name
+        for key, tensor in state.items():
+            problem = mismatches(model, {**state, key: tensor.new_zeros(*tensor.shape, 1)})[0]
+            assert problem.startswith(f"{key} is ["), name
 
 
 def test_the_same_weights_twice_are_refused():
@@ -126,17 +138,6 @@ def test_only_the_unused_pooler_is_passed_over():
     assert "unknown" in mismatches(build(parse_config(settings)), {**state, **other})[0]
 
 
-@pytest.mark.parametrize("name", PUBLISHED)
-def test_published_sizes_are_told_apart(name):
-    shapes = published_shapes(parse_config(published_config(name)))
-    state = {key: torch.empty(shape, device="meta") for key, shape in shapes.items()}
-    assert fitting(state) == [name]
-    wrong = "openlrm-base-1.1" if name != "openlrm-base-1.1" else "openlrm-small-1.1"
-    with pytest.raises(LRMError) as caught:
-        fill(build(parse_config(published_config(wrong))), state)
-    assert f"It fits {name} ({PUBLISHED[name].choice})" in str(caught.value)
-
-
 LISTINGS = {
     name: name.replace("-1.0", "-obj-1.0") + ".json" if name.endswith("1.0") else f"{name}.json"
     for name in PUBLISHED
@@ -144,32 +145,36 @@ LISTINGS = {
 POOLER = 768 * 768 + 768
 
 
-@pytest.mark.parametrize("name", LISTINGS)
-def test_full_size_listings_load_strictly(name):
-    listing = json.loads((FOLDER / "fullsize_shapes" / LISTINGS[name]).read_text())
-    model = build(parse_config(listing["config"]))
-    state = {key: torch.empty(shape, device="meta") for key, shape in listing["shapes"].items()}
-    assert len(state) == listing["num_tensors"]
-    fill(model, state)
-    unused = POOLER if name == "triposr" else 0
-    count = sum(parameter.numel() for parameter in model.parameters())
-    assert count == listing["num_parameters"] - unused
-    assert model.config == parse_config(published_config(name))
+def test_full_size_listings_load_strictly_and_are_told_apart():
+    """Names and shapes of the published tensors, without their values."""
+    small, base = "openlrm-small-1.1", "openlrm-base-1.1"
+    others = {name: build(parse_config(published_config(name))) for name in (small, base)}
+    for name, file in LISTINGS.items():
+        listing = json.loads((FOLDER / "fullsize_shapes" / file).read_text())
+        model = build(parse_config(listing["config"]))
+        state = {key: torch.empty(shape, device="meta") for key, shape in listing["shapes"].items()}
+        assert len(state) == listing["num_tensors"], name
+        fill(model, state)
+        unused = POOLER if name == "triposr" else 0
+        count = sum(parameter.numel() for parameter in model.parameters())
+        assert count == listing["num_parameters"] - unused, name
+        assert model.config == parse_config(published_config(name)), name
+        with pytest.raises(LRMError) as caught:
+            fill(others[small if name == base else base], state)
+        assert str(caught.value).endswith(f"It fits {name} ({PUBLISHED[name].choice})")
 
 
-@pytest.mark.parametrize(
-    ("folder", "file"), [(VERSIONS["1.0"], "model.pth"), ("triposr_tiny", "model.ckpt")]
-)
-def test_pickled_and_safetensors_weights_load_alike(folder, file, tmp_path):
-    first = load(config(folder), FOLDER / folder / file)
-    content = torch.load(FOLDER / folder / file, weights_only=True)
-    state = content.get("weights", content)
-    copy = save(tmp_path / "model.safetensors", {k: v.contiguous() for k, v in state.items()})
-    second = load(config(folder), copy)
-    for (name, one), (_, other) in zip(
-        first.state_dict().items(), second.state_dict().items(), strict=True
-    ):
-        assert torch.equal(one, other), name
+def test_pickled_and_safetensors_weights_load_alike(tmp_path):
+    for folder, file in ((VERSIONS["1.0"], "model.pth"), ("triposr_tiny", "model.ckpt")):
+        first = load(config(folder), FOLDER / folder / file)
+        content = torch.load(FOLDER / folder / file, weights_only=True)
+        state = content.get("weights", content)
+        copy = save(tmp_path / "model.safetensors", {k: v.contiguous() for k, v in state.items()})
+        second = load(config(folder), copy)
+        for (name, one), (_, other) in zip(
+            first.state_dict().items(), second.state_dict().items(), strict=True
+        ):
+            assert torch.equal(one, other), f"{folder}: {name}"
 
 
 def test_configuration_inside_the_file_wins_for_a_published_name(tmp_path):
@@ -208,18 +213,18 @@ def test_pickled_code_is_never_run(tmp_path, capsys):
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.parametrize("file", ["model.safetensors", "model.ckpt"])
-def test_damaged_files_are_named(tmp_path, file):
+def test_damaged_files_are_named(tmp_path):
     settings, state = reduced("triposr")
-    path = save(tmp_path / file, state)
-    whole = path.read_bytes()
-    for content in (whole[: len(whole) // 2], whole[:10], b"", b"<html>not found</html>"):
-        path.write_bytes(content)
-        with pytest.raises(LRMError, match=file):
+    for file in ("model.safetensors", "model.ckpt"):
+        path = save(tmp_path / file, state)
+        whole = path.read_bytes()
+        for content in (whole[: len(whole) // 2], whole[:10], b"", b"<html>not found</html>"):
+            path.write_bytes(content)
+            with pytest.raises(LRMError, match=file):
+                load(settings, path)
+        path.unlink()
+        with pytest.raises(LRMError, match="is not a file"):
             load(settings, path)
-    path.unlink()
-    with pytest.raises(LRMError, match="is not a file"):
-        load(settings, path)
 
 
 def test_files_without_weights_are_refused(tmp_path):

@@ -4,35 +4,32 @@ import pytest
 from torch import nn
 
 from tests.lrm.reduced import CONFIGS
+from tests.refusals import assert_refused
 from xplanes.lrm import LRMError
 from xplanes.lrm.checkpoint import build
 from xplanes.lrm.config import parse_config
 from xplanes.lrm.published import PUBLISHED, published_config
 
 
-@pytest.mark.parametrize("name", CONFIGS)
-def test_family_is_guessed_or_named(name):
-    assert parse_config(CONFIGS[name]).architecture == name
-    assert (
-        parse_config({**CONFIGS[name], "architecture": name.replace("-", "_")}).architecture == name
-    )
+def test_family_is_guessed_or_named():
+    for name, settings in CONFIGS.items():
+        assert parse_config(settings).architecture == name
+        named = {**settings, "architecture": name.replace("-", "_")}
+        assert parse_config(named).architecture == name
 
 
-@pytest.mark.parametrize(
-    ("name", "size", "heads"),
-    [
+def test_published_sizes():
+    for name, size, heads in (
         ("openlrm-small-1.1", 224, 8),
         ("openlrm-base-1.1", 336, 12),
         ("openlrm-large-1.1", 448, 16),
         ("openlrm-small-1.0", 224, 12),
         ("triposr", 512, 16),
-    ],
-)
-def test_published_sizes(name, size, heads):
-    config = parse_config(published_config(name))
-    assert (config.image_size, config.heads, config.head_width) == (size, heads, 64)
-    assert config.resolution == 64
-    assert config.encoder.width // config.encoder.heads == 64
+    ):
+        config = parse_config(published_config(name))
+        assert (config.image_size, config.heads, config.head_width) == (size, heads, 64), name
+        assert config.resolution == 64, name
+        assert config.encoder.width // config.encoder.heads == 64, name
 
 
 def test_references_are_followed():
@@ -60,31 +57,31 @@ def test_what_the_file_does_not_say_can_be_given():
     assert config.encoder.mean == config.encoder.std == (0.5, 0.5, 0.5)
 
 
-@pytest.mark.parametrize(
-    ("name", "change", "message"),
-    [
-        ("openlrm-1.1", {"transformer_dim": None}, "transformer_dim=None"),
-        ("openlrm-1.1", {"transformer_heads": 3}, "transformer_heads=3"),
-        ("openlrm-1.1", {"triplane_high_res": 9}, "twice"),
-        ("openlrm-1.1", {"encoder_feat_dim": 768}, "encoder_feat_dim=768"),
-        ("openlrm-1.1", {"encoder_model_name": "dinov2_vitg14"}, "dinov2_vitg14"),
-        ("openlrm-1.1", {"encoder_type": "dino"}, "encoder_type='dino'"),
-        ("openlrm-1.0", {"encoder_model_name": "vit"}, "'vit'"),
-        ("openlrm-1.0", {"image_mean": [1, 2]}, "image_mean"),
-        ("triposr", {"renderer": {"density_activation": "softplus"}}, "softplus"),
-        ("triposr", {"renderer": {"radius": 1.0}}, "radius=1.0"),
-        ("triposr", {"decoder": {"in_channels": 120, "activation": "silu"}}, "in_channels=120"),
-        ("triposr", {"tokenizer": None}, "section tokenizer"),
-        ("triposr", {"cond_image_size": True}, "cond_image_size=True"),
-        ("triposr", {"architecture": "triplane"}, "triplane"),
-    ],
-)
-def test_unusable_configurations_are_refused(name, change, message):
-    with pytest.raises(LRMError, match=message):
-        parse_config({**CONFIGS[name], **change})
+UNUSABLE = [
+    ("openlrm-1.1", {"transformer_dim": None}, "transformer_dim=None"),
+    ("openlrm-1.1", {"transformer_heads": 3}, "transformer_heads=3"),
+    ("openlrm-1.1", {"triplane_high_res": 9}, "twice"),
+    ("openlrm-1.1", {"encoder_feat_dim": 768}, "encoder_feat_dim=768"),
+    ("openlrm-1.1", {"encoder_model_name": "dinov2_vitg14"}, "dinov2_vitg14"),
+    ("openlrm-1.1", {"encoder_type": "dino"}, "encoder_type='dino'"),
+    ("openlrm-1.0", {"encoder_model_name": "vit"}, "'vit'"),
+    ("openlrm-1.0", {"image_mean": [1, 2]}, "image_mean"),
+    ("triposr", {"renderer": {"density_activation": "softplus"}}, "softplus"),
+    ("triposr", {"renderer": {"radius": 1.0}}, "radius=1.0"),
+    ("triposr", {"decoder": {"in_channels": 120, "activation": "silu"}}, "in_channels=120"),
+    ("triposr", {"tokenizer": None}, "section tokenizer"),
+    ("triposr", {"cond_image_size": True}, "cond_image_size=True"),
+    ("triposr", {"architecture": "triplane"}, "triplane"),
+]
 
 
-def test_a_stranger_is_refused():
+def test_unusable_configurations_are_refused():
+    for name, change, message in UNUSABLE:
+        settings = {**CONFIGS[name], **change}
+        assert_refused(LRMError, message, lambda settings=settings: parse_config(settings), change)
+
+
+def test_configurations_and_names_of_no_known_model_are_refused():
     with pytest.raises(LRMError, match=r"config\.json"):
         parse_config({"downloads": 12})
     with pytest.raises(LRMError, match="must be one of"):
@@ -99,13 +96,13 @@ EPSILONS = {
 }
 
 
-@pytest.mark.parametrize("name", CONFIGS)
-def test_norm_epsilons(name):
+def test_norm_epsilons():
     """Too small to show in the outputs of models with random weights."""
-    model = build(parse_config(CONFIGS[name]))
-    norms = [m for m in model.modules() if isinstance(m, nn.LayerNorm)]
-    assert {norm.eps for norm in norms} == EPSILONS[name]
-    encoder = {m.eps for m in model.encoder.modules() if isinstance(m, nn.LayerNorm)}
-    assert encoder == {1e-6 if name == "openlrm-1.1" else 1e-12}
-    groups = [(m.num_groups, m.eps) for m in model.modules() if isinstance(m, nn.GroupNorm)]
-    assert groups == ([(32, 1e-6)] if name == "triposr" else [])
+    for name, settings in CONFIGS.items():
+        model = build(parse_config(settings))
+        norms = [m for m in model.modules() if isinstance(m, nn.LayerNorm)]
+        assert {norm.eps for norm in norms} == EPSILONS[name], name
+        encoder = {m.eps for m in model.encoder.modules() if isinstance(m, nn.LayerNorm)}
+        assert encoder == {1e-6 if name == "openlrm-1.1" else 1e-12}, name
+        groups = [(m.num_groups, m.eps) for m in model.modules() if isinstance(m, nn.GroupNorm)]
+        assert groups == ([(32, 1e-6)] if name == "triposr" else []), name

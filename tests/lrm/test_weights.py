@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from tests.lrm.reduced import published_shapes, reduced
 from xplanes.lrm import LRMError
@@ -16,9 +17,6 @@ from xplanes.lrm.config import parse_config
 from xplanes.lrm.published import published_config
 from xplanes.lrm.reachable import Probe
 from xplanes.lrm.weights import WeightSource, find_weights, load_weights, read_config
-
-safetensors = pytest.importorskip("safetensors.torch")
-pytest.importorskip("huggingface_hub")
 
 SOURCE = WeightSource(
     architecture="openlrm-small-1.1",
@@ -98,7 +96,7 @@ def small(tmp_path):
     settings, state = reduced("openlrm-1.1")
     folder = tmp_path / "published"
     folder.mkdir()
-    safetensors.save_file(state, folder / "model.safetensors")
+    save_file(state, folder / "model.safetensors")
     (folder / "config.json").write_text(json.dumps(settings))
     return folder
 

@@ -57,25 +57,19 @@ def test_compiling_is_no_part_of_a_stages_time(folder: Path, monkeypatch):
     assert warm_up.seconds - before == pytest.approx(30)
 
 
-@pytest.mark.parametrize(
-    "inputs",
-    [
-        [torch.arange(6.0) + 1e-7, INPUTS[1]],
-        [torch.arange(6.0).double(), INPUTS[1]],
-        [torch.arange(6.0).view(2, 3), INPUTS[1]],
-        [INPUTS[0], {"weight": "auto", "limit": 4}],
-        [INPUTS[0], {"weight": "auto"}],
-        [INPUTS[0]],
-    ],
-)
-def test_other_inputs_are_another_stage(folder: Path, inputs):
-    make = Maker()
-    assert not StageCache(folder).stage("parts", inputs, make).cached
-    assert make.calls == 1
-
-
-def test_another_name_is_another_stage(folder: Path):
-    assert not StageCache(folder).stage("planes", INPUTS, Maker()).cached
+def test_other_inputs_or_another_name_are_another_stage(folder: Path):
+    for name, inputs in (
+        ("parts", [torch.arange(6.0) + 1e-7, INPUTS[1]]),
+        ("parts", [torch.arange(6.0).double(), INPUTS[1]]),
+        ("parts", [torch.arange(6.0).view(2, 3), INPUTS[1]]),
+        ("parts", [INPUTS[0], {"weight": "auto", "limit": 4}]),
+        ("parts", [INPUTS[0], {"weight": "auto"}]),
+        ("parts", [INPUTS[0]]),
+        ("planes", INPUTS),
+    ):
+        make = Maker()
+        assert not StageCache(folder).stage(name, inputs, make).cached, (name, inputs)
+        assert make.calls == 1, (name, inputs)
 
 
 def damaged(path: Path, kind: str) -> None:
@@ -103,19 +97,22 @@ def damaged(path: Path, kind: str) -> None:
         torch.save(payload, path)
 
 
-@pytest.mark.parametrize(
-    "kind",
-    "truncated empty flipped foreign version report key checksum content seconds".split(),
-)
-def test_what_is_damaged_is_said_and_made_anew(folder: Path, kind: str, caplog):
-    damaged(entry(folder), kind)
-    make = Maker()
-    with caplog.at_level(logging.WARNING):
-        stage = StageCache(folder).stage("parts", INPUTS, make)
-    assert (make.calls, stage.cached) == (1, False)
-    assert str(entry(folder)) in caplog.text
-    assert torch.equal(stage.content["planes"], make()["planes"])
-    assert StageCache(folder).stage("parts", INPUTS, Maker()).cached
+DAMAGES = "truncated empty flipped foreign version report key checksum content seconds".split()
+
+
+def test_what_is_damaged_is_said_and_made_anew(tmp_path: Path, caplog):
+    for kind in DAMAGES:
+        folder = tmp_path / kind
+        StageCache(folder).stage("parts", INPUTS, Maker())
+        damaged(entry(folder), kind)
+        make = Maker()
+        caplog.clear()
+        with caplog.at_level(logging.WARNING):
+            stage = StageCache(folder).stage("parts", INPUTS, make)
+        assert (make.calls, stage.cached) == (1, False), kind
+        assert str(entry(folder)) in caplog.text, kind
+        assert torch.equal(stage.content["planes"], make()["planes"]), kind
+        assert StageCache(folder).stage("parts", INPUTS, Maker()).cached, kind
 
 
 def test_every_byte_of_an_entry_may_flip(folder: Path):

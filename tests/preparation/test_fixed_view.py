@@ -2,13 +2,16 @@
 
 import math
 from dataclasses import replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 
 import pytest
 import torch
 
 from tests.baselines.runs import KPLANES, PROPOSAL
-from tests.synthetic import ball_scene, ball_views, inside_ball
+from tests.refusals import assert_refused
+from tests.synthetic import ball_scene, ball_views, inside_ball, swinging
 from tests.training.runs import small_config
 from xplanes.checks import parse
 from xplanes.config import ConfigError, compose_plain
@@ -21,6 +24,17 @@ from xplanes.preparation.fixed_view import canonical_pose, filming_settings, fix
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, scene_frame
 
+SMALL_FIELD = (
+    "model.resolution=24",
+    "model.channels=8",
+    "model.decoder.width=32",
+    "sampler.grid_resolution=24",
+    "sampler.samples=64",
+    "sampler.update_cells=512",
+    "sampler.coarse_steps=10",
+    "sampler.sweep_at=[15]",
+)
+MOMENTS = torch.linspace(0, 1, 50)
 VIEWS = {"openlrm": OPENLRM_VIEW, "triposr": TRIPOSR_VIEW}
 
 
@@ -72,27 +86,99 @@ def test_a_model_that_is_not_there_cannot_film(tmp_path: Path):
         settings(tmp_path, "preparation.fixed_view_model=nerf")
 
 
-def test_kplanes_film_in_their_own_cube(tmp_path: Path, monkeypatch):
-    reduced = (*KPLANES, *PROPOSAL)
-    monkeypatch.setattr(
-        module, "compose_plain", lambda name, lines: compose_plain(name, [*lines, *reduced])
+@pytest.fixture
+def small_fields(monkeypatch):
+    """Fields that film are small, whichever their model."""
+
+    def composed(name, lines):
+        reduced = (*KPLANES, *PROPOSAL) if "model=kplanes" in lines else SMALL_FIELD
+        return compose_plain(name, [*lines, *reduced])
+
+    monkeypatch.setattr(module, "compose_plain", composed)
+
+
+class KnownField:
+    """Stands for a trained field: shows a moving ball, and keeps where rays began."""
+
+    device = torch.device("cpu")
+
+    def __init__(self, frame: Frame, radius: float, centre):
+        self.frame, self.radius, self.centre = frame, radius, centre
+        self.field, self.renderer, self.began = None, self, []
+
+    def eval(self):
+        return self
+
+    def image(self, field, origins, directions, time, background):
+        starts, ends = self.frame.to_world(origins), self.frame.to_world(origins + directions)
+        self.began.append(starts)
+        towards = torch.nn.functional.normalize(ends - starts, dim=-1)
+        offset = self.centre(time) - starts
+        along = (offset * towards).sum(dim=-1)
+        hit = offset.square().sum(dim=-1) - along.square() < self.radius**2
+        colour = torch.tensor([200.0, 100.0, 50.0]) / 255
+        return {"colour": hit[:, None] * colour, "opacity": hit.float()}
+
+
+def test_the_film_shows_what_the_field_holds_from_the_models_camera(tmp_path: Path, monkeypatch):
+    """In K-Planes' own cube, with rays that begin as far away as in training."""
+    scene, centre, fields = ball_scene(count=12, size=24), swinging(0.3, 0.5), []
+
+    def known(_config, _scene, frame, _folder):
+        fields.append(KnownField(frame, 0.5, centre))
+        return fields[0]
+
+    monkeypatch.setattr(module, "_train", known)
+    config = settings(tmp_path, "preparation.fixed_view_model=kplanes")
+    made, _ = film(config, scene, tmp_path / "cache")
+    assert fields[0].frame.scale == pytest.approx(1 / 1.3)
+    views = made.views
+    assert views.focal == pytest.approx(24 * OPENLRM_VIEW.focal)
+    expected = ball_views(
+        4,
+        0.5,
+        centre=centre,
+        size=24,
+        angle=2 * math.atan(0.5 / OPENLRM_VIEW.focal),
+        times=views.times,
+        poses=views.camera_to_world,
     )
-    options = ("preparation.fixed_view_model=kplanes", "preparation.fixed_view_steps=200")
-    config = settings(tmp_path, *options)
-    made, said = film(config, ball_scene(count=12, size=24), tmp_path / "cache")
+    assert (views.images != expected.images).float().mean() < 0.005  # edges, by rounding
+    assert (expected.images[0] != expected.images[2]).any()
+    # Rays begin on a line through the model's camera, at the training cameras' distance.
+    frame = scene_frame(scene.splits["train"])
+    poses = scene.splits["train"].camera_to_world
+    away = (poses[:, :3, 3] - frame.centre).norm(dim=-1).mean()
+    middle = fields[0].began[0].view(24, 24, 3)[11:13, 11:13].mean(dim=(0, 1))
+    torch.testing.assert_close((middle - frame.centre).norm(), away, rtol=1e-3, atol=0)
+
+
+def test_kplanes_film(tmp_path: Path, small_fields):
+    options = ("preparation.fixed_view_model=kplanes", "preparation.fixed_view_steps=10")
+    made, said = film(settings(tmp_path, *options), ball_scene(), tmp_path / "cache", size=12)
     assert "training kplanes for" in said[0]
+    assert made.views.images.shape == (4, 12, 12, 4)
+
+
+@pytest.mark.slow
+def test_kplanes_film_in_their_own_cube(tmp_path: Path, small_fields):
+    options = ("preparation.fixed_view_model=kplanes", "preparation.fixed_view_steps=200")
+    made, _ = film(settings(tmp_path, *options), ball_scene(count=12, size=24), tmp_path / "cache")
     alpha = made.views.images[..., 3].float() / 255
     # Coarse planes blur it.
     assert alpha[:, 9:15, 9:15].mean() > 1.5 * alpha[:, :3, :3].mean() > 0
 
 
-@pytest.mark.parametrize("count", [1, 4, 9])
-def test_frames_are_picked_evenly(count):
+def test_frames_are_picked_evenly():
     video = ball_views(33, 0.5)
-    expected = torch.linspace(0, 1, count) if count > 1 else torch.tensor([0.4])
-    picked = pick_frames(video, expected)
-    assert (picked.times - expected).abs().max() <= 0.5 / 32 + 1e-6
-    assert len(picked) == count
+    for count in (1, 4, 9):
+        expected = torch.linspace(0, 1, count) if count > 1 else torch.tensor([0.4])
+        picked = pick_frames(video, expected)
+        assert (picked.times - expected).abs().max() <= 0.5 / 32 + 1e-6, count
+        assert len(picked) == count
+    # Of few frames, some are taken more than once.
+    picked = pick_frames(ball_views(3, 0.5), torch.linspace(0, 1, 7))
+    assert picked.times.tolist() == [0, 0, 0.5, 0.5, 0.5, 1, 1]
 
 
 def test_of_a_scene_of_one_moment_the_frame_of_that_moment_is_picked(tmp_path: Path):
@@ -104,40 +190,35 @@ def test_of_a_scene_of_one_moment_the_frame_of_that_moment_is_picked(tmp_path: P
     assert made.views.times.tolist() == [0.5]
 
 
-def test_a_video_of_few_frames_repeats_them():
-    picked = pick_frames(ball_views(3, 0.5), torch.linspace(0, 1, 7))
-    assert picked.times.tolist() == [0, 0, 0.5, 0.5, 0.5, 1, 1]
+def test_a_video_that_leaves_out_moments_is_refused():
+    for times in ([0.0, 0.1, 0.2, 0.3], [0.6, 0.8, 1.0], [0, 0.05, 0.95, 1]):
+        video = ball_views(len(times), 0.5, size=4, times=torch.tensor(times))
+        words = r"no frame near time .*preparation\.fixed_view=train"
+        assert_refused(SceneError, words, partial(pick_frames, video, MOMENTS), times)
 
 
-@pytest.mark.parametrize("times", [[0.0, 0.1, 0.2, 0.3], [0.6, 0.8, 1.0], [0, 0.05, 0.95, 1]])
-def test_a_video_that_leaves_out_moments_is_refused(times):
-    video = ball_views(len(times), 0.5, times=torch.tensor(times))
-    with pytest.raises(SceneError, match=r"no frame near time .*preparation\.fixed_view=train"):
-        pick_frames(video, torch.linspace(0, 1, 50))
-
-
-@pytest.mark.parametrize("name", VIEWS)
-@pytest.mark.parametrize("azimuth", [None, 0.0, 70.0, -160.0])
-def test_the_models_camera_sees_the_whole_scene_inside_its_box(name, azimuth):
-    view, views = VIEWS[name], ball_views(12, 0.5)
+def test_the_models_camera_sees_the_whole_scene_inside_its_box():
+    views, side = ball_views(12, 0.5, size=4), 200
     frame = Frame(0.7, torch.eye(3), torch.tensor([0.2, -0.1, 0.3]))
-    pose = canonical_pose(views, frame, view, azimuth=azimuth, elevation=25.0)
-    offset = pose[:3, 3] - frame.centre
-    assert float(offset[2] / offset.norm()) == pytest.approx(math.sin(math.radians(25)), abs=1e-5)
-    if azimuth is not None:
-        found = math.degrees(math.atan2(float(offset[1]), float(offset[0])))
-        assert found == pytest.approx(azimuth, abs=1e-3)
-    side = 200
-    alignment = align(
-        pose, focal=view.focal * side, height=side, width=side, target=frame.centre, view=view
-    )
-    assert alignment.mismatch.largest < 1e-3
-    ball = inside_ball(2000, 1 / frame.scale) + frame.centre
-    own = alignment.frame.points(ball)
-    assert own.norm(dim=-1).max() <= view.half_side + 1e-4
-    local = (ball - pose[:3, 3]) @ pose[:3, :3]
-    seen = local[:, :2].abs().amax(dim=-1) / -local[:, 2] * view.focal
-    assert 0.3 < seen.max() <= 0.5 + 1e-4
+    for (name, view), azimuth in product(VIEWS.items(), (None, 0.0, 70.0, -160.0)):
+        case = f"{name}, azimuth {azimuth}"
+        pose = canonical_pose(views, frame, view, azimuth=azimuth, elevation=25.0)
+        offset = pose[:3, 3] - frame.centre
+        rise = float(offset[2] / offset.norm())
+        assert rise == pytest.approx(math.sin(math.radians(25)), abs=1e-5), case
+        if azimuth is not None:
+            found = math.degrees(math.atan2(float(offset[1]), float(offset[0])))
+            assert found == pytest.approx(azimuth, abs=1e-3), case
+        alignment = align(
+            pose, focal=view.focal * side, height=side, width=side, target=frame.centre, view=view
+        )
+        assert alignment.mismatch.largest < 1e-3, case
+        ball = inside_ball(2000, 1 / frame.scale) + frame.centre
+        own = alignment.frame.points(ball)
+        assert own.norm(dim=-1).max() <= view.half_side + 1e-4, case
+        local = (ball - pose[:3, 3]) @ pose[:3, :3]
+        seen = local[:, :2].abs().amax(dim=-1) / -local[:, 2] * view.focal
+        assert 0.3 < seen.max() <= 0.5 + 1e-4, case
 
 
 def test_without_an_azimuth_the_axis_nearest_to_a_camera_of_that_height_is_taken():
@@ -167,7 +248,7 @@ def test_a_video_that_is_not_there_is_refused(tmp_path: Path):
         film(settings(tmp_path, "preparation.fixed_view=video"), ball_scene(), tmp_path)
 
 
-def test_a_field_films_the_scene_and_the_film_is_kept(tmp_path: Path, monkeypatch):
+def test_a_field_films_the_scene_and_the_film_is_kept(tmp_path: Path, small_fields, monkeypatch):
     scene, cache = ball_scene(count=12, size=24), tmp_path / "cache"
     made, said = film(settings(tmp_path), scene, cache)
     assert len(said) == 1
@@ -187,16 +268,16 @@ def test_a_field_films_the_scene_and_the_film_is_kept(tmp_path: Path, monkeypatc
     assert torch.equal(again.views.images, made.views.images)
 
 
-def test_a_still_scene_is_filmed_once(tmp_path: Path):
+def test_a_still_scene_is_filmed_once(tmp_path: Path, small_fields):
     made, _ = film(
         settings(tmp_path, "preparation.fixed_view_steps=5"), ball_scene(moving=False), tmp_path
     )
     assert len(made.views) == 1
 
 
-def test_an_interrupted_field_goes_on_where_it_stopped(tmp_path: Path, monkeypatch):
+def test_an_interrupted_field_goes_on_where_it_stopped(tmp_path: Path, small_fields, monkeypatch):
     scene, cache = ball_scene(count=12, size=24), tmp_path / "cache"
-    config = settings(tmp_path, "preparation.fixed_view_steps=20")
+    config = settings(tmp_path, "preparation.fixed_view_steps=10")
 
     def stop(*_):
         raise KeyboardInterrupt

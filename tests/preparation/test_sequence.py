@@ -1,12 +1,15 @@
 """Files of triplane sequences: back as they were, and refused in words."""
 
 from dataclasses import replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 
 import pytest
 import torch
 
 from tests.preparation.sequences import moving_sequence
+from tests.refusals import assert_refused
 from xplanes.config import ConfigError
 from xplanes.fields import Decoder
 from xplanes.preparation import TriplaneSequence, load_triplanes, save_triplanes
@@ -32,26 +35,30 @@ def whole(channels: int = 4) -> TriplaneSequence:
     )
 
 
-@pytest.mark.parametrize("kind", [torch.float32, torch.float16, torch.bfloat16, torch.float64])
-@pytest.mark.parametrize("name", ["a.pt", "a.safetensors"])
-def test_a_sequence_comes_back_as_it_was(tmp_path: Path, kind, name):
-    sequence = replace(whole(), triplanes=whole().triplanes.to(kind))
-    save_triplanes(tmp_path / name, sequence)
-    back = load_triplanes(tmp_path / name)
-    assert back.triplanes.dtype == kind
-    assert torch.equal(back.triplanes, sequence.triplanes)
-    assert all(torch.equal(back.decoder[key], value) for key, value in sequence.decoder.items())
-    assert back.decoder_config == OPTIONS
-    assert back.frame.scale == 0.5
-    assert torch.equal(back.frame.rotation, ROTATION)
-    assert torch.equal(back.frame.centre, sequence.frame.centre)
+FILES = ("a.pt", "a.safetensors")
 
 
-@pytest.mark.parametrize("name", ["a.pt", "a.safetensors"])
-def test_triplanes_alone_are_enough(tmp_path: Path, name):
-    save_triplanes(tmp_path / name, TriplaneSequence(moving_sequence()))
-    back = load_triplanes(tmp_path / name)
-    assert (back.decoder, back.decoder_config, back.frame) == (None, None, None)
+def test_a_sequence_comes_back_as_it_was(tmp_path: Path):
+    kinds = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
+    for name, kind in product(FILES, kinds):
+        case = f"{kind} in {name}"
+        sequence = replace(whole(), triplanes=whole().triplanes.to(kind))
+        save_triplanes(tmp_path / name, sequence)
+        back = load_triplanes(tmp_path / name)
+        assert back.triplanes.dtype == kind, case
+        assert torch.equal(back.triplanes, sequence.triplanes), case
+        assert all(torch.equal(back.decoder[key], v) for key, v in sequence.decoder.items()), case
+        assert back.decoder_config == OPTIONS, case
+        assert back.frame.scale == 0.5, case
+        assert torch.equal(back.frame.rotation, ROTATION), case
+        assert torch.equal(back.frame.centre, sequence.frame.centre), case
+
+
+def test_triplanes_alone_are_enough(tmp_path: Path):
+    for name in FILES:
+        save_triplanes(tmp_path / name, TriplaneSequence(moving_sequence()))
+        back = load_triplanes(tmp_path / name)
+        assert (back.decoder, back.decoder_config, back.frame) == (None, None, None), name
 
 
 def test_a_view_of_a_larger_tensor_is_written_alone(tmp_path: Path):
@@ -67,21 +74,15 @@ def refusal(path: Path) -> str:
     return str(caught.value)
 
 
-def test_a_damaged_safetensors_file_is_named(tmp_path: Path):
+def test_missing_and_damaged_files_are_named(tmp_path: Path):
+    assert "no such file" in refusal(tmp_path / "none.pt")
     save_triplanes(tmp_path / "a.safetensors", whole())
     content = (tmp_path / "a.safetensors").read_bytes()
     (tmp_path / "a.safetensors").write_bytes(content[: len(content) // 2])
     assert "damaged" in refusal(tmp_path / "a.safetensors")
-
-
-def test_a_missing_file_is_named(tmp_path: Path):
-    assert "no such file" in refusal(tmp_path / "none.pt")
-
-
-@pytest.mark.parametrize("content", [b"", b"text", b"PK\x03\x04 half a zip"])
-def test_a_damaged_file_is_named(tmp_path: Path, content):
-    (tmp_path / "a.pt").write_bytes(content)
-    assert "cannot be read" in refusal(tmp_path / "a.pt")
+    for content in (b"", b"text", b"PK\x03\x04 half a zip"):
+        (tmp_path / "a.pt").write_bytes(content)
+        assert "cannot be read" in refusal(tmp_path / "a.pt"), content
 
 
 def spoiled(entry: int, value: float) -> torch.Tensor:
@@ -146,13 +147,12 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_what_cannot_be_used_is_refused_in_words(tmp_path: Path, case: str):
-    content, words = WRONG[case]
-    torch.save(content, tmp_path / "a.pt")
-    with pytest.raises((ConfigError, SceneError), match=words) as caught:
-        load_triplanes(tmp_path / "a.pt")
-    assert str(tmp_path / "a.pt") in str(caught.value)
+def test_what_cannot_be_used_is_refused_in_words(tmp_path: Path):
+    path = tmp_path / "a.pt"
+    for case, (content, words) in WRONG.items():
+        torch.save(content, path)
+        said = assert_refused((ConfigError, SceneError), words, partial(load_triplanes, path), case)
+        assert str(path) in said, case
 
 
 def test_what_could_not_be_loaded_is_not_written(tmp_path: Path):

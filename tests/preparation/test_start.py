@@ -2,12 +2,15 @@
 
 import logging
 from dataclasses import replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 
 import pytest
 import torch
 
 from tests.preparation.sequences import blob, moving_sequence, still_features
+from tests.refusals import assert_refused
 from tests.synthetic import ball_scene
 from tests.training.runs import small_config
 from xplanes import decomposition
@@ -23,6 +26,7 @@ from xplanes.preparation import stages as stages_module
 from xplanes.preparation.start import STAGES
 from xplanes.scenes.frame import Frame, cube_frame
 from xplanes.training.builder import build_module
+from xplanes.training.module import RadianceModule
 
 FRAME = cube_frame(1.5, torch.zeros(3))
 OPTIONS = {
@@ -62,6 +66,13 @@ def start(
 SEQUENCE = TriplaneSequence(moving_sequence())
 
 
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> tuple[Path, Start, RadianceModule]:
+    """A start whose stages are kept: its folder, itself, and the field that it built."""
+    folder = tmp_path_factory.mktemp("start")
+    return folder, *start(folder, SEQUENCE)
+
+
 def test_no_source_is_a_random_start_that_touches_nothing(tmp_path: Path):
     config = parse(small_config(tmp_path, f"preparation.cache={tmp_path}/cache"))
     begun = prepare(config, ball_scene(), FRAME, find_source(config.lrm))
@@ -73,32 +84,40 @@ def test_no_source_is_a_random_start_that_touches_nothing(tmp_path: Path):
     assert (module.method.product, module.origin) == (None, None)
 
 
-@pytest.mark.parametrize("model", ["six_planes", "nine_planes"])
-@pytest.mark.parametrize(("resolution", "rows"), [(16, 8), (24, 8), (9, 5)])
-def test_a_rank_one_start_explains_what_moves(tmp_path: Path, model, resolution, rows):
-    begun, module = start(
-        tmp_path,
-        SEQUENCE,
-        f"model={model}",
-        f"model.resolution={resolution}",
-        f"model.time_resolution={rows}",
-    )
-    field = module.field
-    count = len(TIME_ROWS[field.plane_set][-1]) * 3 if model == "nine_planes" else 3
-    assert field.space.shape == (3, resolution, resolution, 8)
-    assert field.time.shape == (count, rows, resolution, 8)
-    unexplained = begun.report["unexplained"]
-    assert unexplained["before"] == pytest.approx(1, abs=0.05)
-    # With fewer texels and rows than the blob needs, less of it can be held.
-    assert unexplained["after"] < (0.3 if resolution >= 16 else 0.8)
-    again = unexplained_energy(field.time, begun.sparse, rows=field.rows)
-    assert again == pytest.approx(unexplained["after"], rel=1e-5)
+def test_a_rank_one_start_explains_what_moves(finished):
+    folder, *_ = finished
+    for model, (resolution, rows) in product(
+        ("six_planes", "nine_planes"), ((16, 8), (24, 8), (9, 5))
+    ):
+        case = f"{model} of {resolution} texels, {rows} rows"
+        begun, module = start(
+            folder,
+            SEQUENCE,
+            f"model={model}",
+            f"model.resolution={resolution}",
+            f"model.time_resolution={rows}",
+        )
+        field = module.field
+        count = len(TIME_ROWS[field.plane_set][-1]) * 3 if model == "nine_planes" else 3
+        assert field.space.shape == (3, resolution, resolution, 8), case
+        assert field.time.shape == (count, rows, resolution, 8), case
+        unexplained = begun.report["unexplained"]
+        assert unexplained["before"] == pytest.approx(1, abs=0.05), case
+        # With fewer texels and rows than the blob needs, less of it can be held.
+        assert unexplained["after"] < (0.3 if resolution >= 16 else 0.8), case
+        again = unexplained_energy(field.time, begun.sparse, rows=field.rows)
+        assert again == pytest.approx(unexplained["after"], rel=1e-5), case
 
 
-def test_left_open_the_rows_of_time_are_those_of_a_random_start(tmp_path: Path):
-    _, module = start(tmp_path, SEQUENCE)
+def test_left_open_rows_of_time_frame_and_decoder_are_those_of_a_random_start(
+    finished, tmp_path: Path
+):
+    _, begun, module = finished
     random = build_module(parse(small_config(tmp_path)), ball_scene(), FRAME)
     assert module.field.time.shape[1] == random.field.time.shape[1] == 3
+    assert begun.frame is FRAME
+    assert begun.decoder is None
+    assert len(module.field.decoder.layers) == 4
 
 
 def test_the_field_shows_what_stands_still_where_nothing_moves(tmp_path: Path):
@@ -114,8 +133,8 @@ def test_the_field_shows_what_stands_still_where_nothing_moves(tmp_path: Path):
         assert torch.equal(module.field.planes[name], begun.planes[name])
 
 
-def test_reports_and_seconds_are_whole(tmp_path: Path):
-    begun, _ = start(tmp_path, SEQUENCE)
+def test_reports_and_seconds_are_whole(finished):
+    _, begun, _ = finished
     assert set(begun.report) == {"xy", "xz", "yz", "unexplained"}
     for name in ("xy", "xz", "yz"):
         report = begun.report[name]
@@ -132,15 +151,15 @@ def test_reports_and_seconds_are_whole(tmp_path: Path):
     assert begun.pictures["decomposition"].max() <= 1
 
 
-def test_a_second_start_comes_from_the_cache(tmp_path: Path, monkeypatch):
-    first, _ = start(tmp_path, SEQUENCE)
+def test_a_second_start_comes_from_the_cache(finished, monkeypatch):
+    folder, first, _ = finished
 
     def refuse(*_args, **_options):
         raise AssertionError("computed again")
 
     monkeypatch.setattr(stages_module, "decompose", refuse)
     monkeypatch.setattr(stages_module, "time_planes", refuse)
-    again, _ = start(tmp_path, SEQUENCE)
+    again, _ = start(folder, SEQUENCE)
     assert again.report == first.report
     for stage in ("decomposition", "convert"):
         assert again.seconds[stage] == first.seconds[stage]
@@ -148,20 +167,20 @@ def test_a_second_start_comes_from_the_cache(tmp_path: Path, monkeypatch):
     assert all(torch.equal(again.planes[name], plane) for name, plane in first.planes.items())
     assert "cached" in again.words
     with pytest.raises(AssertionError, match="computed again"):
-        start(tmp_path, SEQUENCE, "decomposition.tolerance=0.001")
+        start(folder, SEQUENCE, "decomposition.tolerance=0.001")
 
 
-@pytest.mark.parametrize("override", ["preparation.cache=null", "decomposition.cache=false"])
-def test_the_cache_can_be_switched_off(tmp_path: Path, monkeypatch, override):
-    start(tmp_path, SEQUENCE, override)
-    assert not list(tmp_path.glob("cache/decomposition-*"))
+def test_the_cache_can_be_switched_off(tmp_path: Path, monkeypatch):
     calls = []
     original = stages_module.decompose
     monkeypatch.setattr(
         stages_module, "decompose", lambda *a, **o: calls.append(1) or original(*a, **o)
     )
-    start(tmp_path, SEQUENCE, override)
-    assert calls
+    for count, override in enumerate(("preparation.cache=null", "decomposition.cache=false"), 1):
+        for _ in range(2):
+            start(tmp_path, SEQUENCE, override)
+        assert not list(tmp_path.glob("cache/decomposition-*")), override
+        assert len(calls) == 2 * count, override
 
 
 def test_channels_decoder_and_frame_of_the_file_prevail(tmp_path: Path):
@@ -180,13 +199,6 @@ def test_channels_decoder_and_frame_of_the_file_prevail(tmp_path: Path):
         assert torch.equal(ours, theirs)
 
 
-def test_the_scene_keeps_its_frame_and_decoder_where_the_file_has_none(tmp_path: Path):
-    begun, module = start(tmp_path, SEQUENCE)
-    assert begun.frame is FRAME
-    assert begun.decoder is None
-    assert len(module.field.decoder.layers) == 4
-
-
 def test_options_that_no_decoder_has_are_refused(tmp_path: Path):
     options = OPTIONS | {"activation": "sine"}
     decoder = Decoder(8, **OPTIONS).state_dict()
@@ -203,16 +215,17 @@ def test_a_scene_of_one_moment_takes_the_low_rank_part_alone(tmp_path: Path):
     assert set(begun.report) == {"xy", "xz", "yz"}
 
 
-@pytest.mark.parametrize("moving", [True, False])
-def test_one_triplane_is_the_space_planes(tmp_path: Path, caplog, moving):
+def test_one_triplane_is_the_space_planes(tmp_path: Path, caplog):
     sequence = TriplaneSequence(moving_sequence(frames=1))
-    with caplog.at_level(logging.WARNING):
-        begun, module = start(tmp_path, sequence, "model.resolution=16", moving=moving)
-    assert ("trains as a still one" in caplog.text) == moving
-    assert module.field.time is None
-    assert (begun.report, begun.pictures, begun.sparse) == ({}, {}, None)
-    for index, name in enumerate(("xy", "xz", "yz")):
-        assert torch.equal(begun.planes[name], sequence.triplanes[0, index])
+    for moving in (True, False):
+        caplog.clear()
+        with caplog.at_level(logging.WARNING):
+            begun, module = start(tmp_path, sequence, "model.resolution=16", moving=moving)
+        assert ("trains as a still one" in caplog.text) == moving
+        assert module.field.time is None
+        assert (begun.report, begun.pictures, begun.sparse) == ({}, {}, None)
+        for index, name in enumerate(("xy", "xz", "yz")):
+            assert torch.equal(begun.planes[name], sequence.triplanes[0, index]), name
 
 
 def test_a_sequence_that_stands_still_starts_with_noise_in_time(tmp_path: Path):
@@ -222,16 +235,16 @@ def test_a_sequence_that_stands_still_starts_with_noise_in_time(tmp_path: Path):
     assert begun.planes["xy"].sub(still[0, 0]).norm() < 0.1 * still[0, 0].norm()
 
 
-@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float64])
-def test_every_floating_type_gives_single_precision_planes(tmp_path: Path, kind):
-    begun, module = start(tmp_path, TriplaneSequence(SEQUENCE.triplanes.to(kind)))
-    assert module.field.space.dtype == torch.float32
-    assert begun.report["xy"]["converged"]
+def test_every_floating_type_gives_single_precision_planes(tmp_path: Path):
+    for kind in (torch.float16, torch.bfloat16, torch.float64):
+        begun, module = start(tmp_path, TriplaneSequence(SEQUENCE.triplanes.to(kind)))
+        assert module.field.space.dtype == torch.float32, kind
+        assert begun.report["xy"]["converged"], kind
 
 
-def test_seeds_change_the_noise_alone(tmp_path: Path):
-    first, _ = start(tmp_path, SEQUENCE)
-    other, _ = start(tmp_path, SEQUENCE, "seed=1")
+def test_seeds_change_the_noise_alone(finished):
+    folder, first, _ = finished
+    other, _ = start(folder, SEQUENCE, "seed=1")
     assert torch.equal(first.planes["xy"], other.planes["xy"])
     gap = (first.planes["xt"] - other.planes["xt"]).std()
     assert float(gap) == pytest.approx(0.01 * 2**0.5, rel=0.1)
@@ -249,8 +262,9 @@ def test_an_open_decomposition_is_said_once_also_from_the_cache(tmp_path: Path, 
     assert not [w for w in recwarn if "robust PCA" in str(w.message)]
 
 
-def test_no_weight_needs_no_sparse_part(tmp_path: Path):
-    begun, module = start(tmp_path, SEQUENCE, "loss.sparse_weight=0")
+def test_no_weight_needs_no_sparse_part(finished):
+    folder, *_ = finished
+    begun, module = start(folder, SEQUENCE, "loss.sparse_weight=0")
     assert (begun.sparse, module.method.product) == (None, None)
     assert module.field.time is not None
 
@@ -260,36 +274,26 @@ def test_the_papers_choices_run(tmp_path: Path):
     assert begun.report["unexplained"]["before"] == begun.report["unexplained"]["after"]
 
 
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
+def test_a_source_that_is_not_there_is_refused_first(tmp_path: Path):
+    for overrides, words in (
         ((), "lrm=file needs lrm.triplanes=FILE"),
         (("lrm.triplanes=nowhere.pt",), "lrm.triplanes=nowhere.pt: there is no such file"),
-    ],
-)
-def test_a_source_that_is_not_there_is_refused_first(tmp_path: Path, overrides, words):
-    with pytest.raises(ConfigError, match=words):
-        find_source(settings(tmp_path, *overrides).lrm)
+    ):
+        lrm = settings(tmp_path, *overrides).lrm
+        assert_refused(ConfigError, words, partial(find_source, lrm), overrides)
 
 
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
+def test_settings_of_the_decomposition_are_checked(tmp_path: Path):
+    for override, words in (
         ("decomposition.sparsity_weight=often", "sparsity_weight=often: must be auto or a number"),
         ("decomposition.sparsity_weight=0", "sparsity_weight=0: must be auto or a number"),
         ("decomposition.sparsity_weight=-0.1", "sparsity_weight=-0.1: must be auto or a number"),
         ("decomposition={dynamic: random, noise: 0}", "products of two zeros have no gradient"),
-    ],
-)
-def test_settings_that_cannot_work_are_refused(tmp_path: Path, override, words):
-    with pytest.raises(ConfigError, match=words):
-        settings(tmp_path, override)
-
-
-@pytest.mark.parametrize("weight", ["auto", "0.009", "1"])
-def test_a_weight_is_auto_or_a_number(tmp_path: Path, weight):
-    config = settings(tmp_path, f"decomposition.sparsity_weight={weight}")
-    assert str(config.decomposition.sparsity_weight) == weight
+    ):
+        assert_refused(ConfigError, words, partial(settings, tmp_path, override), override)
+    for weight in ("auto", "0.009", "1"):
+        config = settings(tmp_path, f"decomposition.sparsity_weight={weight}")
+        assert str(config.decomposition.sparsity_weight) == weight
 
 
 def test_choices_are_those_of_the_decomposition():

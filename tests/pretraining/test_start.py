@@ -1,9 +1,12 @@
 """A model before its first step, and one that goes on with finer planes."""
 
+from functools import partial
+
 import pytest
 import torch
 
-from tests.pretraining.small import same, small_config, small_sizes
+from tests.pretraining.small import same, small_config, small_plain, small_sizes
+from tests.refusals import assert_refused
 from xplanes.config import ConfigError
 from xplanes.lrm import LRMError, load
 from xplanes.lrm.bundled import bundled_models, load_bundled
@@ -11,7 +14,7 @@ from xplanes.lrm.canonical import canonical_vector
 from xplanes.lrm.config import parse_config
 from xplanes.pretraining.export import export, published_state
 from xplanes.pretraining.observe import FOCAL
-from xplanes.pretraining.settings import published_sizes
+from xplanes.pretraining.settings import parse_pretraining, published_sizes
 from xplanes.pretraining.start import grow_model, start_model
 
 SIZES = published_sizes(small_config().model, FOCAL)
@@ -87,20 +90,20 @@ def test_weights_keep_their_meaning_on_the_way_through_a_file(tmp_path):
     assert load(SIZES, path).config == loaded.config
 
 
-def test_wide_models_have_separate_query_and_key_names(tmp_path):
+def test_published_names_of_equally_wide_queries_and_keys():
     state = published_state(start_model(small_sizes(), 0))
     assert "transformer.layers.0.cross_attn.in_proj_weight" in state
     assert not [name for name in state if "q_proj" in name]
 
 
-@pytest.mark.parametrize("key", ["source_distance", "source_focal", "density_scale"])
-def test_the_camera_and_scale_have_the_published_defaults(key):
-    plain = {k: v for k, v in SIZES.items() if k != key}
-    defaults = {"source_distance": 2.0, "source_focal": 0.75, "density_scale": 1.0}
-    assert getattr(parse_config(plain), key) == defaults[key]
-    for wrong in (0, -1.0, float("inf"), "far"):
-        with pytest.raises(LRMError, match=key):
-            parse_config({**SIZES, key: wrong})
+def test_the_camera_and_scale_have_the_published_defaults():
+    for key, default in (("source_distance", 2.0), ("source_focal", 0.75), ("density_scale", 1.0)):
+        plain = {k: v for k, v in SIZES.items() if k != key}
+        assert getattr(parse_config(plain), key) == default, key
+        for wrong in (0, -1.0, float("inf"), "far"):
+            sizes = {**SIZES, key: wrong}
+            call = partial(parse_config, sizes)
+            assert_refused(LRMError, key, call, f"{key}={wrong}")
 
 
 def test_encoder_sizes_go_by_either_name():
@@ -110,25 +113,23 @@ def test_encoder_sizes_go_by_either_name():
     )
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("model.patch=7", r"model\.image_size=24.*model\.patch=7"),
-        ("model.heads=5", r"model\.width=48"),
-        ("batch.objects=0", r"batch\.objects=0"),
+def test_settings_that_cannot_work_are_refused_by_name():
+    for section, key, value, message in (
+        ("model", "patch", 7, r"model\.image_size=24.*model\.patch=7"),
+        ("model", "heads", 5, r"model\.width=48"),
+        ("batch", "objects", 0, r"batch\.objects=0"),
+        ("batch", "samples", 2, r"batch\.samples=2"),
+        ("schedule", "max_steps", 0, r"schedule\.max_steps=0"),
+        ("schedule", "clip", -1.0, r"schedule\.clip=-1"),
+        ("schedule", "decay_share", 1.5, r"schedule\.decay_share=1\.5"),
+    ):
+        plain = small_plain()
+        plain[section][key] = value
+        assert_refused(ConfigError, message, partial(parse_pretraining, plain), key)
+    for override, message in (
         ("schedule.clip=-1", r"schedule\.clip=-1"),
-        ("schedule.decay_share=1.5", r"schedule\.decay_share=1\.5"),
-        ("batch.samples=2", r"batch\.samples=2"),
         ("batch.object=3", "batch.object"),
         ("pretrain=huge", "huge"),
         ("seed=some", "seed"),
-    ],
-)
-def test_settings_that_cannot_work_are_refused_by_name(override, message):
-    with pytest.raises(ConfigError, match=message):
-        small_config(override)
-
-
-def test_mini_is_larger_than_tiny():
-    tiny, mini = (small_config(f"pretrain={name}").model for name in ("tiny", "mini"))
-    assert (tiny.name, mini.name) == ("tiny", "mini")
+    ):
+        assert_refused(ConfigError, message, partial(small_config, override), override)

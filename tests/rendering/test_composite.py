@@ -1,5 +1,6 @@
 """Compositing: values and gradients against Beer and Lambert, at every density."""
 
+import itertools
 import math
 
 import numpy as np
@@ -12,7 +13,8 @@ from tests.oracles import composite as oracle
 from tests.oracles import composite_gradient
 from xplanes.rendering.compositing import composite, composite_reference, depth_before
 
-BOTH = pytest.mark.parametrize("merge", [composite, composite_reference])
+BOTH = (composite, composite_reference)
+FLOATS = (torch.float32, torch.float64)
 COUNTS = (0, 3, 1, 0, 0, 7, 12, 0)
 """Samples of each ray: none at the ends and in the middle."""
 
@@ -33,58 +35,58 @@ def expected_of(depth, colour, distances, ray, starts):
     return oracle(*arrays, ray.tolist(), len(starts))
 
 
-@BOTH
-@pytest.mark.parametrize("scale", [0.0, 1e-8, 1e-3, 1.0, 30.0])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_values_are_the_oracle_s(merge, scale, dtype):
-    inputs = rays_of(dtype=dtype, scale=scale)
-    total, weights = merge(*inputs)
-    expected, expected_weights = expected_of(*inputs)
-    tolerance = {"atol": 1e-30, "rtol": 1e-6 if dtype == torch.float32 else 1e-7}
-    np.testing.assert_allclose(total, expected, **tolerance)
-    if scale != 1e-8:  # 1 - exp(-x) loses digits in the oracle, not in the code
-        np.testing.assert_allclose(weights, expected_weights, **{**tolerance, "atol": 1e-7})
-    assert total.dtype == weights.dtype == dtype
+@pytest.mark.parametrize("merge", BOTH)
+def test_values_equal_the_loops_of_the_oracle(merge):
+    for dtype, scale in itertools.product(FLOATS, (0.0, 1e-8, 1e-3, 1.0, 30.0)):
+        case = f"{dtype}, depths up to {scale}"
+        inputs = rays_of(dtype=dtype, scale=scale)
+        total, weights = merge(*inputs)
+        expected, expected_weights = expected_of(*inputs)
+        tolerance = {"atol": 1e-30, "rtol": 1e-6 if dtype == torch.float32 else 1e-7}
+        np.testing.assert_allclose(total, expected, **tolerance, err_msg=case)
+        if scale != 1e-8:  # 1 - exp(-x) loses digits in the oracle, not in the code
+            tolerance["atol"] = 1e-7
+            np.testing.assert_allclose(weights, expected_weights, **tolerance, err_msg=case)
+        assert total.dtype == weights.dtype == dtype, case
 
 
 def test_thin_media_keep_their_digits():
     depth = torch.full((4,), 1e-12, dtype=torch.float64)
     colour, distances = torch.ones(4, 3).double(), torch.ones(4).double()
-    for dtype in (torch.float32, torch.float64):
+    for dtype in FLOATS:
         inputs = (t.to(dtype) for t in (depth, colour, distances))
         total, _ = composite(*inputs, torch.zeros(4, dtype=torch.long), torch.zeros(1).long())
-        assert float(total[0, 3]) == pytest.approx(4e-12, rel=1e-6)
+        assert float(total[0, 3]) == pytest.approx(4e-12, rel=1e-6), dtype
 
 
-@BOTH
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 20.0])
-def test_gradients_are_the_product_rule_s(merge, scale):
-    depth, colour, *rest = rays_of(scale=scale)
-    depth.requires_grad_()
-    colour.requires_grad_()
-    total, _ = merge(depth, colour, *rest)
-    pull = torch.randn(total.shape, generator=torch.Generator().manual_seed(2)).double()
-    ours = torch.autograd.grad((total * pull).sum(), (depth, colour))
-    arrays = (t.detach().numpy() for t in (depth, colour, rest[0]))
-    theirs = composite_gradient(*arrays, rest[1].tolist(), len(rest[2]), pull.numpy())
-    for a, b in zip(ours, theirs, strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-10)
+def test_gradients_follow_the_product_rule():
+    for merge, scale in itertools.product(BOTH, (1e-3, 1.0, 20.0)):
+        depth, colour, *rest = rays_of(scale=scale)
+        depth.requires_grad_()
+        colour.requires_grad_()
+        total, _ = merge(depth, colour, *rest)
+        pull = torch.randn(total.shape, generator=torch.Generator().manual_seed(2)).double()
+        ours = torch.autograd.grad((total * pull).sum(), (depth, colour))
+        arrays = (t.detach().numpy() for t in (depth, colour, rest[0]))
+        theirs = composite_gradient(*arrays, rest[1].tolist(), len(rest[2]), pull.numpy())
+        for a, b in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-10, err_msg=f"{merge.__name__}, {scale}")
 
 
-@BOTH
-def test_thick_media_keep_their_digits_in_the_gradient(merge):
-    depth = torch.tensor([20.0], requires_grad=True)
-    nothing = torch.zeros(1, dtype=torch.long)
-    total, _ = merge(depth, torch.ones(1, 3), torch.ones(1), nothing, nothing)
-    total[0, 3].backward()
-    assert float(depth.grad) == pytest.approx(math.exp(-20), rel=1e-5)
+def test_thick_media_keep_their_digits_in_the_gradient():
+    for merge in BOTH:
+        depth = torch.tensor([20.0], requires_grad=True)
+        nothing = torch.zeros(1, dtype=torch.long)
+        total, _ = merge(depth, torch.ones(1, 3), torch.ones(1), nothing, nothing)
+        total[0, 3].backward()
+        assert float(depth.grad) == pytest.approx(math.exp(-20), rel=1e-5), merge.__name__
 
 
 def test_gradients_are_finite_differences():
     depth, colour, *rest = rays_of((0, 2, 0, 4, 1))
     depth.requires_grad_()
     colour.requires_grad_()
-    for merge in (composite, composite_reference):
+    for merge in BOTH:
         assert torch.autograd.gradcheck(lambda d, c, f=merge: f(d, c, *rest)[0], (depth, colour))
 
 
@@ -92,93 +94,88 @@ DENSITIES = [0.0, 1e-30, 1e-8, 1e-3, 1.0, 30.0, 79.9, 80.1, 1e3, 1e8, 3e38, math
 
 
 @pytest.mark.parametrize("loops", ["1", "0"])
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32, torch.float64])
-@pytest.mark.parametrize("value", DENSITIES)
-def test_no_density_makes_a_nan(loops, value, dtype, monkeypatch):
+def test_no_density_makes_a_nan(loops, monkeypatch):
     monkeypatch.setenv("XPLANES_CPU_LOOPS", loops)
-    depth, colour, distances, ray, starts = rays_of(dtype=dtype)
-    depth[1::2] = value
-    depth.requires_grad_()
-    colour.requires_grad_()
-    total, weights = composite(depth, colour, distances, ray, starts)
-    assert total.dtype == (torch.float64 if dtype == torch.float64 else torch.float32)
-    assert total.isfinite().all()
-    assert (weights >= 0).all()
-    sums = torch.zeros(len(starts), dtype=weights.dtype).index_add(0, ray, weights)
-    assert (sums <= 1 + 1e-6).all()
-    total.sum().backward()
-    assert depth.grad.isfinite().all()
-    assert colour.grad.isfinite().all()
-    assert depth.grad.dtype == dtype
-    assert colour.grad.dtype == dtype
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("value", [*DENSITIES, -1e-9, -1.0, -math.inf])
-def test_loops_and_twin_agree_at_every_density(value, dtype):
-    results = []
-    for merge in (composite, composite_reference):
-        depth, colour, *rest = rays_of(dtype=dtype)
-        depth = depth.clone()
-        depth[::3] = value
+    for dtype, value in itertools.product((torch.bfloat16, *FLOATS), DENSITIES):
+        case = f"{dtype}, density {value}"
+        depth, colour, distances, ray, starts = rays_of(dtype=dtype)
+        depth[1::2] = value
         depth.requires_grad_()
         colour.requires_grad_()
+        total, weights = composite(depth, colour, distances, ray, starts)
+        expected = torch.float64 if dtype == torch.float64 else torch.float32
+        assert total.dtype == expected, case
+        assert total.isfinite().all(), case
+        assert (weights >= 0).all(), case
+        sums = torch.zeros(len(starts), dtype=weights.dtype).index_add(0, ray, weights)
+        assert (sums <= 1 + 1e-6).all(), case
+        total.sum().backward()
+        for leaf in (depth, colour):
+            assert leaf.grad.isfinite().all(), case
+            assert leaf.grad.dtype == dtype, case
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_loops_and_twin_agree_at_every_density(dtype):
+    for value in (*DENSITIES, -1e-9, -1.0, -math.inf):
+        results = []
+        for merge in BOTH:
+            depth, colour, *rest = rays_of(dtype=dtype)
+            depth = depth.clone()
+            depth[::3] = value
+            depth.requires_grad_()
+            colour.requires_grad_()
+            total, weights = merge(depth, colour, *rest)
+            gradients = torch.autograd.grad((total * torch.arange(5)).sum(), (depth, colour))
+            results.append((total.detach(), weights, *gradients))
+        for ours, theirs in zip(*results, strict=True):
+            torch.testing.assert_close(
+                ours, theirs, atol=2e-5, rtol=1e-5, msg=lambda m, v=value: f"density {v}: {m}"
+            )
+
+
+def test_a_nan_stays_on_its_ray():
+    for merge in BOTH:
+        depth, colour, distances, ray, starts = rays_of()
+        clean, _ = merge(depth, colour, distances, ray, starts)
+        depth = depth.clone()
+        depth[5] = math.nan
+        total, _ = merge(depth, colour, distances, ray, starts)
+        broken = int(ray[5])
+        assert total[broken].isnan().all(), merge.__name__
+        others = torch.arange(len(starts)) != broken
+        torch.testing.assert_close(total[others], clean[others], atol=1e-14, rtol=0)
+
+
+def test_no_rays_and_rays_without_samples_see_nothing():
+    for merge in BOTH:
+        depth, colour, *rest = rays_of((0, 0, 0))
+        depth.requires_grad_()
         total, weights = merge(depth, colour, *rest)
-        gradients = torch.autograd.grad((total * torch.arange(5)).sum(), (depth, colour))
-        results.append((total.detach(), weights, *gradients))
-    for ours, theirs in zip(*results, strict=True):
-        torch.testing.assert_close(ours, theirs, atol=2e-5, rtol=1e-5)
+        assert torch.equal(total.detach(), torch.zeros(3, 5).double()), merge.__name__
+        assert weights.shape == (0,), merge.__name__
+        total.sum().backward()
+        assert depth.grad.shape == (0,), merge.__name__
+        total, weights = merge(*rays_of(()))
+        assert total.shape == (0, 5), merge.__name__
+        assert weights.shape == (0,), merge.__name__
 
 
-@BOTH
-def test_a_nan_stays_on_its_ray(merge):
-    depth, colour, distances, ray, starts = rays_of()
-    clean, _ = merge(depth, colour, distances, ray, starts)
-    depth = depth.clone()
-    depth[5] = math.nan
-    total, _ = merge(depth, colour, distances, ray, starts)
-    broken = int(ray[5])
-    assert total[broken].isnan().all()
-    others = torch.arange(len(starts)) != broken
-    torch.testing.assert_close(total[others], clean[others], atol=1e-14, rtol=0)
+def test_an_opaque_sample_hides_all_behind_it():
+    for merge in BOTH:
+        inputs = list(rays_of((6,)))
+        inputs[0] = torch.tensor([0.0, 0.0, math.inf, 5.0, 1e8, 1.0]).double()
+        total, weights = merge(*inputs)
+        assert weights.tolist() == pytest.approx([0, 0, 1, 0, 0, 0], abs=1e-30), merge.__name__
+        torch.testing.assert_close(total[0, :3], inputs[1][2])
+        assert float(total[0, 4]) == pytest.approx(float(inputs[2][2])), merge.__name__
 
 
-@BOTH
-def test_rays_without_samples_see_nothing(merge):
-    depth, colour, *rest = rays_of((0, 0, 0))
-    depth.requires_grad_()
-    total, weights = merge(depth, colour, *rest)
-    assert torch.equal(total.detach(), torch.zeros(3, 5).double())
-    assert weights.shape == (0,)
-    total.sum().backward()
-    assert depth.grad.shape == (0,)
-
-
-@BOTH
-def test_no_rays(merge):
-    total, weights = merge(*rays_of(()))
-    assert total.shape == (0, 5)
-    assert weights.shape == (0,)
-
-
-@BOTH
-def test_an_opaque_sample_hides_all_behind_it(merge):
-    inputs = list(rays_of((6,)))
-    inputs[0] = torch.tensor([0.0, 0.0, math.inf, 5.0, 1e8, 1.0]).double()
-    total, weights = merge(*inputs)
-    assert weights.tolist() == pytest.approx([0, 0, 1, 0, 0, 0], abs=1e-30)
-    torch.testing.assert_close(total[0, :3], inputs[1][2])
-    assert float(total[0, 4]) == pytest.approx(float(inputs[2][2]))
-
-
-@BOTH
-def test_weights_carry_no_gradient(merge):
-    depth, colour, *rest = rays_of()
-    _, weights = merge(depth.requires_grad_(), colour, *rest)
-    assert not weights.requires_grad
-
-
-def test_only_what_asks_gets_a_gradient():
+def test_weights_carry_no_gradient_and_only_what_asks_gets_one():
+    for merge in BOTH:
+        depth, colour, *rest = rays_of()
+        _, weights = merge(depth.requires_grad_(), colour, *rest)
+        assert not weights.requires_grad, merge.__name__
     depth, colour, *rest = rays_of()
     colour.requires_grad_()
     composite(depth, colour, *rest)[0].sum().backward()
@@ -225,7 +222,7 @@ def test_weights_are_shares_of_the_light(depth, split):
     colour, distances = torch.ones(len(depth), 3), torch.arange(len(depth)).float()
     ray = (torch.arange(len(depth)) >= split).long()
     starts = torch.tensor([0, split])
-    for merge in (composite, composite_reference):
+    for merge in BOTH:
         total, weights = merge(tau, colour, distances, ray, starts)
         assert (weights >= 0).all()
         assert (total[:, :4] <= 1 + 1e-6).all()

@@ -7,6 +7,7 @@ border of their cell, and samples may come or go within 1e-5 of where the ray le
 nothing else may differ.
 """
 
+import itertools
 import math
 
 import numpy as np
@@ -65,48 +66,57 @@ def by_oracle(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0):
 OPTIONS = [(skip, occlusion) for skip in (True, False) for occlusion in (0.0, 0.001, 0.3)]
 
 
-@pytest.mark.parametrize(("skip", "occlusion"), OPTIONS)
-def test_samples_are_the_oracle_s(skip, occlusion):
-    grid, rays = grid_of(), rays_of(60)
-    kept, counts = by_oracle(rays, grid, skip_empty=skip, occlusion=occlusion)
-    for found in (
-        march(*rays, grid, step=STEP, skip_empty=skip, occlusion=occlusion),
-        twin(rays, grid, skip_empty=skip, occlusion=occlusion),
-    ):
-        assert found.ray.tolist() == [row[0] for row in kept]
-        assert found.cells.tolist() == [row[2] for row in kept]
-        np.testing.assert_allclose(found.distances, [row[1] for row in kept], atol=1e-12)
-        np.testing.assert_allclose(found.points, [row[3:] for row in kept], atol=1e-12)
-        assert (found.candidates, found.empty, found.occluded) == counts
-    assert (counts[1] > 0) == skip
-    assert (counts[2] > 0) == (occlusion > 0)
+def test_samples_equal_the_loops_of_the_oracle():
+    for skip, occlusion in OPTIONS:
+        case = f"skip={skip}, occlusion={occlusion}"
+        grid, rays = grid_of(), rays_of(60)
+        kept, counts = by_oracle(rays, grid, skip_empty=skip, occlusion=occlusion)
+        for found in (
+            march(*rays, grid, step=STEP, skip_empty=skip, occlusion=occlusion),
+            twin(rays, grid, skip_empty=skip, occlusion=occlusion),
+        ):
+            assert found.ray.tolist() == [row[0] for row in kept], case
+            assert found.cells.tolist() == [row[2] for row in kept], case
+            np.testing.assert_allclose(
+                found.distances, [row[1] for row in kept], atol=1e-12, err_msg=case
+            )
+            np.testing.assert_allclose(
+                found.points, [row[3:] for row in kept], atol=1e-12, err_msg=case
+            )
+            assert (found.candidates, found.empty, found.occluded) == counts, case
+        assert (counts[1] > 0) == skip, case
+        assert (counts[2] > 0) == (occlusion > 0), case
 
 
-@pytest.mark.parametrize(("skip", "occlusion"), OPTIONS)
-def test_loops_and_twin_agree_on_many_rays(skip, occlusion):
-    grid, rays = grid_of(17, 5), rays_of(3000)
-    ours = march(*rays, grid, step=STEP, skip_empty=skip, occlusion=occlusion)
-    theirs = twin(rays, grid, skip_empty=skip, occlusion=occlusion)
-    for name in ("ray", "starts", "cells"):
-        assert torch.equal(getattr(ours, name), getattr(theirs, name)), name
-    for name in ("points", "distances"):
-        torch.testing.assert_close(
-            getattr(ours, name), getattr(theirs, name), atol=1e-12, rtol=0, msg=name
-        )
-    for name in ("candidates", "empty", "occluded"):
-        assert getattr(ours, name) == getattr(theirs, name), name
+def test_loops_and_twin_agree_on_many_rays():
+    for skip, occlusion in OPTIONS:
+        case = f"skip={skip}, occlusion={occlusion}"
+        grid, rays = grid_of(17, 5), rays_of(3000)
+        ours = march(*rays, grid, step=STEP, skip_empty=skip, occlusion=occlusion)
+        theirs = twin(rays, grid, skip_empty=skip, occlusion=occlusion)
+        for name in ("ray", "starts", "cells"):
+            assert torch.equal(getattr(ours, name), getattr(theirs, name)), (case, name)
+        for name in ("points", "distances"):
+            torch.testing.assert_close(
+                getattr(ours, name),
+                getattr(theirs, name),
+                atol=1e-12,
+                rtol=0,
+                msg=f"{case}, {name}",
+            )
+        for name in ("candidates", "empty", "occluded"):
+            assert getattr(ours, name) == getattr(theirs, name), (case, name)
 
 
 def test_in_float32_only_samples_on_borders_differ():
     grid, rays = grid_of(17, 5, filled=1.1), rays_of(3000, torch.float32)
     ours, theirs = march(*rays, grid, step=STEP), twin(rays, grid)
+    near = near_of(rays)
     numbers = [
-        {
-            (int(r), round(float(d / STEP - j))): n
-            for n, (r, d, j) in enumerate(zip(*x, strict=True))
-        }
+        {(r, round(d / STEP - j)): n for n, (r, d, j) in enumerate(zip(*x, strict=True))}
         for x in (
-            (s.ray, s.distances - near_of(rays)[s.ray], rays[3][s.ray]) for s in (ours, theirs)
+            [v.tolist() for v in (s.ray, s.distances - near[s.ray], rays[3][s.ray])]
+            for s in (ours, theirs)
         )
     ]
     for key in set(numbers[0]) ^ set(numbers[1]):
@@ -129,23 +139,23 @@ def near_of(rays):
     return torch.tensor([ray_box(o, d)[0] for o, d in zip(origins, directions, strict=True)])
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(("skip", "occlusion"), OPTIONS)
-def test_counters_add_up_and_samples_are_in_order(skip, occlusion, dtype):
-    grid, rays = grid_of(), rays_of(500, dtype)
-    for found in (
-        march(*rays, grid, step=STEP, skip_empty=skip, occlusion=occlusion),
-        twin(rays, grid, skip_empty=skip, occlusion=occlusion),
-    ):
-        assert found.candidates == found.empty + found.occluded + len(found)
-        assert (found.ray.diff() >= 0).all()
-        same = found.ray[1:] == found.ray[:-1]
-        assert (found.distances.diff()[same] > 0.99 * STEP).all()
-        counts = torch.bincount(found.ray, minlength=500)
-        assert torch.equal(found.starts, counts.cumsum(0) - counts)
-        assert found.points.abs().max() <= 1 + 1e-6
-        assert found.points.dtype == found.distances.dtype == dtype
-        assert not skip or grid.occupied[found.cells].all()
+def test_counters_add_up_and_samples_are_in_order():
+    for dtype, (skip, occlusion) in itertools.product([torch.float32, torch.float64], OPTIONS):
+        case = f"dtype={dtype}, skip={skip}, occlusion={occlusion}"
+        grid, rays = grid_of(), rays_of(500, dtype)
+        for found in (
+            march(*rays, grid, step=STEP, skip_empty=skip, occlusion=occlusion),
+            twin(rays, grid, skip_empty=skip, occlusion=occlusion),
+        ):
+            assert found.candidates == found.empty + found.occluded + len(found), case
+            assert (found.ray.diff() >= 0).all(), case
+            same = found.ray[1:] == found.ray[:-1]
+            assert (found.distances.diff()[same] > 0.99 * STEP).all(), case
+            counts = torch.bincount(found.ray, minlength=500)
+            assert torch.equal(found.starts, counts.cumsum(0) - counts), case
+            assert found.points.abs().max() <= 1 + 1e-6, case
+            assert found.points.dtype == found.distances.dtype == dtype, case
+            assert not skip or grid.occupied[found.cells].all(), case
 
 
 def test_cells_are_those_that_hold_the_points_at_their_times():
@@ -179,23 +189,23 @@ def test_rays_that_miss_have_no_samples_and_do_not_shift_the_others():
             assert (end == start) == (ray % 3 == 0)
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_impossible_rays_have_no_samples(bad):
-    grid, rays = grid_of(filled=1.1), list(rays_of(4))
-    rays[0][1, 2], rays[1][2, 0] = bad, bad
-    for found in (march(*rays, grid, step=STEP), twin(rays, grid)):
-        assert set(found.ray.tolist()) <= {0, 3}
-        assert found.points.isfinite().all()
+def test_impossible_rays_have_no_samples():
+    for bad in [math.nan, math.inf, -math.inf]:
+        grid, rays = grid_of(filled=1.1), list(rays_of(4))
+        rays[0][1, 2], rays[1][2, 0] = bad, bad
+        for found in (march(*rays, grid, step=STEP), twin(rays, grid)):
+            assert set(found.ray.tolist()) <= {0, 3}, bad
+            assert found.points.isfinite().all(), bad
 
 
-@pytest.mark.parametrize(
-    "rays", [rays_of(0), tuple(r + 9 for r in rays_of(3)[:1]) + rays_of(3)[1:]]
-)
-def test_no_rays_or_no_hits(rays):
-    for found in (march(*rays, grid_of(), step=STEP), twin(rays, grid_of())):
-        assert len(found) == found.candidates == found.empty == found.occluded == 0
-        assert found.points.shape == (0, 3)
-        assert found.starts.tolist() == [0] * len(rays[0])
+def test_no_rays_or_no_hits():
+    missing = rays_of(3)[0] + 9, *rays_of(3)[1:]
+    for rays in (rays_of(0), missing):
+        case = f"{len(rays[0])} rays"
+        for found in (march(*rays, grid_of(), step=STEP), twin(rays, grid_of())):
+            assert len(found) == found.candidates == found.empty == found.occluded == 0, case
+            assert found.points.shape == (0, 3), case
+            assert found.starts.tolist() == [0] * len(rays[0]), case
 
 
 def test_an_empty_grid_leaves_nothing():
@@ -224,17 +234,17 @@ def test_the_first_opaque_cell_hides_what_lies_behind_but_not_itself():
         assert found.points[-1, 2] == pytest.approx(0.45)
 
 
-@pytest.mark.parametrize("huge", [1e8, 1e20, 1e30, 3e38, math.inf])
-def test_huge_densities_on_one_ray_do_not_disturb_the_next(huge):
-    grid, rays = grid_of(8, 1, filled=1.1, dense=3.0), rays_of(400)
-    grid.density[::7] = huge
-    ours = march(*rays, grid, step=STEP, occlusion=0.2)
-    theirs = twin(rays, grid, occlusion=0.2)
-    assert torch.equal(ours.ray, theirs.ray)
-    assert torch.equal(ours.cells, theirs.cells)
-    kept, counts = by_oracle(rays, grid, occlusion=0.2)
-    assert ours.cells.tolist() == [row[2] for row in kept]
-    assert (ours.candidates, ours.empty, ours.occluded) == counts
+def test_huge_densities_on_one_ray_do_not_disturb_the_next():
+    for huge in [1e8, 1e20, 1e30, 3e38, math.inf]:
+        grid, rays = grid_of(8, 1, filled=1.1, dense=3.0), rays_of(400)
+        grid.density[::7] = huge
+        ours = march(*rays, grid, step=STEP, occlusion=0.2)
+        theirs = twin(rays, grid, occlusion=0.2)
+        assert torch.equal(ours.ray, theirs.ray), huge
+        assert torch.equal(ours.cells, theirs.cells), huge
+        kept, counts = by_oracle(rays, grid, occlusion=0.2)
+        assert ours.cells.tolist() == [row[2] for row in kept], huge
+        assert (ours.candidates, ours.empty, ours.occluded) == counts, huge
 
 
 def test_time_decides_which_bin_is_looked_into():

@@ -24,9 +24,8 @@ def one(origin, direction, **options):
     return float(near), float(far)
 
 
-@pytest.mark.parametrize(
-    ("origin", "direction", "expected"),
-    [
+def test_known_rays():
+    for origin, direction, expected in [
         ((0, 0, 4), (0, 0, -1), (3, 5)),
         ((0, 0, 4), (0, 0, 1), (0, 0)),  # points away
         ((0, 0, 0), (0, 0, 1), (0, 1)),  # from inside
@@ -46,10 +45,9 @@ def one(origin, direction, **options):
         ((0, 0, 4), (0, 0, -2), (1.5, 2.5)),  # distances in units of the direction
         ((0, 0, 4), (-0.0, -0.0, -1), (3, 5)),
         ((1, 0, -3), (-0.0, 0, 1), (2, 4)),
-    ],
-)
-def test_known_rays(origin, direction, expected):
-    assert one(origin, direction) == pytest.approx(expected)
+    ]:
+        case = f"from {origin} to {direction}"
+        assert one(origin, direction) == pytest.approx(expected), case
 
 
 def test_another_half_side():
@@ -57,24 +55,25 @@ def test_another_half_side():
     assert one((0.3, 0, 4), (0, 0, -1), half=0.25) == (0, 0)
 
 
-@pytest.mark.parametrize("bad", [NAN, INF, -INF, 3e38, -3e38])
-@pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_rays_with_impossible_numbers_miss(bad, axis, dtype):
-    good = torch.tensor([[0.1, 0.2, 4.0]], dtype=dtype)
-    straight = torch.tensor([[0.0, 0.0, -1.0]], dtype=dtype)
-    origin, direction = good.clone(), straight.clone()
-    origin[0, axis] = bad
-    near, far = ray_box(origin, straight)
-    assert near == far == 0 or abs(bad) == 3e38
-    assert near.isfinite().all()
-    assert far.isfinite().all()
-    direction[0, axis] = bad
-    near, far = ray_box(good, direction)
-    assert near.isfinite().all()
-    assert far.isfinite().all()
-    if math.isnan(bad):
-        assert near == far == 0
+def test_rays_with_impossible_numbers_miss():
+    for bad, axis, dtype in itertools.product(
+        [NAN, INF, -INF, 3e38, -3e38], [0, 1, 2], [torch.float32, torch.float64]
+    ):
+        case = f"bad={bad}, axis={axis}, dtype={dtype}"
+        good = torch.tensor([[0.1, 0.2, 4.0]], dtype=dtype)
+        straight = torch.tensor([[0.0, 0.0, -1.0]], dtype=dtype)
+        origin, direction = good.clone(), straight.clone()
+        origin[0, axis] = bad
+        near, far = ray_box(origin, straight)
+        assert near == far == 0 or abs(bad) == 3e38, case
+        assert near.isfinite().all(), case
+        assert far.isfinite().all(), case
+        direction[0, axis] = bad
+        near, far = ray_box(good, direction)
+        assert near.isfinite().all(), case
+        assert far.isfinite().all(), case
+        if math.isnan(bad):
+            assert near == far == 0, case
 
 
 def test_a_bad_ray_leaves_its_neighbours_alone():
@@ -90,15 +89,15 @@ def test_no_rays():
     assert near.shape == far.shape == (0,)
 
 
-@pytest.mark.parametrize("tiny", [1e-45, 1e-38, 1e-20, 1e-8])
-def test_nearly_parallel_rays_are_like_parallel_ones(tiny):
-    for x, hits in ((0.5, True), (1.5, False)):
-        origin = torch.tensor([[x, 0.0, 4.0]])
-        near, far = ray_box(origin, torch.tensor([[tiny, -tiny, -1.0]]))
-        assert (float(near), float(far)) == ((3, 5) if hits else (0, 0))
+def test_nearly_parallel_rays_are_like_parallel_ones():
+    for tiny in [1e-45, 1e-38, 1e-20, 1e-8]:
+        for x, hits in ((0.5, True), (1.5, False)):
+            origin = torch.tensor([[x, 0.0, 4.0]])
+            near, far = ray_box(origin, torch.tensor([[tiny, -tiny, -1.0]]))
+            assert (float(near), float(far)) == ((3, 5) if hits else (0, 0)), (tiny, x)
 
 
-def test_random_rays_are_the_oracle_s():
+def test_random_rays_equal_the_loops_of_the_oracle():
     generator = np.random.default_rng(0)
     origins = generator.uniform(-2, 2, (500, 3))
     directions = generator.normal(size=(500, 3))

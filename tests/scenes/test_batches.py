@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from itertools import product
 
 import pytest
 import torch
@@ -34,15 +35,15 @@ def same(first, second):
     return all(torch.equal(first[name], second[name]) for name in first)
 
 
-@pytest.mark.parametrize("background", ["white", "random"])
-def test_a_batch_depends_on_its_step_alone(background):
-    fresh, used = batches_of(background=background), batches_of(background=background)
-    for step in (0, 17, 3, 10**9):
-        used.draw(step)
-    torch.manual_seed(5)
-    torch.rand(100)
-    for step in (0, 1, 17, 10**9):
-        assert same(fresh.draw(step), used.draw(step))
+def test_a_batch_depends_on_its_step_alone():
+    for background in ("white", "random"):
+        fresh, used = batches_of(background=background), batches_of(background=background)
+        for step in (0, 17, 3, 10**9):
+            used.draw(step)
+        torch.manual_seed(5)
+        torch.rand(100)
+        for step in (0, 1, 17, 10**9):
+            assert same(fresh.draw(step), used.draw(step)), (background, step)
 
 
 def test_steps_ranks_and_seeds_draw_different_rays():
@@ -94,31 +95,29 @@ def pixels_of(batch, views, frame):
     return torch.tensor(found).T
 
 
-@pytest.mark.parametrize("background", ["white", "random"])
-@pytest.mark.parametrize(
-    "frame",
-    [FRAME, Frame(0.3, torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), torch.ones(3))],
-)
-def test_targets_are_the_pixels_that_the_rays_go_through(background, frame):
+def test_targets_are_the_pixels_that_the_rays_go_through():
     colours = torch.randint(
         0, 256, VIEWS.images.shape, generator=torch.Generator().manual_seed(0), dtype=torch.uint8
     )
     colours[..., :3] = torch.minimum(colours[..., :3], colours[..., 3:])  # multiplied by alpha
     views = VIEWS.__class__(colours, VIEWS.camera_to_world, VIEWS.times, VIEWS.focal, VIEWS.files)
-    batch = batches_of(views, frame, background=background).draw(3)
-    view, row, column = pixels_of(batch, views, frame)
-    pixel = colours[view, row, column].double() / 255
-    expected = pixel[:, :3] + (1 - pixel[:, 3:]) * batch["background"].double()
-    torch.testing.assert_close(batch["target"].double(), expected, atol=1e-6, rtol=0)
-    torch.testing.assert_close(batch["directions"].norm(dim=-1), torch.ones(64))
-    assert torch.equal(batch["times"], views.times[view])
-    white = (batch["background"] == 1).all()
-    assert white == (background == "white")
-    for index in range(len(views)):
-        image = views.composite(index, torch.ones(3))
-        assert not white or torch.allclose(
-            batch["target"][view == index], image[row[view == index], column[view == index]]
-        )
+    turned = Frame(0.3, torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), torch.ones(3))
+    for background, frame in product(("white", "random"), (FRAME, turned)):
+        case = f"{background} background, frame of scale {frame.scale}"
+        batch = batches_of(views, frame, background=background).draw(3)
+        view, row, column = pixels_of(batch, views, frame)
+        pixel = colours[view, row, column].double() / 255
+        expected = pixel[:, :3] + (1 - pixel[:, 3:]) * batch["background"].double()
+        assert (batch["target"].double() - expected).abs().max() < 1e-6, case
+        torch.testing.assert_close(batch["directions"].norm(dim=-1), torch.ones(64))
+        assert torch.equal(batch["times"], views.times[view]), case
+        white = (batch["background"] == 1).all()
+        assert white == (background == "white"), case
+        for index in range(len(views)):
+            image = views.composite(index, torch.ones(3))
+            assert not white or torch.allclose(
+                batch["target"][view == index], image[row[view == index], column[view == index]]
+            ), case
 
 
 def test_shapes_and_ranges():
@@ -163,47 +162,46 @@ def near_share(batches, steps=40):
     return float(torch.cat(found).float().mean()), float(near.float().mean())
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.4])
-def test_the_share_of_background_rays_is_the_asked_one(share):
-    batches = batches_of(background_share=share)
-    drawn, natural = near_share(batches, steps=30)
-    assert drawn == pytest.approx(1 - share, abs=4 * (share * (1 - share) / (30 * 64)) ** 0.5)
-    assert batches.skipped == pytest.approx(1 - natural - share)
+def test_the_share_of_background_rays_is_the_asked_one():
+    for share in (0.0, 0.1, 0.4):
+        batches = batches_of(background_share=share)
+        drawn, natural = near_share(batches, steps=30)
+        margin = 4 * (share * (1 - share) / (30 * 64)) ** 0.5
+        assert drawn == pytest.approx(1 - share, abs=margin), share
+        assert batches.skipped == pytest.approx(1 - natural - share), share
 
 
-@pytest.mark.parametrize("options", [{"skip_background": False}, {"background_share": 1.0}])
-def test_without_skipping_pixels_are_drawn_evenly(options):
-    batches = batches_of(rays=20_000, **options)
-    assert batches.skipped == 0
-    views = batches.views
-    height, width = views.height, views.width
-    counts = torch.zeros(len(views) * height * width)
-    for step in range(10):
-        batch = batches.draw(step)
-        origins = FRAME.to_world(batch["origins"])
-        view = torch.cdist(origins, views.camera_to_world[:, :3, 3]).argmin(dim=1)
-        local = (batch["directions"][:, None] @ views.camera_to_world[view, :3, :3])[:, 0]
-        column = (local[:, 0] / -local[:, 2] * views.focal + width / 2).floor().long()
-        row = (-local[:, 1] / -local[:, 2] * views.focal + height / 2).floor().long()
-        pixel = (view * height + row) * width + column
-        counts += torch.bincount(pixel, minlength=len(counts))
-    expected = counts.sum() / len(counts)
-    chi_squared = float(((counts - expected).square() / expected).sum())
-    freedom = len(counts) - 1
-    assert abs(chi_squared - freedom) < 5 * (2 * freedom) ** 0.5
-    assert counts.min() > 0
+def test_without_skipping_pixels_are_drawn_evenly():
+    for options in ({"skip_background": False}, {"background_share": 1.0}):
+        batches = batches_of(rays=20_000, **options)
+        assert batches.skipped == 0, options
+        views = batches.views
+        height, width = views.height, views.width
+        counts = torch.zeros(len(views) * height * width)
+        for step in range(10):
+            batch = batches.draw(step)
+            origins = FRAME.to_world(batch["origins"])
+            view = torch.cdist(origins, views.camera_to_world[:, :3, 3]).argmin(dim=1)
+            local = (batch["directions"][:, None] @ views.camera_to_world[view, :3, :3])[:, 0]
+            column = (local[:, 0] / -local[:, 2] * views.focal + width / 2).floor().long()
+            row = (-local[:, 1] / -local[:, 2] * views.focal + height / 2).floor().long()
+            pixel = (view * height + row) * width + column
+            counts += torch.bincount(pixel, minlength=len(counts))
+        expected = counts.sum() / len(counts)
+        chi_squared = float(((counts - expected).square() / expected).sum())
+        freedom = len(counts) - 1
+        assert abs(chi_squared - freedom) < 5 * (2 * freedom) ** 0.5, options
+        assert counts.min() > 0, options
 
 
-@pytest.mark.parametrize("alpha", [0, 255])
-def test_images_that_are_all_background_or_all_content_are_drawn_evenly(alpha):
-    images = torch.full_like(VIEWS.images, alpha)
-    views = VIEWS.__class__(images, VIEWS.camera_to_world, VIEWS.times, VIEWS.focal, VIEWS.files)
-    batches = batches_of(views, rays=2000)
-    assert batches.skipped == 0
-    batch = batches.draw(0)
-    assert len(batch["times"].unique()) == 5
-    assert (batch["target"] == 1).all()
-    assert batch["directions"].unique(dim=0).shape[0] > 1000
+def test_images_that_are_all_background_or_all_content_are_drawn_evenly():
+    for alpha in (0, 255):
+        batches = batches_of(replace(VIEWS, images=torch.full_like(VIEWS.images, alpha)), rays=2000)
+        assert batches.skipped == 0, alpha
+        batch = batches.draw(0)
+        assert len(batch["times"].unique()) == 5, alpha
+        assert (batch["target"] == 1).all(), alpha
+        assert batch["directions"].unique(dim=0).shape[0] > 1000, alpha
 
 
 def test_jitter_is_even():

@@ -84,20 +84,21 @@ def test_each_ray_may_have_its_own_camera():
 PLACES = torch.tensor([[3.0, 0, 0], [0, -2, 1], [1, 1, -5], [0, 0, 4], [0, 0, -4]])
 
 
-@pytest.mark.parametrize("target", [None, torch.tensor([0.5, 0.25, -1.0])])
-def test_look_at_makes_rigid_right_handed_poses_that_see_their_target(target):
-    poses = look_at(PLACES, target)
-    aim = torch.zeros(3) if target is None else target
-    for pose, place in zip(poses, PLACES, strict=True):
-        rotation = pose[:3, :3]
-        torch.testing.assert_close(rotation.T @ rotation, torch.eye(3), atol=1e-6, rtol=0)
-        assert float(rotation.det()) == pytest.approx(1, abs=1e-5)
-        assert torch.equal(pose[:3, 3], place)
-        assert pose[3].tolist() == [0, 0, 0, 1]
-        towards = (aim - place) / (aim - place).norm()
-        torch.testing.assert_close(-rotation[:, 2], towards)
-        assert rotation[2, 0] == pytest.approx(0, abs=1e-6)  # no roll
-        assert rotation[2, 1] >= -1e-6  # up is up
+def test_look_at_makes_rigid_right_handed_poses_that_see_their_target():
+    for target in (None, torch.tensor([0.5, 0.25, -1.0])):
+        poses = look_at(PLACES, target)
+        aim = torch.zeros(3) if target is None else target
+        for pose, place in zip(poses, PLACES, strict=True):
+            case = f"from {place.tolist()} to {aim.tolist()}"
+            rotation = pose[:3, :3]
+            torch.testing.assert_close(rotation.T @ rotation, torch.eye(3), atol=1e-6, rtol=0)
+            assert float(rotation.det()) == pytest.approx(1, abs=1e-5), case
+            assert torch.equal(pose[:3, 3], place), case
+            assert pose[3].tolist() == [0, 0, 0, 1], case
+            towards = (aim - place) / (aim - place).norm()
+            torch.testing.assert_close(-rotation[:, 2], towards)
+            assert rotation[2, 0] == pytest.approx(0, abs=1e-6), case  # no roll
+            assert rotation[2, 1] >= -1e-6, case  # up is up
 
 
 def test_straight_up_and_down_take_y_as_up():

@@ -1,6 +1,8 @@
 import json
 import math
 import warnings
+from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.refusals import assert_refused
 from xplanes.scenes.cameras import focal_length, look_at
 from xplanes.scenes.dnerf import SceneError, read_scene
 from xplanes.scenes.images import load_images, load_premultiplied, shrink
@@ -61,10 +64,8 @@ class SceneFolder:
     def read(self, resolution=None, splits=("train",), **counts):
         return read_scene(self.path, resolution=resolution, splits=splits, **counts)
 
-    def error(self, **arguments):
-        with pytest.raises(SceneError) as caught:
-            self.read(**arguments)
-        return str(caught.value)
+    def error(self, case=None, **arguments):
+        return assert_refused(SceneError, "", partial(self.read, **arguments), case)
 
 
 @pytest.fixture
@@ -105,37 +106,37 @@ def test_reads_images_cameras_and_times(scene):
         assert error <= 0.5 + 1e-4
 
 
-@pytest.mark.parametrize("factor", [2, 3, 4, 12])
-def test_integer_factors_average_premultiplied_blocks(scene, factor):
-    views = scene.read(resolution=12 // factor).splits["train"]
-    assert views.images.shape == (5, 12 // factor, 12 // factor, 4)
-    assert views.focal == pytest.approx(focal_length(ANGLE, 12 // factor))
-    for i in range(5):
-        expected = box_average(picture(i), factor)
-        assert np.abs(views.images[i].numpy() - expected).max() <= 1
+def test_integer_factors_average_premultiplied_blocks(scene):
+    for factor in (2, 3, 4, 12):
+        views = scene.read(resolution=12 // factor).splits["train"]
+        assert views.images.shape == (5, 12 // factor, 12 // factor, 4)
+        assert views.focal == pytest.approx(focal_length(ANGLE, 12 // factor)), factor
+        for i in range(5):
+            expected = box_average(picture(i), factor)
+            assert np.abs(views.images[i].numpy() - expected).max() <= 1, factor
 
 
-@pytest.mark.parametrize("resolution", [5, 7, 8, 11])
-def test_other_factors_average_the_area_that_a_pixel_covers(scene, resolution):
-    views = scene.read(resolution=resolution).splits["train"]
-    for i in range(5):
-        # Enlarged by whole pixels, the picture divides into blocks again.
-        enlarged = picture(i).repeat(resolution, axis=0).repeat(resolution, axis=1)
-        found = views.images[i].numpy()
-        assert np.abs(found - box_average(enlarged, 12)).max() <= 1
-        assert (found[..., :3] <= found[..., 3:]).all()
+def test_other_factors_average_the_area_that_a_pixel_covers(scene):
+    for resolution in (5, 7, 8, 11):
+        views = scene.read(resolution=resolution).splits["train"]
+        for i in range(5):
+            # Enlarged by whole pixels, the picture divides into blocks again.
+            enlarged = picture(i).repeat(resolution, axis=0).repeat(resolution, axis=1)
+            found = views.images[i].numpy()
+            assert np.abs(found - box_average(enlarged, 12)).max() <= 1, resolution
+            assert (found[..., :3] <= found[..., 3:]).all(), resolution
 
 
-@pytest.mark.parametrize("resolution", [7, 12, 24, 36, 47])
-def test_edges_neither_ring_nor_spill(resolution):
+def test_edges_neither_ring_nor_spill():
     straight = np.zeros((4, 48, 48), np.float32)
     straight[:, 16:32, 16:32] = 255
-    pixels = shrink(straight, resolution, resolution)
-    scale = resolution / 48
-    middle = slice(math.ceil(16 * scale), math.floor(32 * scale))
-    assert (pixels[middle, middle] == 255).all()
-    assert (pixels[: math.floor(16 * scale)] == 0).all()
-    assert (pixels[:, math.ceil(32 * scale) :] == 0).all()
+    for resolution in (7, 12, 24, 36, 47):
+        pixels = shrink(straight, resolution, resolution)
+        scale = resolution / 48
+        middle = slice(math.ceil(16 * scale), math.floor(32 * scale))
+        assert (pixels[middle, middle] == 255).all(), resolution
+        assert (pixels[: math.floor(16 * scale)] == 0).all(), resolution
+        assert (pixels[:, math.ceil(32 * scale) :] == 0).all(), resolution
 
 
 def test_hidden_colour_does_not_bleed(tmp_path):
@@ -156,13 +157,13 @@ def test_images_without_alpha_are_opaque(scene):
     assert (image[..., :3].numpy() == straight).all()
 
 
-@pytest.mark.parametrize("mode", ["L", "LA", "P", "1", "RGB", "RGBA"])
-def test_other_kinds_of_pixels_are_converted(tmp_path, mode):
-    original = Image.fromarray(picture(0)).convert(mode)
-    original.save(tmp_path / "image.png")
-    straight = np.asarray(original.convert("RGBA"))
-    found = load_images([tmp_path / "image.png"], None)[0].numpy()
-    assert np.abs(found - box_average(straight, 1)).max() <= 0.5 + 1e-4
+def test_other_kinds_of_pixels_are_converted(tmp_path):
+    for mode in ("L", "LA", "P", "1", "RGB", "RGBA"):
+        original = Image.fromarray(picture(0)).convert(mode)
+        original.save(tmp_path / "image.png")
+        straight = np.asarray(original.convert("RGBA"))
+        found = load_images([tmp_path / "image.png"], None)[0].numpy()
+        assert np.abs(found - box_average(straight, 1)).max() <= 0.5 + 1e-4, mode
 
 
 def test_transparent_palette_entries_stay_transparent(tmp_path):
@@ -191,13 +192,11 @@ def test_cmyk_is_refused_in_words(scene):
     assert "RGBA" in message
 
 
-@pytest.mark.parametrize(
-    "name", ["train/r_1.png", "train/r_1", ".\\train\\r_1", "./train/../train/r_1"]
-)
-def test_spellings_of_file_path(scene, name):
-    scene.frame(1)["file_path"] = name
-    scene.write()
-    assert scene.read().splits["train"].files[1] == "train/r_1.png"
+def test_spellings_of_file_path(scene):
+    for name in ("train/r_1.png", "train/r_1", ".\\train\\r_1", "./train/../train/r_1"):
+        scene.frame(1)["file_path"] = name
+        scene.write()
+        assert scene.read().splits["train"].files[1] == "train/r_1.png", name
 
 
 def test_focal_length_in_pixels_instead_of_an_angle(scene):
@@ -216,20 +215,19 @@ def test_no_times_at_all_is_a_static_scene(scene):
     assert scene.read().splits["train"].times.tolist() == [0] * 5
 
 
-@pytest.mark.parametrize("split", ["test", "video"])
-def test_frames_without_times_do_not_pass_for_those_of_time_zero(scene, split):
-    scene.add(split, 3, fixed=split == "video")
-    for frame in scene.contents[split]["frames"]:
-        del frame["time"]
-    scene.write(split)
-    splits = ["train", "test"] if split == "test" else ["train"]
-    message = scene.error(splits=splits)
-    assert f"transforms_{split}.json" in message
-    assert "Give every frame its time" in message
-    for frame in scene.contents["train"]["frames"]:
-        del frame["time"]
-    scene.write()
-    assert scene.read(splits=splits).splits["train"].is_still
+def test_frames_without_times_do_not_pass_for_those_of_time_zero(tmp_path):
+    for split, splits in (("test", ["train", "test"]), ("video", ["train"])):
+        scene = SceneFolder(tmp_path / split).add("train", 5).add(split, 3, fixed=split == "video")
+        for frame in scene.contents[split]["frames"]:
+            del frame["time"]
+        scene.write(split)
+        message = scene.error(split, splits=splits)
+        assert f"transforms_{split}.json" in message
+        assert "Give every frame its time" in message, split
+        for frame in scene.contents["train"]["frames"]:
+            del frame["time"]
+        scene.write()
+        assert scene.read(splits=splits).splits["train"].is_still, split
 
 
 def test_video_is_read_when_there_is_one(scene):
@@ -263,17 +261,20 @@ def test_a_sound_scene_gives_no_warning(scene):
         scene.read(resolution=6)
 
 
-@pytest.mark.parametrize(
-    ("count", "expected"), [(1, [0]), (2, [0, 4]), (3, [0, 2, 4]), (4, [0, 1, 3, 4]), (5, range(5))]
-)
-def test_few_views_spread_over_time(scene, count, expected):
+def test_few_views_spread_over_time(scene):
     scene.add("val", 3)
-    result = scene.read(splits=["train", "val"], views=count)
-    assert result.splits["train"].files == tuple(f"train/r_{i}.png" for i in expected)
-    assert len(result.splits["val"]) == 3
-
-
-def test_few_views_follow_time_rather_than_file_order(scene):
+    for count, expected in (
+        (1, [0]),
+        (2, [0, 4]),
+        (3, [0, 2, 4]),
+        (4, [0, 1, 3, 4]),
+        (5, range(5)),
+    ):
+        result = scene.read(splits=["train", "val"], views=count)
+        files = tuple(f"train/r_{i}.png" for i in expected)
+        assert result.splits["train"].files == files, count
+        assert len(result.splits["val"]) == 3, count
+    # Times decide, not the order of the files.
     for index, time in enumerate([0.5, 1, 0, 0.75, 0.25]):
         scene.frame(index)["time"] = time
     scene.write()
@@ -287,46 +288,47 @@ def test_fewer_views_are_scored(scene):
     assert result.splits["val"].files == ("val/r_0.png", "val/r_2.png")
 
 
-@pytest.mark.parametrize("count", [0, -1, 6])
-@pytest.mark.parametrize(("key", "split"), [("views", "train"), ("eval_views", "val")])
-def test_more_views_than_there_are(scene, count, key, split):
+def test_more_views_than_there_are(scene):
     scene.add("val", 5)
-    message = scene.error(splits=["train", "val"], **{key: count})
-    assert f"data.{key}={count}, but the {split} split" in message
-    assert "1 to 5" in message
+    for (key, split), count in product((("views", "train"), ("eval_views", "val")), (0, -1, 6)):
+        case = f"{key}={count}"
+        message = scene.error(case, splits=["train", "val"], **{key: count})
+        assert f"data.{key}={count}, but the {split} split" in message, case
+        assert "1 to 5" in message, case
 
 
 # What is refused
 
 
 def test_missing_folder_names_its_neighbours_and_the_ways_out(scene):
-    scene.path = scene.path.parent / "bal"
+    root = scene.path.parent
+    scene.path = root / "bal"
     message = scene.error()
     assert str(scene.path) in message
     assert "does not exist" in message
     assert "ball" in message
     assert "xplanes download dnerf" in message
     assert "data=demo" in message
+    empty = root / "ball" / "train"
+    message = SceneFolder(empty / "no" / "such" / "scene").error()
+    assert f"There is no scene in {empty}." in message
 
 
-def test_missing_root_names_the_nearest_folder(tmp_path):
-    message = SceneFolder(tmp_path / "no" / "such" / "scene").error()
-    assert f"There is no scene in {tmp_path}." in message
-
-
-def test_a_file_is_not_a_scene_folder(scene):
-    scene.path = scene.path / "transforms_train.json"
+def test_what_is_no_scene_folder(scene):
+    folder = scene.path
+    scene.path = folder / "transforms_train.json"
     assert "is not a folder" in scene.error()
-
-
-def test_a_folder_of_scenes_is_not_a_scene(scene):
-    scene.path = scene.path.parent
+    scene.path = folder.parent
     message = scene.error()
     assert "no transforms_train.json" in message
     assert "Scenes inside it: ball" in message
 
 
-def test_missing_test_split_points_to_val(scene):
+def test_missing_split(scene):
+    message = scene.error(splits=["test"])
+    assert "transforms_test.json" in message
+    assert "Splits of this scene: train. Move some of its frames" in message
+    assert "data.eval_split" not in message
     scene.add("val", 2)
     message = scene.error(splits=["train", "test"])
     assert "transforms_test.json" in message
@@ -334,74 +336,56 @@ def test_missing_test_split_points_to_val(scene):
     assert "data.eval_split=val" in message
 
 
-def test_missing_split_without_val(scene):
-    message = scene.error(splits=["test"])
-    assert "transforms_test.json" in message
-    assert "Splits of this scene: train. Move some of its frames" in message
-    assert "data.eval_split" not in message
+def test_broken_json(scene):
+    for text in ("{", "", "\x80", "[" * 100000):
+        (scene.path / "transforms_train.json").write_bytes(text.encode("latin-1"))
+        message = scene.error(text[:10])
+        assert "transforms_train.json" in message, text[:10]
+        assert "JSON" in message, text[:10]
 
 
-@pytest.mark.parametrize("text", ["{", "", "\x80", "[" * 100000])
-def test_broken_json(scene, text):
-    (scene.path / "transforms_train.json").write_bytes(text.encode("latin-1"))
-    message = scene.error()
-    assert "transforms_train.json" in message
-    assert "JSON" in message
+def test_no_frames(scene):
+    for text in ("[]", "3", '{"camera_angle_x": 1}', '{"frames": []}', '{"frames": 3}'):
+        (scene.path / "transforms_train.json").write_text(text)
+        message = scene.error(text)
+        assert "transforms_train.json" in message, text
+        assert "frames" in message, text
 
 
-@pytest.mark.parametrize(
-    "text", ["[]", "3", '{"camera_angle_x": 1}', '{"frames": []}', '{"frames": 3}']
-)
-def test_no_frames(scene, text):
-    (scene.path / "transforms_train.json").write_text(text)
-    message = scene.error()
-    assert "transforms_train.json" in message
-    assert "frames" in message
-
-
-@pytest.mark.parametrize("key", ["file_path", "transform_matrix"])
-def test_missing_key(scene, key):
-    del scene.frame(2)[key]
-    scene.write()
-    message = scene.error()
-    assert "frame 2" in message
-    assert f'"{key}"' in message
-
-
-def test_a_frame_that_is_no_object(scene):
+def test_incomplete_frames(scene):
+    for key in ("file_path", "transform_matrix"):
+        value = scene.frame(2).pop(key)
+        scene.write()
+        message = scene.error(key)
+        assert "frame 2" in message, key
+        assert f'"{key}"' in message
+        scene.frame(2)[key] = value
     scene.contents["train"]["frames"][2] = "r_2"
     scene.write()
     assert "frame 2 is 'r_2'" in scene.error()
 
 
-def test_missing_image(scene):
-    (scene.path / "train" / "r_2.png").unlink()
+def test_file_path_that_is_no_name(scene):
+    for name in (3, "", None, "train/r_1\0"):
+        scene.frame(1)["file_path"] = name
+        scene.write()
+        assert "file_path must be text" in scene.error(repr(name)), name
+
+
+def test_damaged_or_missing_image(scene):
+    path = scene.path / "train" / "r_2.png"
+    whole = path.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 0xFF
+    for content in (whole[: len(whole) // 2], bytes(flipped), b"no image", b""):
+        path.write_bytes(content)
+        message = scene.error(content[:8])
+        assert "r_2.png" in message, content
+        assert "cannot be decoded" in message, content
+    path.unlink()
     message = scene.error()
     assert "frame 2 (./train/r_2)" in message
     assert ".png" in message
-
-
-@pytest.mark.parametrize("name", [3, "", None, "train/r_1\0"])
-def test_file_path_that_is_no_name(scene, name):
-    scene.frame(1)["file_path"] = name
-    scene.write()
-    assert "file_path must be text" in scene.error()
-
-
-@pytest.mark.parametrize("damage", ["truncate", "flip", "text", "empty"])
-def test_damaged_image(scene, damage):
-    path = scene.path / "train" / "r_2.png"
-    content = bytearray(path.read_bytes())
-    if damage == "truncate":
-        content = content[: len(content) // 2]
-    elif damage == "flip":
-        content[len(content) // 2] ^= 0xFF
-    else:
-        content = b"no image" if damage == "text" else b""
-    path.write_bytes(content)
-    message = scene.error()
-    assert "r_2.png" in message
-    assert "cannot be decoded" in message
 
 
 def test_images_of_different_sizes(scene):
@@ -411,20 +395,20 @@ def test_images_of_different_sizes(scene):
     assert "r_0.png has 12x12" in message
 
 
-@pytest.mark.parametrize(("resolution", "words"), [(13, "at most 12"), (0, "1 to 12")])
-def test_impossible_resolution(scene, resolution, words):
-    message = scene.error(resolution=resolution)
-    assert f"data.resolution={resolution}" in message
-    assert words in message
+def test_impossible_resolution(scene):
+    for resolution, words in ((13, "at most 12"), (0, "1 to 12")):
+        message = scene.error(resolution, resolution=resolution)
+        assert f"data.resolution={resolution}" in message
+        assert words in message, resolution
 
 
-@pytest.mark.parametrize("matrix", [[[1, 0], [0, 1]], "identity", None, [[1, 2, 3, 4]] * 3, [[[]]]])
-def test_pose_of_another_shape(scene, matrix):
-    scene.frame(1)["transform_matrix"] = matrix
-    scene.write()
-    message = scene.error()
-    assert "frame 1" in message
-    assert "4 rows of 4 numbers" in message
+def test_pose_of_another_shape(scene):
+    for matrix in ([[1, 0], [0, 1]], "identity", None, [[1, 2, 3, 4]] * 3, [[[]]]):
+        scene.frame(1)["transform_matrix"] = matrix
+        scene.write()
+        message = scene.error(matrix)
+        assert "frame 1" in message, matrix
+        assert "4 rows of 4 numbers" in message, matrix
 
 
 def _not_a_number(matrix):
@@ -443,69 +427,60 @@ def _mirrored(matrix):
     matrix[:3, 0] *= -1
 
 
-@pytest.mark.parametrize(
-    ("damage", "words"),
-    [
+def test_pose_that_is_not_rigid(scene):
+    for damage, words in (
         (_not_a_number, "NaN"),
         (_transposed, "last row"),
         (_scaled, "not orthonormal"),
         (_mirrored, "determinant -1"),
-    ],
-)
-def test_pose_that_is_not_rigid(scene, damage, words):
-    matrix = np.array(pose(1))
-    damage(matrix)
-    scene.frame(1)["transform_matrix"] = matrix.tolist()
-    scene.write()
-    message = scene.error()
-    assert "frame 1 (./train/r_1)" in message
-    assert words in message
+    ):
+        matrix = np.array(pose(1))
+        damage(matrix)
+        scene.frame(1)["transform_matrix"] = matrix.tolist()
+        scene.write()
+        message = scene.error(words)
+        assert "frame 1 (./train/r_1)" in message, words
+        assert words in message
 
 
-@pytest.mark.parametrize("time", [-0.1, 1.1, math.nan, math.inf, "0", None, True])
-def test_time_out_of_range(scene, time):
-    scene.frame(1)["time"] = time
+def test_time_out_of_range_or_missing_on_some_frames(scene):
+    for time in (-0.1, 1.1, math.nan, math.inf, "0", None, True):
+        scene.frame(1)["time"] = time
+        scene.write()
+        message = scene.error(repr(time))
+        assert "frame 1" in message, time
+        assert f"time is {time!r}" in message
+        assert "[0, 1]" in message, time
+    del scene.frame(1)["time"]
     scene.write()
     message = scene.error()
     assert "frame 1" in message
-    assert f"time is {time!r}" in message
-    assert "[0, 1]" in message
-
-
-def test_time_missing_on_some_frames(scene):
-    del scene.frame(3)["time"]
-    scene.write()
-    message = scene.error()
-    assert "frame 3" in message
     assert "4 of 5 frames" in message
 
 
-def test_the_same_file_twice(scene):
-    scene.frame(3)["file_path"] = "train/r_1.png"
-    scene.write()
-    message = scene.error()
-    assert "frame 3" in message
-    assert "same file" in message
-    assert "frame 1" in message
+def test_the_same_view_twice(scene):
+    whole = dict(scene.frame(3))
+    first = scene.frame(1)
+    for change, words in (
+        ({"file_path": "train/r_1.png"}, "same file"),
+        ({"time": 0.25, "transform_matrix": first["transform_matrix"]}, "same camera and time"),
+    ):
+        scene.frame(3).update(whole | change)
+        scene.write()
+        message = scene.error(words)
+        assert "frame 3" in message, words
+        assert words in message
+        assert "frame 1" in message, words
 
 
-def test_the_same_camera_and_time_twice(scene):
-    scene.frame(3).update(time=0.25, transform_matrix=scene.frame(1)["transform_matrix"])
-    scene.write()
-    message = scene.error()
-    assert "frame 3" in message
-    assert "same camera and time" in message
-    assert "frame 1" in message
-
-
-@pytest.mark.parametrize("name", ["../outside", "train/../../outside", "/etc/hostname", "C:\\r_1"])
-def test_file_path_outside_the_folder(scene, name):
+def test_file_path_outside_the_folder(scene):
     Image.fromarray(picture(0)).save(scene.path.parent / "outside.png")
-    scene.frame(1)["file_path"] = name
-    scene.write()
-    message = scene.error()
-    assert "frame 1" in message
-    assert "leaves the scene's folder" in message or "absolute" in message
+    for name in ("../outside", "train/../../outside", "/etc/hostname", "C:\\r_1"):
+        scene.frame(1)["file_path"] = name
+        scene.write()
+        message = scene.error(name)
+        assert "frame 1" in message, name
+        assert "leaves the scene's folder" in message or "absolute" in message, name
 
 
 def test_a_link_that_leaves_the_folder(scene):
@@ -521,38 +496,39 @@ def test_a_link_that_leaves_the_folder(scene):
     assert "outside.png" in message
 
 
-@pytest.mark.parametrize("angle", [0, -1, math.pi, math.nan, "wide", None, True])
-def test_field_of_view_out_of_range(scene, angle):
-    scene.contents["train"]["camera_angle_x"] = angle
-    scene.write()
-    message = scene.error()
-    assert f"camera_angle_x is {angle!r}" in message
-    assert "between 0 and pi" in message
+def test_field_of_view_out_of_range(scene):
+    for angle in (0, -1, math.pi, math.nan, "wide", None, True):
+        scene.contents["train"]["camera_angle_x"] = angle
+        scene.write()
+        message = scene.error(repr(angle))
+        assert f"camera_angle_x is {angle!r}" in message
+        assert "between 0 and pi" in message, angle
 
 
-@pytest.mark.parametrize("other", [{}, {"fl_x": 30}, {"fl_x": 0, "w": 12}])
-def test_field_of_view_missing(scene, other):
-    del scene.contents["train"]["camera_angle_x"]
-    scene.contents["train"] |= other
-    scene.write()
-    message = scene.error()
-    assert 'no "camera_angle_x"' in message
-    assert "fl_x and w" in message
+def test_field_of_view_missing(scene):
+    whole = scene.contents["train"]
+    del whole["camera_angle_x"]
+    for other in ({}, {"fl_x": 30}, {"fl_x": 0, "w": 12}):
+        scene.contents["train"] = whole | other
+        scene.write()
+        message = scene.error(other)
+        assert 'no "camera_angle_x"' in message, other
+        assert "fl_x and w" in message, other
 
 
-@pytest.mark.parametrize(
-    ("other", "word"),
-    [({"k1": 0.1}, "k1"), ({"fl_x": 10, "fl_y": 12}, "fl_y"), ({"cx": 3, "w": 12}, "cx")],
-)
-def test_lenses_that_are_not_read(scene, other, word):
-    scene.contents["train"] |= other
-    scene.write()
-    message = scene.error()
-    assert word in message
-    assert "undistort" in message
-
-
-def test_focal_length_of_single_frames(scene):
+def test_lenses_that_are_not_read(scene):
+    whole = scene.contents["train"]
+    for other, word in (
+        ({"k1": 0.1}, "k1"),
+        ({"fl_x": 10, "fl_y": 12}, "fl_y"),
+        ({"cx": 3, "w": 12}, "cx"),
+    ):
+        scene.contents["train"] = whole | other
+        scene.write()
+        message = scene.error(other)
+        assert word in message
+        assert "undistort" in message, word
+    scene.contents["train"] = whole
     scene.frame(1)["camera_angle_x"] = 0.5
     scene.write()
     assert "camera_angle_x of single frames" in scene.error()

@@ -5,27 +5,37 @@ import shutil
 import threading
 import zipfile
 from collections import namedtuple
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import product
 
 import pytest
 
+from tests.refusals import assert_refused
+from xplanes.scenes import download as download_module
 from xplanes.scenes import fetch as fetch_module
 from xplanes.scenes.download import DNERF_URL, TRAIN_VIEWS, download_dnerf
 from xplanes.scenes.errors import SceneError
 
+VIEWS = {name: count // 25 for name, count in TRAIN_VIEWS.items()}
+"""Numbers of training views in these tests, but for those that want the published ones."""
 
-def make_archive(*, top="data/", skip=(), extra=(), train_views=None):
-    """A zip in the shape of the D-NeRF archive, with a few bytes for every image."""
+COPIES = 60
+"""How often the text of an image repeats, for an archive of some size."""
+
+
+def make_archive(*, top="data/", skip=(), extra=(), train_views=None, held_out=2):
+    """A zip in the shape of the D-NeRF archive, with some text for every image."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        for scene, train in ({**TRAIN_VIEWS, **(train_views or {})}).items():
-            for split, count in (("train", train), ("val", 20), ("test", 20)):
+        for scene, train in ({**VIEWS, **(train_views or {})}).items():
+            for split, count in (("train", train), ("val", held_out), ("test", held_out)):
                 frames = [{"file_path": f"./{split}/r_{i:03}"} for i in range(count)]
                 files = [f"{scene}/{split}/r_{i:03}.png" for i in range(count)]
                 listing = f"{scene}/transforms_{split}.json"
                 for name, text in [
                     (listing, json.dumps({"frames": frames})),
-                    *((file, file) for file in files),
+                    *((file, file * COPIES) for file in files),
                 ]:
                     if name not in skip:
                         archive.writestr(top + name, text)
@@ -79,6 +89,8 @@ class Handler(BaseHTTPRequestHandler):
 def server(archive, monkeypatch):
     monkeypatch.setenv("no_proxy", "*")
     monkeypatch.setattr(fetch_module, "PAUSE_SECONDS", 0.01)
+    monkeypatch.setattr(download_module, "TRAIN_VIEWS", VIEWS)
+    monkeypatch.setattr(download_module, "TEST_VIEWS", 2)
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         server.content = archive
         server.requests = []
@@ -104,30 +116,35 @@ def download(root, server, **arguments):
 
 
 def error(root, server, **arguments):
-    with pytest.raises(SceneError) as caught:
-        download(root, server, **arguments)
-    return str(caught.value)
+    call = partial(download, root, server, **arguments)
+    return assert_refused(SceneError, "", call, arguments)
 
 
-def assert_complete(root):
-    assert sorted(path.name for path in root.iterdir()) == sorted(TRAIN_VIEWS)
-    for scene, count in TRAIN_VIEWS.items():
-        assert len(list((root / scene / "train").iterdir())) == count
-        assert (root / scene / "val" / "r_019.png").read_text() == f"{scene}/val/r_019.png"
+def assert_complete(root, views=VIEWS, case=None):
+    assert sorted(path.name for path in root.iterdir()) == sorted(views), case
+    for scene, count in views.items():
+        assert len(list((root / scene / "train").iterdir())) == count, case
+        assert (root / scene / "val" / "r_001.png").read_text() == (
+            f"{scene}/val/r_001.png" * COPIES
+        ), case
 
 
 def scenes_in(root):
     return [path.name for path in root.iterdir() if path.is_dir()]
 
 
-def test_downloads_and_unpacks_all_scenes(tmp_path, server):
+def test_downloads_and_unpacks_all_scenes(tmp_path, server, monkeypatch):
+    monkeypatch.setattr(download_module, "TRAIN_VIEWS", TRAIN_VIEWS)
+    monkeypatch.setattr(download_module, "TEST_VIEWS", 20)
+    server.content = make_archive(train_views=TRAIN_VIEWS, held_out=20)
     root = tmp_path / "data" / "dnerf"
     checksum = hashlib.sha256(server.content).hexdigest().upper()
     result, lines = download(root, server, sha256=checksum)
     assert result == root
-    assert_complete(root)
+    assert_complete(root, TRAIN_VIEWS)
     assert server.url in lines[0]
     assert "lego" in lines[-1]
+    assert not any("Note" in line for line in lines)
 
 
 def test_scenes_may_lie_at_the_top_of_the_archive(tmp_path, server):
@@ -148,7 +165,7 @@ def test_scenes_already_there_are_kept(tmp_path, server):
     (tmp_path / "lego" / "transforms_train.json").write_text("mine")
     download(tmp_path, server)
     assert (tmp_path / "lego" / "transforms_train.json").read_text() == "mine"
-    assert sorted(scenes_in(tmp_path)) == sorted(TRAIN_VIEWS)
+    assert sorted(scenes_in(tmp_path)) == sorted(VIEWS)
 
 
 def test_a_folder_in_the_way_is_not_touched(tmp_path, server):
@@ -195,28 +212,35 @@ def test_a_complete_part_is_not_fetched_again(tmp_path, server):
     assert_complete(tmp_path)
 
 
-@pytest.mark.parametrize("ignores_if_range", [False, True])
-@pytest.mark.parametrize("size", [1000, 10_000_000])
-def test_a_changed_file_is_fetched_from_its_start(tmp_path, server, ignores_if_range, size):
-    part = tmp_path / "dnerf.zip.part"
-    part.write_bytes(b"old" * (size // 3))
-    note = {"url": server.url, "validator": '"zero"'}
-    part.with_name("dnerf.zip.part.json").write_text(json.dumps(note))
-    server.ignores_if_range = ignores_if_range
-    download(tmp_path, server)
-    assert "Range" in server.requests[0]
-    assert_complete(tmp_path)
+def test_a_changed_file_is_fetched_from_its_start(tmp_path, server):
+    for ignores_if_range, size in product((False, True), (1000, 10_000_000)):
+        case = f"If-Range ignored: {ignores_if_range}, {size} bytes"
+        root = tmp_path / f"{ignores_if_range} {size}"
+        root.mkdir()
+        part = root / "dnerf.zip.part"
+        part.write_bytes(b"old" * (size // 3))
+        note = {"url": server.url, "validator": '"zero"'}
+        part.with_name("dnerf.zip.part.json").write_text(json.dumps(note))
+        server.ignores_if_range = ignores_if_range
+        server.requests.clear()
+        download(root, server)
+        assert "Range" in server.requests[0], case
+        assert_complete(root, case=case)
 
 
-@pytest.mark.parametrize("note", [None, "{", '{"url": "elsewhere", "validator": "one"}', "[]"])
-def test_a_part_of_unknown_origin_is_not_continued(tmp_path, server, note):
-    part = tmp_path / "dnerf.zip.part"
-    part.write_bytes(b"old")
-    if note is not None:
-        part.with_name("dnerf.zip.part.json").write_text(note)
-    download(tmp_path, server)
-    assert "Range" not in server.requests[0]
-    assert_complete(tmp_path)
+def test_a_part_of_unknown_origin_is_not_continued(tmp_path, server):
+    notes = (None, "{", '{"url": "elsewhere", "validator": "one"}', "[]")
+    for number, note in enumerate(notes):
+        root = tmp_path / str(number)
+        root.mkdir()
+        part = root / "dnerf.zip.part"
+        part.write_bytes(b"old")
+        if note is not None:
+            part.with_name("dnerf.zip.part.json").write_text(note)
+        server.requests.clear()
+        download(root, server)
+        assert "Range" not in server.requests[0], note
+        assert_complete(root, case=note)
 
 
 def test_server_without_ranges_starts_again(tmp_path, server):
@@ -227,13 +251,15 @@ def test_server_without_ranges_starts_again(tmp_path, server):
     assert_complete(tmp_path)
 
 
-@pytest.mark.parametrize("etag", [None, 'W/"weak"'])
-def test_server_that_names_no_version_starts_again(tmp_path, server, etag):
-    server.etag = etag
-    server.limits = [50_000]
-    download(tmp_path, server)
-    assert "Range" not in server.requests[1]
-    assert_complete(tmp_path)
+def test_server_that_names_no_version_starts_again(tmp_path, server):
+    for etag in (None, 'W/"weak"'):
+        root = tmp_path / str(etag is None)
+        server.etag = etag
+        server.limits = [50_000]
+        server.requests.clear()
+        download(root, server)
+        assert "Range" not in server.requests[1], etag
+        assert_complete(root, case=etag)
 
 
 def test_server_that_tells_no_length(tmp_path, server):
@@ -242,61 +268,55 @@ def test_server_that_tells_no_length(tmp_path, server):
     assert_complete(tmp_path)
 
 
-def test_wrong_checksum(tmp_path, server):
+def test_damaged_archives_leave_no_scene(tmp_path, server):
+    whole = server.content
     message = error(tmp_path, server, sha256="ab" * 32)
-    assert hashlib.sha256(server.content).hexdigest() in message
+    assert hashlib.sha256(whole).hexdigest() in message
     assert "ab" * 32 in message
     assert list(tmp_path.iterdir()) == []
 
-
-def test_truncated_archive(tmp_path, server):
-    server.content = server.content[:-100]
+    server.content = whole[:-100]
     message = error(tmp_path, server)
     assert "dnerf.zip" in message
     assert "damaged" in message
     assert list(tmp_path.iterdir()) == []
 
-
-def test_damaged_member_leaves_no_scene(tmp_path, server):
-    content = bytearray(server.content)
-    place = content.index(b"trex/test/r_019.png", content.index(b"data/trex/test/r_019.png") + 10)
-    content[place] ^= 0xFF
-    server.content = bytes(content)
+    flipped = bytearray(whole)
+    name = b"trex/test/r_001.png"
+    flipped[whole.index(name, whole.index(b"data/" + name) + 10)] ^= 0xFF
+    server.content = bytes(flipped)
     message = error(tmp_path, server)
     assert "CRC" in message
-    assert "r_019.png" in message
+    assert "r_001.png" in message
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    "name", ["../evil", "data/../../evil", "/evil", "data\\..\\evil", "C:/evil"]
-)
-def test_members_that_leave_the_folder(tmp_path, server, name):
-    server.content = make_archive(extra=[name])
+def test_members_that_leave_the_folder(tmp_path, server):
     root = tmp_path / "root"
-    message = error(root, server)
-    assert "evil" in message
-    assert "leads out" in message
-    assert list(root.iterdir()) == []
-    assert [path.name for path in tmp_path.iterdir()] == ["root"]
+    for name in ("../evil", "data/../../evil", "/evil", "data\\..\\evil", "C:/evil"):
+        server.content = make_archive(extra=[name])
+        message = error(root, server)
+        assert "evil" in message, name
+        assert "leads out" in message, name
+        assert list(root.iterdir()) == [], name
+        assert [path.name for path in tmp_path.iterdir()] == ["root"], name
 
 
-@pytest.mark.parametrize(
-    ("missing", "words"),
-    [
-        ("trex/transforms_val.json", "trex/transforms_val.json is missing"),
-        ("hook/test/r_007.png", "hook lacks ./test/r_007.png"),
-    ],
-)
-def test_incomplete_archive_leaves_no_scene(tmp_path, server, missing, words):
-    server.content = make_archive(skip=[missing])
-    assert words in error(tmp_path, server)
-    assert list(tmp_path.iterdir()) == []
+def test_incomplete_archive_leaves_no_scene(tmp_path, server):
+    for changes, words in (
+        ({"skip": ["trex/transforms_val.json"]}, "trex/transforms_val.json is missing"),
+        ({"skip": ["hook/test/r_000.png"]}, "hook lacks ./test/r_000.png"),
+        ({"train_views": {"lego": 1}}, "lego has 1 training views instead of 2"),
+    ):
+        server.content = make_archive(**changes)
+        assert words in error(tmp_path, server), changes
+        assert list(tmp_path.iterdir()) == [], changes
 
 
-def test_other_number_of_training_views(tmp_path, server):
-    server.content = make_archive(train_views={"lego": 49})
-    assert "lego has 49 training views instead of 50" in error(tmp_path, server)
+def test_other_numbers_of_test_views_are_said(tmp_path, server):
+    server.content = make_archive(held_out=3)
+    _, lines = download(tmp_path, server)
+    assert sum("3 test views; 2 are usual" in line for line in lines) == len(VIEWS)
 
 
 def test_not_found_names_the_address_and_the_way_by_hand(tmp_path, server):
@@ -316,7 +336,9 @@ def test_web_page_instead_of_the_archive(tmp_path, server):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_offline(tmp_path, server):
+def test_addresses_that_cannot_be_reached(tmp_path, server):
+    server.url = "file:///etc/hostname"
+    assert "not an http or https address" in error(tmp_path, server)
     server.url = "http://127.0.0.1:9/data.zip"
     message = error(tmp_path, server)
     assert "cannot be reached" in message
@@ -324,17 +346,12 @@ def test_offline(tmp_path, server):
     assert str(tmp_path / "dnerf.zip") in message
 
 
-def test_other_kinds_of_address(tmp_path, server):
-    server.url = "file:///etc/hostname"
-    assert "not an http or https address" in error(tmp_path, server)
-
-
 def test_archive_fetched_by_hand_is_used_and_kept(tmp_path, server):
     (tmp_path / "dnerf.zip").write_bytes(server.content)
     _, lines = download(tmp_path, server)
     assert "already" in lines[0]
     assert not server.requests
-    assert sorted(scenes_in(tmp_path)) == sorted(TRAIN_VIEWS)
+    assert sorted(scenes_in(tmp_path)) == sorted(VIEWS)
     assert (tmp_path / "dnerf.zip").exists()
 
 
@@ -351,4 +368,9 @@ def test_full_disk(tmp_path, server, monkeypatch):
     message = error(tmp_path, server)
     assert "free space" in message
     assert str(tmp_path) in message
+    assert scenes_in(tmp_path) == []
+    # An archive fetched by hand has to be unpacked too.
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 0, 1000))
+    (tmp_path / "dnerf.zip").write_bytes(server.content)
+    assert "free space" in error(tmp_path, server)
     assert scenes_in(tmp_path) == []

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 
 from tests.synthetic import ball_scene, ball_views
@@ -19,9 +18,9 @@ def film(*, change: int = 0, count: int = 5):
     return replace(views, images=images)
 
 
-@pytest.mark.parametrize("change", [0, 1, SAME, SAME + 1, 200])
-def test_one_pixel_tells(change):
-    assert stands_still(film(change=change)) == (change <= SAME)
+def test_one_pixel_tells():
+    for change in (0, 1, SAME, SAME + 1, 200):
+        assert stands_still(film(change=change)) == (change <= SAME), change
 
 
 def test_frames_of_one_moment_say_nothing():

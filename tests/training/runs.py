@@ -1,11 +1,21 @@
 """Small runs for tests: composed like the command line, trained in this process."""
 
+import copy
+import functools
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_dir
+import hydra
+import pytest
+from hydra import initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
 
 from xplanes.config import CONF, register_schemas, to_plain
+
+COMPOSE = hydra.compose
 
 SMALL = (
     "lrm=none",
@@ -32,9 +42,54 @@ SMALL = (
 )
 
 
-def small_config(root: Path, *overrides: str) -> dict[str, Any]:
-    """A configuration that trains in seconds, as plain builtins."""
+@functools.cache
+def _compose(*overrides: str) -> DictConfig:
+    return COMPOSE("train", list(overrides))
+
+
+@functools.cache
+def composed(*overrides: str) -> DictConfig:
+    """What Hydra makes of these overrides; composing takes a fifth of a second."""
     register_schemas()
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("train", [f"data.root={root}", *SMALL, *overrides])
+        return _compose(*overrides)
+
+
+@functools.cache
+def _parsed(override: str) -> Any:
+    return OverridesParser.create().parse_override(override).value()
+
+
+def changed(base: tuple[str, ...], *overrides: str) -> dict[str, Any]:
+    """What ``base`` and these overrides compose to, as plain builtins.
+
+    Options of groups are composed anew; keys are set in what was composed before, where their
+    types are checked as Hydra checks them.
+    """
+    values = [
+        text
+        for text in overrides
+        if "." in text.split("=")[0] or text.split("=")[0] in ("seed", "resume")
+    ]
+    config = copy.deepcopy(composed(*base, *(text for text in overrides if text not in values)))
+    for text in values:
+        key = text.partition("=")[0]
+        OmegaConf.update(config, key, _parsed(text))
     return to_plain(config)
+
+
+def small_config(root: Path, *overrides: str) -> dict[str, Any]:
+    """A configuration that trains in seconds, as plain builtins."""
+    return changed(SMALL, f"data.root={root}", *overrides)
+
+
+@contextmanager
+def composing_once() -> Iterator[None]:
+    """While command lines are checked, compose each choice of options but once."""
+
+    def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:
+        return _compose(*overrides) if name == "train" else COMPOSE(name, list(overrides))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hydra, "compose", compose)
+        yield

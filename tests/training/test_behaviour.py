@@ -2,9 +2,12 @@
 
 import csv
 import json
+import shutil
 import signal
 import time
+import weakref
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -15,14 +18,10 @@ from xplanes import pipeline
 from xplanes.config import ConfigError
 from xplanes.pipeline import run
 from xplanes.training import scorer, warming
+from xplanes.training.checkpoints import Checkpoints
 from xplanes.training.clock import TrainingClock
 from xplanes.training.module import RadianceModule, TrainingError
 from xplanes.training.sampling.occupancy import OccupancySampling
-
-
-@pytest.fixture(scope="module")
-def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("scenes")
 
 
 def metrics(folder: Path) -> dict:
@@ -45,19 +44,52 @@ def exact(folder: Path) -> dict:
     return {name: content[name] for name in kept}
 
 
+@pytest.fixture
+def trained(trained_run: Path) -> Path:
+    return trained_run
+
+
+@dataclass
+class Watched:
+    """A run whose doings were noted."""
+
+    folder: Path
+    moves: list[str] = field(default_factory=list)
+    pictures: list[weakref.ref] = field(default_factory=list)
+    saved: list[tuple[int, str]] = field(default_factory=list)
+
+
 @pytest.fixture(scope="module")
-def trained(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "whole"
-    run(small_config(scenes), folder, ["seed=0"], resume=False)
-    return folder
+def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Watched:
+    notes = Watched(tmp_path_factory.mktemp("runs") / "watched")
+    away, back = RadianceModule.cpu, RadianceModule.to
+    finish, score, save = scorer.Scorer.finish, scorer.score_view, Checkpoints.save
 
+    def note_picture(*parts):
+        found, images = score(*parts)
+        notes.pictures.append(weakref.ref(images.colour))
+        return found, images
 
-def test_training_improves_the_scored_views(scenes: Path, tmp_path: Path) -> None:
-    config = small_config(scenes, "trainer.max_steps=200", "sampler.sweep_at=[60]")
-    run(config, tmp_path / "longer", [], resume=False)
-    rows = curve(tmp_path / "longer")
-    assert [int(row["step"]) for row in rows] == [0, 100, 200]
-    assert float(rows[-1]["psnr"]) > float(rows[0]["psnr"]) + 4
+    def note(text: str, call: Callable) -> Callable:
+        def noted(*parts):
+            notes.moves.append(text.format(*parts))
+            return call(*parts)
+
+        return noted
+
+    def note_checkpoint(self, trainer, name) -> None:
+        notes.saved.append((trainer.global_step, name))
+        save(self, trainer, name)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RadianceModule, "cpu", note("away to the CPU", away))
+        patch.setattr(RadianceModule, "to", note("to {1}", back))
+        patch.setattr(scorer.Scorer, "finish", note("scored", finish))
+        patch.setattr(scorer, "score_view", note_picture)
+        patch.setattr(scorer, "SHOWN", 2)
+        patch.setattr(Checkpoints, "save", note_checkpoint)
+        run(small_config(scenes), notes.folder, [], resume=False)
+    return notes
 
 
 def test_run_directory_holds_what_it_promises(trained: Path) -> None:
@@ -86,21 +118,22 @@ def test_score_is_the_mean_of_the_views_scores(trained: Path) -> None:
     assert content["test"]["psnr"] == pytest.approx(sum(scores) / len(scores), abs=1e-9)
 
 
-def test_same_seed_gives_the_same_numbers(trained: Path, scenes: Path, tmp_path: Path) -> None:
-    run(small_config(scenes), tmp_path / "again", [], resume=False)
-    assert exact(tmp_path / "again") == exact(trained)
+def test_same_seed_gives_the_same_numbers(trained: Path, watched: Watched) -> None:
+    assert exact(watched.folder) == exact(trained)
 
 
 def test_another_seed_gives_other_numbers(trained: Path, scenes: Path, tmp_path: Path) -> None:
-    run(small_config(scenes, "seed=1"), tmp_path / "other", [], resume=False)
-    assert exact(tmp_path / "other")["test"] != exact(trained)["test"]
+    config = small_config(scenes, "seed=1", "trainer.max_steps=2", "trainer.evaluate_at=[0]")
+    run(config, tmp_path / "other", [], resume=False)
+    assert curve(tmp_path / "other")[0]["psnr"] != curve(trained)[0]["psnr"]
 
 
-@pytest.mark.parametrize("stop", [13, 20, 27])
-def test_resumed_run_equals_an_uninterrupted_one(
-    trained: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int
+def test_a_run_resumed_after_failures_equals_an_uninterrupted_one(
+    trained: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """It fails between checkpoints, at one with an evaluation, and between later ones."""
     original = TrainingClock.on_train_batch_end
+    stop = 0
 
     def break_down(self, trainer, module, *rest) -> None:
         original(self, trainer, module, *rest)
@@ -108,11 +141,12 @@ def test_resumed_run_equals_an_uninterrupted_one(
             raise OSError("power cut")
 
     folder = tmp_path / "broken"
-    monkeypatch.setattr(TrainingClock, "on_train_batch_end", break_down)
-    with pytest.raises(OSError, match="power cut"):
-        run(small_config(scenes), folder, [], resume=False)
-    assert status(folder)["status"] == "failed"
-    monkeypatch.undo()
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingClock, "on_train_batch_end", break_down)
+        for stop in (13, 20, 27):
+            with pytest.raises(OSError, match="power cut"):
+                run(small_config(scenes), folder, [], resume=stop > 13)
+            assert status(folder)["status"] == "failed"
     run(small_config(scenes), folder, [], resume=True)
     assert status(folder)["status"] == "finished"
     assert exact(folder) == exact(trained)
@@ -136,18 +170,6 @@ def interrupt_where(
     monkeypatch.setattr(TrainingClock, "on_train_batch_end", press_ctrl_c)
 
 
-def test_interrupt_saves_the_step_it_stopped_at(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    interrupt_where(lambda module: module.global_step == 17, monkeypatch)
-    folder = tmp_path / "stopped"
-    with pytest.raises(KeyboardInterrupt):
-        run(small_config(scenes), folder, [], resume=False)
-    assert status(folder)["status"] == "interrupted"
-    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
-    assert state["global_step"] == 17
-
-
 def test_a_second_interrupt_saves_no_half_of_a_step(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -162,7 +184,7 @@ def test_a_second_interrupt_saves_no_half_of_a_step(
     monkeypatch.setattr(RadianceModule, "manual_backward", press_twice)
     folder = tmp_path / "stopped"
     with pytest.raises(KeyboardInterrupt):
-        run(small_config(scenes), folder, [], resume=False)
+        run(small_config(scenes, "trainer.evaluate_at=[]"), folder, [], resume=False)
     state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
     assert (state["global_step"], state["progress"]["batches"]) == (10, 10)
 
@@ -172,65 +194,45 @@ def test_an_interrupt_waits_for_the_update_of_its_batches(
 ) -> None:
     interrupt_where(lambda module: module.batches == 7, monkeypatch)
     folder = tmp_path / "stopped"
+    config = small_config(scenes, "trainer.accumulate=3", "trainer.evaluate_at=[]")
     with pytest.raises(KeyboardInterrupt):
-        run(small_config(scenes, "trainer.accumulate=3"), folder, [], resume=False)
+        run(config, folder, [], resume=False)
     state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
     assert (state["global_step"], state["progress"]["batches"]) == (3, 9)
 
 
-def test_an_evaluation_that_was_stopped_is_done_again(
+def test_interrupt_saves_the_step_it_stopped_at_and_its_evaluation_is_done_again(
     trained: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The evaluation at step 20 finds that it was asked to stop.
     interrupt_where(lambda module: module.global_step == 20, monkeypatch)
     folder = tmp_path / "stopped"
+    config = small_config(scenes, "trainer.checkpoint_every=1000")
     with pytest.raises(KeyboardInterrupt):
-        run(small_config(scenes), folder, [], resume=False)
+        run(config, folder, [], resume=False)
+    assert status(folder)["status"] == "interrupted"
+    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    assert state["global_step"] == 20
     assert [row["step"] for row in curve(folder)] == ["0"]
     monkeypatch.undo()
-    run(small_config(scenes), folder, [], resume=True)
+    run(config, folder, [], resume=True)
     assert [row["step"] for row in curve(folder)] == ["0", "21", "40"]
     assert exact(folder) == exact(trained)
 
 
-def test_scoring_uses_the_device_that_trained(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    moves: list[str] = []
-    away, back = RadianceModule.cpu, RadianceModule.to
-    monkeypatch.setattr(
-        RadianceModule, "cpu", lambda self: moves.append("away to the CPU") or away(self)
-    )
-    monkeypatch.setattr(
-        RadianceModule, "to", lambda self, place: moves.append(f"to {place}") or back(self, place)
-    )
-    finish = scorer.Scorer.finish
-    monkeypatch.setattr(
-        scorer.Scorer, "finish", lambda self, *rest: moves.append("scored") or finish(self, *rest)
-    )
-    run(small_config(scenes, "trainer.max_steps=2"), tmp_path / "run", [], resume=False)
-    assert moves[-3:] == ["away to the CPU", "to cpu", "scored"]
+def test_scoring_uses_the_device_that_trained(watched: Watched) -> None:
+    assert watched.moves[-3:] == ["away to the CPU", "to cpu", "scored"]
 
 
-def test_only_the_pictures_that_are_shown_are_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import weakref
+def test_only_the_pictures_that_are_shown_are_kept(watched: Watched) -> None:
+    assert len(watched.pictures) == 3 * 3
+    assert not any(colour() is not None for colour in watched.pictures)
+    assert len(list((watched.folder / "media" / "step000040").glob("*.png"))) == 2
 
-    made: list[weakref.ref] = []
-    original = scorer.score_view
 
-    def watched(*parts):
-        score, images = original(*parts)
-        made.append(weakref.ref(images.colour))
-        return score, images
-
-    monkeypatch.setattr(scorer, "score_view", watched)
-    config = small_config(tmp_path / "scenes", "trainer.max_steps=2", "data.test_views=7")
-    run(config, tmp_path / "run", [], resume=False)
-    assert len(made) == 3 * 7
-    assert not any(colour() is not None for colour in made)
-    assert len(list((tmp_path / "run" / "media" / "step000002").glob("*.png"))) == scorer.SHOWN
+def test_the_best_is_written_before_the_last(watched: Watched) -> None:
+    """Killed in between, a run whose last checkpoint knows of a best one would never write it."""
+    assert [name for step, name in watched.saved if step == 20] == ["best.ckpt", "last.ckpt"]
 
 
 def test_digits_cannot_be_kept_on_a_gpu(
@@ -262,21 +264,22 @@ def test_checkpoint_holds_only_tensors_and_builtins(trained: Path) -> None:
     assert state["progress"]["batches"] == 40
 
 
-def test_few_shot_run_names_its_views(scenes: Path, tmp_path: Path) -> None:
-    config = small_config(scenes, "data.views=3", "trainer.max_steps=2", "trainer.evaluate_at=[]")
+def test_few_shot_run_names_its_views_and_accumulated_batches_make_one_step(
+    scenes: Path, tmp_path: Path
+) -> None:
+    config = small_config(
+        scenes,
+        "data.views=3",
+        "trainer.accumulate=2",
+        "trainer.max_steps=4",
+        "trainer.evaluate_at=[]",
+    )
     run(config, tmp_path / "few", [], resume=False)
     files = status(tmp_path / "few")["files"]["train"]
     assert len(files) == 3
     assert files[0].endswith("r_000.png")
     assert files[-1].endswith("r_009.png")
-
-
-def test_accumulated_batches_make_one_step(scenes: Path, tmp_path: Path) -> None:
-    config = small_config(
-        scenes, "trainer.accumulate=2", "trainer.max_steps=4", "trainer.evaluate_at=[]"
-    )
-    run(config, tmp_path / "accumulated", [], resume=False)
-    state = torch.load(tmp_path / "accumulated" / "checkpoints" / "last.ckpt", weights_only=True)
+    state = torch.load(tmp_path / "few" / "checkpoints" / "last.ckpt", weights_only=True)
     assert (state["global_step"], state["progress"]["batches"]) == (4, 8)
 
 
@@ -294,14 +297,14 @@ def test_non_finite_loss_is_skipped_then_diagnosed(
     monkeypatch.setattr(RadianceModule, "on_train_batch_start", spoil)
     folder = tmp_path / "spoiled"
     with pytest.raises(TrainingError, match=r"not finite: field\.space;.*trainer\.plane_lr"):
-        run(small_config(scenes), folder, [], resume=False)
+        run(small_config(scenes, "trainer.evaluate_at=[]"), folder, [], resume=False)
     assert status(folder)["status"] == "failed"
     assert "field" not in status(folder)["reason"].split(":")[0]
 
 
-def test_one_bad_batch_costs_one_step(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def bad_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One of the pixels of the fourth batch is not a number."""
     from xplanes.scenes.batches import RayBatches
 
     original = RayBatches.draw
@@ -313,6 +316,9 @@ def test_one_bad_batch_costs_one_step(
         return batch
 
     monkeypatch.setattr(RayBatches, "draw", spoil)
+
+
+def test_one_bad_batch_costs_one_step(scenes: Path, tmp_path: Path, bad_batch) -> None:
     config = small_config(scenes, "trainer.max_steps=6", "trainer.evaluate_at=[]")
     run(config, tmp_path / "one", [], resume=False)
     content = metrics(tmp_path / "one")
@@ -320,18 +326,8 @@ def test_one_bad_batch_costs_one_step(
 
 
 def test_a_bad_batch_takes_those_of_its_update_along(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scenes: Path, tmp_path: Path, bad_batch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from xplanes.scenes.batches import RayBatches
-
-    original = RayBatches.draw
-
-    def spoil(self, step: int):
-        batch = original(self, step)
-        if step == 3:
-            batch["target"][0] = float("nan")
-        return batch
-
     left: list[bool] = []
     refuse = RadianceModule._refuse
 
@@ -339,7 +335,6 @@ def test_a_bad_batch_takes_those_of_its_update_along(
         left.append(any(p.grad is not None and bool(p.grad.any()) for p in self.parameters()))
         refuse(self, *rest)
 
-    monkeypatch.setattr(RayBatches, "draw", spoil)
     monkeypatch.setattr(RadianceModule, "_refuse", watched)
     config = small_config(
         scenes, "trainer.accumulate=2", "trainer.max_steps=3", "trainer.evaluate_at=[]"
@@ -348,10 +343,10 @@ def test_a_bad_batch_takes_those_of_its_update_along(
     assert left == [False]
 
 
-def test_scene_of_one_moment_trains_without_planes_of_time(tmp_path: Path) -> None:
-    config = small_config(tmp_path / "scenes", "trainer.max_steps=2", "trainer.evaluate_at=[]")
-    run(config, tmp_path / "moving", [], resume=False)
-    (folder,) = [p for p in (tmp_path / "scenes").iterdir() if p.is_dir()]
+def test_scene_of_one_moment_trains_without_planes_of_time(scenes: Path, tmp_path: Path) -> None:
+    config = small_config(tmp_path, "trainer.max_steps=2", "trainer.evaluate_at=[]")
+    (original,) = scenes.glob("excavator*")
+    folder = Path(shutil.copytree(original, tmp_path / original.name))
     for path in folder.glob("transforms_*.json"):
         content = json.loads(path.read_text())
         for frame in content["frames"]:
@@ -366,28 +361,23 @@ def test_scene_of_one_moment_trains_without_planes_of_time(tmp_path: Path) -> No
     assert "field.time" not in state["state_dict"]
 
 
-@pytest.mark.parametrize(
-    ("overrides", "moves"),
-    [
-        (["data.scene=still"], False),
-        (["data.scene=still", "data.still=false"], True),
-        (["data.scene=balls"], True),
-        (["data.scene=balls", "data.still=true"], False),
-    ],
-)
-def test_a_scene_without_motion_has_no_planes_of_time(
-    overrides, moves, scenes: Path, tmp_path: Path
-) -> None:
-    config = small_config(scenes, "trainer.max_steps=2", "trainer.evaluate_at=[]", *overrides)
-    run(config, tmp_path / "run", [], resume=False)
-    state = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
-    assert ("field.time" in state["state_dict"]) == moves
-    assert metrics(tmp_path / "run")["skipped"]["static"] == (0.0 if moves else 1.0)
-    text = (tmp_path / "run" / "train.log").read_text()
-    if not moves:
-        reason = "data.still=true" if "balls" in overrides[0] else "frames are equal"
-        assert reason in text
-    assert ("trains as a still one" in text) == (not moves)
+def test_a_scene_without_motion_has_no_planes_of_time(scenes: Path, tmp_path: Path) -> None:
+    cases = {
+        ("data.scene=still",): "frames are equal",
+        ("data.scene=still", "data.still=false"): None,
+        ("data.scene=excavator",): None,
+        ("data.scene=excavator", "data.still=true"): "data.still=true",
+    }
+    for overrides, reason in cases.items():
+        folder = tmp_path / "-".join(overrides)
+        config = small_config(scenes, "trainer.max_steps=2", "trainer.evaluate_at=[]", *overrides)
+        run(config, folder, [], resume=False)
+        state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+        assert ("field.time" in state["state_dict"]) == (reason is None), overrides
+        assert metrics(folder)["skipped"]["static"] == (0.0 if reason is None else 1.0), overrides
+        text = (folder / "train.log").read_text()
+        assert ("trains as a still one" in text) == (reason is not None), overrides
+        assert reason is None or reason in text, overrides
 
 
 def test_a_slow_warm_up_says_what_it_does(
@@ -402,5 +392,6 @@ def test_a_slow_warm_up_says_what_it_does(
     monkeypatch.setattr(warming, "PATIENCE", 0.05)
     warming.say_why.cache_clear()
     monkeypatch.setattr(OccupancySampling, "render", slow)
-    run(small_config(scenes, "trainer.max_steps=1"), tmp_path / "run", [], resume=False)
+    config = small_config(scenes, "trainer.max_steps=1", "trainer.evaluate_at=[]")
+    run(config, tmp_path / "run", [], resume=False)
     assert capsys.readouterr().out.count("compiling the inner loops") == 1

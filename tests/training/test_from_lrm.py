@@ -16,18 +16,23 @@ from xplanes.preparation import start as start_module
 STAGES = ("fixed_view", "lrm", "decomposition", "convert")
 
 
-def settings(place: Path, name: str, *overrides: str) -> dict:
-    return small_config(
-        place / "scenes",
-        *CHOICES[name],
-        f"lrm.weights={publish(place / name, name)}",
-        f"preparation.cache={place}/cache",
-        "preparation.frames=3",
-        "preparation.fixed_view_seconds=1000",
-        "preparation.fixed_view_steps=12",
-        "trainer.max_steps=12",
-        *overrides,
-    )
+@pytest.fixture(scope="module")
+def settings(scenes: Path):
+    def settings(place: Path, name: str, *overrides: str) -> dict:
+        return small_config(
+            scenes,
+            *CHOICES[name],
+            f"lrm.weights={publish(place / name, name)}",
+            f"preparation.cache={place}/cache",
+            "preparation.frames=3",
+            "preparation.fixed_view_seconds=1000",
+            "preparation.fixed_view_steps=12",
+            "trainer.max_steps=6",
+            "trainer.evaluate_at=[0]",
+            *overrides,
+        )
+
+    return settings
 
 
 def metrics(folder: Path) -> dict:
@@ -38,7 +43,7 @@ def metrics(folder: Path) -> dict:
     ("name", "model"),
     [("openlrm-1.0", "six_planes"), ("openlrm-1.1", "nine_planes"), ("triposr", "six_planes")],
 )
-def test_a_run_from_the_scenes_video(tmp_path: Path, name, model):
+def test_a_run_from_the_scenes_video(settings, tmp_path: Path, name, model):
     folder = tmp_path / "run"
     run(settings(tmp_path, name, f"model={model}"), folder, [], resume=False)
     told = metrics(folder)
@@ -56,9 +61,18 @@ def test_a_run_from_the_scenes_video(tmp_path: Path, name, model):
     assert again["test"]["psnr"] == pytest.approx(told["test"]["psnr"], abs=1e-4)
 
 
+@pytest.fixture(scope="module")
+def uninterrupted(settings, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose fixed view a field films."""
+    place = tmp_path_factory.mktemp("uninterrupted")
+    config = settings(place, "openlrm-1.1", "preparation.fixed_view=train")
+    run(config, place / "run", [], resume=False)
+    return place / "run"
+
+
 @pytest.mark.parametrize("stopped", ["encode", "start_from"])
 def test_a_stopped_preparation_goes_on_from_the_last_finished_stage(
-    tmp_path: Path, monkeypatch, stopped
+    settings, uninterrupted: Path, tmp_path: Path, monkeypatch, stopped
 ):
     folder = tmp_path / "run"
     config = settings(tmp_path, "openlrm-1.1", "preparation.fixed_view=train")
@@ -81,6 +95,4 @@ def test_a_stopped_preparation_goes_on_from_the_last_finished_stage(
     told = metrics(folder)
     assert told["seconds"]["prepare"]["fixed_view"] > 0
     assert "filmed by six_planes" in told["lrm"]["fixed_view"]
-    uninterrupted = tmp_path / "other"
-    run(config, uninterrupted, [], resume=False)
     assert told["test"] == metrics(uninterrupted)["test"]

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -24,28 +25,23 @@ from xplanes.training.methods.xplanes import XPlanesMethod
 from xplanes.training.module import RadianceModule, TrainingError
 
 FEW = ("trainer.max_steps=12", "trainer.checkpoint_every=5", "trainer.evaluate_at=[]")
-
-
-@pytest.fixture(scope="module")
-def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("scenes")
+SCORED = (*FEW, "trainer.evaluate_at=[0.4]")
 
 
 def state(run_folder: Path) -> dict:
     return torch.load(run_folder / "checkpoints" / "last.ckpt", weights_only=True)
 
 
-@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
-@pytest.mark.parametrize(
-    ("value", "expected"),
-    [(0.0, True), (1e18, True), (2e19, False), (math.inf, False), (math.nan, False)],
-)
-def test_a_gradient_is_usable_if_adam_can_square_it(value, expected, layout) -> None:
-    gradient = torch.zeros(1, 4, 3, 5).to(memory_format=layout)
-    gradient[0, 2, 1, 3] = value
-    assert usable(gradient) is expected
-    assert usable_together([gradient]) is expected
-    assert usable_together([torch.ones(7), gradient, torch.zeros(2, 2)]) is expected
+def test_a_gradient_is_usable_if_adam_can_square_it() -> None:
+    values = {0.0: True, 1e18: True, 2e19: False, math.inf: False, math.nan: False}
+    for layout in (torch.contiguous_format, torch.channels_last):
+        for value, expected in values.items():
+            gradient = torch.zeros(1, 4, 3, 5).to(memory_format=layout)
+            gradient[0, 2, 1, 3] = value
+            case = f"{value}, {layout}"
+            assert usable(gradient) is expected, case
+            assert usable_together([gradient]) is expected, case
+            assert usable_together([torch.ones(7), gradient, torch.zeros(2, 2)]) is expected, case
 
 
 def test_names_are_those_of_the_broken() -> None:
@@ -71,13 +67,15 @@ def spoil_gradient(monkeypatch: pytest.MonkeyPatch, value: float, steps: range) 
     monkeypatch.setattr(XPlanesMethod, "regularise", spoil)
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, 1e25])
-def test_one_bad_gradient_costs_one_step(scenes, tmp_path, monkeypatch, value) -> None:
-    spoil_gradient(monkeypatch, value, range(3, 4))
-    run(small_config(scenes, *FEW), tmp_path / "one", [], resume=False)
-    content = json.loads((tmp_path / "one" / "metrics.json").read_text())
-    assert (content["steps_skipped"], content["step"]) == (1, 12)
-    assert not_finite(state(tmp_path / "one")["state_dict"].items()) == []
+def test_one_bad_gradient_costs_one_step(scenes, tmp_path, monkeypatch) -> None:
+    for value in (math.nan, math.inf, 1e25):
+        folder = tmp_path / f"{value}"
+        with monkeypatch.context() as patch:
+            spoil_gradient(patch, value, range(3, 4))
+            run(small_config(scenes, *FEW, "trainer.max_steps=6"), folder, [], resume=False)
+        content = json.loads((folder / "metrics.json").read_text())
+        assert (content["steps_skipped"], content["step"]) == (1, 6), value
+        assert not_finite(state(folder)["state_dict"].items()) == [], value
 
 
 def test_gradients_that_stay_bad_end_training_in_words(scenes, tmp_path, monkeypatch) -> None:
@@ -111,9 +109,22 @@ def test_a_checkpoint_never_holds_what_is_not_finite(scenes, tmp_path, monkeypat
     assert state(tmp_path / "spoiled")["global_step"] == 12
 
 
-def test_a_resumed_run_takes_new_learning_rates(scenes, tmp_path, monkeypatch) -> None:
-    folder, seen = tmp_path / "slower", []
-    run(small_config(scenes, *FEW), folder, [], resume=False)
+@pytest.fixture(scope="module")
+def whole(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run with a best checkpoint on the way."""
+    folder = tmp_path_factory.mktemp("health") / "whole"
+    run(small_config(scenes, *SCORED), folder, [], resume=False)
+    return folder
+
+
+@pytest.fixture
+def folder(whole: Path, tmp_path: Path) -> Path:
+    """The finished run, to be changed."""
+    return Path(shutil.copytree(whole, tmp_path / "run"))
+
+
+def test_a_resumed_run_takes_new_learning_rates(scenes, folder, monkeypatch) -> None:
+    seen = []
     original = RadianceModule._set_learning_rates
 
     def note(self) -> None:
@@ -139,14 +150,10 @@ def flipped(content: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("damage", [shortened, flipped])
-def test_a_damaged_checkpoint_gives_way_to_the_best(scenes, tmp_path, caplog, damage) -> None:
-    whole, folder = tmp_path / "whole", tmp_path / "damaged"
-    settings = (*FEW, "trainer.evaluate_at=[0.4]")
-    run(small_config(scenes, *settings), whole, [], resume=False)
-    run(small_config(scenes, *settings), folder, [], resume=False)
+def test_a_damaged_checkpoint_gives_way_to_the_best(scenes, whole, folder, caplog, damage) -> None:
     last = folder / "checkpoints" / "last.ckpt"
     last.write_bytes(damage(last.read_bytes()))
-    run(small_config(scenes, *settings), folder, [], resume=True)
+    run(small_config(scenes, *SCORED), folder, [], resume=True)
     assert "last.ckpt cannot be read" in caplog.text
     assert "Going on from" in caplog.text
     for name, value in state(whole)["state_dict"].items():
@@ -161,13 +168,11 @@ def test_damaged_checkpoints_alone_are_refused_in_words(tmp_path: Path) -> None:
             find_resumable(tmp_path)
 
 
-def test_a_damaged_record_does_not_end_a_run(scenes, tmp_path, caplog) -> None:
-    folder = tmp_path / "record"
-    run(small_config(scenes, *FEW), folder, [], resume=False)
+def test_a_damaged_record_does_not_end_a_run(scenes, folder, caplog) -> None:
     (folder / "run.json").write_text('{"status": "runn')
     with pytest.raises(ConfigError, match=r"holds a run already \(damaged\)"):
-        run(small_config(scenes, *FEW), folder, [], resume=False)
-    run(small_config(scenes, *FEW), folder, [], resume=True)
+        run(small_config(scenes, *SCORED), folder, [], resume=False)
+    run(small_config(scenes, *SCORED), folder, [], resume=True)
     assert "record of this run begins anew" in caplog.text
     record = json.loads((folder / "run.json").read_text())
     assert (record["status"], record["resumed"]) == ("finished", 1)

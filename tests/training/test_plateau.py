@@ -2,6 +2,8 @@
 
 import json
 import math
+import shutil
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -20,12 +22,12 @@ def errors_at(count: int, *, rise: float, level: float = 0.0) -> list[float]:
     return [10 ** (-0.1 * (15 + rise * math.log2(n + 1))) + level for n in range(count)]
 
 
-@pytest.mark.parametrize("rise", [0.1, 0.5, 2.0])
-@pytest.mark.parametrize("count", [20, 64, 500])
-def test_the_gain_of_a_doubling_is_what_is_judged(rise, count):
-    errors = errors_at(count, rise=rise)
-    assert converged(errors, 1.15 * rise)
-    assert not converged(errors, 0.85 * rise)
+def test_the_gain_of_a_doubling_is_what_is_judged():
+    for rise in (0.1, 0.5, 2.0):
+        for count in (20, 64, 500):
+            errors = errors_at(count, rise=rise)
+            assert converged(errors, 1.15 * rise), (rise, count)
+            assert not converged(errors, 0.85 * rise), (rise, count)
 
 
 def test_a_floor_ends_a_rise():
@@ -34,25 +36,14 @@ def test_a_floor_ends_a_rise():
     assert 100 < ends[0] < 2000
 
 
-@pytest.mark.parametrize("count", [0, 1, LEAST - 1, LEAST + 1])
-def test_too_little_is_not_judged(count):
-    assert not converged([1.0] * count, 100.0)
+def test_too_little_is_not_judged():
+    for count in (0, 1, LEAST - 1, LEAST + 1):
+        assert not converged([1.0] * count, 100.0), count
 
 
 def test_errors_of_zero_and_rising_errors_are_convergence():
     assert converged([0.0] * LEAST, 0.1)
     assert converged([1.0 + n for n in range(LEAST)], 0.1)
-
-
-@pytest.fixture(scope="module")
-def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("scenes")
-
-
-@pytest.fixture
-def soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plateau, "BLOCK", 1)
-    monkeypatch.setattr(plateau, "LEAST", 8)
 
 
 def outcome(folder: Path) -> dict:
@@ -64,7 +55,31 @@ def weights(folder: Path) -> dict:
     return state["state_dict"]
 
 
-def test_a_converged_run_cools_down_and_stops(scenes, tmp_path, soon, monkeypatch, capsys):
+def judge_soon(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(plateau, "BLOCK", 1)
+    patch.setattr(plateau, "LEAST", 8)
+
+
+@pytest.fixture
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    judge_soon(monkeypatch)
+
+
+def config_of(scenes: Path, *overrides: str) -> dict:
+    """Whatever the run gains is too little."""
+    return small_config(scenes, "trainer.plateau=1000", "trainer.evaluate_at=[]", *overrides)
+
+
+@dataclass
+class Stopped:
+    """A run that had converged."""
+
+    folder: Path
+    rates: dict[int, float]
+
+
+@pytest.fixture(scope="module")
+def stopped(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Stopped:
     rates = {}
     original = XPlanesMethod.rate
 
@@ -72,59 +87,67 @@ def test_a_converged_run_cools_down_and_stops(scenes, tmp_path, soon, monkeypatc
         rates[step] = original(self, step, progress)
         return rates[step]
 
-    monkeypatch.setattr(XPlanesMethod, "rate", rate)
-    # Whatever it gains is too little.
-    run(small_config(scenes, "trainer.plateau=1000"), tmp_path / "run", [], resume=False)
-    found = outcome(tmp_path / "run")
+    folder = tmp_path_factory.mktemp("plateau") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        judge_soon(patch)
+        patch.setattr(XPlanesMethod, "rate", rate)
+        run(config_of(scenes), folder, [], resume=False)
+    return Stopped(folder, rates)
+
+
+@pytest.fixture
+def folder(stopped: Stopped, tmp_path: Path) -> Path:
+    """The finished run, to be changed."""
+    return Path(shutil.copytree(stopped.folder, tmp_path / "run"))
+
+
+def test_a_converged_run_cools_down_and_stops(stopped: Stopped):
+    found = outcome(stopped.folder)
     assert found["converged"] == 8
     assert found["step"] == 10
     assert found["skipped"]["budget"] == pytest.approx(1 - 10 / 40)
-    assert len(rates) == 10
+    assert len(stopped.rates) == 10
     # The last steps fall to the end of the cosine, less its warm-up.
-    assert rates[9] / 10 < rates[8] / 9
-    assert "75% of the budget, as training had converged at step 8" in capsys.readouterr().out
+    assert stopped.rates[9] / 10 < stopped.rates[8] / 9
+    text = (stopped.folder / "train.log").read_text()
+    assert "75% of the budget, as training had converged at step 8" in text
 
 
-def test_without_the_rule_the_budget_is_spent(scenes, tmp_path, soon):
-    run(small_config(scenes), tmp_path / "run", [], resume=False)
-    found = outcome(tmp_path / "run")
-    assert (found["step"], found["converged"], found["skipped"]["budget"]) == (40, None, 0)
-
-
-def test_a_run_that_was_stopped_ends_at_the_same_step(scenes, tmp_path, soon, monkeypatch):
-    config = small_config(scenes, "trainer.plateau=1000", "trainer.checkpoint_every=1")
-    run(config, tmp_path / "whole", [], resume=False)
+def test_a_run_that_failed_ends_at_the_same_step(scenes, stopped, tmp_path, soon, monkeypatch):
+    """It fails before it has converged, and while it cools down."""
+    config = config_of(scenes, "trainer.checkpoint_every=1")
     step = plateau.PlateauStop.on_train_batch_end
+    stop = 0
 
     def break_down(self, trainer, *rest):
         step(self, trainer, *rest)
-        if trainer.global_step == 9:
+        if trainer.global_step == stop:
             raise OSError("power cut")
 
     with monkeypatch.context() as patch:
         patch.setattr(plateau.PlateauStop, "on_train_batch_end", break_down)
-        with pytest.raises(OSError, match="power cut"):
-            run(config, tmp_path / "halved", [], resume=False)
+        for stop in (5, 9):
+            with pytest.raises(OSError, match="power cut"):
+                run(config, tmp_path / "halved", [], resume=stop > 5)
     run(config, tmp_path / "halved", [], resume=True)
-    assert outcome(tmp_path / "halved")["step"] == outcome(tmp_path / "whole")["step"] == 10
-    whole, halved = weights(tmp_path / "whole"), weights(tmp_path / "halved")
+    assert outcome(tmp_path / "halved")["step"] == outcome(stopped.folder)["step"] == 10
+    whole, halved = weights(stopped.folder), weights(tmp_path / "halved")
     assert all(torch.equal(whole[name], halved[name]) for name in whole)
 
 
-def test_a_finished_run_stays_finished(scenes, tmp_path, soon):
-    config = small_config(scenes, "trainer.plateau=1000")
-    run(config, tmp_path / "run", [], resume=False)
-    before = weights(tmp_path / "run")
-    run(config, tmp_path / "run", [], resume=True)
-    assert outcome(tmp_path / "run")["step"] == 10
-    after = weights(tmp_path / "run")
+def test_a_finished_run_stays_finished(scenes, folder, soon):
+    before = weights(folder)
+    run(config_of(scenes), folder, [], resume=True)
+    assert outcome(folder)["step"] == 10
+    after = weights(folder)
     assert all(torch.equal(before[name], after[name]) for name in before)
 
 
-def test_a_finished_run_goes_on_without_the_rule(scenes, tmp_path, soon):
-    run(small_config(scenes, "trainer.plateau=1000"), tmp_path / "run", [], resume=False)
-    run(small_config(scenes), tmp_path / "run", [], resume=True)
-    assert outcome(tmp_path / "run")["step"] == 40
+def test_without_the_rule_the_budget_is_spent(scenes, folder, soon):
+    """By a run that had converged, too."""
+    run(small_config(scenes, "trainer.evaluate_at=[]"), folder, [], resume=True)
+    found = outcome(folder)
+    assert (found["step"], found["converged"], found["skipped"]["budget"]) == (40, None, 0)
 
 
 def test_a_gain_below_zero_is_refused(scenes):

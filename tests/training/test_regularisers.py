@@ -24,39 +24,63 @@ def planes_of(shape, seed=0):
     return torch.randn(shape, generator=generator, dtype=torch.float64)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+def check_gradient(shape, add, value):
+    """What ``add`` adds to a gradient is what autograd finds for ``value``."""
+    planes = planes_of(shape).requires_grad_()
+    before = planes_of(shape, seed=1)
+    gradient = before.clone()
+    add(gradient, planes)
+    (value(planes) + 0 * planes.sum()).backward()
+    torch.testing.assert_close(
+        gradient - before, planes.grad, atol=1e-13, rtol=0, msg=lambda text: f"{shape}: {text}"
+    )
+
+
+def test_total_variation_is_the_oracle_s():
+    for shape, dims in itertools.product(SHAPES, DIMS):
+        planes = planes_of(shape)
+        expected = oracles.total_variation(planes.numpy(), dims)
+        found = float(total_variation(planes, dims))
+        assert found == pytest.approx(expected, rel=1e-12, abs=1e-15), (shape, dims)
+
+
+def test_time_smoothness_is_the_oracle_s():
+    for shape in [*SHAPES, (2, 3, 4, 2), (2, 2, 4, 2)]:
+        planes = planes_of(shape)
+        expected = oracles.time_smoothness(planes.numpy())
+        found = float(time_smoothness(planes))
+        assert found == pytest.approx(expected, rel=1e-12, abs=1e-15), shape
+
+
 @pytest.mark.parametrize("dims", DIMS)
-def test_total_variation_is_the_oracle_s(shape, dims):
-    planes = planes_of(shape)
-    expected = oracles.total_variation(planes.numpy(), dims)
-    assert float(total_variation(planes, dims)) == pytest.approx(expected, rel=1e-12, abs=1e-15)
+def test_total_variation_gradient_is_autograd_s(dims):
+    for shape in SHAPES:
+        check_gradient(
+            shape,
+            lambda gradient, planes: add_total_variation_gradient(gradient, planes, dims, 0.7),
+            lambda planes: 0.7 * total_variation(planes, dims),
+        )
 
 
-@pytest.mark.parametrize("shape", [*SHAPES, (2, 3, 4, 2), (2, 2, 4, 2)])
-def test_time_smoothness_is_the_oracle_s(shape):
-    planes = planes_of(shape)
-    expected = oracles.time_smoothness(planes.numpy())
-    assert float(time_smoothness(planes)) == pytest.approx(expected, rel=1e-12, abs=1e-15)
+def test_time_smoothness_gradient_is_autograd_s():
+    for shape in [*SHAPES, (2, 3, 4, 2), (2, 2, 4, 2), (1, 9, 2, 1)]:
+        check_gradient(
+            shape,
+            lambda gradient, planes: add_time_smoothness_gradient(gradient, planes, 0.3),
+            lambda planes: 0.3 * time_smoothness(planes),
+        )
 
 
-@pytest.mark.parametrize(("shape", "dims"), list(itertools.product(SHAPES, DIMS)))
-def test_total_variation_gradient_is_autograd_s(shape, dims):
-    planes = planes_of(shape).requires_grad_()
-    before = planes_of(shape, seed=1)
-    gradient = before.clone()
-    add_total_variation_gradient(gradient, planes, dims, 0.7)
-    (0.7 * total_variation(planes, dims) + 0 * planes.sum()).backward()
-    torch.testing.assert_close(gradient - before, planes.grad, atol=1e-13, rtol=0)
-
-
-@pytest.mark.parametrize("shape", [*SHAPES, (2, 3, 4, 2), (2, 2, 4, 2), (1, 9, 2, 1)])
-def test_time_smoothness_gradient_is_autograd_s(shape):
-    planes = planes_of(shape).requires_grad_()
-    before = planes_of(shape, seed=1)
-    gradient = before.clone()
-    add_time_smoothness_gradient(gradient, planes, 0.3)
-    (0.3 * time_smoothness(planes) + 0 * planes.sum()).backward()
-    torch.testing.assert_close(gradient - before, planes.grad, atol=1e-13, rtol=0)
+def test_distance_gradient_is_autograd_s():
+    for shape in SHAPES:
+        start = planes_of(shape, seed=2)
+        check_gradient(
+            shape,
+            lambda gradient, planes, start=start: add_distance_gradient(
+                gradient, planes, start, 0.6
+            ),
+            lambda planes, start=start: 0.6 * (planes - start).square().mean(),
+        )
 
 
 def test_constant_planes_and_straight_motion_cost_nothing():
@@ -76,13 +100,3 @@ def test_float32_planes_are_changed_in_place_without_a_graph():
     assert not gradient.requires_grad
     assert gradient.abs().max() > 0
     assert np.isclose(float(gradient.sum()), 0, atol=1e-6)
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_distance_gradient_is_autograd_s(shape):
-    planes, start = planes_of(shape).requires_grad_(), planes_of(shape, seed=2)
-    before = planes_of(shape, seed=1)
-    gradient = before.clone()
-    add_distance_gradient(gradient, planes, start, 0.6)
-    (0.6 * (planes - start).square().mean()).backward()
-    torch.testing.assert_close(gradient - before, planes.grad, atol=1e-13, rtol=0)

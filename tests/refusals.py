@@ -1,0 +1,19 @@
+"""Refusals in a loop: the bad value shows in the report, which `pytest.raises` leaves out."""
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+
+def assert_refused(
+    error: type[Exception], words: str, call: Callable[[], Any], case: object
+) -> str:
+    """A call raises an error whose message holds the words. Returns the message."""
+    try:
+        call()
+    except error as raised:
+        message = str(raised)
+    else:
+        raise AssertionError(f"{case} is not refused")
+    assert re.search(words, message), f"{case} is refused with {message!r}, not with {words!r}"
+    return message

@@ -106,7 +106,7 @@ def test_a_part_that_fails_stops_no_other_and_sets_the_exit_code(gpu, faked, fou
     page = (tmp_path / "gpu.md").read_text(encoding="utf-8")
     assert "* training (random, GPU): RuntimeError: no memory\n" in page
     assert faked.begun[-1] == gpu.PARTS[-1].name
-    assert "python -m xplanes download dnerf" in page  # There is no lego.
+    assert "xplanes download dnerf" in page  # There is no lego.
 
 
 def test_parts_that_do_not_fit_into_the_minutes_are_left_out(gpu, faked, found_gpu, tmp_path):

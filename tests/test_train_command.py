@@ -137,6 +137,7 @@ def test_two_processes_share_the_rays_and_end_with_one_model(scenes: str, tmp_pa
         assert torch.equal(first[name], state["state_dict"][name]), name
 
 
+@pytest.mark.slow
 def test_two_processes_stop_together_and_go_on(scenes: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     checkpoint = run / "checkpoints" / "last.ckpt"

@@ -45,9 +45,7 @@ def main() -> int:
     args = parser.parse_args()
     chosen = {name: runs for name, runs in scripts(args.lego).items() if name in args.only}
     if any(any(runs) for runs in chosen.values()) and not args.lego.is_dir():
-        parser.error(
-            f"--lego {args.lego}: there is no such folder; xplanes download dnerf"
-        )
+        parser.error(f"--lego {args.lego}: there is no such folder; xplanes download dnerf")
     failed = []
     for name, runs in chosen.items():
         began = time.perf_counter()

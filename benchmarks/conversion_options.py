@@ -7,6 +7,7 @@ moving ball whose features cover the background on all three planes, a slow flic
 triplane as per-frame predictions have it, and noise.
 """
 
+import argparse
 import math
 import time
 import warnings
@@ -92,6 +93,7 @@ def train(planes: Tensor, sparse: Tensor, plane_set: str, steps: int) -> float:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0]).parse_args()
     warnings.simplefilter("ignore")
     static_rows, dynamic_rows, totals = [], [], {}
     for name in SEQUENCES:

@@ -24,8 +24,7 @@ from decomposition_speed_report import CLOCK, TABLE, report
 from torch import Tensor
 
 from xplanes.decomposition import RobustPCA, robust_pca
-from xplanes.decomposition.passes import Step, Workspace, iterate, start
-from xplanes.decomposition.svt import shrinkage_from_gram
+from xplanes.decomposition.svt import Step, Workspace, iterate, shrinkage_from_gram, start
 from xplanes.files import read_rows, write_rows
 
 PARTS = ("reference", "svd", "gram", "adaptive", "growing", "admm", "clock")

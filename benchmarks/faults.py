@@ -34,7 +34,7 @@ def page(found: Gatherer) -> str:
         notes += f"\nFailed without a count: {', '.join(found.other_failures)}.\n"
     return f"""# Faults
 
-Runs of 40 steps on a scene of 32 pixels, a checkpoint every 3 steps, planes at random or from
+Runs of 40 steps on a scene of 32 pixels, a checkpoint every 3 steps, random planes or from
 `tiny`, forked from one process that has loaded everything. "Same end": once the fault is gone, the
 run (resumed where one had begun) comes to the parameters, scores and curve of an uninterrupted one,
 bit for bit, and leaves no unfinished file; a curve.csv that was cut short itself loses rows.

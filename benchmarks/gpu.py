@@ -52,7 +52,7 @@ ROUNDS, WARM_UP = 50, 10
 COPIED = 2**28
 """Bytes of the copy that gives the speed of memory."""
 POINTS = 2**13, 2**18
-"""Samples of a step (default, trainer=gpu) at which kernels are timed."""
+"""Samples of a step (default, large batches) at which kernels are timed."""
 MANY, FEW = 2**16, 2**7
 """Points at which kernels are compared with float64, on a GPU and in the interpreter."""
 RAY = 32
@@ -330,7 +330,7 @@ def measure_run(record: Record, part: "Part", args: argparse.Namespace) -> None:
     where = ["data=demo", f"data.root={args.work / 'demo'}", "data.resolution=64"]
     if part.section == "lego":
         where = [*lego(args.lego.resolve()), "data.resolution=400"]
-    always = ["preparation.cache=null", "trainer.media=false"]
+    always = ["preparation.cache=null", "media=false"]
     done = measure([*part.overrides, *where, *always], args.work)
     metrics, test, seconds = done.metrics, done.metrics["test"], done.metrics["seconds"]
     rays = metrics["rays_per_second"]
@@ -399,23 +399,25 @@ class Part:
 
 def training(row: str, start: str, device: str, precision: str = "32", **options: Any) -> Part:
     """A fixed number of steps, the same on both devices."""
-    budget = (f"trainer.max_steps={STEPS}", "trainer.max_seconds=null", "trainer.evaluate_at=[]")
+    steps = (f"trainer.max_steps={STEPS}", "trainer.max_seconds=null")
+    budget = (*steps, "callbacks.evaluation.at=[]")
     # Which samples pass gradients on is drawn on the device, and each draws otherwise: 0.2 dB.
-    equal = (f"trainer.precision={precision}", "sampler.thinning=0")
+    equal = (f"model.precision={precision}", "model.sampler.thinning=0")
     given = (start, f"trainer.accelerator={device}", *equal, *budget)
     return Part("training", row, overrides=given, **options)
 
 
 def throughput(row: str, *overrides: str, **options: Any) -> Part:
     """Some seconds of training; the score on the way marks where the count of steps begins."""
-    budget = (f"trainer.max_seconds={SETTLED}", f"trainer.evaluate_at=[{SHARE}]")
-    views = ("trainer.evaluate_views=1", "data.eval_views=2")
+    budget = (f"trainer.max_seconds={SETTLED}", f"callbacks.evaluation.at=[{SHARE}]")
+    views = ("callbacks.evaluation.views=1", "data.eval_views=2")
     given = (*overrides, "trainer.accelerator=gpu", *budget, *views)
     return Part("throughput", row, overrides=given, **options)
 
 
-NONE, TINY, LARGE, NINE = "lrm=none", "lrm=tiny", "trainer=gpu", "model=nine_planes"
-LEGO = (LARGE, NONE, f"trainer.max_seconds={LEGO_SECONDS}", "trainer.evaluate_at=[]")
+NONE, TINY, NINE = "lrm=none", "lrm=tiny", "model=nine_planes"
+LARGE = ("model.rays.per_batch=8192", "model.rays.samples_per_batch=262144")
+LEGO = (*LARGE, NONE, f"trainer.max_seconds={LEGO_SECONDS}", "callbacks.evaluation.at=[]")
 NO_KERNELS = (("XPLANES_GPU_KERNELS", "0"),)
 
 PARTS = (
@@ -424,13 +426,13 @@ PARTS = (
     training("random, GPU", NONE, "gpu"),
     training("random, CPU", NONE, "cpu", needs_gpu=False, need=60, limit=120),
     throughput("six planes", NONE),
-    throughput("six planes, trainer=gpu", LARGE, NONE),
+    throughput("six planes, large batches", *LARGE, NONE),
     throughput("nine planes", NINE, NONE),
-    throughput("nine planes, trainer=gpu", LARGE, NINE, NONE),
+    throughput("nine planes, large batches", *LARGE, NINE, NONE),
     Part("lego", "six planes", overrides=LEGO, need=110, limit=180),
     training("tiny, GPU", TINY, "gpu"),
     training("tiny, CPU", TINY, "cpu", need=60, limit=120),
-    throughput("six planes, trainer=gpu, torch", LARGE, NONE, environment=NO_KERNELS),
+    throughput("six planes, large batches, torch", *LARGE, NONE, environment=NO_KERNELS),
     training("random, GPU, bfloat16 decoder", NONE, "gpu", "bf16"),
     throughput("K-Planes", "model=kplanes"),
 )
@@ -569,22 +571,23 @@ TABLES = {
     "training": (
         f"{STEPS} steps on the GPU and on the CPU",
         "Excavator at 64 px, six planes, 8192 samples a step, the same seed, gradients from all "
-        "samples (`sampler.thinning=0`: the default draws them on the device), decoder in float32 "
-        'unless noted. "random": planes at random (`lrm=none`); "tiny": planes from `lrm=tiny`. '
+        "samples (`model.sampler.thinning=0`: the default draws them on the device), decoder in "
+        'float32 unless noted. "random": random planes (`lrm=none`); "tiny": those of `lrm=tiny`. '
         "PSNR and SSIM are means over the test views. Steps/s and rays/s are of the training "
         "clock. Peak memory is the GPU's; in runs on the CPU, the process's.",
     ),
     "throughput": (
         "Steps per second",
-        f"Excavator at 64 px, {SETTLED} s of training, planes at random, default precision. "
+        f"Excavator at 64 px, {SETTLED} s of training, random planes, default precision. "
         f"Steps/s leave the first {SHARE * SETTLED:g} s out; rays/s and samples/s are of the whole "
-        "run. A step has 8192 samples, with `trainer=gpu` 262,144 at most; K-Planes has 4096 rays. "
+        "run. A step has 8192 samples, large batches 262,144 at most "
+        f"(`{' '.join(LARGE)}`); K-Planes has 4096 rays. "
         '"torch": without Triton kernels.',
     ),
     "lego": (
         "lego at 400 px",
-        f"D-NeRF's lego, val split, planes at random, `trainer=gpu`, {LEGO_SECONDS} s of training; "
-        "PSNR and SSIM are means over the views.",
+        f"D-NeRF's lego, val split, random planes, {LEGO_SECONDS} s of training, "
+        f"`{' '.join(LARGE)}`; PSNR and SSIM are means over the views.",
     ),
 }
 

@@ -12,6 +12,7 @@ from xplanes.process import waiting
 
 os.environ.update(waiting(os.environ))
 
+import argparse
 import json
 import resource
 import subprocess
@@ -26,9 +27,8 @@ from safetensors.torch import save_file
 
 from xplanes.files import write_text
 from xplanes.lrm.checkpoint import build, load
-from xplanes.lrm.config import parse_config
-from xplanes.lrm.published import PUBLISHED, published_config
-from xplanes.pretraining.export import published_state
+from xplanes.lrm.config import PUBLISHED, parse_config, published_config
+from xplanes.pretraining.run import published_state
 
 COLUMNS = (
     "model",
@@ -76,6 +76,7 @@ def main() -> None:
     if len(sys.argv) == 3:
         print(json.dumps(try_out(sys.argv[1], Path(sys.argv[2]))))
         return
+    argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0]).parse_args()
     rows = []
     for name in PUBLISHED:
         with tempfile.TemporaryDirectory() as folder:

@@ -21,7 +21,15 @@ from runner import RESULTS, Measured, command, lego, machine, markdown, run_apar
 
 from xplanes.files import replacing, write_rows, write_text
 
-SMALLER = ("recipe=none", "sampler=occupancy", "model.scales=[2]", "model.warmup_steps=50")
+SMALLER = (
+    "model/sampler=occupancy",
+    "model.scales=[2]",
+    "model.warmup_steps=50",
+    "model.rays.per_batch=1024",
+    "model.rays.samples_per_batch=8192",
+    "model.rays.skip_background=true",
+    "model.rays.background=white",
+)
 """K-Planes at a size that learns within a minute on a CPU."""
 
 FIRST = 1.0
@@ -30,7 +38,7 @@ FIRST = 1.0
 MARGIN = 0.05
 """Decibels by which a run may be behind and still count as the best: less than a seed makes."""
 
-SELDOM = ("trainer.evaluate_at=[0.5,1.0]", "trainer.evaluate_views=2")
+SELDOM = ("callbacks.evaluation.at=[0.5,1.0]", "callbacks.evaluation.views=2")
 """How often a baseline is scored: a picture takes it seconds."""
 
 CASES: dict[str, tuple[str, ...]] = {
@@ -42,13 +50,13 @@ CASES: dict[str, tuple[str, ...]] = {
     "six, random, 32 texels": ("lrm=none", "model.resolution=32"),
     "six, random, 128 texels": ("lrm=none", "model.resolution=128"),
     "six, random, 256 texels": ("lrm=none", "model.resolution=256"),
-    "six, random, 64 samples": ("lrm=none", "sampler.samples=64"),
-    "six, random, 256 samples": ("lrm=none", "sampler.samples=256"),
-    "six, random, float32": ("lrm=none", "trainer.precision=32"),
-    "six, random, bfloat16": ("lrm=none", "trainer.precision=bf16"),
+    "six, random, 64 samples": ("lrm=none", "model.sampler.samples=64"),
+    "six, random, 256 samples": ("lrm=none", "model.sampler.samples=256"),
+    "six, random, float32": ("lrm=none", "model.precision=32"),
+    "six, random, bfloat16": ("lrm=none", "model.precision=bf16"),
     "K-Planes, smaller, our grid": ("model=kplanes", *SMALLER, *SELDOM),
     "K-Planes": ("model=kplanes", *SELDOM),
-    "K-Planes, our grid": ("model=kplanes", "sampler=occupancy", *SELDOM),
+    "K-Planes, our grid": ("model=kplanes", "model/sampler=occupancy", *SELDOM),
     "TiNeuVox-S": ("model=tineuvox_s", *SELDOM),
     "Tensor4D, density": ("model=tensor4d_density", *SELDOM),
 }
@@ -167,8 +175,8 @@ def main() -> None:
                 f"trainer.max_seconds={args.seconds}",
                 "trainer.max_steps=1000000",
                 "trainer.accelerator=cpu",
-                "trainer.media=false",
-                "trainer.evaluate_views=4",
+                "media=false",
+                "callbacks.evaluation.views=4",
                 "data.eval_views=5",
                 # A stage taken from the cache would cost its run nothing.
                 "preparation.cache=null",

@@ -22,10 +22,9 @@ from runner import RESULTS, command, lego, machine, markdown, run_apart
 
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.files import write_rows, write_text
-from xplanes.rendering.renderer import Renderer
+from xplanes.rendering.grid_renderer import GridRenderer
 from xplanes.scenes.views import Views
-from xplanes.training.builder import build_scene
-from xplanes.training.scoring import mean, render_view, score_view
+from xplanes.training.evaluation import mean, render_view, score_view
 
 SIZES = (100, 200, 400, 800)
 SAMPLES = (64, 128, 256)
@@ -35,21 +34,21 @@ COLUMNS = ("pixels", "samples along the cube", "seconds a frame", "frames/s", "r
 
 def views_at(run: TrainedRun, size: int) -> tuple[Views, bool]:
     """Views of the scored split at a size, and whether true images of that size exist."""
-    whole = replace(run.config.data, resolution=None, eval_views=FRAMES)
-    native = build_scene(whole, (run.split,)).splits[run.split]
+    whole = replace(run.experiment.data, resolution=None, eval_views=FRAMES)
+    native = whole.read((run.split,)).splits[run.split]
     if size <= native.width:
-        scene = build_scene(replace(whole, resolution=size), (run.split,))
+        scene = replace(whole, resolution=size).read((run.split,))
         return scene.splits[run.split], True
     blank = torch.zeros(FRAMES, size, size, 4, dtype=torch.uint8)
-    focal = native.focal * size / native.width
-    return replace(native, images=blank, focal=focal), False
+    focal = native.intrinsics.focal_at(size)
+    return replace(native, images=blank, intrinsics=focal), False
 
 
 @torch.no_grad()
 def measure(run: TrainedRun, size: int, samples: int) -> tuple:
     """One line of the table."""
     renderer = run.module.renderer
-    assert isinstance(renderer, Renderer)
+    assert isinstance(renderer, GridRenderer)
     renderer = replace(renderer, samples=samples)
     views, known = views_at(run, size)
     parts = (run.module.field, renderer, run.frame, views)
@@ -87,13 +86,13 @@ def main() -> None:
         scene.append("data.resolution=200")
     folder = (args.work / f"{args.seconds:g}s").absolute()
     overrides = ["lrm=none", f"trainer.max_seconds={args.seconds:g}", "trainer.accelerator=cpu"]
-    run_apart([*scene, *overrides, "trainer.media=false"], folder)
+    run_apart([*scene, *overrides, "media=false"], folder)
     run = load_run(folder)
     rows = [measure(run, size, samples) for size in SIZES for samples in SAMPLES]
     write_rows(RESULTS / "rendering.csv", COLUMNS, rows)
     page = f"""# Rendering: seconds per frame against PSNR
 
-{name}, six planes at random trained for {args.seconds:g} s at
+{name}, six random planes trained for {args.seconds:g} s at
 {run.scene.splits["train"].width} px with 128 samples along the cube's diagonal; median of {FRAMES}
 views, PSNR their mean, blank where the scene has no images of that size; {machine()}.
 `{command()}`

@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_dir
 
 from xplanes.backend import fast_bf16
-from xplanes.config import CONF, register_schemas, to_plain
+from xplanes.config import CONF, compose_plain
 from xplanes.files import read_rows
 from xplanes.pipeline import run
 
@@ -31,9 +30,7 @@ class Measured:
 
 def measure(overrides: list[str], work: Path) -> Measured:
     """Train once in a fresh folder below ``work``."""
-    register_schemas()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = to_plain(compose("train", overrides))
+    config = compose_plain("train", overrides)
     folder = Path(tempfile.mkdtemp(dir=work)) / "run"
     run(config, folder, overrides, resume=False)
     metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))

@@ -25,19 +25,19 @@ from xplanes.files import write_rows, write_text
 
 SWITCHES = {
     "all savings": (),
-    "empty space off": ("sampler.skip_empty=false",),
-    "occlusion off": ("sampler.skip_occluded=false",),
-    "silhouettes off": ("sampler.silhouettes=false",),
-    "background off": ("data.skip_background=false",),
-    "coarse start off": ("sampler.coarse_steps=0",),
-    "thinning off": ("sampler.thinning=0",),
+    "empty space off": ("model.sampler.skip_empty=false",),
+    "occlusion off": ("model.sampler.skip_occluded=false",),
+    "silhouettes off": ("model.sampler.silhouettes=false",),
+    "background off": ("model.rays.skip_background=false",),
+    "coarse start off": ("model.sampler.coarse_steps=0",),
+    "thinning off": ("model.sampler.thinning=0",),
     "all off": (
-        "sampler.skip_empty=false",
-        "sampler.skip_occluded=false",
-        "sampler.silhouettes=false",
-        "data.skip_background=false",
-        "sampler.coarse_steps=0",
-        "sampler.thinning=0",
+        "model.sampler.skip_empty=false",
+        "model.sampler.skip_occluded=false",
+        "model.sampler.silhouettes=false",
+        "model.rays.skip_background=false",
+        "model.sampler.coarse_steps=0",
+        "model.sampler.thinning=0",
     ),
 }
 
@@ -45,15 +45,15 @@ KINDS = ("empty", "occluded", "background", "gradients")
 
 PAIRS = {
     "planes of time of a still scene": (("data.scene=still",), ("data.still=false",), 1),
-    "grid in bins of time": (("data.scene=balls",), ("sampler.time_bins=1",), 1),
+    "grid in bins of time": (("data.scene=balls",), ("model.sampler.time_bins=1",), 1),
     "grid filled from the start": (
         ("data.scene=excavator", "lrm=tiny"),
-        ("sampler.fill=false",),
+        ("model.sampler.fill=false",),
         1,
     ),
     "steps after convergence": (
-        ("data.scene=excavator", "trainer.plateau=0.3"),
-        ("trainer.plateau=null",),
+        ("data.scene=excavator", "callbacks.plateau.gain=0.3"),
+        ("callbacks.plateau.gain=null",),
         4,
     ),
 }
@@ -95,11 +95,11 @@ def train(scene: list[str], switches: tuple[str, ...], seed: int, work: Path, ar
         f"data.resolution={args.resolution}",
         f"trainer.max_steps={args.steps}",
         "trainer.max_seconds=null",
-        "trainer.rays_per_batch=512",
+        "model.rays.per_batch=512",
         # No limit on samples, so that every run sees the same rays at the same step.
-        "trainer.samples_per_batch=1000000",
-        "trainer.evaluate_at=[]",
-        "trainer.media=false",
+        "model.rays.samples_per_batch=1000000",
+        "callbacks.evaluation.at=[]",
+        "media=false",
         "trainer.accelerator=cpu",
         *switches,
     ]
@@ -139,7 +139,7 @@ def preparation(work: Path) -> list[tuple]:
     }
     rows = []
     for name, overrides in cases.items():
-        lines = [*overrides, "trainer.max_steps=1", "trainer.evaluate_at=[]", "trainer.media=false"]
+        lines = [*overrides, "trainer.max_steps=1", "callbacks.evaluation.at=[]", "media=false"]
         for _ in range(2):  # Whatever is made once, the second finds.
             metrics = measure([*lines, "trainer.accelerator=cpu"], work).metrics
         # Not the stages' own seconds: of what was kept these are the ones that it once took.
@@ -194,7 +194,7 @@ def main() -> None:
     write_rows(RESULTS / f"{args.name}.csv", COLUMNS, rows)
     page = f"""# Savings, one switched off at a time
 
-{args.steps} steps of 512 rays, {args.resolution} px, six planes at random,
+{args.steps} steps of 512 rays, {args.resolution} px, six random planes,
 {"one seed" if args.seeds == 1 else f"means of {args.seeds} seeds"}; {machine()}. `{command()}`
 
 empty and occluded: shares of the samples in the box; background: share of the pixels; gradients:

@@ -14,6 +14,7 @@ from xplanes.process import waiting
 
 os.environ.update(waiting(os.environ))
 
+import argparse
 import math
 import time
 from collections.abc import Callable
@@ -142,6 +143,7 @@ def growth(sizes: tuple[int, ...], spent: list[float]) -> float:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0]).parse_args()
     rows = []
     for stage in STAGES:
         print(f"{stage.name}: {stage.unit}", flush=True)

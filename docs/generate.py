@@ -1,86 +1,207 @@
-"""Write docs/configuration.md from the schemas and the YAML files: `python docs/generate.py`."""
+"""Write docs/configuration.md from conf/ and the classes it names: `python docs/generate.py`."""
 
+import importlib
 import inspect
 import re
-from dataclasses import fields, is_dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import yaml
 
-from xplanes import config as schemas
-from xplanes.pretraining.settings import PretrainConfig
-from xplanes.schemas import kplanes, samplers, tensor4d, tineuvox
+from xplanes.pretraining.settings import PretrainingSettings
+from xplanes.settings import Settings
 
 ROOT = Path(__file__).resolve().parent.parent
+CONF = ROOT / "conf"
 TARGET = ROOT / "docs" / "configuration.md"
 
-_FIELD = re.compile(r"^    (\w+): [^#\n]*#\s*(.+)$", re.MULTILINE)
+GROUPS = ("data", "model", "model/sampler", "lrm", "preparation", "decomposition")
+"""Groups of settings classes, in the order of the page."""
 
-GROUPS: dict[str, dict[str, type]] = {
-    "data": {"demo": schemas.DemoConfig, "dnerf": schemas.DataConfig},
-    "model": {
-        **dict.fromkeys(("six_planes", "nine_planes"), schemas.ModelConfig),
-        **dict.fromkeys(("kplanes", "kplanes_explicit"), kplanes.KPlanesConfig),
-        **dict.fromkeys(("tineuvox_s", "tineuvox_b"), tineuvox.TiNeuVoxConfig),
-        "tensor4d": tensor4d.Tensor4DConfig,
-        "tensor4d_density": tensor4d.Tensor4DDensityConfig,
-    },
-    "lrm": {
-        "none": schemas.LRMConfig,
-        "file": schemas.TriplaneFileConfig,
-        **dict.fromkeys(("tiny", "mini"), schemas.BundledLRMConfig),
-        **dict.fromkeys(("small", "base", "large", "xlarge"), schemas.PretrainedLRMConfig),
-    },
-    "preparation": {"default": schemas.PreparationConfig},
-    "decomposition": dict.fromkeys(("default", "paper"), schemas.DecompositionConfig),
-    "sampler": {
-        "occupancy": samplers.SamplerConfig,
-        **dict.fromkeys(("proposal", "kplanes", "kplanes_explicit"), samplers.ProposalConfig),
-        "fixed_step": samplers.FixedStepConfig,
-        "neus": samplers.NeusConfig,
-    },
-    "loss": {
-        "default": schemas.LossConfig,
-        "kplanes": kplanes.KPlanesLossConfig,
-        "tineuvox": tineuvox.TiNeuVoxLossConfig,
-        "tensor4d": tensor4d.Tensor4DLossConfig,
-        "tensor4d_density": tensor4d.Tensor4DDensityLossConfig,
-    },
-    "trainer": dict.fromkeys(("default", "cpu", "gpu", "ddp", "debug"), schemas.TrainerConfig),
-}
+_FIELD = re.compile(r"    (\w+): .*?(?:  # (.+))?$")
+_ARGUMENT = re.compile(r"^    (\w+): (.+?)(?=^    \w|\Z)", re.MULTILINE | re.DOTALL)
+_TOP_LEVEL = re.compile(r"^(\w+): (.*?)(?:  # (.+))?$", re.MULTILINE)
+
+LIGHTNING = (
+    "See [Lightning's manual](https://lightning.ai/docs/pytorch/stable/common/trainer.html)."
+)
 
 
-def comments(schema: type) -> dict[str, str]:
-    """What the source says behind each field, inherited fields included."""
-    found: dict[str, str] = {}
-    for parent in reversed(schema.__mro__):
-        if is_dataclass(parent):
-            found.update(_FIELD.findall(inspect.getsource(parent)))
-    return found
+def merged(base: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
+    """One mapping over another, at every depth."""
+    whole = dict(base)
+    for key, value in more.items():
+        both = isinstance(value, dict) and isinstance(whole.get(key), dict)
+        whole[key] = merged(whole[key], value) if both else value
+    return whole
 
 
 def values(group: str, option: str) -> dict[str, Any]:
     """The values of a YAML file, those it inherits from a sibling included."""
-    content = yaml.safe_load((ROOT / "conf" / group / f"{option}.yaml").read_text())
-    merged: dict[str, Any] = {}
+    content = yaml.safe_load((CONF / group / f"{option}.yaml").read_text(encoding="utf-8"))
+    found: dict[str, Any] = {}
     for parent in content.pop("defaults", []):
-        if (ROOT / "conf" / group / f"{parent}.yaml").is_file():
-            merged.update(values(group, parent))
-    return {**merged, **content}
+        if isinstance(parent, str) and parent != "_self_":
+            found = merged(found, values(group, parent))
+    return merged(found, content)
 
 
-def rows(schema: type, options: dict[str, dict[str, Any]], prefix: str) -> list[str]:
-    """One line per setting: key, meaning, value in each option."""
-    lines, meaning = [], comments(schema)
-    for entry in fields(schema):
-        inner = {name: value.get(entry.name) for name, value in options.items()}
-        if isinstance(entry.type, type) and is_dataclass(entry.type):
-            lines += rows(entry.type, inner, f"{prefix}{entry.name}.")  # type: ignore[arg-type]
+FIRST = "demo six_planes none default small base tineuvox_s tiny occupancy proposal csv".split()
+"""Options that stand before others of their group."""
+
+
+def options_of(group: str) -> dict[str, dict[str, Any]]:
+    """The options of a group with their values."""
+    names = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+    order = [name for name in FIRST if name in names]
+    return {name: values(group, name) for name in dict.fromkeys([*order, *names])}
+
+
+def class_of(node: Mapping[str, Any]) -> type:
+    """The class that a node names as ``_target_``."""
+    module, _, name = node["_target_"].rpartition(".")
+    return getattr(importlib.import_module(module), name)
+
+
+def comments(cls: type) -> dict[str, str]:
+    """What the source says of each setting: behind it, above it, or under "Args:"."""
+    found: dict[str, str] = {}
+    for parent in reversed(cls.__mro__):
+        if not parent.__module__.startswith("xplanes"):
             continue
-        shown = [yaml.safe_dump(v, default_flow_style=True).split("\n")[0] for v in inner.values()]
-        cells = shown[:1] if len(set(shown)) == 1 else shown
-        lines.append(f"| `{prefix}{entry.name}` | {meaning[entry.name]} | {' · '.join(cells)} |")
+        found |= arguments(parent)
+        above: list[str] = []
+        for line in inspect.getsource(parent).splitlines():
+            if line.startswith("    # "):
+                above.append(line.removeprefix("    # "))
+                continue
+            if (match := _FIELD.fullmatch(line)) is not None:
+                text = match[2] or " ".join(above)
+                if text:
+                    found[match[1]] = text
+            above = []
+    return found
+
+
+def arguments(cls: type) -> dict[str, str]:
+    """The section "Args:" of a docstring, one line for each."""
+    _, _, section = (inspect.getdoc(cls) or "").partition("Args:\n")
+    section = re.split(r"^\S", section, maxsplit=1, flags=re.MULTILINE)[0]
+    return {name: in_yaml(" ".join(text.split())) for name, text in _ARGUMENT.findall(section)}
+
+
+def about(cls: type) -> str:
+    """The first line of a docstring."""
+    return in_yaml((cls.__doc__ or "").split("\n")[0])
+
+
+def in_yaml(text: str) -> str:
+    """Words of a docstring, with values as YAML has them."""
+    return re.sub(r"\bNone\b", "null", text.replace("``", "`"))
+
+
+def choices(hint: Any) -> str:
+    """The values of a setting that is one of a few, as a sentence."""
+    if get_origin(hint) is not Literal:
+        return ""
+    return f"One of {', '.join(f'`{choice}`' for choice in get_args(hint))}."
+
+
+def sentence(text: str) -> str:
+    """Words that stand behind a key in a YAML file, as a sentence."""
+    capital = text[:1].upper() + text[1:] if re.match(r"[a-z]+ [a-z]", text) else text
+    return capital + ("" if text.endswith(".") else ".")
+
+
+def listed(group: str, options: Iterable[str]) -> list[str]:
+    """What each option is, where there are several."""
+    lines = [f"- `{option}`: {head(CONF / group / f'{option}.yaml')}" for option in options]
+    return [*lines, ""] if len(lines) > 1 else []
+
+
+def shown(value: Any) -> str:
+    """A value as YAML writes it, on one line."""
+    return yaml.safe_dump(value, default_flow_style=True, width=10_000).split("\n")[0]
+
+
+def row(key: str, meaning: str, of_options: Mapping[str, Any]) -> str:
+    """A line of a table; one value where that of all options is the same."""
+    cells = [shown(value) for value in of_options.values()]
+    cells = cells[:1] if len(set(cells)) == 1 else cells
+    return f"| `{key}` | {meaning} | {' · '.join(cells)} |"
+
+
+def rows(cls: type[Settings], options: Mapping[str, Any], prefix: str) -> list[str]:
+    """One line per setting: key, meaning, value in each option."""
+    lines, meaning, hints = [], comments(cls), get_type_hints(cls)
+    for entry in fields(cls):
+        key, hint = f"{prefix}{entry.name}", hints[entry.name]
+        if isinstance(hint, type) and issubclass(hint, Settings):
+            if f"{prefix}{entry.name}".replace(".", "/") not in GROUPS:
+                inner = {name: value[entry.name] for name, value in options.items()}
+                lines += rows(hint, inner, f"{key}.")
+            continue
+        words = [meaning.get(entry.name, ""), choices(hint)]
+        inner = {name: value[entry.name] for name, value in options.items()}
+        lines.append(row(key, " ".join(filter(None, words)), inner))
+    return lines
+
+
+TABLE = ["| key | meaning | value |", "|---|---|---|"]
+
+
+def section(group: str) -> list[str]:
+    """The options of a group of settings: a table for each class."""
+    by_class: dict[type, dict[str, dict[str, Any]]] = {}
+    for option, content in options_of(group).items():
+        by_class.setdefault(class_of(content), {})[option] = content
+    parts: list[str] = []
+    for cls, named in by_class.items():
+        names = ", ".join(f"`{group}={option}`" for option in named)
+        parts += ["", f"## {names}", "", about(cls), ""]
+        parts += listed(group, named)
+        parts += [*TABLE, *rows(cls, named, f"{group.replace('/', '.')}.")]
+    return parts
+
+
+def trainer() -> list[str]:
+    """The Trainer's arguments."""
+    options = options_of("trainer")
+    cls = class_of(options["default"])
+    names = ", ".join(f"`trainer={option}`" for option in options)
+    told = arguments(cls)
+    text = (CONF / "trainer" / "default.yaml").read_text(encoding="utf-8")
+    told = {key: sentence(words) for key, _, words in _TOP_LEVEL.findall(text) if words} | told
+    lines = ["", f"## {names}", "", about(cls)]
+    lines += ["Further arguments of Lightning's are added with `+trainer.KEY=VALUE`.", ""]
+    lines += [*listed("trainer", options), *TABLE]
+    keys = [key for key in options["default"] if key != "_target_"]
+    for key in keys:
+        of_options = {name: content[key] for name, content in options.items()}
+        lines.append(row(f"trainer.{key}", told.get(key, LIGHTNING), of_options))
+    return lines
+
+
+def nodes(group: str, words: str) -> list[str]:
+    """A group of components by name: callbacks, loggers."""
+    options = options_of(group)
+    names = ", ".join(f"`{group}={option}`" for option in options)
+    lines = ["", f"## {names}", "", words, ""]
+    lines += [*listed(group, options), *TABLE]
+    everything: dict[str, Any] = {}
+    for content in options.values():
+        everything = merged(everything, content)
+    for name, node in everything.items():
+        cls = class_of(node) if node["_target_"].startswith("xplanes.") else None
+        words = "" if cls is None else about(cls)
+        lines.append(f"| `{group}.{name}` | {words} | `{node['_target_']}` |")
+        told = {} if cls is None else arguments(cls)
+        for key, value in node.items():
+            if key != "_target_":
+                full = f"{group}.{name}.{key}"
+                lines.append(row(full, told.get(key, ""), {"": value}))
     return lines
 
 
@@ -89,33 +210,25 @@ def document() -> str:
     parts = [
         "# Configuration",
         "",
-        "Generated from `xplanes/config.py`, `xplanes/schemas/` and `conf/` by "
-        "`python docs/generate.py`.",
+        "Generated from `conf/` and the classes that it names by `python docs/generate.py`.",
         "",
         "Every key can be set on the command line, `python train.py data.views=10 trainer=cpu`.",
         "Where the options of a group differ, their values stand in the order of the options.",
         "",
-        "| key | meaning | value |",
-        "|---|---|---|",
-        "| `seed` | Source of all randomness. | 0 |",
-        "| `resume` | A run directory to go on with, or `auto`: the newest unfinished run with the "
-        "same overrides, or the job's own folder in a sweep. | null |",
+        *TABLE,
     ]
-    for group, options in GROUPS.items():
-        by_schema: dict[type, dict[str, dict[str, Any]]] = {}
-        for option, schema in options.items():
-            by_schema.setdefault(schema, {})[option] = values(group, option)
-        for schema, named in by_schema.items():
-            names = ", ".join(f"`{group}={option}`" for option in named)
-            parts += ["", f"## {names}", "", (schema.__doc__ or "").split("\n")[0], ""]
-            parts += ["| key | meaning | value |", "|---|---|---|"]
-            parts += rows(schema, named, f"{group}.")
-    parts += ["", "## `recipe`", "", RECIPE, "", "| recipe | key | value |", "|---|---|---|"]
-    for path in sorted((ROOT / "conf" / "recipe").glob("*.yaml")):
-        parts += [f"| `recipe={path.stem}` | `{key}` | {value} |" for key, value in settings(path)]
+    text = (CONF / "train.yaml").read_text(encoding="utf-8")
+    for key, value, words in _TOP_LEVEL.findall(text):
+        if value:
+            parts.append(f"| `{key}` | {sentence(words)} | {value} |")
+    for group in GROUPS:
+        parts += section(group)
+    parts += trainer()
+    for group, words in NODES.items():
+        parts += nodes(group, words)
     for group, words in SETS.items():
         parts += ["", f"## `{group}`", "", words, "", f"| {group} | what it is |", "|---|---|"]
-        for path in sorted((ROOT / "conf" / group).glob("*.yaml")):
+        for path in sorted((CONF / group).glob("*.yaml")):
             parts.append(f"| `{group}={path.stem}` | {head(path)} |")
     parts += ["", "## Environment", "", "| variable | meaning |", "|---|---|"]
     parts += [f"| `{name}` | {meaning} |" for name, meaning in ENVIRONMENT.items()]
@@ -124,7 +237,7 @@ def document() -> str:
 
 def pretraining() -> list[str]:
     """The settings of the other program."""
-    shared = yaml.safe_load((ROOT / "conf" / "pretrain_lrm.yaml").read_text())
+    shared = yaml.safe_load((CONF / "pretrain_lrm.yaml").read_text(encoding="utf-8"))
     shared.pop("defaults")
     options = {name: {**shared, "model": values("pretrain", name)} for name in ("tiny", "mini")}
     return [
@@ -133,21 +246,23 @@ def pretraining() -> list[str]:
         "",
         "Training of a small LRM: cards of [tiny](lrm_tiny.md) and [mini](lrm_mini.md).",
         "",
-        "| key | meaning | value |",
-        "|---|---|---|",
-        *rows(PretrainConfig, options, ""),
+        *TABLE,
+        *rows(PretrainingSettings, options, ""),
     ]
 
 
-RECIPE = (
-    "What a published baseline sets in other groups. Its model chooses it; `recipe=none` trains "
-    "it on the same rays and batches as X-Planes."
-)
-
+NODES = {
+    "callbacks": "What runs beside training. `callbacks.NAME=null` leaves one out; any callback of "
+    "Lightning is added with `+callbacks.NAME={_target_: MODULE.CLASS, ...}`.",
+    "logger": "Where scalars and images go; any logger of Lightning is added with "
+    "`+logger.NAME={_target_: MODULE.CLASS, ...}`.",
+}
+"""Groups of components that have names of their own."""
 
 SETS = {
     "experiment": "Settings for a purpose; most are sweeps.",
-    "entry": "One model with its start, as a row of a table: `entry=six_planes_tiny,kplanes`.",
+    "entry": "One model with its initialisation, as a row of a table: "
+    "`entry=six_planes_tiny,kplanes`.",
 }
 """Groups whose files set keys of other groups."""
 
@@ -161,14 +276,10 @@ ENVIRONMENT = {
 
 def head(path: Path) -> str:
     """The first sentence of the comment in a file that says what it is."""
-    lines = [line[2:] for line in path.read_text().splitlines() if line.startswith("# ")]
-    return next(line for line in lines if not line.startswith("@")).split(". ")[0].rstrip(".") + "."
-
-
-def settings(path: Path) -> list[tuple[str, Any]]:
-    """Dotted keys of a YAML file of groups, and their values."""
-    content = yaml.safe_load(path.read_text()) or {}
-    return [(f"{group}.{key}", v) for group, keys in content.items() for key, v in keys.items()]
+    text = path.read_text(encoding="utf-8")
+    lines = [line[2:] for line in text.splitlines() if line.startswith("# ")]
+    first = next(line for line in lines if not line.startswith("@"))
+    return first.split(". ")[0].rstrip(".") + "."
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
 from xplanes.locks import alone_in, in_turn
 
 HOLD = """

@@ -46,9 +46,9 @@ def test_misspelled_key_names_its_neighbours() -> None:
 
 
 def test_setting_out_of_range_stops_before_anything_is_written(tmp_path: Path) -> None:
-    result = train("trainer.rays_per_batch=0", f"hydra.run.dir={tmp_path / 'run'}")
+    result = train("model.rays.per_batch=0", f"hydra.run.dir={tmp_path / 'run'}")
     assert result.returncode == 1
-    assert "trainer.rays_per_batch=0" in result.stderr
+    assert "model.rays.per_batch=0" in result.stderr
     assert not (tmp_path / "run" / "run.json").exists()
 
 
@@ -115,8 +115,8 @@ def test_two_processes_share_the_rays_and_end_with_one_model(scenes: str, tmp_pa
         EACH_RANK.format(root=str(ROOT), train=str(ROOT / "train.py"), folder=str(tmp_path))
     )
     # Between updates each process's grid sees its own samples.
-    settings = [scenes, *SMALL, "trainer=ddp", "trainer.max_steps=20", "sampler.update_every=1"]
-    settings.append(f"hydra.run.dir={run}")
+    settings = [scenes, *SMALL, "trainer=ddp", "trainer.max_steps=20", f"hydra.run.dir={run}"]
+    settings.append("model.sampler.update_every=1")
     result = subprocess.run(
         [sys.executable, str(script), *settings],
         cwd=ROOT,
@@ -158,7 +158,7 @@ def test_two_processes_stop_together_and_go_on(scenes: str, tmp_path: Path) -> N
 
 
 def start(run: Path, scenes: str, *overrides: str) -> subprocess.Popen[bytes]:
-    arguments = [scenes, *SMALL, "trainer.max_steps=400", "trainer.checkpoint_every=20"]
+    arguments = [scenes, *SMALL, "trainer.max_steps=400", "callbacks.checkpoints.every=20"]
     arguments += overrides
     return subprocess.Popen(
         [sys.executable, str(ROOT / "train.py"), *arguments, f"hydra.run.dir={run}"],
@@ -201,8 +201,8 @@ def test_killed_and_resumed_run_ends_with_the_same_numbers(scenes: str, tmp_path
     assert exact(killed) == exact(whole)
 
 
-def test_a_field_films_the_scene_inside_a_job(scenes: str, tmp_path: Path) -> None:
-    # The film's own settings are composed while Hydra's job is under way.
+def test_a_field_renders_the_scene_inside_a_job(scenes: str, tmp_path: Path) -> None:
+    # That field's own settings are composed while Hydra's job is under way.
     folder = tmp_path / "run"
     result = train(
         scenes,

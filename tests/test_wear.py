@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from tests.training.runs import small_config
-from xplanes.checks import parse
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
+from xplanes.experiment import Experiment
 from xplanes.files import MARK, StorageError
 from xplanes.launch import prepare
 from xplanes.pipeline import run
@@ -18,9 +18,8 @@ from xplanes.preparation.cache import DAY, StageCache
 from xplanes.pretraining.pool import RECORD, SHARD, ensure_pool
 from xplanes.scenes.demo import ensure_demo_scene, write
 from xplanes.scenes.errors import SceneError
-from xplanes.training.builder import build_scene
 from xplanes.training.checkpoints import LAST
-from xplanes.training.scoring import Curve
+from xplanes.training.evaluation import Curve
 
 
 def aged(path: Path) -> Path:
@@ -54,12 +53,12 @@ def test_rendering_a_scene_clears_what_is_a_day_old(tmp_path: Path, monkeypatch)
 def test_a_damaged_demo_scene_says_to_delete_it(trained_run: Path, tmp_path: Path) -> None:
     config = small_config(tmp_path / "scenes")
     shutil.copytree(trained_run.parents[1] / "scenes", tmp_path / "scenes")
-    data = parse(config).data
-    build_scene(data)
+    data = Experiment.read(config).data
+    data.read()
     (picture,) = (tmp_path / "scenes").glob("excavator*/train/r_003.png")
     picture.write_bytes(picture.read_bytes()[:50])
     with pytest.raises(SceneError, match=r"r_003\.png.*demo scene: delete .* rendered again"):
-        build_scene(data)
+        data.read()
 
 
 def test_a_damaged_record_of_a_pool_is_named(tmp_path: Path) -> None:
@@ -105,7 +104,7 @@ def test_a_disk_that_fills_up_ends_a_run_in_words(
 
     monkeypatch.setattr(Trainer, "save_checkpoint", fill_up)
     folder = tmp_path / "run"
-    config = small_config(trained_run.parents[1] / "scenes", "trainer.evaluate_at=[]")
+    config = small_config(trained_run.parents[1] / "scenes", "callbacks.evaluation.at=[]")
     with pytest.raises(StorageError, match=r"last\.ckpt cannot be written.*Free some space"):
         run(config, folder, [], resume=False)
     assert f"resume={folder}" in capsys.readouterr().out

@@ -1,3 +1,23 @@
-"""Dynamic radiance fields that start from a Large Reconstruction Model."""
+"""Dynamic radiance fields initialised from Large Reconstruction Models."""
 
-__version__ = "0.1.0"
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from xplanes.scenes.datamodule import SceneDataModule
+    from xplanes.training.module import RadianceModule
+
+__version__ = "0.2.0"
+__all__ = ["RadianceModule", "SceneDataModule"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is heavy when it is asked for."""
+    if name == "SceneDataModule":
+        from xplanes.scenes.datamodule import SceneDataModule
+
+        return SceneDataModule
+    if name == "RadianceModule":
+        from xplanes.training.module import RadianceModule
+
+        return RadianceModule
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

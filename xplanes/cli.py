@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _known_errors() -> tuple[type[Exception], ...]:
     """Errors whose message says all."""
-    from xplanes.config import ConfigError
+    from xplanes.errors import ConfigError
     from xplanes.files import StorageError
     from xplanes.lrm.errors import LRMError
     from xplanes.optional import MissingExtraError
@@ -107,17 +107,18 @@ def _add_triplanes(commands: "argparse._SubParsersAction") -> None:
 
 
 def _triplanes(options: argparse.Namespace) -> None:
-    from xplanes.launch import settings
+    from xplanes.config import compose_plain
 
     changed = [text for text in options.arguments if "=" in text and not Path(text).exists()]
     paths = [Path(text) for text in options.arguments if text not in changed]
     outs = [text for text in changed if text.startswith("out=")]
-    config = settings([text for text in changed if text not in outs])
+    plain = compose_plain("train", [text for text in changed if text not in outs])
     out = outs[-1].removeprefix("out=") if outs else "triplanes.safetensors"
 
     from xplanes.evaluation.turntable import write_triplanes
+    from xplanes.experiment import Experiment
 
-    write_triplanes(paths, Path(out), config, say=_say)
+    write_triplanes(paths, Path(out), Experiment.read(plain), say=_say)
 
 
 def _add_run(parser: argparse.ArgumentParser) -> None:
@@ -125,13 +126,26 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--checkpoint", choices=["last", "best"], default="last", help="default: %(default)s"
     )
+    parser.add_argument(
+        "--plugin",
+        action="append",
+        default=[],
+        metavar="MODULE",
+        help="a module of your own whose classes the run's settings may name",
+    )
 
 
 def _load(options: argparse.Namespace, split: str | None = None) -> "TrainedRun":
     from xplanes.evaluation.runs import find_run, load_run
 
     run = find_run(options.run)
-    return load_run(run, checkpoint=options.checkpoint, split=split, announce=_say)
+    return load_run(
+        run,
+        checkpoint=options.checkpoint,
+        split=split,
+        plugins=options.plugin,
+        announce=_say,
+    )
 
 
 def _say(text: str) -> None:
@@ -157,7 +171,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 
     trained = _load(options, options.split)
     views = trained.views
-    _say(f"split       {trained.split}, {len(views)} views of {views.width}x{views.height} px\n")
+    _say(f"split       {trained.split}, {len(views)} views of {views.outline}\n")
     scores = evaluate(trained, options.lpips)
     _say(score_table(scores))
     _say(f"wrote {write_scores(trained.path, scores)}")
@@ -224,7 +238,7 @@ def _add_view(commands: "argparse._SubParsersAction") -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    from xplanes.config import ConfigError
+    from xplanes.errors import ConfigError
     from xplanes.evaluation.viewer import Viewer
     from xplanes.optional import require
 
@@ -234,7 +248,7 @@ def _view(options: argparse.Namespace) -> None:
     viewer = Viewer(_load(options), options.port)
     port = viewer.port
     _say(f"\nopen        http://localhost:{port}")
-    _say(f"from afar   ssh -L {port}:localhost:{port} USER@THIS_MACHINE, then the same address")
+    _say(f"remotely    ssh -L {port}:localhost:{port} USER@THIS_MACHINE, then the same address")
     _say("stop        Ctrl-C")
     try:
         viewer.run()
@@ -268,7 +282,7 @@ def _add_pretrain(commands: "argparse._SubParsersAction") -> None:
 
 
 def _pretrain(options: argparse.Namespace) -> None:
-    from xplanes.pretraining.command import run_pretraining
+    from xplanes.pretraining.run import run_pretraining
 
     _say(f"wrote {run_pretraining(options.overrides, _say)}")
 
@@ -284,7 +298,7 @@ def _add_score(commands: "argparse._SubParsersAction") -> None:
 
 
 def _score(options: argparse.Namespace) -> None:
-    from xplanes.config import ConfigError
+    from xplanes.errors import ConfigError
     from xplanes.lrm.bundled import FOLDER, load_bundled
     from xplanes.pretraining.score import score_all
 

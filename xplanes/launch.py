@@ -1,10 +1,10 @@
-"""Training from the command line: checks, resumed runs, and the job that Hydra runs.
+"""Training from the command line: resumed runs, and the job that Hydra runs.
 
 Must stay quick: it imports neither torch nor lightning before the job begins.
 """
 
-import difflib
-import re
+import contextlib
+import io
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,19 +16,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from xplanes.checks import parse
-from xplanes.config import (
-    CONF,
-    ConfigError,
-    TrainConfig,
-    compose_plain,
-    register_schemas,
-    to_plain,
-)
+from xplanes import __version__
+from xplanes.config import CONF, near_names, to_plain
+from xplanes.errors import ConfigError
 from xplanes.files import StorageError, read_json, require_writable
-from xplanes.schemas.families import XPLANES_RATES
-
-_OVERRIDE = re.compile(r"^(?P<mark>\+\+?|~)?(?P<key>[\w./@-]+)=(?P<value>.*)$", re.DOTALL)
 
 
 def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
@@ -41,20 +32,48 @@ def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
     Raises:
         SystemExit: With a message after an error that was explained, or 130 after Ctrl-C.
     """
-    register_schemas()
     try:
         prepared = prepare(list(arguments))
     except (ConfigError, StorageError) as error:
         sys.exit(f"error: {error}")
-    program = sys.argv[0]
+    program, begun = sys.argv[0], False
 
     def job(config: DictConfig) -> float:
+        nonlocal begun
+        begun = True
         # Lightning starts the other processes of a distributed run with this command line.
         sys.argv = [program, *words, *prepared]
         return _job(config)
 
     sys.argv = [program, *prepared]
-    hydra.main(config_path=str(CONF), config_name="train", version_base="1.3")(job)()
+    printed = _Copied(sys.stderr)
+    try:
+        with contextlib.redirect_stderr(printed):
+            hydra.main(config_path=str(CONF), config_name="train", version_base="1.3")(job)()
+    except SystemExit as end:
+        if end.code and not begun:
+            print(near_names(printed.copy.getvalue()).strip(), file=sys.stderr)
+        raise
+
+
+class _Copied(io.TextIOBase):
+    """A stream whose text is kept as well."""
+
+    def __init__(self, stream: Any) -> None:
+        self.stream, self.copy = stream, io.StringIO()
+
+    def write(self, text: str) -> int:
+        self.copy.write(text)
+        return self.stream.write(text)
+
+    def flush(self) -> None:
+        self.stream.flush()
+
+    def isatty(self) -> bool:
+        return self.stream.isatty()
+
+    def fileno(self) -> int:
+        return self.stream.fileno()
 
 
 def _job(config: DictConfig) -> float:
@@ -66,7 +85,7 @@ def _job(config: DictConfig) -> float:
     folder = Path(settings.runtime.output_dir)
     try:
         plain = to_plain(config)
-        if sweep and plain["trainer"]["devices"] > 1:
+        if sweep and plain["trainer"].get("devices") not in (1, "1"):
             raise ConfigError(
                 "trainer.devices > 1 in a multirun: helper processes would start the whole sweep "
                 "again. Use one device per job, with hydra/launcher=joblib for several at a time"
@@ -82,30 +101,29 @@ def _job(config: DictConfig) -> float:
         sys.exit(130)
 
 
-def prepare(arguments: list[str], conf: Path = CONF) -> list[str]:
-    """Check overrides and turn ``resume=`` into the overrides of the run that goes on.
+def prepare(arguments: list[str]) -> list[str]:
+    """Turn ``resume=RUN`` into the overrides of the run that continues, and try its folder.
 
     Args:
         arguments: Overrides and options of Hydra.
-        conf: The configuration folder.
 
     Returns:
         Arguments for Hydra.
 
     Raises:
-        ConfigError: For an unknown key, with near matches, or a run that cannot be resumed.
+        ConfigError: If the run cannot be resumed.
         StorageError: If the folder of the run cannot be written.
     """
-    check_keys(arguments, conf)
-    values = dict(_split(arguments))
-    if not _is_multirun(arguments) and _is_sweep(values.get("experiment", ""), conf):
+    values = {key: value for key, value in map(_split, arguments) if key}
+    if not _is_multirun(arguments) and _is_sweep(values.get("experiment", "")):
         # Hydra from 1.4 on takes the mode from here, not from the experiment's file.
         arguments = [*arguments, "--multirun"]
     resume = values.get("resume", "null")
     if resume in ("null", "", "None", "auto"):
+        # Before Hydra makes the folder, whose errors are tracebacks.
         place = "hydra.sweep.dir" if _is_multirun(arguments) else "hydra.run.dir"
-        require_writable(Path(values.get(place, "outputs")))
-    if resume in ("null", "", "None"):
+        require_writable(Path(values.get(place, "outputs").strip("\"'")))
+    if not resume or resume in ("null", "None") or "resume" not in values:
         return arguments
     folder = values.get("hydra.run.dir")
     if folder is not None:
@@ -122,8 +140,8 @@ def prepare(arguments: list[str], conf: Path = CONF) -> list[str]:
         raise ConfigError(f"resume={resume} with --multirun: resume one run at a time, or auto")
     if folder is not None and Path(folder).resolve() != Path(resume).resolve():
         raise ConfigError(
-            f"resume={resume} with hydra.run.dir={folder}: a run goes on in its own folder; leave "
-            "hydra.run.dir out"
+            f"resume={resume} with hydra.run.dir={folder}: a run continues in its own folder; "
+            "leave hydra.run.dir out"
         )
     return _resumed(Path(resume), arguments)
 
@@ -134,6 +152,7 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
     if not path.is_file():
         raise ConfigError(f"resume={run}: not a run directory, no overrides.txt in it")
     require_writable(run)
+    _require_version(run)
     text = path.read_text(encoding="utf-8")
     if text and not text.endswith("\n"):
         raise ConfigError(
@@ -141,13 +160,22 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
             "one key=value a line"
         )
     new = [a for a in arguments if not a.startswith(("resume=", "hydra.run.dir="))]
-    changed = {key for key, _ in _split(new)}
-    old = [
-        line
-        for line in text.splitlines()
-        if line and not {key for key, _ in _split([line])} & changed
-    ]
+    changed = {key for key, _ in map(_split, new) if key}
+    old = [line for line in text.splitlines() if line and _split(line)[0] not in changed]
     return [*old, *new, f"hydra.run.dir={run}", f"resume={run}"]
+
+
+def _require_version(run: Path) -> None:
+    """Refuse a run of a version whose settings were others."""
+    try:
+        version = str(read_json(run / "run.json").get("xplanes", __version__))
+    except (OSError, ValueError):
+        return
+    if version.split(".")[:2] != __version__.split(".")[:2]:
+        raise ConfigError(
+            f"resume={run}: it was made by xplanes {version}, whose settings are not those of "
+            f"{__version__}; continue it with that version, or train anew in another folder"
+        )
 
 
 def _latest(outputs: Path, overrides: list[str]) -> Path | None:
@@ -169,80 +197,21 @@ def _mtime(path: Path) -> float:
     return path.stat().st_mtime
 
 
-def settings(overrides: list[str], conf: Path = CONF) -> TrainConfig:
-    """The settings of train.py with some of them changed.
-
-    Raises:
-        ConfigError: If a setting does not exist or cannot work.
-    """
-    check_keys(overrides, conf)
-    return parse(compose_plain("train", overrides, conf))
-
-
-def check_keys(arguments: list[str], conf: Path = CONF) -> None:
-    """Refuse overrides of keys that do not exist, naming those that are spelled alike."""
-    groups = {str(p.relative_to(conf)) for p in conf.rglob("*") if p.is_dir()}
-    pairs = [
-        (match["key"], match["value"])
-        for match in map(_OVERRIDE.match, arguments)
-        if match and not match["mark"] and not match["key"].startswith("hydra")
-    ]
-    chosen = [f"{key}={value.split(',')[0]}" for key, value in pairs if key in groups]
-    keys = _known_keys(conf, chosen)
-    for key, _ in pairs:
-        if "model.family" in keys and key in XPLANES_RATES:
-            own = sorted(name for name in keys if re.match(r"model\..*learning_rate", name))
-            raise ConfigError(f"{key}: only X-Planes use it; this model has {', '.join(own)}")
-        if key in groups or key in keys:
-            continue
-        if any(known.startswith(f"{key}.") for known in keys):
-            continue
-        near = difflib.get_close_matches(key, sorted(keys | groups), n=3, cutoff=0.5)
-        near = near or [k for k in sorted(keys) if k.rsplit(".", 1)[-1] == key.rsplit(".", 1)[-1]]
-        hint = f" Did you mean {' or '.join(near)}?" if near else ""
-        raise ConfigError(
-            f"{key}: there is no such setting.{hint} All are in docs/configuration.md"
-        )
-
-
-def _known_keys(conf: Path, overrides: list[str]) -> set[str]:
-    """Dotted names of all settings under a choice of groups."""
-    from hydra import compose, initialize_config_dir
-    from hydra.errors import HydraException
-    from omegaconf import OmegaConf
-
-    register_schemas()
-    try:
-        with initialize_config_dir(str(conf), version_base="1.3"):
-            config = compose("train", overrides)
-    except HydraException:
-        # An unknown option of a group: Hydra's own message lists those that exist.
-        with initialize_config_dir(str(conf), version_base="1.3"):
-            config = compose("train")
-    return set(_dotted(OmegaConf.to_container(config, resolve=False)))
-
-
-def _dotted(node: Any, prefix: str = "") -> list[str]:
-    if not isinstance(node, dict):
-        return [prefix]
-    names = []
-    for key, value in node.items():
-        names += _dotted(value, f"{prefix}.{key}" if prefix else str(key))
-    return names
-
-
-def _split(arguments: list[str]) -> list[tuple[str, str]]:
-    matches = map(_OVERRIDE.match, arguments)
-    return [(match["key"], match["value"]) for match in matches if match]
+def _split(argument: str) -> tuple[str, str]:
+    """Key and value of an override; an empty key for anything else."""
+    key, equals, value = argument.partition("=")
+    if not equals or key.startswith("-"):
+        return "", ""
+    return key.lstrip("+~"), value
 
 
 def _is_multirun(arguments: list[str]) -> bool:
     return not {"-m", "--multirun", "hydra.mode=MULTIRUN"}.isdisjoint(arguments)
 
 
-def _is_sweep(experiment: str, conf: Path) -> bool:
+def _is_sweep(experiment: str) -> bool:
     """Whether the experiment's file says that it is a multirun."""
-    path = conf / "experiment" / f"{experiment}.yaml"
+    path = CONF / "experiment" / f"{experiment}.yaml"
     if not path.is_file():
         return False
     content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
 from xplanes.files import read_json
 
 logger = logging.getLogger(__name__)

@@ -4,22 +4,22 @@ import logging
 import os
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 import yaml
 from lightning import seed_everything
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from xplanes.backend import warm_up
-from xplanes.checks import parse
-from xplanes.config import ConfigError, TrainConfig
-from xplanes.evaluation.media import film_times, orbit_poses, render_path, write_film
-from xplanes.evaluation.report import closing, header, summary, write_hparams, write_start
+from xplanes.errors import ConfigError
+from xplanes.evaluation.render import film_times, orbit_poses, render_path, write_film
+from xplanes.evaluation.report import closing, header, log_hparams, summary, write_pictures
 from xplanes.evaluation.runs import read_config
+from xplanes.experiment import Experiment
 from xplanes.files import (
     StorageError,
     clear_unfinished,
@@ -30,29 +30,32 @@ from xplanes.files import (
 )
 from xplanes.locks import alone_in
 from xplanes.lrm import LRMError
+from xplanes.models.initialisation import Initialisation, Place
 from xplanes.optional import MissingExtraError
-from xplanes.preparation import find_source, prepare
 from xplanes.process import train_command
-from xplanes.scenes.datamodule import RayDataModule
+from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene
-from xplanes.training.builder import (
-    build_batches,
-    build_frame,
-    build_module,
-    build_scene,
-    training_device,
-)
-from xplanes.training.checkpoints import LAST
-from xplanes.training.fit import fit
+from xplanes.training.checkpoints import LAST, find_resumable
+from xplanes.training.clock import find_callback, training_seconds
+from xplanes.training.evaluation import Evaluation, final_scores
+from xplanes.training.fit import estimate
+from xplanes.training.fit import warm_up as warm_up_loops
 from xplanes.training.module import RadianceModule, TrainingError
-from xplanes.training.record import RunRecord, claim
-from xplanes.training.resuming import require_same_settings, require_same_views
+from xplanes.training.record import RunRecord, claim, require_same_settings, require_same_views
 
 logger = logging.getLogger(__name__)
 
-KNOWN_ERRORS = (ConfigError, SceneError, LRMError, TrainingError, MissingExtraError, StorageError)
+KNOWN_ERRORS = (
+    ConfigError,
+    SceneError,
+    LRMError,
+    TrainingError,
+    MissingExtraError,
+    StorageError,
+    MisconfigurationException,
+)
 """Errors whose message says all; their traceback goes to train.log alone."""
 
 FILM_FRAMES, FILM_FPS, FILM_SIZE = 48, 16, 200
@@ -65,7 +68,7 @@ def run(config: dict[str, Any], folder: Path, overrides: list[str], *, resume: b
         config: The resolved configuration, builtins only.
         folder: The run directory.
         overrides: What the command line changed.
-        resume: Whether to go on with the run in ``folder``.
+        resume: Whether to continue the run in ``folder``.
 
     Returns:
         PSNR of the scored split in dB; NaN in helper processes of a distributed run.
@@ -75,9 +78,9 @@ def run(config: dict[str, Any], folder: Path, overrides: list[str], *, resume: b
             what to do.
         KeyboardInterrupt: If the user stopped it; the state is saved.
     """
-    typed = parse(config)
+    experiment = Experiment.read(config)
     if int(os.environ.get("LOCAL_RANK", "0")):
-        train(typed, folder, resume=resume)
+        train(experiment, folder, resume=resume)
         return float("nan")
     try:
         with alone_in(folder):
@@ -86,7 +89,7 @@ def run(config: dict[str, Any], folder: Path, overrides: list[str], *, resume: b
                 _require_same(folder, config)
             clear_unfinished(folder)
             with _settings(folder, config, overrides):
-                return _recorded(typed, folder, overrides, resume=resume)
+                return _recorded(experiment, folder, overrides, resume=resume)
     except OSError as problem:
         if (words := storage_error(problem)) is None:
             raise
@@ -122,12 +125,12 @@ def _require_same(folder: Path, config: dict[str, Any]) -> None:
     require_same_settings(folder, before, config)
 
 
-def _recorded(config: TrainConfig, folder: Path, overrides: list[str], *, resume: bool) -> float:
+def _recorded(experiment: Experiment, folder: Path, overrides: list[str], *, resume: bool) -> float:
     """Train with run.json and train.log kept, and give PSNR."""
     with _logged(folder / "train.log"):
-        record = RunRecord(folder, config.seed)
+        record = RunRecord(folder, experiment.method.seed)
         try:
-            metrics = train(config, folder, resume=resume, record=record, overrides=overrides)
+            metrics = train(experiment, folder, resume=resume, record=record, overrides=overrides)
             record.end("finished")
         except KeyboardInterrupt:
             record.end("interrupted")
@@ -145,93 +148,81 @@ def _recorded(config: TrainConfig, folder: Path, overrides: list[str], *, resume
 
 
 def train(
-    config: TrainConfig,
+    experiment: Experiment,
     folder: Path,
     *,
     resume: bool,
     record: RunRecord | None = None,
-    overrides: list[str] | None = None,
+    overrides: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Build, fit, score and report; only the process with a ``record`` reports.
 
     Returns:
         The content of metrics.json; empty without a ``record``.
     """
-    _check_device(config)
-    seed_everything(config.seed, verbose=False)
-    source = find_source(config.lrm, say=say)
+    method, settings = experiment.method, experiment.data
+    device = experiment.device
+    trainer = experiment.build_trainer(folder)
+    seed_everything(method.seed, verbose=False)
+    source = method.lrm.load(say)
     warm = warm_up.seconds
     started = time.monotonic()
-    scene = build_scene(config.data)
+    data = SceneDataModule(settings, seed=method.seed)
+    scene, views = data.scene, data.scene.splits["train"]
     if resume and record is not None and _has_checkpoint(folder):
-        require_same_views(folder, record.content, scene.splits["train"])
-    frame = build_frame(config, scene.splits["train"])
+        require_same_views(folder, record.content, views)
+    frame = method.model.frame(views, settings.half_side)
     loaded = time.monotonic() - started
-    start = prepare(config, scene, frame, source, say=say)
+    found = Initialisation(method.model, frame)
+    if source is not None:
+        place = Place(scene, frame, device, experiment.devices, say)
+        found = source.initialise(method, place)
     del source
-    config, frame = replace(config, model=start.model), start.frame
     began = time.monotonic() - warm_up.seconds
-    module = build_module(
-        config,
-        scene,
-        frame,
-        planes=start.planes,
-        decoder_state=start.decoder,
-        sparse=start.sparse,
-    )
-    data = RayDataModule(scene, frame, lambda rank: build_batches(config, scene, frame, rank))
+    module = RadianceModule(experiment.config, experiment.config.get("plugins") or [])
+    module.build(scene, frame, device=device, initialise=lambda *_: found)
     loaded += time.monotonic() - warm_up.seconds - began
     if record is not None:
-        device = training_device(config.trainer.accelerator)
         record.note(
             device=torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
             precision=module.field.precision,
             files={name: list(views.files) for name, views in scene.splits.items()},
         )
-        text = header(config, folder, scene, frame, module, device, overrides or [], start.words)
+        warm_up_loops(module, data, device)
+        expected = estimate(module, data, settings.eval_split)
+        text = header(experiment, folder, scene, module, overrides, expected)
         logger.info("\n%s", text)
         say(text + "\n")
-        write_start(folder, start.pictures, log=not resume)
-    scorer = fit(config, module, data, folder, resume=resume)
+        write_pictures(trainer, found.pictures, log=not resume)
+    trainer.train(module, data, find_resumable(folder / "checkpoints") if resume else None)
     if record is None:
         return {}
+    began = time.perf_counter()
+    scores = final_scores(trainer, module, data)
+    evaluation = find_callback(trainer, Evaluation)
+    scoring = time.perf_counter() - began + (0.0 if evaluation is None else evaluation.seconds)
     seconds = {
         "load": loaded,
         "warm_up": warm_up.seconds - warm,
-        "prepare": dict(start.seconds),
-        "train": module.clock,
-        "evaluate": scorer.seconds,
+        "prepare": dict(found.seconds),
+        "train": training_seconds(trainer),
+        "evaluate": scoring,
     }
-    skipped = data.batches(0).skipped
-    metrics = summary(module, scorer.latest, config.data.eval_split, seconds, skipped)
-    metrics["skipped"] |= start.skipped
-    metrics["decomposition"] = start.report
-    metrics["lrm"] = start.lrm
-    if config.trainer.media:
-        metrics["media"] = str(_film(module, frame, scene, folder).relative_to(folder))
+    skipped = data.batches_for(module, 0).skipped
+    metrics = summary(trainer, module, scores, settings.eval_split, seconds, skipped)
+    metrics["skipped"] |= found.skipped
+    metrics["decomposition"] = found.report
+    metrics["lrm"] = found.lrm
+    if experiment.media:
+        video = _video(module, found.frame, scene, folder)
+        metrics["media"] = str(video.relative_to(folder))
     seconds["total"] = record.total_seconds
     write_json(folder / "metrics.json", metrics)
-    write_hparams(folder, config, metrics)
-    text = closing(folder, config, metrics)
+    log_hparams(trainer, experiment, metrics)
+    text = closing(folder, experiment, metrics)
     logger.info("\n%s", text)
     say(text)
     return metrics
-
-
-def _check_device(config: TrainConfig) -> None:
-    """Refuse what the device cannot do, before anything slow begins."""
-    if training_device(config.trainer.accelerator).type != "cuda":
-        return
-    if config.trainer.deterministic:
-        raise ConfigError(
-            "trainer.deterministic=true: sums on a GPU come out in any order; set trainer=cpu, or "
-            "do without"
-        )
-    if config.trainer.devices > (found := torch.cuda.device_count()):
-        raise ConfigError(
-            f"trainer.devices={config.trainer.devices}: {found} GPUs found; set "
-            f"trainer.devices={found}, or trainer.accelerator=cpu"
-        )
 
 
 def say(text: str) -> None:
@@ -239,19 +230,18 @@ def say(text: str) -> None:
     print(text, flush=True)
 
 
-def _film(module: RadianceModule, frame: Frame, scene: Scene, folder: Path) -> Path:
+def _video(module: RadianceModule, frame: Frame, scene: Scene, folder: Path) -> Path:
     """The scene turning once while its time runs forth and back."""
     views = scene.splits["train"]
-    say(f"filming {FILM_FRAMES} frames of the turning scene ...")
-    longer = max(views.height, views.width)
-    size = min(FILM_SIZE, longer)
+    say(f"rendering {FILM_FRAMES} frames of the turning scene ...")
+    size = min(FILM_SIZE, max(views.height, views.width))
     frames = render_path(
         module.field,
         module.renderer,
         frame,
         orbit_poses(views, frame, FILM_FRAMES),
         film_times(FILM_FRAMES),
-        focal=views.focal * size / longer,
+        focal=views.intrinsics.focal_at(size),
         size=size,
         background=scene.background,
     )

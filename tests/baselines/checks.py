@@ -9,11 +9,11 @@ import torch
 
 from tests.baselines.runs import baseline_config
 from tests.refusals import assert_refused
-from xplanes.checks import parse
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
 from xplanes.evaluation.evaluate import evaluate
 from xplanes.evaluation.render import FilmOptions, film
 from xplanes.evaluation.runs import TrainedRun, load_run
+from xplanes.experiment import Experiment
 from xplanes.pipeline import run
 from xplanes.training.clock import TrainingClock
 
@@ -22,7 +22,7 @@ def check_refused(root: Path, words: str, *overrides: str) -> str:
     """These overrides make a configuration that is refused. Returns the message."""
 
     def call() -> None:
-        parse(baseline_config(root, *overrides))
+        Experiment.read(baseline_config(root, *overrides))
 
     return assert_refused(ConfigError, words, call, overrides)
 

@@ -11,11 +11,11 @@ SCENE = (
     "data.test_views=2",
     "data.val_views=1",
     "trainer.accelerator=cpu",
-    "trainer.precision=32",
+    "model.precision=32",
     "trainer.max_seconds=null",
-    "trainer.checkpoint_every=10",
-    "trainer.evaluate_at=[0,0.5]",
-    "trainer.media=false",
+    "callbacks.checkpoints.every=10",
+    "callbacks.evaluation.at=[0,0.5]",
+    "media=false",
 )
 
 KPLANES = (
@@ -24,24 +24,24 @@ KPLANES = (
     "model.channels=4",
     "model.width=16",
     "model.warmup_steps=10",
-    "trainer.rays_per_batch=128",
+    "model.rays.per_batch=128",
 )
 
 PROPOSAL = (
-    "sampler.resolutions=[8,12]",
-    "sampler.time_resolution=4",
-    "sampler.channels=4",
-    "sampler.width=16",
-    "sampler.proposal_samples=[32,24]",
-    "sampler.samples=16",
-    "sampler.anneal_steps=20",
+    "model.sampler.resolutions=[8,12]",
+    "model.sampler.time_resolution=4",
+    "model.sampler.channels=4",
+    "model.sampler.width=16",
+    "model.sampler.proposal_samples=[32,24]",
+    "model.sampler.samples=16",
+    "model.sampler.anneal_steps=20",
 )
 
 OCCUPANCY = (
-    "sampler.grid_resolution=16",
-    "sampler.samples=48",
-    "sampler.update_cells=256",
-    "sampler.coarse_steps=0",
+    "model.sampler.grid_resolution=16",
+    "model.sampler.samples=48",
+    "model.sampler.update_cells=256",
+    "model.sampler.coarse_steps=0",
 )
 
 
@@ -54,8 +54,8 @@ TINEUVOX = (
     "model.resolution=20",
     "model.width=16",
     "model.grow_at=[8,30]",
-    "sampler.step=1.0",
-    "trainer.rays_per_batch=128",
+    "model.sampler.step=1.0",
+    "model.rays.per_batch=128",
 )
 
 TENSOR4D = (
@@ -74,4 +74,4 @@ TENSOR4D = (
     "model.plane_learning_rate=0.02",
 )
 
-NEUS = ("trainer.rays_per_batch=64", "sampler.samples=16", "sampler.more_samples=9")
+NEUS = ("model.rays.per_batch=64", "model.sampler.samples=16", "model.sampler.more_samples=9")

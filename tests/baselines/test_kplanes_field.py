@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from tests.baselines.oracles import product_features
-from xplanes.fields.encodings import octaves, spherical_harmonics
 from xplanes.fields.kplanes import DensityField, ExplicitDecoder, HybridDecoder, KPlanes
-from xplanes.fields.networks import PaddedMLP, truncated_exponential
+from xplanes.fields.networks import PaddedMLP, octaves, spherical_harmonics, truncated_exponential
 from xplanes.fields.products import (
     PlaneProducts,
     plane_product,

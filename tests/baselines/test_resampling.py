@@ -8,9 +8,13 @@ import torch
 
 from tests.baselines import oracles
 from xplanes.rendering.compositing import composite_reference
-from xplanes.rendering.proposal import Level, ProposalRenderer, dense_samples
+from xplanes.rendering.proposal import (
+    Level,
+    ProposalRenderer,
+    dense_samples,
+    histogram_loss,
+)
 from xplanes.rendering.resampling import covering_weights, ray_weights, resample, uniform_edges
-from xplanes.training.losses import histogram_loss
 
 
 def bins(rays, count, seed=0):

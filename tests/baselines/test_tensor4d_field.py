@@ -9,13 +9,13 @@ import torch
 from tests.baselines import oracles
 from xplanes.fields.hierarchy import MOVING, STILL, HierarchicalPlanes, Level, bilinear
 from xplanes.fields.tensor4d import SkipNetwork, Tensor4D, Tensor4DDensity
-from xplanes.rendering.neus import NeusRenderer, section_opacity, weights_of
-from xplanes.training.losses import (
+from xplanes.models.tensor4d import (
     eikonal_error,
     feature_change,
     masked_colour_error,
     silhouette_error,
 )
+from xplanes.rendering.neus import NeusRenderer, section_opacity, weights_of
 
 
 def planes(groups=STILL, *, fine=True, size=6, filled=True):

@@ -5,10 +5,11 @@ import pytest
 from tests.baselines.checks import check_learns, check_refused, check_reload, check_resume
 from tests.baselines.runs import NEUS, OCCUPANCY, TENSOR4D, baseline_config
 from tests.synthetic import ball_views
-from xplanes.checks import parse
-from xplanes.training.assembly.site import Site, scene_cube
-from xplanes.training.assembly.tensor4d import tensor4d_method
-from xplanes.training.sampling.base import Moment
+from xplanes.errors import ConfigError
+from xplanes.experiment import Experiment
+from xplanes.models.initialisation import Method
+from xplanes.rendering.sampler import Site, scene_cube
+from xplanes.streams import TrainingState
 
 
 def test_surface_run_learns_goes_on_and_is_loaded(scenes, tmp_path, monkeypatch):
@@ -28,22 +29,24 @@ def test_density_run_learns_and_is_loaded(scenes, tmp_path):
         "model=tensor4d_density",
         *TENSOR4D,
         *OCCUPANCY,
-        "trainer.rays_per_batch=128",
-        "trainer.samples_per_batch=1024",
+        "model.rays.per_batch=128",
+        "model.rays.samples_per_batch=1024",
         "trainer.max_steps=20",
     )
     check_reload(check_learns(config, tmp_path / "run", gain=1.5))
 
 
-def method(scenes, *overrides):
-    config = parse(baseline_config(scenes, "model=tensor4d", *TENSOR4D, *overrides))
+def model(scenes, *overrides):
+    settings = Method.read(baseline_config(scenes, "model=tensor4d", *overrides)).model
     views = ball_views(4, 0.6)
-    return tensor4d_method(config, Site(views, scene_cube(config, views), "32"))
+    frame = settings.frame(views, None)
+    assert frame.scale == scene_cube(views, None).scale
+    return settings.build(Site(frame, views.times, 0, "32"))
 
 
 def test_planes_of_the_flow_are_trained_unless_left_out_as_released(scenes):
     for train in (True, False):
-        made = method(scenes, f"model.flow_planes={str(train).lower()}")
+        made = model(scenes, *TENSOR4D, f"model.flow_planes={str(train).lower()}")
         trained = {id(p) for group in made.groups() for p in group["params"]}
         left_out = {name for name, p in made.field.named_parameters() if id(p) not in trained}
         assert all(name.startswith("flow_planes.") for name in left_out)
@@ -53,17 +56,15 @@ def test_planes_of_the_flow_are_trained_unless_left_out_as_released(scenes):
 
 
 def test_fine_level_joins_and_planes_get_sharp_at_their_steps(scenes):
-    made = method(scenes)
+    made = model(scenes, *TENSOR4D)
     for step, fine, blurred in ((0, 0, 1), (14, 0, 1), (15, 1, 1), (29, 1, 1), (30, 1, 0)):
-        made.before_step(Moment(0, step, step, 0), made.optimizer(made.groups()))
+        made.before_step(TrainingState(0, step, step, 0), made.optimizer(made.groups()))
         for part in (made.field.canonical_planes, made.field.flow_planes):
             assert (bool(part.fine), bool(part.blurred)) == (fine, blurred)
 
 
 def test_learning_rates_are_the_published_ones(scenes):
-    config = parse(baseline_config(scenes, "model=tensor4d"))
-    views = ball_views(4, 0.6)
-    made = tensor4d_method(config, Site(views, scene_cube(config, views), "32"))
+    made = model(scenes)
     rates = {group["name"]: group["lr"] for group in made.groups()}
     assert rates.pop("canonical_planes") == rates.pop("flow_planes") == 0.0025
     assert set(rates.values()) == {0.0005}
@@ -73,10 +74,13 @@ def test_learning_rates_are_the_published_ones(scenes):
 
 def test_other_samplers_triplanes_and_losses_that_lack_terms_are_refused(scenes):
     for override, words in (
-        ("sampler=occupancy", "sampler=occupancy with model=tensor4d: .* neus"),
-        ("sampler=proposal", "sampler=proposal with model=tensor4d: .* neus"),
-        ("sampler=fixed_step", "sampler=fixed_step with model=tensor4d: .* neus"),
+        ("model/sampler=occupancy", r"model\.sampler\.name=occupancy: .* model/sampler=neus"),
+        ("model/sampler=proposal", r"model\.sampler\.name=proposal: .* model/sampler=neus"),
+        ("model/sampler=fixed_step", r"model\.sampler\.name=fixed_step: .* model/sampler=neus"),
         ("lrm=file", "lrm=file with model=tensor4d"),
-        ("loss=tensor4d_density", r"loss\.eikonal .* set loss=tensor4d"),
     ):
         check_refused(scenes, words, "model=tensor4d", override)
+    config = baseline_config(scenes, "model=tensor4d")
+    del config["model"]["loss"]["eikonal"]
+    with pytest.raises(ConfigError, match=r"model\.loss\.eikonal: it is not set"):
+        Experiment.read(config)

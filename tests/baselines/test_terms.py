@@ -8,28 +8,21 @@ import torch
 
 from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX, baseline_config
 from tests.synthetic import ball_scene
-from xplanes.checks import parse
-from xplanes.training.builder import build_frame, build_module
-from xplanes.training.losses import (
-    eikonal_error,
-    histogram_loss,
-    light_entropy,
-    masked_colour_error,
-    sample_colour_error,
-    silhouette_error,
-)
-from xplanes.training.methods.base import warm_cosine
-from xplanes.training.plane_terms import PlaneTerms
-from xplanes.training.sampling.base import Moment
+from xplanes.fields.regularisers import PlaneTerms
+from xplanes.models.base import warm_cosine
+from xplanes.models.tensor4d import eikonal_error, masked_colour_error, silhouette_error
+from xplanes.models.tineuvox import light_entropy, sample_colour_error
+from xplanes.rendering.proposal import histogram_loss
+from xplanes.streams import TrainingState
+from xplanes.training.module import RadianceModule
 
-FIRST = Moment(seed=0, step=0, batch=0, rank=0)
+FIRST = TrainingState(seed=0, step=0, batch=0, rank=0)
 
 
 def module_of(tmp_path, *overrides):
-    config = parse(baseline_config(tmp_path, *overrides))
-    scene = ball_scene()
-    frame = build_frame(config, scene.splits["train"])
-    return build_module(config, scene, frame), rays_of(frame)
+    module = RadianceModule(baseline_config(tmp_path, *overrides))
+    module.build(ball_scene())
+    return module, rays_of(module.frame)
 
 
 def rays_of(frame, count=24):
@@ -73,55 +66,60 @@ def test_kplanes_regularises_its_planes_and_those_of_the_density_fields(tmp_path
         "model=kplanes",
         *KPLANES,
         *PROPOSAL,
-        *("loss.total_variation=0.3", "loss.time_smoothness=0.7", "loss.time_identity=0.2"),
         *(
-            "sampler.total_variation=0.5",
-            "sampler.time_smoothness=0.1",
-            "sampler.time_identity=0.4",
+            "model.loss.total_variation=0.3",
+            "model.loss.time_smoothness=0.7",
+            "model.loss.time_identity=0.2",
+        ),
+        *(
+            "model.sampler.total_variation=0.5",
+            "model.sampler.time_smoothness=0.1",
+            "model.sampler.time_identity=0.4",
         ),
     )
     with torch.no_grad():
         for parameter in module.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
     planes = module.field.products
-    check_planes(planes, (0.3, 0.7, 0.2), lambda: module.method.regularise(FIRST))
-    proposals = module.sampling.renderer.proposals
+    check_planes(planes, (0.3, 0.7, 0.2), lambda: module.model.regularise(FIRST))
+    proposals = module.sampler.renderer.proposals
     assert len(proposals) == 2
     for proposal in proposals:
         module.zero_grad()
-        check_planes(proposal.products, (0.5, 0.1, 0.4), module.sampling.regularise)
+        check_planes(proposal.products, (0.5, 0.1, 0.4), module.sampler.regularise)
 
 
 def test_density_fields_learn_by_the_weighted_histogram_term(tmp_path):
     module, rays = module_of(
-        tmp_path, "model=kplanes", *KPLANES, *PROPOSAL, "sampler.histogram=0.3"
+        tmp_path, "model=kplanes", *KPLANES, *PROPOSAL, "model.sampler.histogram=0.3"
     )
-    rendering = module.sampling.render(module.field, rays, FIRST)
-    found = module.sampling.loss(rendering).detach()
+    rendering = module.sampler.render(module.field, rays, FIRST)
+    (found,) = (term.detach() for term in module.sampler.losses(rendering).values())
     assert float(found) == pytest.approx(0.3 * histogram_loss(rendering.levels).item(), rel=1e-6)
     assert float(found) > 0
-    total, error = module.method.loss(rendering, rays, FIRST)
-    assert total is error
+    (total,) = module.model.losses(rendering, rays, FIRST).values()
     assert total.item() == pytest.approx(error_of(rendering, rays).item(), rel=1e-6)
-    late = next(s for s in range(6000, 6006) if not module.sampling.schedule.learns(s))
-    still = module.sampling.render(module.field, rays, Moment(seed=0, step=late, batch=0, rank=0))
-    assert module.sampling.loss(still) is None
+    late = next(s for s in range(6000, 6006) if not module.sampler.schedule.learns(s))
+    still = module.sampler.render(
+        module.field, rays, TrainingState(seed=0, step=late, batch=0, rank=0)
+    )
+    assert module.sampler.losses(still) == {}
 
 
-def test_annealing_rises_as_published_and_stays_for_pictures(tmp_path):
+def test_annealing_rises_as_published_and_stays_for_images(tmp_path):
     small = [override for override in PROPOSAL if "anneal" not in override]
     module, rays = module_of(tmp_path, "model=kplanes", *KPLANES, *small)
-    sampling = module.sampling
+    sampler = module.sampler
     for step in (0, 1, 100, 500, 999, 1000, 30000):
         share = min(step / 1000, 1)
         expected = 10 * share / (9 * share + 1)
-        assert sampling.anneal(step) == pytest.approx(expected)
-        sampling.render(module.field, rays, Moment(seed=0, step=step, batch=0, rank=0))
-        assert float(sampling.renderer.exponent) == pytest.approx(expected)
+        assert sampler.anneal(step) == pytest.approx(expected)
+        sampler.render(module.field, rays, TrainingState(seed=0, step=step, batch=0, rank=0))
+        assert float(sampler.renderer.exponent) == pytest.approx(expected)
     # With an exponent of 0 all bins weigh the same, whatever the density fields hold.
-    sampling.render(module.field, rays, FIRST)
+    sampler.render(module.field, rays, FIRST)
     keys = ("origins", "directions", "times", "background")
-    flat = sampling.renderer.render(module.field, *(rays[key] for key in keys))
+    flat = sampler.renderer.render(module.field, *(rays[key] for key in keys))
     gaps = [level.edges.diff(dim=1) for level in flat.levels]
     for gap in gaps:
         torch.testing.assert_close(gap, gap.mean().expand_as(gap), atol=1e-5, rtol=1e-4)
@@ -138,8 +136,8 @@ def test_rates_rise_and_fall_as_published(tmp_path):
                 case = warmup, final, step, progress
                 assert found == pytest.approx(expected, abs=1e-12), case
     kplanes, _ = module_of(tmp_path, "model=kplanes", *KPLANES, *PROPOSAL, "model.warmup_steps=512")
-    assert kplanes.method.rate(255, 0.5) == pytest.approx(0.25)
-    assert kplanes.method.rate(10**4, 1.0) == pytest.approx(0)
+    assert kplanes.model.rate(255, 0.5) == pytest.approx(0.25)
+    assert kplanes.model.rate(10**4, 1.0) == pytest.approx(0)
 
 
 def test_tineuvox_adds_up_colours_decided_rays_and_single_samples(tmp_path):
@@ -149,13 +147,18 @@ def test_tineuvox_adds_up_colours_decided_rays_and_single_samples(tmp_path):
             tmp_path,
             "model=tineuvox_s",
             *TINEUVOX,
-            *(f"loss.entropy={entropy}", f"loss.sample_colour={spread}", "sampler.threshold=1e-30"),
+            *(
+                f"model.loss.entropy={entropy}",
+                f"model.loss.sample_colour={spread}",
+                "model.sampler.threshold=1e-30",
+            ),
         )
-        seen = module.sampling.render(module.field, rays, FIRST)
-        total, error = module.method.loss(seen, rays, FIRST)
-        assert float(error) == pytest.approx(float(error_of(seen, rays)), rel=1e-6)
-        single = sample_colour_error(seen.colours, rays["target"], seen.weights, seen.ray)
-        terms = entropy * light_entropy(seen.opacity) + spread * single
+        seen = module.sampler.render(module.field, rays, FIRST)
+        losses = module.model.losses(seen, rays, FIRST)
+        total, error = sum(losses.values()).detach(), error_of(seen, rays).detach()
+        assert losses["colour"].item() == pytest.approx(float(error), rel=1e-6)
+        single = sample_colour_error(seen.colours, rays["target"], seen.weights, seen.ray).detach()
+        terms = entropy * light_entropy(seen.opacity).detach() + spread * single
         assert float(total) == pytest.approx(float(error + terms), rel=1e-5)
         totals[entropy, spread] = float(total)
     assert len(set(totals.values())) == 4
@@ -176,20 +179,19 @@ def test_tensor4d_adds_up_its_terms(tmp_path, monkeypatch):
             "model=tensor4d",
             *TENSOR4D,
             *NEUS,
-            f"loss.eikonal={eikonal}",
-            f"loss.opacity={opacity}",
-            f"loss.smoothness={smoothness}",
-            f"loss.smoothness_distance={distance}",
-            f"loss.masked={str(masked).lower()}",
+            f"model.loss.eikonal={eikonal}",
+            f"model.loss.opacity={opacity}",
+            f"model.loss.smoothness={smoothness}",
+            f"model.loss.smoothness_distance={distance}",
+            f"model.loss.masked={str(masked).lower()}",
         )
         # Features that change by 3 per unit of length, whichever way.
         monkeypatch.setattr(module.field, "features", lambda places: 3 * places)
         monkeypatch.setattr(
             module.field, "distance", lambda places: (places.norm(dim=1) - 0.5, places.repeat(1, 8))
         )
-        seen = module.sampling.render(module.field, rays, FIRST)
-        total, error = module.method.loss(seen, rays, FIRST)
-        assert float(error) == pytest.approx(float(error_of(seen, rays)), rel=1e-6), weights
+        seen = module.sampler.render(module.field, rays, FIRST)
+        total = sum(module.model.losses(seen, rays, FIRST).values())
         mask = rays["alpha"]
         expected = masked_colour_error(
             seen.colour, rays["target"], mask if masked else torch.ones_like(mask)
@@ -197,6 +199,6 @@ def test_tensor4d_adds_up_its_terms(tmp_path, monkeypatch):
         expected = expected + eikonal * eikonal_error(seen.slopes, len(seen.samples))
         expected = expected + opacity * silhouette_error(seen.opacity, mask)
         change = (3 * distance) ** 2 / 3 * float(seen.weights.sum()) / len(mask)
-        expected = float(expected) + smoothness * change
+        expected = expected.item() + smoothness * change
         assert float(total) == pytest.approx(expected, rel=1e-4), weights
         assert change > 0, weights

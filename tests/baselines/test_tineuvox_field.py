@@ -8,9 +8,8 @@ import torch
 
 from tests.baselines import oracles
 from xplanes.fields.tineuvox import TiNeuVox
+from xplanes.models.tineuvox import MaskedAdam, light_entropy, sample_colour_error
 from xplanes.rendering.fixed_step import FixedStepRenderer
-from xplanes.training.losses import light_entropy, sample_colour_error
-from xplanes.training.masked_adam import MaskedAdam
 
 BOX = torch.tensor([[-2.0, -1.5, -1.0], [2.0, 1.0, 1.2]])
 

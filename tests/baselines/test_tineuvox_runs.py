@@ -6,9 +6,9 @@ import torch
 from tests.baselines.checks import check_learns, check_refused, check_reload, check_resume
 from tests.baselines.runs import OCCUPANCY, TINEUVOX, baseline_config
 from tests.synthetic import ball_views
-from xplanes.checks import parse
-from xplanes.training.assembly.site import Site
-from xplanes.training.assembly.tineuvox import frusta_box, tineuvox_frame, tineuvox_method
+from xplanes.models.initialisation import Method
+from xplanes.models.tineuvox import frusta_box
+from xplanes.rendering.sampler import Site
 
 FAST = ("model.network_learning_rate=0.004", "trainer.max_steps=34")
 
@@ -26,9 +26,9 @@ def test_grid_of_occupied_cells_serves_too(scenes, tmp_path):
     config = baseline_config(
         scenes,
         "model=tineuvox_b",
-        "sampler=occupancy",
+        "model/sampler=occupancy",
         "model.half_side=1.5",
-        *[o for o in TINEUVOX if not o.startswith("sampler")],
+        *[o for o in TINEUVOX if not o.startswith("model.sampler")],
         *OCCUPANCY,
         *FAST,
         "trainer.max_steps=24",
@@ -49,28 +49,32 @@ def test_box_holds_what_cameras_see_between_the_bounds(scenes):
 
 
 def test_learning_rates_and_cells_follow_the_published_schedule(scenes):
-    config = parse(baseline_config(scenes, "model=tineuvox_s"))
+    settings = Method.read(baseline_config(scenes, "model=tineuvox_s")).model
     views = ball_views(4, 0.6)
-    method = tineuvox_method(config, Site(views, tineuvox_frame(config, views), "32"))
+    frame, bounds = settings.frame(views, None), settings.bounds(views)
+    model = settings.build(Site(frame, views.times, 0, "32", bounds))
     steps = (0, 1999, 2000, 4000, 6000, 19999)
-    assert [method.voxels(s) for s in steps] == [125000, 125000, 250000, 500000, 1000000, 1000000]
+    assert [model.voxels(s) for s in steps] == [125000, 125000, 250000, 500000, 1000000, 1000000]
     for step, since in zip(steps, (0, 1999, 0, 0, 0, 13999), strict=True):
-        assert method.rate(step, 0.5) == pytest.approx(0.1 ** (since / 20000))
-    rates = {group["name"]: group["lr"] for group in method.groups()}
+        assert model.rate(step, 0.5) == pytest.approx(0.1 ** (since / 20000))
+    rates = {group["name"]: group["lr"] for group in model.groups()}
     assert (rates["grid"], rates["deformation"], rates["trunk"]) == (0.08, 0.0006, 0.0008)
 
 
 def test_settings_that_cannot_work_are_refused(scenes):
     for override, words in (
-        ("model.near=7", "must be below model.far=6.0"),
-        ("sampler.near=7", "must be below sampler.far=6.0"),
-        ("sampler.threshold=1", "must be below 1"),
+        ("model.near=7", r"model\.near=7\.0: must be below far=6\.0"),
+        ("model.sampler.near=7", r"model\.sampler\.near=7\.0: must be below far=6\.0"),
+        ("model.sampler.threshold=1", "must lie between 0 and 1"),
         ("model.alpha_start=1", "must lie between 0 and 1"),
         ("model.alpha_start=0", "must lie between 0 and 1"),
-        ("lrm=file", "triplanes start X-Planes alone"),
-        ("sampler.step=0", "must be above 0"),
+        ("lrm=file", "triplanes initialise X-Planes alone"),
+        ("model.sampler.step=0", "must be above 0"),
     ):
         check_refused(scenes, words, "model=tineuvox_s", override)
     # Samplers that need two stages refuse other models.
-    words = "sampler=fixed_step with model=six_planes: must be one"
-    check_refused(scenes, words, "sampler=fixed_step")
+    words = r"model\.sampler\.name=fixed_step: needs a field of cells.* model/sampler=occupancy"
+    check_refused(scenes, words, "model/sampler=fixed_step")
+    words = r"model\.sampler\.name=neus: needs a field with a surface.* model/sampler=occupancy"
+    for model in ("six_planes", "tineuvox_s"):
+        check_refused(scenes, words, f"model={model}", "model/sampler=neus")

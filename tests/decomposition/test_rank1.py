@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from xplanes.decomposition import TIME_ROWS, time_planes, unexplained_energy
-from xplanes.decomposition.rank1 import rank1_factors, shared_factors
+from xplanes.decomposition.conversion import rank1_factors, shared_factors
 
 
 def moving(frames=6, channels=3, size=12, seed=0):

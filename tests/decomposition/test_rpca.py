@@ -71,7 +71,7 @@ def test_several_blocks_and_both_layouts_give_the_same(monkeypatch):
         matrix = mixture(rows=300, columns=columns)
         whole = robust_pca(matrix, sparsity_weight="auto")
         with monkeypatch.context() as patch:
-            patch.setattr("xplanes.decomposition.passes.block_rows", lambda _: 96)
+            patch.setattr("xplanes.decomposition.svt.block_rows", lambda _: 96)
             blocks = robust_pca(matrix, sparsity_weight="auto")
             frames_first = robust_pca(matrix.mT.contiguous().mT, sparsity_weight="auto")
         for other in (blocks, frames_first):

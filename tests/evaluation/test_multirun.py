@@ -15,14 +15,14 @@ from xplanes.evaluation.table import SweepTable, choose_gpu
 
 ROOT = Path(__file__).resolve().parents[2]
 
-CHANGED = ("model.channels", "trainer.max_steps", "trainer.evaluate_at")
+CHANGED = ("model.channels", "trainer.max_steps", "callbacks.evaluation.at")
 
 
 def test_a_failed_job_is_a_row_and_the_others_go_on(trained_run: Path, tmp_path: Path):
     command = [
         *(sys.executable, str(ROOT / "train.py"), "-m", "model.channels=0,4"),
         *(option for option in SMALL if not option.startswith(CHANGED)),
-        *("trainer.max_steps=2", "trainer.evaluate_at=[]"),
+        *("trainer.max_steps=2", "callbacks.evaluation.at=[]"),
         *(f"data.root={trained_run.parents[1] / 'scenes'}", f"hydra.sweep.dir={tmp_path}"),
     ]
     environment = os.environ | {"OMP_WAIT_POLICY": "PASSIVE"}

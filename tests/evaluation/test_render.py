@@ -9,13 +9,20 @@ import pytest
 import torch
 from PIL import Image
 
-from xplanes.config import ConfigError
-from xplanes.evaluation.media import write_film
-from xplanes.evaluation.render import FilmOptions, check_out, film, poses, times, view_pose
+from xplanes.errors import ConfigError
+from xplanes.evaluation.render import (
+    FilmOptions,
+    check_out,
+    film,
+    poses,
+    times,
+    view_pose,
+    write_film,
+)
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.optional import MissingExtraError
 from xplanes.rendering.pictures import to_bytes
-from xplanes.training.scoring import render_view
+from xplanes.training.evaluation import render_view
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +85,8 @@ def test_a_webp_is_the_default(trained: TrainedRun):
 
 def test_a_film_of_upright_pictures_shows_all_of_their_height(trained: TrainedRun, tmp_path: Path):
     train = trained.scene.splits["train"]
-    upright = replace(train, images=train.images[:, :, : train.width // 2])
+    half, focal = train.images[:, :, : train.width // 2], float(train.intrinsics.focal[0, 0])
+    upright = replace(train, images=half, intrinsics=focal)
     scene = replace(trained.scene, splits=trained.scene.splits | {"train": upright})
     options = FilmOptions(frames=1, time="0.5")
     narrow = film(replace(trained, scene=scene), options, str(tmp_path / "narrow.png"))

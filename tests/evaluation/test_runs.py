@@ -8,8 +8,9 @@ import pytest
 import torch
 import yaml
 
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
 from xplanes.evaluation.runs import find_run, load_run
+from xplanes.scenes.datamodule import SceneDataModule
 
 
 @pytest.fixture
@@ -95,16 +96,26 @@ def test_a_run_without_checkpoint_says_so(copied: Path):
 
 def test_a_foreign_checkpoint_is_refused(copied: Path):
     torch.save({"weights": torch.zeros(3)}, copied / "checkpoints" / "last.ckpt")
-    with pytest.raises(ConfigError, match=r"not a checkpoint of train\.py"):
+    with pytest.raises(ConfigError, match="not a checkpoint of xplanes"):
         load_run(copied)
 
 
 def test_another_model_than_the_checkpoints_is_refused(copied: Path):
     config = yaml.safe_load((copied / "config.yaml").read_text())
-    config["model"]["channels"] *= 2
-    (copied / "config.yaml").write_text(yaml.safe_dump(config))
-    with pytest.raises(ConfigError, match="does not fit"):
-        load_run(copied)
+    model = config["model"]
+    for change in ({"channels": 2 * model["channels"]}, {"name": "nine", "plane_set": "nine"}):
+        changed = config | {"model": model | change}
+        (copied / "config.yaml").write_text(yaml.safe_dump(changed))
+        with pytest.raises(ConfigError, match="does not fit"):
+            load_run(copied)
+
+
+def test_the_data_of_a_run_is_that_which_it_was_trained_on(trained_run: Path):
+    data, trained = SceneDataModule.from_run(trained_run), load_run(trained_run)
+    assert data.seed == 0
+    assert data.settings == trained.experiment.data
+    for split, views in trained.scene.splits.items():
+        assert torch.equal(data.scene.splits[split].images, views.images)
 
 
 def test_other_training_views_are_refused(copied: Path):
@@ -123,5 +134,5 @@ def test_a_relative_data_folder_is_found_from_elsewhere(copied: Path, monkeypatc
     record = json.loads((copied / "run.json").read_text())
     (copied / "run.json").write_text(json.dumps(record | {"directory": str(root.parent)}))
     monkeypatch.chdir(tmp_path)
-    assert load_run(copied).config.data.root == str(root)
+    assert load_run(copied).experiment.data.root == str(root)
     assert not (tmp_path / root.name).exists()

@@ -11,7 +11,8 @@ import pytest
 import yaml
 from PIL import Image
 
-from xplanes.config import CONF, ConfigError
+from xplanes.config import CONF
+from xplanes.errors import ConfigError
 from xplanes.evaluation.curves import _mean_curve
 from xplanes.evaluation.published import read_published
 from xplanes.evaluation.sweep import Point, read_rows
@@ -271,7 +272,7 @@ def dnerf(
     run = make(folder, model=model, psnr=psnr)
     config = yaml.safe_load((run / "config.yaml").read_text())
     config["data"] |= {"name": "dnerf", "scene": scene, "resolution": 400}
-    config["sampler"] = {"name": settings.get("sampler", "proposal")}
+    config["model"]["sampler"] = {"name": settings.get("sampler", "proposal")}
     (run / "config.yaml").write_text(yaml.safe_dump(config))
     return run
 
@@ -292,7 +293,7 @@ def test_means_stand_beside_what_was_published(tmp_path: Path) -> None:
     assert [line[:5] for line in lines[:1]] == [["kplanes", "none", "proposal", "2", "25.50"]]
     for line, entry in zip(lines, entries, strict=False):
         assert line[6:] == [entry[n] for n in ("psnr", "ssim", "minutes", "scenes", "source")]
-    # Six planes at random were not published: their own figures stand alone.
+    # Six random planes were not published: their own figures stand alone.
     assert lines[-1][:5] == ["six_planes", "none", "occupancy", "1", "25.00"]
     assert set(lines[-1][6:]) == {""}
 
@@ -301,12 +302,12 @@ def test_means_keep_runs_with_other_settings_apart(tmp_path: Path) -> None:
     for weight, psnr in ((0.0, 26.0), (0.5, 24.0)):
         run = dnerf(tmp_path / f"{weight}", "lego", psnr)
         config = yaml.safe_load((run / "config.yaml").read_text())
-        config["loss"] = {"start_weight": weight}
+        config["model"]["loss"] = {"initial_weight": weight}
         (run / "config.yaml").write_text(yaml.safe_dump(config))
     found = [line[3:6] for line in published_lines(tmp_path) if line[4]]
     assert sorted(found) == [
-        ["loss.start_weight=0.0", "1", "26.00"],
-        ["loss.start_weight=0.5", "1", "24.00"],
+        ["model.loss.initial_weight=0.0", "1", "26.00"],
+        ["model.loss.initial_weight=0.5", "1", "24.00"],
     ]
 
 

@@ -10,14 +10,19 @@ from PIL import Image
 from tests.preparation.test_encode import frames_of, model_of
 from tests.preparation.test_reconstruct import publish
 from xplanes.cli import main
-from xplanes.config import ConfigError
+from xplanes.config import compose_plain
+from xplanes.errors import ConfigError
 from xplanes.evaluation import turntable as module
 from xplanes.evaluation.turntable import find_pictures, turntable, write_triplanes
-from xplanes.launch import settings
+from xplanes.experiment import Experiment
 from xplanes.lrm import LRMError
 from xplanes.preparation import load_triplanes
 from xplanes.preparation.encode import straight_alpha
 from xplanes.scenes.errors import SceneError
+
+
+def settings(*overrides: str) -> Experiment:
+    return Experiment.read(compose_plain("train", overrides))
 
 
 @pytest.fixture
@@ -81,8 +86,7 @@ def test_the_film_begins_at_the_models_camera_and_goes_round(few):
 
 def test_settings_that_make_no_triplanes_are_refused(tmp_path: Path, pictures):
     def make(*arguments, out="made.pt"):
-        config = settings(list(arguments))
-        write_triplanes([pictures], Path(out), config, say=lambda _: None)
+        write_triplanes([pictures], Path(out), settings(*arguments), say=lambda _: None)
 
     with pytest.raises(ConfigError, match=r"lrm=none makes no triplanes.*lrm=small"):
         make("lrm=none")
@@ -108,7 +112,7 @@ def test_opaque_pictures_are_remarked_upon(tmp_path: Path, few):
     Image.fromarray(np.full((30, 30, 3), 90, np.uint8)).save(picture)
     said: list[str] = []
     weights = publish(tmp_path, "openlrm-1.1")
-    config = settings(["lrm=small", f"lrm.weights={weights}", "preparation.cache=null"])
-    write_triplanes([picture], tmp_path / "a.pt", config, say=said.append)
+    experiment = settings("lrm=small", f"lrm.weights={weights}", "preparation.cache=null")
+    write_triplanes([picture], tmp_path / "a.pt", experiment, say=said.append)
     assert any("no transparency" in line for line in said)
     assert load_triplanes(tmp_path / "a.pt").triplanes.shape == (1, 3, 6, 8, 8)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from xplanes.evaluation.media import orbit_poses
+from xplanes.evaluation.render import orbit_poses
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.evaluation.viewer import HOST, Viewer, camera_pose, draw
 from xplanes.rendering.pictures import to_bytes
-from xplanes.training.scoring import render_view
+from xplanes.training.evaluation import render_view
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def test_cameras_come_back_as_ours(trained: TrainedRun):
 
 def test_a_picture_from_a_view_is_that_view(trained: TrainedRun):
     views = trained.views
-    fov = 2 * float(torch.atan(torch.tensor(0.5 * views.height / views.focal)))
+    fov = 2 * float(torch.atan(0.5 * views.height / views.intrinsics.focal[0, 1]))
     picture = draw(
         trained,
         views.camera_to_world[2],

@@ -17,8 +17,8 @@ from xplanes.files import MARK, read_rows
 ROOT = Path(__file__).resolve().parents[2]
 
 SETTINGS = (
-    "trainer.checkpoint_every=3",
-    "trainer.precision=32",
+    "callbacks.checkpoints.every=3",
+    "model.precision=32",
     "preparation.frames=6",
     "preparation.fixed_view=train",
     "preparation.fixed_view_steps=10",
@@ -121,7 +121,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def config_of(root: Path, lrm: str, cache: Path | None, *overrides: str) -> dict[str, Any]:
-    """A run of 40 steps with planes at random or from an LRM."""
+    """A run of 40 steps with random planes or from an LRM."""
     place = f"preparation.cache={'null' if cache is None else cache}"
     wide = ("model.channels=32", "model.decoder.width=64") if lrm == "tiny" else ()
     return small_config(root / "scenes", *SETTINGS, *wide, f"lrm={lrm}", place, *overrides)

@@ -13,7 +13,7 @@ import torch
 
 from tests.faults.conftest import config_of, outcome
 from tests.lrm.reduced import CONFIGS
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
 from xplanes.lrm import LRMError, load
 from xplanes.lrm.bundled import FOLDER, load_bundled
 from xplanes.pipeline import run
@@ -53,7 +53,9 @@ def half(nursery, shared, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("half") / "run"
     child = nursery.start(config_of(shared, "none", None), folder, resume=False)
     last = folder / "checkpoints" / "last.ckpt"
+    deadline = time.monotonic() + 60
     while not last.is_file() or load_checkpoint(last)["global_step"] < 24:
+        assert time.monotonic() < deadline, child.output()
         time.sleep(0.005)
     with suppress(ProcessLookupError):
         os.kill(child.pid, signal.SIGKILL)
@@ -73,7 +75,7 @@ def test_checkpoint(tally, nursery, shared, whole, half, tmp_path: Path, share: 
     else:
         cut(last, share)
     child = nursery.run(config_of(shared, "none", None), folder, resume=True)
-    tally.said(child.output(), "last.ckpt cannot be read", "damaged", "Going on from")
+    tally.said(child.output(), "last.ckpt cannot be read", "damaged", "Continuing from")
     assert outcome(folder) == whole["none"]
     tally.recovered()
 

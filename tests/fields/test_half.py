@@ -5,8 +5,7 @@ import itertools
 import torch
 
 from xplanes.fields.decoder import Decoder
-from xplanes.fields.half import ROWS, half_rows
-from xplanes.fields.networks import PaddedMLP
+from xplanes.fields.networks import ROWS, PaddedMLP, half_rows
 
 NETWORKS = {
     "decoder": lambda: Decoder(4, precision="bf16"),

@@ -16,8 +16,8 @@ from xplanes.lrm.canonical import OPENLRM_VIEW, TRIPOSR_VIEW
 from xplanes.lrm.images import Crop
 from xplanes.lrm.openlrm import turn_third_plane
 from xplanes.lrm.triposr import CHORD
+from xplanes.rendering.grid_renderer import DIAGONAL, GridRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.rendering.renderer import DIAGONAL, Renderer
 from xplanes.scenes.cameras import focal_length, look_at, pixel_rays
 
 VIEWS = {"openlrm": OPENLRM_VIEW, "triposr": TRIPOSR_VIEW}
@@ -165,7 +165,7 @@ def field_image(model, triplane, alignment, rays, samples=2000):
     planes = dict(zip(("xy", "xz", "yz"), triplane, strict=True))
     field = XPlanes(planes=planes, decoder=model.field_decoder(), plane_set="three")
     grid = OccupancyGrid(8, 1, step=DIAGONAL / samples, threshold=0.0, decay=1.0)
-    renderer = Renderer(grid, samples, skip_empty=False, occlusion=0.0)
+    renderer = GridRenderer(grid, samples, skip_empty=False, occlusion=0.0)
     origins, directions = alignment.field_frame.rays(*rays)
     return renderer.image(field, origins, directions, 0.5, torch.ones(3))["colour"]
 

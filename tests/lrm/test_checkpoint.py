@@ -14,8 +14,7 @@ from tests.lrm.reduced import CONFIGS, SIDES, published_shapes, random_state, re
 from tests.lrm.reference import FOLDER, VERSIONS, compare, config
 from xplanes.lrm import LRM, LRMError, load
 from xplanes.lrm.checkpoint import build, fill, mismatches
-from xplanes.lrm.config import parse_config
-from xplanes.lrm.published import PUBLISHED, published_config
+from xplanes.lrm.config import PUBLISHED, parse_config, published_config
 
 FAMILIES = list(CONFIGS)
 

@@ -7,8 +7,7 @@ from tests.lrm.reduced import CONFIGS
 from tests.refusals import assert_refused
 from xplanes.lrm import LRMError
 from xplanes.lrm.checkpoint import build
-from xplanes.lrm.config import parse_config
-from xplanes.lrm.published import PUBLISHED, published_config
+from xplanes.lrm.config import PUBLISHED, parse_config, published_config
 
 
 def test_family_is_guessed_or_named():

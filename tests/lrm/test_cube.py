@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from tests.lrm.reference import compare
-from xplanes.lrm.cube import MOST, fit_cube
+from xplanes.lrm.alignment import MOST, fit_cube
 
 SIZE = 10
 

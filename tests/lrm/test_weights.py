@@ -13,10 +13,8 @@ from safetensors.torch import save_file
 
 from tests.lrm.reduced import published_shapes, reduced
 from xplanes.lrm import LRMError
-from xplanes.lrm.config import parse_config
-from xplanes.lrm.published import published_config
-from xplanes.lrm.reachable import Probe
-from xplanes.lrm.weights import WeightSource, find_weights, load_weights, read_config
+from xplanes.lrm.config import parse_config, published_config
+from xplanes.lrm.weights import Probe, WeightSource, find_weights, load_weights, read_config
 
 SOURCE = WeightSource(
     architecture="openlrm-small-1.1",

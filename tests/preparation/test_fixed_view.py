@@ -1,4 +1,4 @@
-"""The fixed-view video: the scene's own, or filmed by a field."""
+"""The fixed-view video: the scene's own, or rendered by a field."""
 
 import math
 from dataclasses import replace
@@ -13,14 +13,14 @@ from tests.baselines.runs import KPLANES, PROPOSAL
 from tests.refusals import assert_refused
 from tests.synthetic import ball_scene, ball_views, inside_ball, swinging
 from tests.training.runs import small_config
-from xplanes.checks import parse
-from xplanes.config import ConfigError, compose_plain
-from xplanes.launch import settings as settings_of
+from xplanes.config import compose_plain
+from xplanes.errors import ConfigError
 from xplanes.lrm.alignment import align
 from xplanes.lrm.canonical import OPENLRM_VIEW, TRIPOSR_VIEW
+from xplanes.models.initialisation import Method, Place, RandomSettings
 from xplanes.preparation import fixed_view as module
 from xplanes.preparation.cache import StageCache
-from xplanes.preparation.fixed_view import canonical_pose, filming_settings, fixed_view, pick_frames
+from xplanes.preparation.fixed_view import canonical_pose, fixed_view, pick_frames, rendering_method
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, scene_frame
 
@@ -28,18 +28,18 @@ SMALL_FIELD = (
     "model.resolution=24",
     "model.channels=8",
     "model.decoder.width=32",
-    "sampler.grid_resolution=24",
-    "sampler.samples=64",
-    "sampler.update_cells=512",
-    "sampler.coarse_steps=10",
-    "sampler.sweep_at=[15]",
+    "model.sampler.grid_resolution=24",
+    "model.sampler.samples=64",
+    "model.sampler.update_cells=512",
+    "model.sampler.coarse_steps=10",
+    "model.sampler.sweep_at=[15]",
 )
 MOMENTS = torch.linspace(0, 1, 50)
 VIEWS = {"openlrm": OPENLRM_VIEW, "triposr": TRIPOSR_VIEW}
 
 
-def settings(folder: Path, *overrides: str):
-    return parse(
+def settings(folder: Path, *overrides: str) -> Method:
+    return Method.read(
         small_config(
             folder,
             "preparation.frames=4",
@@ -50,45 +50,69 @@ def settings(folder: Path, *overrides: str):
     )
 
 
-def film(config, scene, folder, size=24):
-    frame = scene_frame(scene.splits["train"])
+def default_settings(*overrides: str) -> Method:
+    return Method.read(compose_plain("train", overrides))
+
+
+def video_of(method, scene, folder, size=24):
     said = []
-    cache = StageCache(folder)
-    made = fixed_view(config, scene, frame, OPENLRM_VIEW, size, cache, say=said.append)
+    place = Place(scene, scene_frame(scene.splits["train"]), torch.device("cpu"), say=said.append)
+    made = fixed_view(method, place, OPENLRM_VIEW, size, StageCache(folder))
     return made, said
 
 
-def test_the_field_that_films_has_its_models_default_settings(tmp_path: Path):
-    own = settings(tmp_path, "model=nine_planes", "sampler.samples=16", "seed=3")
-    filming, default = filming_settings(own), settings_of([])
-    assert (filming.model, filming.loss) == (default.model, default.loss)
-    # Pictures for a model of few pixels need no more samples than training.
-    assert filming.sampler == replace(default.sampler, render_samples=default.sampler.samples)
-    assert filming.seed == 3
-    assert filming.data == own.data
-    assert (filming.trainer.accelerator, filming.trainer.max_steps) == ("cpu", 60)
+def test_the_field_that_renders_has_its_models_default_settings(tmp_path: Path):
+    changed = ("model=nine_planes", "model.sampler.samples=16", "model.precision=bf16")
+    rendering = rendering_method(settings(tmp_path, *changed, "seed=3"))
+    default = default_settings().model
+    # Images for a model of few pixels need no more samples than training.
+    sampler = replace(default.sampler, render_samples=default.sampler.samples)
+    assert sampler != default.sampler
+    assert rendering.model == replace(default, sampler=sampler, precision="bf16")
+    assert rendering.seed == 3
+    assert isinstance(rendering.lrm, RandomSettings)
+    assert rendering.losses == {}
 
 
-def test_kplanes_film_as_published(tmp_path: Path):
-    filming = filming_settings(settings(tmp_path, "preparation.fixed_view_model=kplanes"))
-    published = settings_of(["model=kplanes"])
-    assert (filming.model, filming.sampler, filming.loss) == (
-        published.model,
-        published.sampler,
-        published.loss,
-    )
-    assert not filming.data.skip_background
-    assert filming.trainer.rays_per_batch == published.trainer.rays_per_batch
+def test_it_trains_on_the_runs_device_within_the_preparations_budget(tmp_path: Path, monkeypatch):
+    asked = {}
+    monkeypatch.setattr(module, "fit_quietly", lambda *_, **options: asked.update(options))
+    video_of(settings(tmp_path), ball_scene(), tmp_path / "cache", size=4)
+    assert asked == {
+        "device": torch.device("cpu"),
+        "max_steps": 60,
+        "max_seconds": 1000.0,
+        "checkpoint_every": module.CHECKPOINT_EVERY,
+    }
 
 
-def test_a_model_that_is_not_there_cannot_film(tmp_path: Path):
-    with pytest.raises(ConfigError, match=r"fixed_view_model=nerf: must be one of kplanes, "):
+def test_it_leaves_the_run_as_deterministic_as_it_was(tmp_path: Path, small_fields):
+    method = settings(tmp_path, "preparation.fixed_view_steps=1")
+    before = torch.are_deterministic_algorithms_enabled()
+    try:
+        for wanted in (True, False):
+            torch.use_deterministic_algorithms(wanted)
+            video_of(method, ball_scene(), None, size=4)
+            assert torch.are_deterministic_algorithms_enabled() == wanted
+    finally:
+        torch.use_deterministic_algorithms(before)
+
+
+def test_kplanes_render_as_published(tmp_path: Path):
+    own = settings(tmp_path, "preparation.fixed_view_model=kplanes")
+    published = default_settings("model=kplanes").model
+    assert rendering_method(own).model == replace(published, precision=own.model.precision)
+    assert not published.rays.skip_background
+
+
+def test_a_model_that_is_not_there_cannot_render(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"^preparation\.fixed_view_model=nerf: .* of kplanes, "):
         settings(tmp_path, "preparation.fixed_view_model=nerf")
 
 
 @pytest.fixture
 def small_fields(monkeypatch):
-    """Fields that film are small, whichever their model."""
+    """Fields that render are small, whichever their model."""
 
     def composed(name, lines):
         reduced = (*KPLANES, *PROPOSAL) if "model=kplanes" in lines else SMALL_FIELD
@@ -120,20 +144,20 @@ class KnownField:
         return {"colour": hit[:, None] * colour, "opacity": hit.float()}
 
 
-def test_the_film_shows_what_the_field_holds_from_the_models_camera(tmp_path: Path, monkeypatch):
+def test_the_video_shows_what_the_field_holds_from_the_models_camera(tmp_path: Path, monkeypatch):
     """In K-Planes' own cube, with rays that begin as far away as in training."""
     scene, centre, fields = ball_scene(count=12, size=24), swinging(0.3, 0.5), []
 
-    def known(_config, _scene, frame, _folder):
+    def known(_rendering, _method, _place, frame, _folder):
         fields.append(KnownField(frame, 0.5, centre))
         return fields[0]
 
     monkeypatch.setattr(module, "_train", known)
-    config = settings(tmp_path, "preparation.fixed_view_model=kplanes")
-    made, _ = film(config, scene, tmp_path / "cache")
+    method = settings(tmp_path, "preparation.fixed_view_model=kplanes")
+    made, _ = video_of(method, scene, tmp_path / "cache")
     assert fields[0].frame.scale == pytest.approx(1 / 1.3)
     views = made.views
-    assert views.focal == pytest.approx(24 * OPENLRM_VIEW.focal)
+    assert views.intrinsics.focal == pytest.approx(24 * OPENLRM_VIEW.focal)
     expected = ball_views(
         4,
         0.5,
@@ -153,17 +177,19 @@ def test_the_film_shows_what_the_field_holds_from_the_models_camera(tmp_path: Pa
     torch.testing.assert_close((middle - frame.centre).norm(), away, rtol=1e-3, atol=0)
 
 
-def test_kplanes_film(tmp_path: Path, small_fields):
+def test_kplanes_render(tmp_path: Path, small_fields):
     options = ("preparation.fixed_view_model=kplanes", "preparation.fixed_view_steps=10")
-    made, said = film(settings(tmp_path, *options), ball_scene(), tmp_path / "cache", size=12)
+    made, said = video_of(settings(tmp_path, *options), ball_scene(), tmp_path / "cache", size=12)
     assert "training kplanes for" in said[0]
     assert made.views.images.shape == (4, 12, 12, 4)
 
 
 @pytest.mark.slow
-def test_kplanes_film_in_their_own_cube(tmp_path: Path, small_fields):
+def test_kplanes_render_in_their_own_cube(tmp_path: Path, small_fields):
     options = ("preparation.fixed_view_model=kplanes", "preparation.fixed_view_steps=200")
-    made, _ = film(settings(tmp_path, *options), ball_scene(count=12, size=24), tmp_path / "cache")
+    made, _ = video_of(
+        settings(tmp_path, *options), ball_scene(count=12, size=24), tmp_path / "cache"
+    )
     alpha = made.views.images[..., 3].float() / 255
     # Coarse planes blur it.
     assert alpha[:, 9:15, 9:15].mean() > 1.5 * alpha[:, :3, :3].mean() > 0
@@ -186,7 +212,7 @@ def test_of_a_scene_of_one_moment_the_frame_of_that_moment_is_picked(tmp_path: P
     views = still.splits["train"]
     views = replace(views, times=torch.full_like(views.times, 0.5))
     scene = replace(still, splits=still.splits | {"train": views}, video=ball_views(5, 0.5))
-    made, _ = film(settings(tmp_path), scene, tmp_path / "cache")
+    made, _ = video_of(settings(tmp_path), scene, tmp_path / "cache")
     assert made.views.times.tolist() == [0.5]
 
 
@@ -236,7 +262,7 @@ def test_without_an_azimuth_the_axis_nearest_to_a_camera_of_that_height_is_taken
 
 def test_the_scenes_video_costs_nothing(tmp_path: Path):
     scene = replace(ball_scene(), video=ball_views(9, 0.6))
-    made, said = film(settings(tmp_path), scene, tmp_path / "cache")
+    made, said = video_of(settings(tmp_path), scene, tmp_path / "cache")
     assert made.seconds == 0
     assert len(made.views) == 4
     assert said == []
@@ -245,12 +271,12 @@ def test_the_scenes_video_costs_nothing(tmp_path: Path):
 
 def test_a_video_that_is_not_there_is_refused(tmp_path: Path):
     with pytest.raises(SceneError, match=r"preparation\.fixed_view=video: ball has no video"):
-        film(settings(tmp_path, "preparation.fixed_view=video"), ball_scene(), tmp_path)
+        video_of(settings(tmp_path, "preparation.fixed_view=video"), ball_scene(), tmp_path)
 
 
-def test_a_field_films_the_scene_and_the_film_is_kept(tmp_path: Path, small_fields, monkeypatch):
+def test_a_field_renders_the_scene_and_the_video_is_kept(tmp_path: Path, small_fields, monkeypatch):
     scene, cache = ball_scene(count=12, size=24), tmp_path / "cache"
-    made, said = film(settings(tmp_path), scene, cache)
+    made, said = video_of(settings(tmp_path), scene, cache)
     assert len(said) == 1
     assert made.seconds > 0
     assert made.views.images.shape == (4, 24, 24, 4)
@@ -262,14 +288,14 @@ def test_a_field_films_the_scene_and_the_film_is_kept(tmp_path: Path, small_fiel
     assert (made.views.images[..., :3] <= made.views.images[..., 3:]).all()
     assert [p.suffix for p in sorted(cache.iterdir())] == [".lock", ".pt"]
     monkeypatch.setattr(module, "_train", None)
-    again, said = film(settings(tmp_path), scene, cache)
+    again, said = video_of(settings(tmp_path), scene, cache)
     assert said == []
     assert again.seconds == made.seconds
     assert torch.equal(again.views.images, made.views.images)
 
 
-def test_a_still_scene_is_filmed_once(tmp_path: Path, small_fields):
-    made, _ = film(
+def test_a_still_scene_is_rendered_once(tmp_path: Path, small_fields):
+    made, _ = video_of(
         settings(tmp_path, "preparation.fixed_view_steps=5"), ball_scene(moving=False), tmp_path
     )
     assert len(made.views) == 1
@@ -277,21 +303,21 @@ def test_a_still_scene_is_filmed_once(tmp_path: Path, small_fields):
 
 def test_an_interrupted_field_goes_on_where_it_stopped(tmp_path: Path, small_fields, monkeypatch):
     scene, cache = ball_scene(count=12, size=24), tmp_path / "cache"
-    config = settings(tmp_path, "preparation.fixed_view_steps=10")
+    method = settings(tmp_path, "preparation.fixed_view_steps=10")
 
     def stop(*_):
         raise KeyboardInterrupt
 
-    original = module._film
-    monkeypatch.setattr(module, "_film", stop)
+    original = module._render
+    monkeypatch.setattr(module, "_render", stop)
     with pytest.raises(KeyboardInterrupt):
-        film(config, scene, cache)
+        video_of(method, scene, cache)
     assert list(cache.glob("fixed_view-*/checkpoints/last.ckpt"))
     steps = []
-    monkeypatch.setattr(module, "_film", original)
+    monkeypatch.setattr(module, "_render", original)
     monkeypatch.setattr(
         module.RadianceModule, "training_step", lambda self, *_: steps.append(self.global_step)
     )
-    film(config, scene, cache)
+    video_of(method, scene, cache)
     assert steps == []  # all were done
     assert not list(cache.glob("fixed_view-*/"))

@@ -13,18 +13,17 @@ from tests.lrm.reduced import SIDES, reduced
 from tests.lrm.reference import compare
 from tests.synthetic import ball_scene, ball_views, inside_ball, surrounding
 from tests.training.runs import small_config
-from xplanes.checks import parse
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
+from xplanes.experiment import Experiment
 from xplanes.fields import Decoder, XPlanes
 from xplanes.lrm import LRMError
 from xplanes.lrm.triposr import CHORD
+from xplanes.models.initialisation import Method, Place
 from xplanes.pipeline import train
-from xplanes.preparation import find_source
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.encode import straight_alpha
 from xplanes.preparation.fixed_view import FixedView
-from xplanes.preparation.reconstruct import load_lrm, picture_crop, place, reconstruct
-from xplanes.preparation.start import prepare
+from xplanes.preparation.reconstruct import align_to, picture_crop, reconstruct
 from xplanes.scenes.frame import scene_frame
 
 CHOICES = {
@@ -48,18 +47,24 @@ def publish(folder: Path, name: str) -> Path:
     return path
 
 
-def settings(folder: Path, name: str, *overrides: str):
+def plain_settings(folder: Path, name: str, *overrides: str) -> dict:
     path = publish(folder / name, name)
-    return parse(
-        small_config(
-            folder,
-            *CHOICES[name],
-            f"lrm.weights={path}",
-            "preparation.frames=3",
-            "lrm.precision=32",
-            *overrides,
-        )
+    return small_config(
+        folder,
+        *CHOICES[name],
+        f"lrm.weights={path}",
+        "preparation.frames=3",
+        "lrm.precision=32",
+        *overrides,
     )
+
+
+def settings(folder: Path, name: str, *overrides: str) -> Method:
+    return Method.read(plain_settings(folder, name, *overrides))
+
+
+def silent(_: str) -> None:
+    pass
 
 
 def filmed(size=24, count=6):
@@ -74,23 +79,27 @@ def filmed(size=24, count=6):
     return replace(scene, video=video)
 
 
-def made_of(config, scene, cache=None):
+def place_of(scene):
     frame = scene_frame(scene.splits["train"])
-    lrm = load_lrm(config.lrm, say=lambda _: None)
-    said: list[str] = []
-    made = reconstruct(config, scene, frame, lrm, StageCache(cache), say=said.append)
-    return made, lrm, frame
+    return Place(scene, frame, torch.device("cpu"), say=silent)
+
+
+def made_of(method, scene, cache=None):
+    place = place_of(scene)
+    lrm = method.lrm.load_model(silent)
+    made = reconstruct(method, method.lrm, place, lrm, StageCache(cache))
+    return made, lrm, place.frame
 
 
 def check_field_of_model(folder: Path, name: str, matching: str) -> None:
     """The field has the colours and densities of the model, at their place in the world."""
-    config = settings(folder, name, f"lrm.matching={matching}", "lrm.crop=false")
+    method = settings(folder, name, f"lrm.matching={matching}", "lrm.crop=false")
     scene = filmed()
-    made, lrm, frame = made_of(config, scene)
+    made, lrm, frame = made_of(method, scene)
     sequence, model = made.sequence, lrm.model
     case = f"{name}, matching {matching}"
     assert len(sequence.triplanes) == 3, case
-    alignment = place(FixedView(scene.video, frame.centre, 0.0, ""), model, config.lrm)
+    alignment = align_to(FixedView(scene.video, frame.centre, 0.0, ""), model, method.lrm)
     options = dict(sequence.decoder_config)
     decoder = Decoder(sequence.triplanes.shape[2], **options)
     decoder.load_state_dict(dict(sequence.decoder))
@@ -153,16 +162,14 @@ def test_the_report_is_whole(tmp_path: Path):
 
 
 def test_equal_frames_count_as_skipped(tmp_path: Path):
-    config = settings(tmp_path, "openlrm-1.1", "preparation.frames=4", "preparation.cache=null")
+    method = settings(tmp_path, "openlrm-1.1", "preparation.frames=4", "preparation.cache=null")
     scene = filmed()
     images = scene.video.images.clone()
     images[1:4] = images[0]
     scene = replace(scene, video=replace(scene.video, images=images))
-    lrm = load_lrm(config.lrm, say=lambda _: None)
-    frame = scene_frame(scene.splits["train"])
-    start = prepare(config, scene, frame, lrm, say=lambda _: None)
-    assert start.lrm["frames"] == 4
-    assert start.skipped["frames"] == 1 - start.lrm["distinct"] / 4 > 0
+    found = method.lrm.load(silent).initialise(method, place_of(scene))
+    assert found.lrm["frames"] == 4
+    assert found.skipped["frames"] == 1 - found.lrm["distinct"] / 4 > 0
 
 
 def test_one_crop_holds_the_object_at_all_times(tmp_path: Path):
@@ -182,19 +189,19 @@ def test_one_crop_holds_the_object_at_all_times(tmp_path: Path):
 
 
 def test_weights_of_another_size_are_refused_before_any_scene_is_read(tmp_path: Path):
-    config = settings(tmp_path, "openlrm-1.1")
+    plain = plain_settings(tmp_path, "openlrm-1.1")
     wrong = publish(tmp_path / "wrong", "triposr")
     (tmp_path / "wrong" / "config.json").unlink()
-    config = replace(config, lrm=replace(config.lrm, weights=str(wrong)))
+    plain["lrm"]["weights"] = str(wrong)
     with pytest.raises(LRMError, match=r"does not fit openlrm-small-1\.1"):
-        train(config, tmp_path / "run", resume=False)
+        train(Experiment.read(plain), tmp_path / "run", resume=False)
     assert not (tmp_path / "excavator_32px_s0").exists()
 
 
 def test_missing_weights_name_the_way_out(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     with pytest.raises(LRMError, match=r"446 MB.*CC-BY-NC-4\.0.*lrm\.weights=FILE"):
-        find_source(parse(small_config(tmp_path, "lrm=small")).lrm)
+        Method.read(small_config(tmp_path, "lrm=small")).lrm.load(silent)
 
 
 def test_a_batch_without_images_is_refused(tmp_path: Path):

@@ -6,10 +6,8 @@ import functools
 import torch
 
 from xplanes.lrm.config import parse_config
-from xplanes.pretraining.command import compose_pretraining
-from xplanes.pretraining.observe import FOCAL
-from xplanes.pretraining.pool import Pool
-from xplanes.pretraining.samples import draw_sample
+from xplanes.pretraining.pool import FOCAL, Pool, draw_sample
+from xplanes.pretraining.run import compose_pretraining
 from xplanes.pretraining.settings import parse_pretraining, published_sizes
 
 OVERRIDES = (

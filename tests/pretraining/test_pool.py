@@ -7,14 +7,18 @@ import pytest
 import torch
 
 from tests.pretraining.small import SIDE, small_pool
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
 from xplanes.lrm.canonical import OPENLRM_VIEW, CanonicalView
 from xplanes.pretraining import pool as pool_module
-from xplanes.pretraining.batches import PretrainingBatches
 from xplanes.pretraining.objects import TRAINING_SEEDS, procedural_object
-from xplanes.pretraining.observe import FOCAL, cast, inside
-from xplanes.pretraining.pool import ensure_pool
-from xplanes.pretraining.samples import draw_sample
+from xplanes.pretraining.pool import (
+    FOCAL,
+    PretrainingBatches,
+    cast,
+    draw_sample,
+    ensure_pool,
+    inside,
+)
 
 VIEW = CanonicalView(OPENLRM_VIEW.rotation, 2.9, FOCAL, 1.0, 1.0)
 

@@ -12,11 +12,10 @@ from tests.pretraining.small import OVERRIDES, same, small_config, small_pool, s
 from xplanes.cli import main
 from xplanes.lrm import load
 from xplanes.pretraining import pool as pool_module
-from xplanes.pretraining.batches import PretrainingBatches
-from xplanes.pretraining.module import PATIENCE, PretrainingError, PretrainingModule
+from xplanes.pretraining.module import PATIENCE, PretrainingError, PretrainingModule, Upkeep
+from xplanes.pretraining.pool import PretrainingBatches
 from xplanes.pretraining.run import CHECKPOINT
 from xplanes.pretraining.start import start_model
-from xplanes.pretraining.upkeep import Upkeep
 
 
 @pytest.fixture(autouse=True)

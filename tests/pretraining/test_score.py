@@ -13,7 +13,7 @@ from xplanes.cli import main
 from xplanes.fields.decoder import Decoder
 from xplanes.lrm.canonical import OPENLRM_VIEW, CanonicalView
 from xplanes.pretraining import score as score_module
-from xplanes.pretraining.observe import FOCAL, camera, film_solids, inside
+from xplanes.pretraining.pool import FOCAL, camera, film_solids, inside
 from xplanes.pretraining.quick import QuickLook, overlap, world_to_model
 from xplanes.pretraining.score import Subject, demo_subjects, held_out, score, score_all
 from xplanes.pretraining.solids import BOX

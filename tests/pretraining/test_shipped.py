@@ -10,8 +10,8 @@ from xplanes.lrm.alignment import align
 from xplanes.lrm.bundled import FOLDER, bundled_models, load_bundled
 from xplanes.lrm.config import parse_config
 from xplanes.pretraining import score as score_module
-from xplanes.pretraining.command import compose_pretraining
-from xplanes.pretraining.observe import FOCAL
+from xplanes.pretraining.pool import FOCAL
+from xplanes.pretraining.run import compose_pretraining
 from xplanes.pretraining.score import held_out
 from xplanes.pretraining.settings import parse_pretraining, published_sizes
 from xplanes.scenes.demo.film import CAMERA_ANGLE_X, CAMERA_DISTANCE, camera_at

@@ -12,7 +12,7 @@ from xplanes.pretraining.objects import (
     TRAINING_SEEDS,
     procedural_object,
 )
-from xplanes.pretraining.observe import FOCAL, camera, cast, film_solids, inside
+from xplanes.pretraining.pool import FOCAL, camera, cast, film_solids, inside
 from xplanes.pretraining.solids import (
     BOX,
     BRICKS,

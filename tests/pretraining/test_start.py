@@ -7,13 +7,13 @@ import torch
 
 from tests.pretraining.small import same, small_config, small_plain, small_sizes
 from tests.refusals import assert_refused
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
 from xplanes.lrm import LRMError, load
 from xplanes.lrm.bundled import bundled_models, load_bundled
 from xplanes.lrm.canonical import canonical_vector
 from xplanes.lrm.config import parse_config
-from xplanes.pretraining.export import export, published_state
-from xplanes.pretraining.observe import FOCAL
+from xplanes.pretraining.pool import FOCAL
+from xplanes.pretraining.run import export, published_state
 from xplanes.pretraining.settings import parse_pretraining, published_sizes
 from xplanes.pretraining.start import grow_model, start_model
 

@@ -10,15 +10,15 @@ import pytest
 import torch
 from torch import nn
 
+from xplanes.decomposition.sparse_loss import SparseProduct
 from xplanes.fields import Decoder, XPlanes
 from xplanes.fields.kplanes import DensityField, ExplicitDecoder, HybridDecoder, KPlanes
 from xplanes.fields.products import PlaneProducts
+from xplanes.fields.regularisers import PlaneTerms
 from xplanes.fields.xplanes import PLANE_SETS, random_planes
 from xplanes.rendering.marching import _starts
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.proposal import ProposalRenderer
-from xplanes.training.plane_terms import PlaneTerms
-from xplanes.training.product import SparseProduct
 
 RAYS = 6
 

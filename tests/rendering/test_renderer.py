@@ -6,15 +6,15 @@ import math
 import pytest
 import torch
 
+from xplanes.rendering.grid_renderer import DIAGONAL, GridRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.rendering.renderer import DIAGONAL, Renderer
 
 COLOUR = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
 WHITE = torch.ones(3, dtype=torch.float64)
 
 
 def renderer_of(samples=64, resolution=4, **options):
-    return Renderer(OccupancyGrid(resolution, 1, step=DIAGONAL / samples), samples, **options)
+    return GridRenderer(OccupancyGrid(resolution, 1, step=DIAGONAL / samples), samples, **options)
 
 
 def fog(density):
@@ -89,7 +89,7 @@ def test_dropping_what_lies_behind_costs_less_than_its_threshold():
     renderer.grid.density.fill_(5.0)
     all_of_it = renderer.render(fog(5.0), *rays, WHITE)
     for occlusion in (1e-4, 1e-2):
-        quick = Renderer(renderer.grid, 128, occlusion=occlusion)
+        quick = GridRenderer(renderer.grid, 128, occlusion=occlusion)
         less = quick.render(fog(5.0), *rays, WHITE)
         assert less.samples.occluded > 0
         assert ((less.colour - all_of_it.colour).abs() <= occlusion).all()
@@ -109,7 +109,7 @@ def test_empty_cells_cost_nothing_where_there_is_nothing():
     less = renderer.render(ball, *rays, WHITE)
     assert less.samples.empty > 0.5 * less.samples.candidates
     torch.testing.assert_close(less.colour, whole.colour, atol=1e-12, rtol=0)
-    every = Renderer(renderer.grid, 128, skip_empty=False, occlusion=0.0)
+    every = GridRenderer(renderer.grid, 128, skip_empty=False, occlusion=0.0)
     assert every.render(ball, *rays, WHITE).samples.empty == 0
 
 

@@ -9,25 +9,30 @@ import torch
 
 from tests.oracles import project
 from tests.synthetic import ball_views
-from xplanes.scenes.batches import NEAR_SILHOUETTE, RayBatches, step_generator
+from xplanes.scenes.batches import NEAR_SILHOUETTE, RayBatches, RaySettings
 from xplanes.scenes.frame import Frame, cube_frame
 from xplanes.scenes.silhouettes import foreground
+from xplanes.streams import step_generator
 
 SQUARE = ball_views(5, 0.5, size=24)
-VIEWS = replace(SQUARE, images=SQUARE.images[:, 4:20].contiguous())  # 16 rows, 24 columns
+FOCAL = float(SQUARE.intrinsics.focal[0, 0])
+VIEWS = replace(SQUARE, images=SQUARE.images[:, 4:20].contiguous(), intrinsics=FOCAL)  # 16 x 24
 FRAME = cube_frame(1.4, torch.zeros(3))
 
 
-def batches_of(views=VIEWS, frame=FRAME, **options):
-    defaults = {
-        "rays": 64,
-        "seed": 0,
-        "background": "white",
-        "skip_background": True,
-        "background_share": 0.1,
-        "background_jitter": 0.0,
-    }
-    return RayBatches(views, frame, **{**defaults, **options})
+SETTINGS = RaySettings(
+    per_batch=64,
+    samples_per_batch=4096,
+    accumulate=1,
+    background="white",
+    skip_background=True,
+    background_share=0.1,
+    background_jitter=0.0,
+)
+
+
+def batches_of(views=VIEWS, frame=FRAME, *, seed=0, rank=0, **options):
+    return RayBatches(views, frame, replace(SETTINGS, **options), seed=seed, rank=rank)
 
 
 def same(first, second):
@@ -88,7 +93,7 @@ def pixels_of(batch, views, frame):
         pose = views.camera_to_world[view]
         torch.testing.assert_close(origin, pose[:3, 3], atol=1e-5, rtol=0)
         row, column, ok = project(
-            point.double().numpy(), pose.double().numpy(), views.focal, views.height, views.width
+            point.double().numpy(), pose.double().numpy(), FOCAL, views.height, views.width
         )
         assert ok
         found.append((view, row, column))
@@ -100,7 +105,7 @@ def test_targets_are_the_pixels_that_the_rays_go_through():
         0, 256, VIEWS.images.shape, generator=torch.Generator().manual_seed(0), dtype=torch.uint8
     )
     colours[..., :3] = torch.minimum(colours[..., :3], colours[..., 3:])  # multiplied by alpha
-    views = VIEWS.__class__(colours, VIEWS.camera_to_world, VIEWS.times, VIEWS.focal, VIEWS.files)
+    views = VIEWS.__class__(colours, VIEWS.camera_to_world, VIEWS.times, FOCAL, VIEWS.files)
     turned = Frame(0.3, torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), torch.ones(3))
     for background, frame in product(("white", "random"), (FRAME, turned)):
         case = f"{background} background, frame of scale {frame.scale}"
@@ -173,7 +178,7 @@ def test_the_share_of_background_rays_is_the_asked_one():
 
 def test_without_skipping_pixels_are_drawn_evenly():
     for options in ({"skip_background": False}, {"background_share": 1.0}):
-        batches = batches_of(rays=20_000, **options)
+        batches = batches_of(per_batch=20_000, **options)
         assert batches.skipped == 0, options
         views = batches.views
         height, width = views.height, views.width
@@ -183,8 +188,8 @@ def test_without_skipping_pixels_are_drawn_evenly():
             origins = FRAME.to_world(batch["origins"])
             view = torch.cdist(origins, views.camera_to_world[:, :3, 3]).argmin(dim=1)
             local = (batch["directions"][:, None] @ views.camera_to_world[view, :3, :3])[:, 0]
-            column = (local[:, 0] / -local[:, 2] * views.focal + width / 2).floor().long()
-            row = (-local[:, 1] / -local[:, 2] * views.focal + height / 2).floor().long()
+            column = (local[:, 0] / -local[:, 2] * FOCAL + width / 2).floor().long()
+            row = (-local[:, 1] / -local[:, 2] * FOCAL + height / 2).floor().long()
             pixel = (view * height + row) * width + column
             counts += torch.bincount(pixel, minlength=len(counts))
         expected = counts.sum() / len(counts)
@@ -196,7 +201,9 @@ def test_without_skipping_pixels_are_drawn_evenly():
 
 def test_images_that_are_all_background_or_all_content_are_drawn_evenly():
     for alpha in (0, 255):
-        batches = batches_of(replace(VIEWS, images=torch.full_like(VIEWS.images, alpha)), rays=2000)
+        batches = batches_of(
+            replace(VIEWS, images=torch.full_like(VIEWS.images, alpha)), per_batch=2000
+        )
         assert batches.skipped == 0, alpha
         batch = batches.draw(0)
         assert len(batch["times"].unique()) == 5, alpha
@@ -205,14 +212,14 @@ def test_images_that_are_all_background_or_all_content_are_drawn_evenly():
 
 
 def test_jitter_is_even():
-    jitter = torch.cat([batches_of(rays=1000).draw(step)["jitter"] for step in range(10)])
+    jitter = torch.cat([batches_of(per_batch=1000).draw(step)["jitter"] for step in range(10)])
     counts = torch.histc(jitter, bins=10, min=0, max=1)
     assert ((counts - 1000).abs() < 150).all()
 
 
 def test_only_rays_far_from_silhouettes_move_in_time_and_not_far():
-    still = batches_of(rays=4000, background_share=0.3).draw(3)
-    moved = batches_of(rays=4000, background_share=0.3, background_jitter=0.2).draw(3)
+    still = batches_of(per_batch=4000, background_share=0.3).draw(3)
+    moved = batches_of(per_batch=4000, background_share=0.3, background_jitter=0.2).draw(3)
     for name in ("origins", "directions", "target", "jitter"):
         assert torch.equal(still[name], moved[name]), name
     change = moved["times"] - still["times"]

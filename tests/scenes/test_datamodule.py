@@ -1,36 +1,36 @@
-"""The data module goes on where a checkpoint left off."""
+"""The data module goes on where a checkpoint left off, and serves whole views."""
 
 from types import SimpleNamespace
 
+import pytest
 import torch
 
 from tests.synthetic import ball_scene
-from xplanes.scenes.batches import RayBatches
-from xplanes.scenes.datamodule import RayDataModule
-from xplanes.scenes.frame import cube_frame
+from xplanes.errors import ConfigError
+from xplanes.scenes.batches import RayBatches, RaySettings
+from xplanes.scenes.datamodule import UNIFORM, SceneDataModule
+from xplanes.scenes.frame import cube_frame, scene_frame
+
+FRAME = cube_frame(1.4, torch.zeros(3))
+RAYS = RaySettings(
+    per_batch=8,
+    samples_per_batch=4096,
+    accumulate=1,
+    background="random",
+    skip_background=True,
+    background_share=0.1,
+    background_jitter=0.0,
+)
 
 
 def module_of(trained=0, rank=0):
-    scene, frame = ball_scene(), cube_frame(1.4, torch.zeros(3))
-
-    def batches(number):
-        return RayBatches(
-            scene.splits["train"],
-            frame,
-            rays=8,
-            seed=3,
-            background="random",
-            skip_background=True,
-            background_share=0.1,
-            background_jitter=0.0,
-            rank=number,
-        )
-
-    module = RayDataModule(scene, frame, batches)
-    module.trainer = SimpleNamespace(
-        global_rank=rank, lightning_module=SimpleNamespace(batches=trained)
-    )
-    return module, batches
+    """The data as a trainer has it, and what it should draw."""
+    scene = ball_scene()
+    data = SceneDataModule.of(scene, seed=3)
+    training = SimpleNamespace(batches=trained, ray_settings=RAYS, frame=FRAME)
+    data.trainer = SimpleNamespace(global_rank=rank, lightning_module=training, limit_val_batches=0)
+    views = scene.splits["train"]
+    return data, lambda number: RayBatches(views, FRAME, RAYS, seed=3, rank=number)
 
 
 def take(module, count):
@@ -61,8 +61,57 @@ def test_a_resumed_run_draws_what_an_uninterrupted_one_would():
             assert same(a, b), trained
 
 
-def test_every_pass_over_the_loader_starts_at_the_same_batch():
-    module, _ = module_of()
+def test_passes_over_the_loader_follow_one_another():
+    """A trainer that starts epochs sees batches that no epoch before had."""
+    module, batches = module_of()
     loader = module.train_dataloader()
-    first, again = next(iter(loader)), next(iter(loader))
-    assert same(first, again)
+    first, second = next(iter(loader)), next(iter(loader))
+    assert same(first, batches(0).draw(0))
+    assert same(second, batches(0).draw(1))
+    views = module.scene.splits["train"]
+    assert len(loader) == len(views) * views.height * views.width // RAYS.per_batch
+
+
+def test_another_module_begins_with_the_first_batch():
+    module, batches = module_of()
+    take(module, 3)
+    module.setup("fit")
+    assert same(take(module, 1)[0], batches(0).draw(0))
+
+
+def test_no_rays_of_held_out_views_are_trained_on():
+    """Though the batches were asked for before, as when loops are warmed up."""
+    data = SceneDataModule.of(ball_scene(count=16))
+    assert len(data.batches(0).views) == 16
+    data.setup("fit")
+    held_out, views = data.scene.splits["val"], data.batches(0).views
+    assert len(held_out) + len(views) == 16
+    assert not set(held_out.files) & set(views.files)
+
+
+def test_a_module_that_says_nothing_gets_rays_over_all_pixels_in_the_scenes_cube():
+    data = SceneDataModule.of(ball_scene(), seed=3)
+    views = data.scene.splits["train"]
+    expected = RayBatches(views, scene_frame(views), UNIFORM, seed=3).draw(0)
+    assert same(take(data, 1)[0], expected)
+    assert len(expected["times"]) == 1024
+
+
+def test_whole_views_are_rays_in_the_world_and_their_colours():
+    data = SceneDataModule.of(ball_scene())
+    views = data.scene.splits["test"]
+    for loader in (data.test_dataloader(), data.predict_dataloader()):
+        batches = list(loader)
+        assert [batch["index"] for batch in batches] == list(range(len(views)))
+        for index, batch in enumerate(batches):
+            origins, directions = views.image_rays(index)
+            assert torch.equal(batch["origins"], origins)
+            assert torch.equal(batch["directions"], directions)
+            assert batch["time"] == views.times[index]
+            assert torch.equal(batch["background"], data.scene.background)
+            assert torch.equal(batch["target"], views.composite(index, data.scene.background))
+
+
+def test_a_folder_that_holds_no_run_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match=f"{tmp_path} is not a run directory"):
+        SceneDataModule.from_run(tmp_path)

@@ -14,11 +14,21 @@ from tests.refusals import assert_refused
 from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.demo import DEMO_SCENES, Assembly, Joint, Part, build_demo_scene
 from xplanes.scenes.demo.film import CAMERA_ANGLE_X, CAMERA_DISTANCE, camera_at, film
+from xplanes.scenes.demo.geometry import (
+    Box,
+    Bricks,
+    Capsule,
+    Checker,
+    Cylinder,
+    Ellipsoid,
+    Plain,
+    Sectors,
+    Stripes,
+    Torus,
+    rgb,
+)
 from xplanes.scenes.demo.motions import Bounce, Keys, Steady, Swing
-from xplanes.scenes.demo.primitives import Box, Capsule, Cylinder, Ellipsoid
 from xplanes.scenes.demo.shading import Light
-from xplanes.scenes.demo.surfaces import Bricks, Checker, Plain, Sectors, Stripes, rgb
-from xplanes.scenes.demo.torus import Torus
 
 RED, BLUE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 

@@ -9,8 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from xplanes.scenes.demo.primitives import Box, Capsule, Cylinder, Ellipsoid
-from xplanes.scenes.demo.torus import Torus
+from xplanes.scenes.demo.geometry import Box, Capsule, Cylinder, Ellipsoid, Torus
 
 SHAPES = [
     Box((0.5, 0.3, 0.7)),

@@ -98,7 +98,7 @@ def test_reads_images_cameras_and_times(scene):
     assert result.video is None
     assert views.files == tuple(f"train/r_{i}.png" for i in range(5))
     assert views.times.tolist() == [0, 0.25, 0.5, 0.75, 1]
-    assert views.focal == pytest.approx(focal_length(ANGLE, 12))
+    assert views.intrinsics.focal == pytest.approx(focal_length(ANGLE, 12))
     assert views.images.dtype == torch.uint8
     for i in range(5):
         torch.testing.assert_close(views.camera_to_world[i], torch.tensor(pose(i)))
@@ -110,7 +110,7 @@ def test_integer_factors_average_premultiplied_blocks(scene):
     for factor in (2, 3, 4, 12):
         views = scene.read(resolution=12 // factor).splits["train"]
         assert views.images.shape == (5, 12 // factor, 12 // factor, 4)
-        assert views.focal == pytest.approx(focal_length(ANGLE, 12 // factor)), factor
+        assert views.intrinsics.focal == pytest.approx(focal_length(ANGLE, 12 // factor)), factor
         for i in range(5):
             expected = box_average(picture(i), factor)
             assert np.abs(views.images[i].numpy() - expected).max() <= 1, factor
@@ -203,8 +203,8 @@ def test_focal_length_in_pixels_instead_of_an_angle(scene):
     del scene.contents["train"]["camera_angle_x"]
     scene.contents["train"] |= {"fl_x": 30.0, "fl_y": 30.0, "w": 24, "h": 24, "cx": 12, "cy": 12}
     scene.write()
-    assert scene.read().splits["train"].focal == pytest.approx(15)
-    assert scene.read(resolution=6).splits["train"].focal == pytest.approx(7.5)
+    assert scene.read().splits["train"].intrinsics.focal == pytest.approx(15)
+    assert scene.read(resolution=6).splits["train"].intrinsics.focal == pytest.approx(7.5)
 
 
 def test_no_times_at_all_is_a_static_scene(scene):
@@ -389,8 +389,20 @@ def test_damaged_or_missing_image(scene):
 
 
 def test_images_of_different_sizes(scene):
-    Image.fromarray(picture(0, 8)).save(scene.path / "train" / "r_3.png")
+    Image.fromarray(picture(0, 8)[:6]).save(scene.path / "train" / "r_3.png")
     message = scene.error(resolution=4)
+    assert "r_3.png has 8x6" in message
+    assert "data.resolution=null" in message
+    Image.fromarray(picture(0, 8)).save(scene.path / "train" / "r_3.png")
+    message = scene.error(resolution=9)
+    assert "data.resolution=9 is more than the 8 pixels" in message
+    assert "r_3.png" in message
+
+
+def test_pictures_of_different_sizes_make_no_film(scene):
+    Image.fromarray(picture(0, 8)).save(scene.path / "train" / "r_3.png")
+    paths = [scene.path / "train" / f"r_{i}.png" for i in (0, 3)]
+    message = assert_refused(SceneError, "", partial(load_images, paths, None), None)
     assert "r_3.png has 8x8" in message
     assert "r_0.png has 12x12" in message
 
@@ -508,7 +520,7 @@ def test_field_of_view_out_of_range(scene):
 def test_field_of_view_missing(scene):
     whole = scene.contents["train"]
     del whole["camera_angle_x"]
-    for other in ({}, {"fl_x": 30}, {"fl_x": 0, "w": 12}):
+    for other in ({}, {"w": 12}, {"fl_x": 0, "w": 12}, {"fl_x": None}, {"fl_y": 30}):
         scene.contents["train"] = whole | other
         scene.write()
         message = scene.error(other)
@@ -517,21 +529,36 @@ def test_field_of_view_missing(scene):
 
 
 def test_lenses_that_are_not_read(scene):
-    whole = scene.contents["train"]
+    whole, frame = scene.contents["train"], dict(scene.frame(1))
     for other, word in (
-        ({"k1": 0.1}, "k1"),
-        ({"fl_x": 10, "fl_y": 12}, "fl_y"),
-        ({"cx": 3, "w": 12}, "cx"),
+        ({"k1": 0.1}, "k1=0.1"),
+        ({"k4": -1e-3}, "k4"),
+        ({"p2": "a"}, "p2"),
+        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model=OPENCV_FISHEYE"),
+        ({"is_fisheye": True}, "is_fisheye"),
     ):
         scene.contents["train"] = whole | other
         scene.write()
         message = scene.error(other)
         assert word in message
         assert "undistort" in message, word
-    scene.contents["train"] = whole
-    scene.frame(1)["camera_angle_x"] = 0.5
-    scene.write()
-    assert "camera_angle_x of single frames" in scene.error()
+        scene.contents["train"] = whole
+        scene.frame(1).update(other)
+        scene.write()
+        message = scene.error(other)
+        assert "frame 1" in message, word
+        assert word in message
+        scene.contents["train"]["frames"][1] = dict(frame)
+
+
+def test_lenses_that_are_no_numbers(scene):
+    whole = scene.contents["train"]
+    for key, value in (("fl_x", "30"), ("fl_x", -3), ("fl_y", math.inf), ("cx", []), ("w", "a")):
+        scene.contents["train"] = whole | {"fl_x": 30, key: value}
+        scene.write()
+        message = scene.error((key, value))
+        assert f"{key} is {value!r}" in message
+        assert "in pixels, or be left out" in message
 
 
 def test_video_of_a_moving_camera(scene):
@@ -550,7 +577,7 @@ def test_lego():
     train, val = scene.splits["train"], scene.splits["val"]
     assert (len(train), len(val)) == (8, 11)
     assert (train.times[0], train.times[-1]) == (0, 1)
-    assert train.focal == pytest.approx(138.8889, abs=1e-3)
+    assert train.intrinsics.focal == pytest.approx(138.8889, abs=1e-3)
     distances = train.camera_to_world[:, :3, 3].norm(dim=1)
     torch.testing.assert_close(distances, torch.full((8,), 4.0311), atol=1e-3, rtol=0)
     assert (train.images[..., :3] <= train.images[..., 3:]).all()

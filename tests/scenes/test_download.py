@@ -13,7 +13,7 @@ import pytest
 
 from tests.refusals import assert_refused
 from xplanes.scenes import download as download_module
-from xplanes.scenes import fetch as fetch_module
+from xplanes.scenes import download as fetch_module
 from xplanes.scenes.download import DNERF_URL, TRAIN_VIEWS, download_dnerf
 from xplanes.scenes.errors import SceneError
 

@@ -10,6 +10,10 @@ from tests.synthetic import ball_views, inside_ball, swinging
 from xplanes.scenes.silhouettes import MOST_VIEWS, WINDOW, foreground, join_in_time, may_hold
 
 
+def focal_of(views):
+    return float(views.intrinsics.focal[0, 0])
+
+
 def silhouette_hull(views, points, *, radius):
     return join_in_time(may_hold(views, points, radius=radius), views.times)
 
@@ -41,7 +45,10 @@ def test_without_a_radius_the_hull_is_that_of_projected_points():
     points = grid_points()
     found = silhouette_hull(views, points, radius=0.0)
     expected = visual_hull(
-        views.images[..., 3].numpy(), views.camera_to_world.double().numpy(), views.focal, points
+        views.images[..., 3].numpy(),
+        views.camera_to_world.double().numpy(),
+        focal_of(views),
+        points,
     )
     assert 0.01 < expected.mean() < 0.9
     assert (found == found[0]).all()
@@ -54,7 +61,7 @@ def test_a_moving_hull_asks_every_view_of_some_span_around():
         points = grid_points(cells=5)
         alpha, poses = views.images[..., 3].numpy(), views.camera_to_world.double().numpy()
         single = [
-            visual_hull(alpha[i : i + 1], poses[i : i + 1], views.focal, points)
+            visual_hull(alpha[i : i + 1], poses[i : i + 1], focal_of(views), points)
             for i in range(count)
         ]
         span = max(1, min(MOST_VIEWS, round(WINDOW * count)))
@@ -87,7 +94,7 @@ def test_what_is_out_of_sight_is_not_ruled_out():
     poses = views.camera_to_world.double().numpy()
     unseen = torch.tensor(
         [
-            not any(project(p, pose, views.focal, 24, 24)[2] for pose in poses)
+            not any(project(p, pose, focal_of(views), 24, 24)[2] for pose in poses)
             for p in points.numpy()
         ]
     )
@@ -120,6 +127,7 @@ def test_the_order_of_the_views_does_not_matter():
 
 def test_images_need_not_be_square():
     views = ball_views(8, 0.5, size=30, times=torch.zeros(8))
-    cut = replace(views, images=views.images[:, 5:25])  # the middle rows: same focal length
+    middle = views.images[:, 5:25]  # rows: same focal length
+    cut = replace(views, images=middle, intrinsics=focal_of(views))
     points = inside_ball(300, 0.5)
     assert silhouette_hull(cut, points, radius=0.05).all()

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from tests.synthetic import ball_scene, ball_views
-from xplanes.scenes.still import SAME, at_one_moment, stands_still
+from xplanes.scenes.source import SAME, at_one_moment, stands_still
 
 
 def film(*, change: int = 0, count: int = 5):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
 from xplanes.lrm import LRMError
 from xplanes.scenes.errors import SceneError
 from xplanes.training.module import TrainingError

@@ -8,25 +8,23 @@ import torch
 from torch import Tensor
 
 from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX
-from xplanes.checks import parse
-from xplanes.config import TrainConfig, compose_plain
+from xplanes.config import compose_plain
+from xplanes.experiment import Experiment
 from xplanes.pipeline import run
-from xplanes.scenes.frame import Frame
-from xplanes.training.builder import build_frame, build_module, build_scene
 from xplanes.training.module import RadianceModule
 
 XPLANES = (
     "model.resolution=16",
     "model.channels=8",
     "model.decoder.width=32",
-    "sampler.grid_resolution=16",
-    "sampler.samples=48",
-    "sampler.update_cells=256",
-    "sampler.coarse_steps=10",
-    "sampler.sweep_at=[15]",
-    "trainer.rays_per_batch=128",
+    "model.sampler.grid_resolution=16",
+    "model.sampler.samples=48",
+    "model.sampler.update_cells=256",
+    "model.sampler.coarse_steps=10",
+    "model.sampler.sweep_at=[15]",
+    "model.rays.per_batch=128",
 )
-SMALLER = ("model.width=16", "trainer.rays_per_batch=32")
+SMALLER = ("model.width=16", "model.rays.per_batch=32")
 
 MODELS: dict[str, tuple[str, ...]] = {
     "six_planes": XPLANES,
@@ -44,8 +42,8 @@ SLOW = ("tensor4d", "tensor4d_density")
 """Models that get fewer steps."""
 
 RATES = {
-    "six_planes": ("trainer.plane_lr", "trainer.time_lr", "trainer.decoder_lr"),
-    "nine_planes": ("trainer.plane_lr", "trainer.time_lr", "trainer.decoder_lr"),
+    "six_planes": ("model.plane_lr", "model.time_lr", "model.decoder_lr"),
+    "nine_planes": ("model.plane_lr", "model.time_lr", "model.decoder_lr"),
     "kplanes": ("model.learning_rate",),
     "kplanes_explicit": ("model.learning_rate",),
     "tineuvox_s": ("model.grid_learning_rate", "model.network_learning_rate"),
@@ -70,11 +68,11 @@ def settings(model: str, scene: Path, *overrides: str, lrm: str = "none") -> dic
             f"lrm={lrm}",
             *MODELS[model],
             "trainer.accelerator=cpu",
-            "trainer.precision=32",
+            "model.precision=32",
             f"trainer.max_steps={steps}",
             "trainer.max_seconds=null",
-            "trainer.evaluate_at=[]",
-            "trainer.media=false",
+            "callbacks.evaluation.at=[]",
+            "media=false",
             "preparation.cache=null",
             *overrides,
         ],
@@ -99,10 +97,10 @@ def trained(config: dict[str, Any], folder: Path) -> dict[str, Tensor]:
     return checkpoint["state_dict"] | {f"score.{k}": torch.tensor(v) for k, v in scores.items()}
 
 
-def built(config: dict[str, Any]) -> tuple[TrainConfig, RadianceModule, Frame]:
+def built(config: dict[str, Any]) -> RadianceModule:
     """The module of a run that has not begun."""
-    typed = parse(config)
-    scene = build_scene(typed.data)
-    frame = build_frame(typed, scene.splits["train"])
+    experiment = Experiment.read(config)
     torch.manual_seed(0)
-    return typed, build_module(typed, scene, frame), frame
+    module = RadianceModule(config)
+    module.build(experiment.data.read(), half_side=experiment.data.half_side)
+    return module

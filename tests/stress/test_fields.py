@@ -15,8 +15,8 @@ from tests.stress.test_lookup import spread
 from xplanes.fields import Decoder, XPlanes
 from xplanes.fields.xplanes import SPACE_PLANES, TIME_PLANES
 from xplanes.preparation.sequence import TriplaneSequence, save_triplanes
+from xplanes.rendering.grid_renderer import DIAGONAL, GridRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.rendering.renderer import DIAGONAL, Renderer
 
 pytestmark = pytest.mark.stress
 
@@ -41,7 +41,7 @@ def seen(field, samples, rays=16):
     aim = 0.5 * torch.randn(rays, 3, generator=generator) - origins
     directions = aim / aim.norm(dim=1, keepdim=True)
     times = torch.linspace(0, 1, rays)
-    renderer = Renderer(OccupancyGrid(8, 2, step=DIAGONAL / samples), samples)
+    renderer = GridRenderer(OccupancyGrid(8, 2, step=DIAGONAL / samples), samples)
     inputs = (t.to(field.space.dtype) for t in (origins, directions, times, torch.ones(3)))
     rendering = renderer.render(field, *inputs)
     rendering.colour.square().sum().backward()

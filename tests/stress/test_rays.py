@@ -7,7 +7,7 @@ import torch
 
 from tests.stress.models import MODELS, built, settings
 from tests.stress.scenes import write_scene
-from xplanes.training.sampling.base import Moment
+from xplanes.streams import TrainingState
 
 pytestmark = pytest.mark.stress
 
@@ -49,29 +49,28 @@ def batch(names):
 @pytest.fixture(scope="module", params=MODELS)
 def module(request, tmp_path_factory: pytest.TempPathFactory):
     scene: Path = write_scene(tmp_path_factory.mktemp("scenes"), "ball")
-    return built(settings(request.param, scene))[1]
+    return built(settings(request.param, scene))
 
 
 @pytest.mark.parametrize("loops", ["1", "0"])
 def test_degenerate_rays(tally, module, monkeypatch, loops) -> None:
     """Degenerate rays, one at a time and together, forward and backward, all models"""
     monkeypatch.setenv("XPLANES_CPU_LOOPS", loops)
-    moment = Moment(seed=0, step=20, batch=0, rank=0)
+    state = TrainingState(seed=0, step=20, batch=0, rank=0)
     for names in ([name] for name in RAYS):
-        check(tally, module, names, moment)
-    check(tally, module, list(RAYS), moment)
+        check(tally, module, names, state)
+    check(tally, module, list(RAYS), state)
 
 
-def check(tally, module, names, moment) -> None:
+def check(tally, module, names, state) -> None:
     rays = batch(names)
-    rendering = module.sampling.render(module.field, rays, moment)
-    loss, error = module.method.loss(rendering, rays, moment)
-    extra = module.sampling.loss(rendering)
-    (loss if extra is None else loss + extra).backward()
-    module.sampling.pass_on(rendering, moment)
+    rendering = module.sampler.render(module.field, rays, state)
+    terms = module.model.losses(rendering, rays, state) | module.sampler.losses(rendering)
+    sum(terms.values()).backward()
+    module.sampler.pass_on(rendering, state)
     gradients = [p.grad for p in module.parameters() if p.grad is not None]
     assert gradients or len(names) == 1, "the rays together must reach the parameters"
-    tally.finite(rendering.colour, rendering.opacity, rendering.depth, loss, error, *gradients)
+    tally.finite(rendering.colour, rendering.opacity, rendering.depth, *terms.values(), *gradients)
     module.zero_grad(set_to_none=True)
     for name, opacity, colour in zip(
         names, rendering.opacity.tolist(), rendering.colour.detach(), strict=True

@@ -57,7 +57,7 @@ def test_same_seed(tally, tmp_path: Path, model, precision) -> None:
     if precision == "bf16" and model in SLOW:
         pytest.skip("this model computes in float32 alone")
     scene = write_scene(tmp_path, "ball")
-    changed = ("trainer.deterministic=true", f"trainer.precision={precision}")
+    changed = ("trainer.deterministic=true", f"model.precision={precision}")
     config = settings(model, scene, *changed)
     try:
         states = [trained(config, tmp_path / f"run{number}") for number in (1, 2)]

@@ -29,7 +29,7 @@ def test_scenes_without_content(tally, root, tmp_path, model, kind) -> None:
 def test_a_start_from_scenes_without_content(tally, root, tmp_path, kind, precision, crop) -> None:
     """The same scenes filmed and started from lrm=tiny, decoder in float32 and bfloat16"""
     changed = (
-        f"trainer.precision={precision}",
+        f"model.precision={precision}",
         f"lrm.crop={crop}",
         "preparation.frames=4",
         "preparation.fixed_view_steps=30",
@@ -55,7 +55,7 @@ def test_absurd_learning_rates(tally, root, tmp_path, model, factor) -> None:
 
 
 FEW = {
-    "one ray": ((6, 6), ("trainer.rays_per_batch=1",)),
+    "one ray": ((6, 6), ("model.rays.per_batch=1",)),
     "one view of many": ((6, 6), ("data.views=1",)),
     "one view": ((1, 1), ()),
     "one moment": ((6, 1), ()),
@@ -77,7 +77,7 @@ def test_as_little_as_there_can_be(tally, root, tmp_path, model, what) -> None:
 def test_rows_of_time(tally, root, tmp_path, model, rows, precision) -> None:
     """1 and 300 rows of time, 300 moments, decoder in float32 and bfloat16"""
     scene = write_scene(root, "ball", views=300, times=300, size=12)
-    changed = (f"model.time_resolution={rows}", f"trainer.precision={precision}")
+    changed = (f"model.time_resolution={rows}", f"model.precision={precision}")
     config = settings(model, scene, *changed)
     assert tally.trained(lambda: trained(config, tmp_path / "run")) is not None
 
@@ -87,7 +87,7 @@ def test_rows_of_time(tally, root, tmp_path, model, rows, precision) -> None:
 def test_samples_and_sizes(tally, root, tmp_path, samples, step) -> None:
     """1 to 1024 samples a ray, cubes 1e3 times too small and too large"""
     scene = write_scene(root, "ball")
-    changed = (f"sampler.samples={samples}", f"data.half_side={step}")
+    changed = (f"model.sampler.samples={samples}", f"data.half_side={step}")
     config = settings("six_planes", scene, *changed)
     assert tally.trained(lambda: trained(config, tmp_path / "run")) is not None
 

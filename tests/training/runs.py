@@ -13,7 +13,7 @@ from hydra import initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from xplanes.config import CONF, register_schemas, to_plain
+from xplanes.config import CONF, to_plain
 
 COMPOSE = hydra.compose
 
@@ -26,19 +26,19 @@ SMALL = (
     "model.resolution=24",
     "model.channels=8",
     "model.decoder.width=32",
-    "sampler.grid_resolution=24",
-    "sampler.samples=64",
-    "sampler.update_cells=512",
-    "sampler.coarse_steps=10",
-    "sampler.sweep_at=[15]",
+    "model.sampler.grid_resolution=24",
+    "model.sampler.samples=64",
+    "model.sampler.update_cells=512",
+    "model.sampler.coarse_steps=10",
+    "model.sampler.sweep_at=[15]",
     "trainer.accelerator=cpu",
-    "trainer.rays_per_batch=256",
-    "trainer.samples_per_batch=4096",
+    "model.rays.per_batch=256",
+    "model.rays.samples_per_batch=4096",
     "trainer.max_seconds=null",
     "trainer.max_steps=40",
-    "trainer.checkpoint_every=10",
-    "trainer.evaluate_at=[0,0.5]",
-    "trainer.media=false",
+    "callbacks.checkpoints.every=10",
+    "callbacks.evaluation.at=[0,0.5]",
+    "media=false",
 )
 
 
@@ -50,7 +50,6 @@ def _compose(*overrides: str) -> DictConfig:
 @functools.cache
 def composed(*overrides: str) -> DictConfig:
     """What Hydra makes of these overrides; composing takes a fifth of a second."""
-    register_schemas()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return _compose(*overrides)
 

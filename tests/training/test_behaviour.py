@@ -15,13 +15,15 @@ import torch
 
 from tests.training.runs import small_config
 from xplanes import pipeline
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
 from xplanes.pipeline import run
-from xplanes.training import scorer, warming
+from xplanes.rendering import warming
+from xplanes.rendering.grid_renderer import OccupancySampler
+from xplanes.training import evaluation, fit
 from xplanes.training.checkpoints import Checkpoints
 from xplanes.training.clock import TrainingClock
+from xplanes.training.evaluation import Evaluation
 from xplanes.training.module import RadianceModule, TrainingError
-from xplanes.training.sampling.occupancy import OccupancySampling
 
 
 def metrics(folder: Path) -> dict:
@@ -63,7 +65,8 @@ class Watched:
 def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Watched:
     notes = Watched(tmp_path_factory.mktemp("runs") / "watched")
     away, back = RadianceModule.cpu, RadianceModule.to
-    finish, score, save = scorer.Scorer.finish, scorer.score_view, Checkpoints.save
+    score, save = evaluation.score_view, Checkpoints._save
+    finish, look = Evaluation.on_train_end, pipeline.final_scores
 
     def note_picture(*parts):
         found, images = score(*parts)
@@ -84,10 +87,11 @@ def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Watched:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(RadianceModule, "cpu", note("away to the CPU", away))
         patch.setattr(RadianceModule, "to", note("to {1}", back))
-        patch.setattr(scorer.Scorer, "finish", note("scored", finish))
-        patch.setattr(scorer, "score_view", note_picture)
-        patch.setattr(scorer, "SHOWN", 2)
-        patch.setattr(Checkpoints, "save", note_checkpoint)
+        patch.setattr(Evaluation, "on_train_end", note("scored", finish))
+        patch.setattr(pipeline, "final_scores", note("looked at all scores", look))
+        patch.setattr(evaluation, "score_view", note_picture)
+        patch.setattr(evaluation, "SHOWN", 2)
+        patch.setattr(Checkpoints, "_save", note_checkpoint)
         run(small_config(scenes), notes.folder, [], resume=False)
     return notes
 
@@ -123,7 +127,7 @@ def test_same_seed_gives_the_same_numbers(trained: Path, watched: Watched) -> No
 
 
 def test_another_seed_gives_other_numbers(trained: Path, scenes: Path, tmp_path: Path) -> None:
-    config = small_config(scenes, "seed=1", "trainer.max_steps=2", "trainer.evaluate_at=[0]")
+    config = small_config(scenes, "seed=1", "trainer.max_steps=2", "callbacks.evaluation.at=[0]")
     run(config, tmp_path / "other", [], resume=False)
     assert curve(tmp_path / "other")[0]["psnr"] != curve(trained)[0]["psnr"]
 
@@ -156,6 +160,32 @@ def test_a_run_resumed_after_failures_equals_an_uninterrupted_one(
     ]
 
 
+def test_a_run_resumed_in_a_later_epoch_equals_an_uninterrupted_one(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An epoch is ten batches here. It fails at the end of one, and in the middle of another."""
+    config = small_config(scenes, "model.rays.per_batch=1024", "callbacks.checkpoints.every=6")
+    run(config, tmp_path / "whole", [], resume=False)
+    original = TrainingClock.on_train_batch_end
+    epochs, stop = set(), 0
+
+    def break_down(self, trainer, module, *rest) -> None:
+        original(self, trainer, module, *rest)
+        epochs.add(trainer.current_epoch)
+        if trainer.global_step == stop:
+            raise OSError("power cut")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingClock, "on_train_batch_end", break_down)
+        for stop in (20, 31):
+            with pytest.raises(OSError, match="power cut"):
+                run(config, tmp_path / "broken", [], resume=stop > 20)
+        stop = 0
+        run(config, tmp_path / "broken", [], resume=True)
+    assert epochs == {0, 1, 2, 3}
+    assert exact(tmp_path / "broken") == exact(tmp_path / "whole")
+
+
 def interrupt_where(
     when: Callable[[RadianceModule], bool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -184,7 +214,7 @@ def test_a_second_interrupt_saves_no_half_of_a_step(
     monkeypatch.setattr(RadianceModule, "manual_backward", press_twice)
     folder = tmp_path / "stopped"
     with pytest.raises(KeyboardInterrupt):
-        run(small_config(scenes, "trainer.evaluate_at=[]"), folder, [], resume=False)
+        run(small_config(scenes, "callbacks.evaluation.at=[]"), folder, [], resume=False)
     state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
     assert (state["global_step"], state["progress"]["batches"]) == (10, 10)
 
@@ -194,7 +224,7 @@ def test_an_interrupt_waits_for_the_update_of_its_batches(
 ) -> None:
     interrupt_where(lambda module: module.batches == 7, monkeypatch)
     folder = tmp_path / "stopped"
-    config = small_config(scenes, "trainer.accumulate=3", "trainer.evaluate_at=[]")
+    config = small_config(scenes, "model.rays.accumulate=3", "callbacks.evaluation.at=[]")
     with pytest.raises(KeyboardInterrupt):
         run(config, folder, [], resume=False)
     state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
@@ -207,9 +237,11 @@ def test_interrupt_saves_the_step_it_stopped_at_and_its_evaluation_is_done_again
     # The evaluation at step 20 finds that it was asked to stop.
     interrupt_where(lambda module: module.global_step == 20, monkeypatch)
     folder = tmp_path / "stopped"
-    config = small_config(scenes, "trainer.checkpoint_every=1000")
+    config = small_config(scenes, "callbacks.checkpoints.every=1000")
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     with pytest.raises(KeyboardInterrupt):
         run(config, folder, [], resume=False)
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
     assert status(folder)["status"] == "interrupted"
     state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
     assert state["global_step"] == 20
@@ -218,10 +250,89 @@ def test_interrupt_saves_the_step_it_stopped_at_and_its_evaluation_is_done_again
     run(config, folder, [], resume=True)
     assert [row["step"] for row in curve(folder)] == ["0", "21", "40"]
     assert exact(folder) == exact(trained)
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+
+
+def test_an_interrupt_after_an_evaluation_leaves_the_best(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = Evaluation.score
+
+    def press(self, trainer, *rest) -> None:
+        original(self, trainer, *rest)
+        if trainer.global_step == 20:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Evaluation, "score", press)
+    folder = tmp_path / "stopped"
+    with pytest.raises(KeyboardInterrupt):
+        run(small_config(scenes), folder, [], resume=False)
+    for name in ("last", "best"):
+        state = torch.load(folder / "checkpoints" / f"{name}.ckpt", weights_only=True)
+        assert state["global_step"] == 20, name
+
+
+def test_a_final_evaluation_that_was_interrupted_is_made_up_for(
+    trained: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though not a step is left to train."""
+    original = Evaluation.on_train_end
+
+    def press(self, *rest) -> None:
+        signal.raise_signal(signal.SIGINT)
+        original(self, *rest)
+
+    monkeypatch.setattr(Evaluation, "on_train_end", press)
+    folder = tmp_path / "stopped"
+    with pytest.raises(KeyboardInterrupt):
+        run(small_config(scenes), folder, [], resume=False)
+    assert [row["step"] for row in curve(folder)] == ["0", "20"]
+    monkeypatch.undo()
+    run(small_config(scenes), folder, [], resume=True)
+    assert [(r["step"], r["psnr"]) for r in curve(folder)] == [
+        (r["step"], r["psnr"]) for r in curve(trained)
+    ]
+    assert exact(folder) == exact(trained)
+    for name in ("last", "best"):
+        ours, theirs = (
+            torch.load(place / "checkpoints" / f"{name}.ckpt", weights_only=True)
+            for place in (folder, trained)
+        )
+        assert ours["global_step"] == theirs["global_step"], name
+        for key, value in theirs["state_dict"].items():
+            assert torch.equal(ours["state_dict"][key], value), (name, key)
+
+
+def test_an_evaluation_waits_for_the_update_of_its_batches(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may stop where it is, and the best checkpoint holds no gradients."""
+    original, score, batches = TrainingClock.on_train_batch_end, Evaluation.score, []
+
+    def go_on(self, trainer, module, *rest) -> None:
+        original(self, trainer, module, *rest)
+        self.seconds = 600.0 if module.batches >= 7 else 0.0
+
+    def note(self, trainer, module, *rest) -> None:
+        batches.append(module.batches)
+        score(self, trainer, module, *rest)
+
+    monkeypatch.setattr(TrainingClock, "on_train_batch_end", go_on)
+    monkeypatch.setattr(Evaluation, "score", note)
+    config = small_config(
+        scenes,
+        "model.rays.accumulate=3",
+        "trainer.max_seconds=1000",
+        "trainer.max_steps=4",
+        "callbacks.evaluation.at=[0,0.55]",
+    )
+    run(config, tmp_path / "run", [], resume=False)
+    assert batches == [0, 9, 12]
 
 
 def test_scoring_uses_the_device_that_trained(watched: Watched) -> None:
-    assert watched.moves[-3:] == ["away to the CPU", "to cpu", "scored"]
+    ends = ["scored", "away to the CPU", "to cpu", "looked at all scores"]
+    assert watched.moves[-4:] == ends
 
 
 def test_only_the_pictures_that_are_shown_are_kept(watched: Watched) -> None:
@@ -238,15 +349,15 @@ def test_the_best_is_written_before_the_last(watched: Watched) -> None:
 def test_digits_cannot_be_kept_on_a_gpu(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline, "training_device", lambda _: torch.device("cuda"))
-    with pytest.raises(ConfigError, match=r"trainer\.deterministic=true.*trainer=cpu"):
+    monkeypatch.setattr(fit, "find_device", lambda _: torch.device("cuda"))
+    with pytest.raises(ConfigError, match=r"trainer\.deterministic=true.*trainer\.accelerator=cpu"):
         run(small_config(scenes, "trainer.deterministic=true"), tmp_path / "run", [], resume=False)
 
 
 def test_more_gpus_than_there_are_are_refused_at_once(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline, "training_device", lambda _: torch.device("cuda"))
+    monkeypatch.setattr(fit, "find_device", lambda _: torch.device("cuda"))
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     with pytest.raises(ConfigError, match=r"trainer\.devices=2: 1 GPUs found"):
         run(small_config(scenes, "trainer=ddp"), tmp_path / "run", [], resume=False)
@@ -270,9 +381,9 @@ def test_few_shot_run_names_its_views_and_accumulated_batches_make_one_step(
     config = small_config(
         scenes,
         "data.views=3",
-        "trainer.accumulate=2",
+        "model.rays.accumulate=2",
         "trainer.max_steps=4",
-        "trainer.evaluate_at=[]",
+        "callbacks.evaluation.at=[]",
     )
     run(config, tmp_path / "few", [], resume=False)
     files = status(tmp_path / "few")["files"]["train"]
@@ -296,8 +407,8 @@ def test_non_finite_loss_is_skipped_then_diagnosed(
 
     monkeypatch.setattr(RadianceModule, "on_train_batch_start", spoil)
     folder = tmp_path / "spoiled"
-    with pytest.raises(TrainingError, match=r"not finite: field\.space;.*trainer\.plane_lr"):
-        run(small_config(scenes, "trainer.evaluate_at=[]"), folder, [], resume=False)
+    with pytest.raises(TrainingError, match=r"not finite: field\.space;.*model\.plane_lr"):
+        run(small_config(scenes, "callbacks.evaluation.at=[]"), folder, [], resume=False)
     assert status(folder)["status"] == "failed"
     assert "field" not in status(folder)["reason"].split(":")[0]
 
@@ -319,7 +430,7 @@ def bad_batch(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_one_bad_batch_costs_one_step(scenes: Path, tmp_path: Path, bad_batch) -> None:
-    config = small_config(scenes, "trainer.max_steps=6", "trainer.evaluate_at=[]")
+    config = small_config(scenes, "trainer.max_steps=6", "callbacks.evaluation.at=[]")
     run(config, tmp_path / "one", [], resume=False)
     content = metrics(tmp_path / "one")
     assert (content["steps_skipped"], content["step"]) == (1, 6)
@@ -337,14 +448,14 @@ def test_a_bad_batch_takes_those_of_its_update_along(
 
     monkeypatch.setattr(RadianceModule, "_refuse", watched)
     config = small_config(
-        scenes, "trainer.accumulate=2", "trainer.max_steps=3", "trainer.evaluate_at=[]"
+        scenes, "model.rays.accumulate=2", "trainer.max_steps=3", "callbacks.evaluation.at=[]"
     )
     run(config, tmp_path / "run", [], resume=False)
     assert left == [False]
 
 
 def test_scene_of_one_moment_trains_without_planes_of_time(scenes: Path, tmp_path: Path) -> None:
-    config = small_config(tmp_path, "trainer.max_steps=2", "trainer.evaluate_at=[]")
+    config = small_config(tmp_path, "trainer.max_steps=2", "callbacks.evaluation.at=[]")
     (original,) = scenes.glob("excavator*")
     folder = Path(shutil.copytree(original, tmp_path / original.name))
     for path in folder.glob("transforms_*.json"):
@@ -352,7 +463,8 @@ def test_scene_of_one_moment_trains_without_planes_of_time(scenes: Path, tmp_pat
         for frame in content["frames"]:
             del frame["time"]
         path.write_text(json.dumps(content))
-    still = dict(config, data={**config["data"], "name": "dnerf"})
+    dnerf = {"_target_": "xplanes.scenes.dnerf.BlenderSettings", "name": "dnerf"}
+    still = dict(config, data=config["data"] | dnerf)
     for name in ("seed", "train_views", "test_views", "val_views"):
         del still["data"][name]
     still["data"].update(scene=folder.name)
@@ -370,20 +482,22 @@ def test_a_scene_without_motion_has_no_planes_of_time(scenes: Path, tmp_path: Pa
     }
     for overrides, reason in cases.items():
         folder = tmp_path / "-".join(overrides)
-        config = small_config(scenes, "trainer.max_steps=2", "trainer.evaluate_at=[]", *overrides)
+        config = small_config(
+            scenes, "trainer.max_steps=2", "callbacks.evaluation.at=[]", *overrides
+        )
         run(config, folder, [], resume=False)
         state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
         assert ("field.time" in state["state_dict"]) == (reason is None), overrides
         assert metrics(folder)["skipped"]["static"] == (0.0 if reason is None else 1.0), overrides
         text = (folder / "train.log").read_text()
-        assert ("trains as a still one" in text) == (reason is not None), overrides
+        assert ("trains as a static one" in text) == (reason is not None), overrides
         assert reason is None or reason in text, overrides
 
 
 def test_a_slow_warm_up_says_what_it_does(
     scenes: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
-    render = OccupancySampling.render
+    render = OccupancySampler.render
 
     def slow(*args):
         time.sleep(0.3)
@@ -391,7 +505,7 @@ def test_a_slow_warm_up_says_what_it_does(
 
     monkeypatch.setattr(warming, "PATIENCE", 0.05)
     warming.say_why.cache_clear()
-    monkeypatch.setattr(OccupancySampling, "render", slow)
-    config = small_config(scenes, "trainer.max_steps=1", "trainer.evaluate_at=[]")
+    monkeypatch.setattr(OccupancySampler, "render", slow)
+    config = small_config(scenes, "trainer.max_steps=1", "callbacks.evaluation.at=[]")
     run(config, tmp_path / "run", [], resume=False)
     assert capsys.readouterr().out.count("compiling the inner loops") == 1

@@ -18,7 +18,7 @@ SETTINGS = (
     "preparation.cache=null",
     "preparation.frames=6",
     "trainer.max_steps=30",
-    "trainer.evaluate_at=[0]",
+    "callbacks.evaluation.at=[0]",
 )
 
 
@@ -34,7 +34,7 @@ def train(scenes: Path):
 
 @pytest.fixture(scope="module")
 def random(train, tmp_path_factory: pytest.TempPathFactory) -> list[float]:
-    """What planes at random come to."""
+    """What random planes come to."""
     return train(tmp_path_factory.mktemp("random") / "run", "lrm=none")
 
 
@@ -70,4 +70,4 @@ def test_a_scene_without_motion_trains_as_a_still_one(train, tmp_path: Path):
     loaded = load_run(folder)
     assert loaded.is_still
     assert loaded.module.renderer.grid.time_bins == 1
-    assert "trains as a still one" in (folder / "train.log").read_text()
+    assert "trains as a static one" in (folder / "train.log").read_text()

@@ -11,7 +11,7 @@ from xplanes.evaluation.evaluate import evaluate
 from xplanes.evaluation.runs import load_run
 from xplanes.pipeline import run
 from xplanes.preparation import reconstruct as reconstruct_module
-from xplanes.preparation import start as start_module
+from xplanes.preparation import sources as sources_module
 
 STAGES = ("fixed_view", "lrm", "decomposition", "convert")
 
@@ -28,7 +28,7 @@ def settings(scenes: Path):
             "preparation.fixed_view_seconds=1000",
             "preparation.fixed_view_steps=12",
             "trainer.max_steps=6",
-            "trainer.evaluate_at=[0]",
+            "callbacks.evaluation.at=[0]",
             *overrides,
         )
 
@@ -70,13 +70,13 @@ def uninterrupted(settings, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place / "run"
 
 
-@pytest.mark.parametrize("stopped", ["encode", "start_from"])
+@pytest.mark.parametrize("stopped", ["encode", "from_sequence"])
 def test_a_stopped_preparation_goes_on_from_the_last_finished_stage(
     settings, uninterrupted: Path, tmp_path: Path, monkeypatch, stopped
 ):
     folder = tmp_path / "run"
     config = settings(tmp_path, "openlrm-1.1", "preparation.fixed_view=train")
-    owner = start_module if stopped == "start_from" else reconstruct_module
+    owner = sources_module if stopped == "from_sequence" else reconstruct_module
 
     def stop(*_args, **_options):
         raise KeyboardInterrupt
@@ -88,11 +88,11 @@ def test_a_stopped_preparation_goes_on_from_the_last_finished_stage(
     assert json.loads((folder / "run.json").read_text())["status"] == "interrupted"
     kept = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "cache").glob("*.pt")}
     assert any(name.startswith("fixed_view") for name in kept)
-    assert any(name.startswith("triplane") for name in kept) == (stopped == "start_from")
+    assert any(name.startswith("triplane") for name in kept) == (stopped == "from_sequence")
     run(config, folder, [], resume=True)
     for name, written in kept.items():
         assert (tmp_path / "cache" / name).stat().st_mtime_ns == written
     told = metrics(folder)
     assert told["seconds"]["prepare"]["fixed_view"] > 0
-    assert "filmed by six_planes" in told["lrm"]["fixed_view"]
+    assert "rendered by six_planes" in told["lrm"]["fixed_view"]
     assert told["test"] == metrics(uninterrupted)["test"]

@@ -1,7 +1,6 @@
 """Runs that start from a triplane file: what they write, how they go on, how they are loaded."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,23 +9,22 @@ from PIL import Image
 
 from tests.preparation.sequences import moving_sequence
 from tests.training.runs import small_config
-from xplanes.checks import parse
-from xplanes.config import ConfigError
 from xplanes.decomposition import TIME_ROWS, decompose, unexplained_energy
 from xplanes.decomposition.conversion import frame_profiles
+from xplanes.errors import ConfigError
 from xplanes.evaluation.evaluate import evaluate
 from xplanes.evaluation.runs import load_run
+from xplanes.experiment import Experiment
 from xplanes.fields import Decoder, XPlanes
 from xplanes.files import read_rows
+from xplanes.models.x_planes import XPlanesModel
 from xplanes.pipeline import run
-from xplanes.preparation import TriplaneSequence, find_source, prepare, save_triplanes
+from xplanes.preparation import TriplaneSequence, save_triplanes
 from xplanes.preparation import stages as stages_module
 from xplanes.scenes.frame import Frame
-from xplanes.training.builder import build_frame, build_module, build_scene
+from xplanes.streams import TrainingState
 from xplanes.training.clock import TrainingClock
-from xplanes.training.methods.xplanes import XPlanesMethod
-from xplanes.training.module import TrainingError
-from xplanes.training.sampling.base import Moment
+from xplanes.training.module import RadianceModule, TrainingError
 
 OPTIONS = {
     "width": 16,
@@ -64,13 +62,13 @@ def settings(place: Path, *overrides: str) -> dict:
         "lrm=file",
         f"lrm.triplanes={place}/triplanes.pt",
         f"preparation.cache={place}/cache",
-        "loss.sparse_weight=0.5",
-        "trainer.log_every=10",
+        "model.loss.sparse_weight=0.5",
+        "trainer.log_every_n_steps=10",
         *overrides,
     )
 
 
-UNSCORED = "trainer.evaluate_at=[]"
+UNSCORED = "callbacks.evaluation.at=[]"
 """Training alone is looked at."""
 
 
@@ -117,8 +115,9 @@ def test_the_parts_are_a_picture_and_the_loss_a_curve(trained: Path) -> None:
     events = EventAccumulator(str(trained / "tb"))
     events.Reload()
     assert "decomposition" in events.Tags()["images"]
-    points = events.Scalars("reg/sparse_product")
-    assert [point.step for point in points] == [10, 20, 30, 40]
+    points = events.Scalars("train/l_r")
+    # Of the field that the tenth batch saw, after nine steps.
+    assert [point.step for point in points] == [9, 19, 29, 39]
     assert all(point.value > 0 for point in points)
 
 
@@ -127,7 +126,8 @@ def test_the_sparse_part_is_in_no_checkpoint(trained: Path, place: Path) -> None
     elements = 8 * 3 * 8 * 16 * 16
     assert all(value.numel() != elements for value in state["state_dict"].values())
     assert not [key for key in state["state_dict"] if "sparse" in key or "product" in key]
-    assert set(state["origin"]) == {"model", "frame"}
+    assert set(state["site"]) == {"model", "frame", "times", "bounds", "initialised"}
+    assert state["site"]["initialised"]
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one(
@@ -178,7 +178,7 @@ def test_planes_do_not_go_on_in_another_frame(empty_place: Path, tmp_path: Path)
 
 
 def test_the_loss_changes_the_run(trained: Path, place: Path, tmp_path: Path) -> None:
-    config = settings(place, "loss.sparse_weight=0", UNSCORED)
+    config = settings(place, "model.loss.sparse_weight=0", UNSCORED)
     run(config, tmp_path / "without", [], resume=False)
     assert not torch.equal(
         weights(tmp_path / "without")["field.time"], weights(trained)["field.time"]
@@ -192,30 +192,37 @@ def test_a_start_holds_the_planes(place: Path, tmp_path: Path) -> None:
         return torch.cat([kept["field.space"].flatten(), kept["field.time"].flatten()])
 
     start = planes("start", "trainer.max_steps=1")
-    free, held = (planes(w, f"loss.start_weight={w}") for w in ("0", "1000"))
+    free, held = (planes(w, f"model.loss.initial_weight={w}") for w in ("0", "1000"))
     assert float((held - start).norm()) < 0.5 * float((free - start).norm())
+
+
+def built(config: dict) -> XPlanesModel:
+    """The model of a configuration at its initialisation."""
+    module = RadianceModule(config)
+    module.build(Experiment.read(config).data.read())
+    assert isinstance(module.model, XPlanesModel)
+    return module.model
 
 
 def test_what_ties_the_planes_to_their_start_fades(place: Path) -> None:
     """Without other terms, a gradient is what it would be without fading times what is left."""
-    quiet = ["loss.total_variation=0", "loss.time_smoothness=0", "loss.time_magnitude=0"]
+    quiet = [
+        "model.loss.total_variation=0",
+        "model.loss.time_smoothness=0",
+        "model.loss.time_magnitude=0",
+    ]
 
     def gradients(step: int, fading: str) -> list[torch.Tensor]:
-        config = parse(settings(place, *quiet, f"loss.start_steps={fading}", "data.views=3"))
-        scene = build_scene(config.data)
-        frame = build_frame(config, scene.splits["train"])
-        start = prepare(config, scene, frame, find_source(config.lrm, say=print), say=print)
-        config = replace(config, model=start.model)
-        module = build_module(config, scene, frame, planes=start.planes, sparse=start.sparse)
-        assert isinstance(module.method, XPlanesMethod)
-        field = module.method.field
+        steps = f"model.loss.initial_steps={fading}"
+        model = built(settings(place, *quiet, steps, "data.views=3"))
+        field = model.field
         assert field.time is not None
         with torch.no_grad():
             field.space.add_(1.0)
             field.time.add_(1.0)
         for plane in (field.space, field.time):
             plane.grad = torch.zeros_like(plane)
-        module.method.regularise(Moment(seed=step, step=step, batch=step, rank=0))
+        model.regularise(TrainingState(seed=step, step=step, batch=step, rank=0))
         return [plane.grad for plane in (field.space, field.time) if plane.grad is not None]
 
     whole, left = gradients(24, "null"), gradients(24, "288")
@@ -227,14 +234,8 @@ def test_what_ties_the_planes_to_their_start_fades(place: Path) -> None:
 
 def test_the_hold_falls_with_the_square_of_the_views(place: Path) -> None:
     def hold(lrm: str, views: int) -> float:
-        overrides = [f"data.views={views}", "loss.start_weight=8"]
-        config = parse(settings(place, *overrides) | ({} if lrm == "file" else none))
-        scene = build_scene(config.data)
-        frame = build_frame(config, scene.splits["train"])
-        start = prepare(config, scene, frame, find_source(config.lrm, say=print), say=print)
-        module = build_module(replace(config, model=start.model), scene, frame, planes=start.planes)
-        assert isinstance(module.method, XPlanesMethod)
-        return module.method.hold
+        overrides = [f"data.views={views}", "model.loss.initial_weight=8"]
+        return built(settings(place, *overrides) | ({} if lrm == "file" else none)).initial_weight
 
     none = {"lrm": small_config(place / "scenes", "lrm=none")["lrm"]}
     assert [hold("file", 2), hold("file", 4)] == [2.0, 0.5]
@@ -254,13 +255,13 @@ def test_the_loss_pulls_random_planes_towards_the_sparse_part(
             f"model={model}",
             "decomposition.dynamic=random",
             "decomposition.noise=0.1",
-            f"loss.sparse_weight={weight}",
-            "loss.every=1",
-            "loss.start_weight=0",
-            "trainer.time_lr=0.1",
+            f"model.loss.sparse_weight={weight}",
+            "model.loss.every=1",
+            "model.loss.initial_weight=0",
+            "model.time_lr=0.1",
             "trainer.max_steps=40",
             UNSCORED,
-            "trainer.warmup_steps=1",
+            "model.warmup_steps=1",
         )
         run(settings(place, *overrides), folder, [], resume=False)
         rows = TIME_ROWS[model.removesuffix("_planes")]
@@ -287,7 +288,8 @@ def test_a_run_is_loaded_without_its_source(empty_place: Path) -> None:
         path.unlink()
     loaded = load_run(folder)
     assert loaded.frame.scale == 0.55
-    assert loaded.config.model.channels == 4
+    assert loaded.module.model is not None
+    assert loaded.module.model.settings.channels == 4
     assert loaded.module.field.decoder.density_activation == "exp"
     scores = evaluate(loaded, network="none")
     assert scores["test"]["psnr"] == pytest.approx(metrics(folder)["test"]["psnr"], abs=1e-6)
@@ -305,15 +307,15 @@ def test_a_run_from_one_triplane_is_loaded_too(place: Path, tmp_path: Path) -> N
     assert load_run(tmp_path / "run").is_still
 
 
-def test_a_damaged_origin_is_named(trained: Path, tmp_path: Path) -> None:
+def test_a_damaged_site_is_named(trained: Path, tmp_path: Path) -> None:
     import shutil
 
     folder = Path(shutil.copytree(trained, tmp_path / "run"))
     path = folder / "checkpoints" / "last.ckpt"
     state = torch.load(path, weights_only=True)
-    del state["origin"]["model"]["channels"]
+    del state["site"]["model"]["channels"]
     torch.save(state, path)
-    with pytest.raises(ConfigError, match=r"last\.ckpt cannot be used"):
+    with pytest.raises(ConfigError, match=r"last\.ckpt cannot be used.*model\.channels"):
         load_run(folder)
 
 
@@ -329,7 +331,7 @@ def test_a_decomposition_that_did_not_converge_is_said_once(
     run(config, tmp_path / "run", [], resume=False)
     said = capfd.readouterr()
     assert said.err.count("did not converge") == 1
-    assert f"start    8 triplanes of {place}/triplanes.pt" in said.out
+    assert f"from     8 triplanes of {place}/triplanes.pt" in said.out
     assert "time planes rank1" in said.out
     assert not metrics(tmp_path / "run")["decomposition"]["xy"]["converged"]
 
@@ -340,9 +342,9 @@ def test_a_random_start_says_so_and_leaves_no_trace(
     config = small_config(place / "scenes", "trainer.max_steps=2", UNSCORED)
     run(config, tmp_path / "run", [], resume=False)
     state = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
-    assert "origin" not in state
+    assert not state["site"]["initialised"]
     assert metrics(tmp_path / "run")["decomposition"] == {}
-    assert "start    planes at random" in capsys.readouterr().out
+    assert "from     random planes" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("model", ["six_planes", "nine_planes"])
@@ -350,11 +352,11 @@ def test_a_trained_fields_own_triplanes_start_a_field_that_renders_as_it(
     place: Path, tmp_path: Path, model: str
 ) -> None:
     """Ties orientation, time, decoder and frame of a file to the field's, end to end."""
-    common = (f"model={model}", "trainer.precision=32", "sampler.coarse_steps=0")
+    common = (f"model={model}", "model.precision=32", "model.sampler.coarse_steps=0")
     config = small_config(place / "scenes", *common, "trainer.max_steps=80", UNSCORED)
     run(config, tmp_path / "first", [], resume=False)
     first = load_run(tmp_path / "first")
-    field, options = first.module.field, first.config.model.decoder
+    field, options = first.module.field, first.experiment.method.model.decoder
     with torch.no_grad():
         sequence = TriplaneSequence(
             triplanes_of(field, frames=20),
@@ -368,7 +370,7 @@ def test_a_trained_fields_own_triplanes_start_a_field_that_renders_as_it(
         f"lrm.triplanes={tmp_path}/own.pt",
         "data.half_side=9",  # The file's frame prevails.
         "trainer.max_steps=1",
-        "trainer.evaluate_at=[0]",
+        "callbacks.evaluation.at=[0]",
         "decomposition.tolerance=1e-5",
         "decomposition.noise=0",
     )

@@ -10,22 +10,23 @@ import torch
 from torch import nn
 
 from tests.training.runs import small_config
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
+from xplanes.models.x_planes import XPlanesModel
 from xplanes.pipeline import run
 from xplanes.training.checkpoints import find_resumable
 from xplanes.training.clock import TrainingClock
-from xplanes.training.health import (
+from xplanes.training.module import (
+    RadianceModule,
+    TrainingError,
     all_usable,
     not_finite,
     unusable_gradients,
     usable,
     usable_together,
 )
-from xplanes.training.methods.xplanes import XPlanesMethod
-from xplanes.training.module import RadianceModule, TrainingError
 
-FEW = ("trainer.max_steps=12", "trainer.checkpoint_every=5", "trainer.evaluate_at=[]")
-SCORED = (*FEW, "trainer.evaluate_at=[0.4]")
+FEW = ("trainer.max_steps=12", "callbacks.checkpoints.every=5", "callbacks.evaluation.at=[]")
+SCORED = (*FEW, "callbacks.evaluation.at=[0.4]")
 
 
 def state(run_folder: Path) -> dict:
@@ -57,14 +58,14 @@ def test_names_are_those_of_the_broken() -> None:
 
 
 def spoil_gradient(monkeypatch: pytest.MonkeyPatch, value: float, steps: range) -> None:
-    original = XPlanesMethod.regularise
+    original = XPlanesModel.regularise
 
-    def spoil(self, moment) -> None:
-        original(self, moment)
-        if moment.batch in steps:
+    def spoil(self, state) -> None:
+        original(self, state)
+        if state.batch in steps:
             self.field.space.grad[0, 0, 0, 0] = value
 
-    monkeypatch.setattr(XPlanesMethod, "regularise", spoil)
+    monkeypatch.setattr(XPlanesModel, "regularise", spoil)
 
 
 def test_one_bad_gradient_costs_one_step(scenes, tmp_path, monkeypatch) -> None:
@@ -87,7 +88,7 @@ def test_gradients_that_stay_bad_end_training_in_words(scenes, tmp_path, monkeyp
 
 def test_a_start_that_cannot_be_trained_is_to_blame(scenes, tmp_path, monkeypatch) -> None:
     spoil_gradient(monkeypatch, 1e30, range(1000))
-    with pytest.raises(TrainingError, match=r"step 0.*start is to blame.*lrm=none"):
+    with pytest.raises(TrainingError, match=r"step 0.*initialisation is to blame.*lrm=none"):
         run(small_config(scenes, *FEW), tmp_path / "start", [], resume=False)
 
 
@@ -125,15 +126,15 @@ def folder(whole: Path, tmp_path: Path) -> Path:
 
 def test_a_resumed_run_takes_new_learning_rates(scenes, folder, monkeypatch) -> None:
     seen = []
-    original = RadianceModule._set_learning_rates
+    original = RadianceModule.on_train_batch_start
 
-    def note(self) -> None:
-        original(self)
+    def note(self, *rest) -> None:
+        original(self, *rest)
         optimizer = self.optimizers().optimizer
         seen.append([group["lr"] for group in optimizer.param_groups])
 
-    monkeypatch.setattr(RadianceModule, "_set_learning_rates", note)
-    changed = (*FEW, "trainer.max_steps=14", "trainer.plane_lr=0.02", "trainer.warmup_steps=0")
+    monkeypatch.setattr(RadianceModule, "on_train_batch_start", note)
+    changed = (*FEW, "trainer.max_steps=14", "model.plane_lr=0.02", "model.warmup_steps=0")
     run(small_config(scenes, *changed), folder, [], resume=True)
     assert len(seen) == 2
     assert all(rates[0] < 0.021 for rates in seen)
@@ -155,7 +156,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_best(scenes, whole, folder, caplo
     last.write_bytes(damage(last.read_bytes()))
     run(small_config(scenes, *SCORED), folder, [], resume=True)
     assert "last.ckpt cannot be read" in caplog.text
-    assert "Going on from" in caplog.text
+    assert "Continuing from" in caplog.text
     for name, value in state(whole)["state_dict"].items():
         assert torch.equal(value, state(folder)["state_dict"][name]), name
 

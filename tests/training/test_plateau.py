@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from tests.training.runs import small_config
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
+from xplanes.models.x_planes import XPlanesModel
 from xplanes.pipeline import run
 from xplanes.training import plateau
-from xplanes.training.methods.xplanes import XPlanesMethod
 from xplanes.training.plateau import LEAST, converged
 
 
@@ -67,7 +67,9 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def config_of(scenes: Path, *overrides: str) -> dict:
     """Whatever the run gains is too little."""
-    return small_config(scenes, "trainer.plateau=1000", "trainer.evaluate_at=[]", *overrides)
+    return small_config(
+        scenes, "callbacks.plateau.gain=1000", "callbacks.evaluation.at=[]", *overrides
+    )
 
 
 @dataclass
@@ -81,7 +83,7 @@ class Stopped:
 @pytest.fixture(scope="module")
 def stopped(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Stopped:
     rates = {}
-    original = XPlanesMethod.rate
+    original = XPlanesModel.rate
 
     def rate(self, step, progress):
         rates[step] = original(self, step, progress)
@@ -90,7 +92,7 @@ def stopped(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Stopped:
     folder = tmp_path_factory.mktemp("plateau") / "run"
     with pytest.MonkeyPatch.context() as patch:
         judge_soon(patch)
-        patch.setattr(XPlanesMethod, "rate", rate)
+        patch.setattr(XPlanesModel, "rate", rate)
         run(config_of(scenes), folder, [], resume=False)
     return Stopped(folder, rates)
 
@@ -115,7 +117,7 @@ def test_a_converged_run_cools_down_and_stops(stopped: Stopped):
 
 def test_a_run_that_failed_ends_at_the_same_step(scenes, stopped, tmp_path, soon, monkeypatch):
     """It fails before it has converged, and while it cools down."""
-    config = config_of(scenes, "trainer.checkpoint_every=1")
+    config = config_of(scenes, "callbacks.checkpoints.every=1")
     step = plateau.PlateauStop.on_train_batch_end
     stop = 0
 
@@ -145,11 +147,11 @@ def test_a_finished_run_stays_finished(scenes, folder, soon):
 
 def test_without_the_rule_the_budget_is_spent(scenes, folder, soon):
     """By a run that had converged, too."""
-    run(small_config(scenes, "trainer.evaluate_at=[]"), folder, [], resume=True)
+    run(small_config(scenes, "callbacks.evaluation.at=[]"), folder, [], resume=True)
     found = outcome(folder)
     assert (found["step"], found["converged"], found["skipped"]["budget"]) == (40, None, 0)
 
 
 def test_a_gain_below_zero_is_refused(scenes):
-    with pytest.raises(ConfigError, match=r"trainer\.plateau=-1"):
-        run(small_config(scenes, "trainer.plateau=-1"), scenes / "no", [], resume=False)
+    with pytest.raises(ConfigError, match=r"callbacks\.plateau\.gain=-1"):
+        run(small_config(scenes, "callbacks.plateau.gain=-1"), scenes / "no", [], resume=False)

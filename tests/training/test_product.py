@@ -5,8 +5,8 @@ import torch
 
 from tests.preparation.sequences import blob
 from xplanes.decomposition import TIME_ROWS, sparse_product_loss
-from xplanes.scenes.batches import step_generator
-from xplanes.training.product import SparseProduct
+from xplanes.decomposition.sparse_loss import SparseProduct
+from xplanes.streams import step_generator
 
 FRAMES = 5
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests import oracles
-from xplanes.training.regularisers import (
+from xplanes.fields.regularisers import (
     add_distance_gradient,
     add_time_smoothness_gradient,
     add_total_variation_gradient,

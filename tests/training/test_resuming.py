@@ -9,13 +9,14 @@ import pytest
 from lightning import Trainer
 
 from tests.training.runs import small_config
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
 from xplanes.pipeline import run
-from xplanes.training import scorer
+from xplanes.training import evaluation
 from xplanes.training.checkpoints import Checkpoints
-from xplanes.training.resuming import KEPT, require_same_settings
+from xplanes.training.evaluation import Evaluation
+from xplanes.training.record import KEPT, require_same_settings
 
-FEW = ("trainer.max_steps=6", "trainer.evaluate_at=[]")
+FEW = ("trainer.max_steps=6", "callbacks.evaluation.at=[]")
 PAGES = ("config.yaml", "overrides.txt", "metrics.json")
 
 
@@ -44,22 +45,25 @@ def test_a_run_does_not_go_on_as_another(scenes: Path, folder: Path) -> None:
             run(changed, folder, ["seed=0", override], resume=True)
         assert {name: (folder / name).read_bytes() for name in PAGES} == before, override
     # The refusals leave a run that goes on as ever, with what may change.
-    more = small_config(scenes, "trainer.max_steps=8", "trainer.plane_lr=0.01", "data.eval_views=2")
-    run(more, folder, ["trainer.plane_lr=0.01"], resume=True)
-    assert (folder / "overrides.txt").read_text() == "trainer.plane_lr=0.01\n"
+    more = small_config(scenes, "trainer.max_steps=8", "model.plane_lr=0.01", "data.eval_views=2")
+    run(more, folder, ["model.plane_lr=0.01"], resume=True)
+    assert (folder / "overrides.txt").read_text() == "model.plane_lr=0.01\n"
     metrics = json.loads((folder / "metrics.json").read_text())
     assert (metrics["step"], len(metrics["views"])) == (8, 2)
 
 
 def test_what_planes_and_frame_depend_on_is_kept(tmp_path: Path) -> None:
     for key in KEPT:
-        group, name = key.split(".")
-        before, now = {group: {name: "this"}}, {group: {name: "that"}}
+        *groups, name = key.split(".")
+
+        before, now, without = {name: "this"}, {name: "that"}, {}
+        for group in reversed(groups):
+            before, now, without = {group: before}, {group: now}, {group: without}
         with pytest.raises(ConfigError, match=rf"{key}=that: .* {key}=this"):
             require_same_settings(tmp_path, before, now)
         require_same_settings(tmp_path, before, before)
         # A setting that an older version did not have.
-        require_same_settings(tmp_path, {group: {}}, now)
+        require_same_settings(tmp_path, without, now)
         require_same_settings(tmp_path, {}, now)
 
 
@@ -76,25 +80,31 @@ def test_the_best_is_chosen_by_the_same_views_throughout(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One view is scored on the way, and the others are harder by 10 dB."""
-    original, improved = scorer.score_view, []
+    original, improved = evaluation.score_view, []
 
     def score(field, renderer, frame, views, index, background):
         found, images = original(field, renderer, frame, views, index, background)
         object.__setattr__(found, "psnr", found.psnr - 10 * (index not in scored))
         return found, images
 
-    save = Checkpoints.save
+    save = Checkpoints._save
 
     def note(self: Checkpoints, trainer: Trainer, name: str) -> None:
         improved.append((trainer.global_step, name))
         save(self, trainer, name)
 
-    scored = scorer.spread(1, 3)
-    monkeypatch.setattr(scorer, "score_view", score)
-    monkeypatch.setattr(Checkpoints, "save", note)
-    few = ("trainer.evaluate_views=1", "trainer.evaluate_at=[0,0.5]", "trainer.checkpoint_every=99")
+    scored = evaluation.spread(1, 3)
+    monkeypatch.setattr(evaluation, "score_view", score)
+    monkeypatch.setattr(Checkpoints, "_save", note)
+    few = (
+        "callbacks.evaluation.views=1",
+        "callbacks.evaluation.at=[0,0.5]",
+        "callbacks.checkpoints.every=99",
+    )
     run(small_config(scenes, *few), tmp_path / "run", [], resume=False)
     assert [step for step, name in improved if name == "best.ckpt"] == [0, 20, 40]
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert len(metrics["views"]) == 3  # In the end all are looked at.
 
 
 def test_no_checkpoint_between_the_batches_of_an_update(
@@ -102,16 +112,16 @@ def test_no_checkpoint_between_the_batches_of_an_update(
 ) -> None:
     """A run that goes on from a checkpoint's step has written none for it yet."""
     batches = []
-    save = Checkpoints.save
+    save = Checkpoints._save
 
     def note(self: Checkpoints, trainer: Trainer, name: str) -> None:
         batches.append(trainer.lightning_module.batches)
         save(self, trainer, name)
 
-    every = (*FEW, "trainer.accumulate=4", "trainer.checkpoint_every=2")
+    every = (*FEW, "model.rays.accumulate=4", "callbacks.checkpoints.every=2")
     folder = tmp_path / "run"
     run(small_config(scenes, *every, "trainer.max_steps=2"), folder, [], resume=False)
-    monkeypatch.setattr(Checkpoints, "save", note)
+    monkeypatch.setattr(Checkpoints, "_save", note)
     run(small_config(scenes, *every, "trainer.max_steps=3"), folder, [], resume=True)
     assert batches[-1] == 12
     assert all(count % 4 == 0 for count in batches)
@@ -120,13 +130,13 @@ def test_no_checkpoint_between_the_batches_of_an_update(
 def test_a_signal_after_the_last_step_is_heard(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    finish = scorer.Scorer.finish
+    finish = Evaluation.on_train_end
 
     def press_ctrl_c(self, *rest) -> None:
         finish(self, *rest)
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(scorer.Scorer, "finish", press_ctrl_c)
+    monkeypatch.setattr(Evaluation, "on_train_end", press_ctrl_c)
     with pytest.raises(KeyboardInterrupt):
         run(small_config(scenes, *FEW), tmp_path / "run", [], resume=False)
     assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "interrupted"

@@ -4,11 +4,12 @@ import pytest
 import torch
 
 from tests.training.runs import small_config
-from xplanes.checks import parse
-from xplanes.config import ConfigError
-from xplanes.training.builder import build_renderer
-from xplanes.training.sampling.base import Moment
-from xplanes.training.sampling.occupancy import OccupancySampling
+from xplanes.errors import ConfigError
+from xplanes.models.initialisation import Method
+from xplanes.rendering.grid_renderer import OccupancySampler
+from xplanes.rendering.sampler import Site
+from xplanes.scenes.frame import cube_frame
+from xplanes.streams import TrainingState
 
 STEPS_OF_A_RAY = {"first": 8, "later": 15, "pictures": 40}
 
@@ -18,12 +19,15 @@ def fog(points, times):
 
 
 @pytest.fixture
-def sampling(tmp_path) -> OccupancySampling:
+def sampling(tmp_path) -> OccupancySampler:
     config = small_config(
-        tmp_path, "sampler.samples=15", "sampler.render_samples=40", "sampler.coarse_steps=10"
+        tmp_path,
+        "model.sampler.samples=15",
+        "model.sampler.render_samples=40",
+        "model.sampler.coarse_steps=10",
     )
-    sampler = parse(config).sampler
-    return OccupancySampling(build_renderer(sampler, still=True), sampler)
+    site = Site(cube_frame(1.0, torch.zeros(3)), times=torch.zeros(1), seed=0, precision="32")
+    return Method.read(config).model.sampler.build(fog, site)
 
 
 def along_the_diagonal() -> dict[str, torch.Tensor]:
@@ -39,7 +43,7 @@ def along_the_diagonal() -> dict[str, torch.Tensor]:
 
 def test_the_first_steps_take_half_the_samples(sampling) -> None:
     for step, phase in ((0, "first"), (9, "first"), (10, "later")):
-        seen = sampling.render(fog, along_the_diagonal(), Moment(0, step, step, 0))
+        seen = sampling.render(fog, along_the_diagonal(), TrainingState(0, step, step, 0))
         assert len(seen.samples) == STEPS_OF_A_RAY[phase], step
 
 
@@ -56,5 +60,5 @@ def test_pictures_of_the_trained_field_have_samples_of_their_own(sampling) -> No
 
 
 def test_no_samples_for_pictures_are_refused(tmp_path) -> None:
-    with pytest.raises(ConfigError, match=r"sampler\.render_samples=0"):
-        parse(small_config(tmp_path, "sampler.render_samples=0"))
+    with pytest.raises(ConfigError, match=r"model\.sampler\.render_samples=0: must be above 0"):
+        Method.read(small_config(tmp_path, "model.sampler.render_samples=0"))

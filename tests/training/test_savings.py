@@ -10,8 +10,8 @@ from tests.training.runs import small_config
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.files import read_rows
 from xplanes.pipeline import run
+from xplanes.training.evaluation import mean, score_view
 from xplanes.training.module import RadianceModule
-from xplanes.training.scoring import mean, score_view
 
 BOUND = 0.05
 """In dB."""
@@ -40,12 +40,12 @@ def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Watched:
     # Where silhouettes forbid to look the field is what it was at the start.
     config = small_config(
         scenes,
-        "sampler.silhouettes=false",
+        "model.sampler.silhouettes=false",
         "trainer.max_steps=200",
-        "trainer.decoder_lr=0.02",
-        "trainer.rays_per_batch=2048",
-        f"trainer.samples_per_batch={SAMPLES}",
-        "trainer.evaluate_at=[0]",
+        "model.decoder_lr=0.02",
+        "model.rays.per_batch=2048",
+        f"model.rays.samples_per_batch={SAMPLES}",
+        "callbacks.evaluation.at=[0]",
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(RadianceModule, "_count", note)

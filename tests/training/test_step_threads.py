@@ -1,12 +1,12 @@
 """The number of threads that a step is done with."""
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from tests.training.runs import small_config
-from xplanes.config import TrainerConfig
 from xplanes.files import read_json
 from xplanes.pipeline import run
 from xplanes.training.step_threads import StepThreads, ThreadChoice
@@ -77,9 +77,13 @@ def test_a_few_slow_steps_mislead_nobody():
     assert choice.count == 1
 
 
-def options(**changes: object) -> TrainerConfig:
-    config = {"accelerator": "cpu", "devices": 1, "max_seconds": 60.0, "deterministic": False}
-    return TrainerConfig(**{**config, **changes})  # type: ignore[arg-type]
+def choice_on(device: str = "cpu", processes: int = 1) -> ThreadChoice | None:
+    callback = StepThreads()
+    callback.on_train_start(
+        SimpleNamespace(world_size=processes),  # type: ignore[arg-type]
+        SimpleNamespace(device=torch.device(device)),  # type: ignore[arg-type]
+    )
+    return callback.choice
 
 
 @pytest.fixture
@@ -90,20 +94,27 @@ def two_threads():
     torch.set_num_threads(before)
 
 
-def test_where_digits_or_other_processes_matter_all_threads_work(two_threads):
-    assert StepThreads(options(), torch.device("cpu")).choice is not None
-    assert StepThreads(options(), torch.device("cuda")).choice is None
-    for changes in ({"deterministic": True}, {"max_seconds": None}, {"devices": 2}):
-        assert StepThreads(options(**changes), torch.device("cpu")).choice is None, changes
+def test_gpus_and_other_processes_leave_no_choice(two_threads):
+    assert choice_on() is not None
+    assert choice_on(device="cuda") is None
+    assert choice_on(processes=2) is None
 
 
 def test_one_thread_leaves_no_choice(two_threads):
     torch.set_num_threads(1)
-    assert StepThreads(options(), torch.device("cpu")).choice is None
+    assert choice_on() is None
+
+
+def test_a_run_chooses_only_where_that_is_asked_for(tmp_path):
+    """Its sums would come out differently each time."""
+    assert "threads" not in small_config(tmp_path)["callbacks"]
+    assert "threads" in small_config(tmp_path, "callbacks=threads")["callbacks"]
 
 
 def test_a_run_reports_its_number_and_leaves_torchs_alone(scenes, tmp_path, two_threads):
-    config = small_config(scenes, "trainer.max_seconds=1.5", "trainer.max_steps=100000")
+    config = small_config(
+        scenes, "callbacks=threads", "trainer.max_seconds=1.5", "trainer.max_steps=100000"
+    )
     run(config, tmp_path / "run", [], resume=False)
     assert torch.get_num_threads() == 2
     metrics, log = read_json(tmp_path / "run" / "metrics.json"), (tmp_path / "run" / "train.log")
@@ -118,6 +129,7 @@ def test_a_run_that_fails_leaves_torchs_number_alone(scenes, tmp_path, two_threa
         raise RuntimeError("no luck")
 
     monkeypatch.setattr(ThreadChoice, "took", fail)
+    config = small_config(scenes, "callbacks=threads", "trainer.max_seconds=5")
     with pytest.raises(RuntimeError, match="no luck"):
-        run(small_config(scenes, "trainer.max_seconds=5"), tmp_path / "run", [], resume=False)
+        run(config, tmp_path / "run", [], resume=False)
     assert torch.get_num_threads() == 2

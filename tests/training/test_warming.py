@@ -5,9 +5,9 @@ import time
 import torch
 
 from xplanes.backend import warm_up
+from xplanes.rendering import warming
+from xplanes.rendering.grid_renderer import DIAGONAL, GridRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.rendering.renderer import DIAGONAL, Renderer
-from xplanes.training import warming
 
 
 def test_the_first_ray_asks_the_field_and_is_counted(monkeypatch, capsys):
@@ -22,7 +22,7 @@ def test_the_first_ray_asks_the_field_and_is_counted(monkeypatch, capsys):
     warming.say_why.cache_clear()
     before = warm_up.seconds
     for _ in range(2):
-        warming.render_one_ray(field, Renderer(OccupancyGrid(4, 1, step=DIAGONAL / 8), 8))
+        warming.render_one_ray(field, GridRenderer(OccupancyGrid(4, 1, step=DIAGONAL / 8), 8))
     assert sum(map(len, asked)) > 0
     assert warm_up.seconds - before >= 0.4
     assert capsys.readouterr().out.count("compiling the inner loops") == 1

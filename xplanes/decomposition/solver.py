@@ -7,9 +7,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xplanes.decomposition.passes import Step, Workspace, finish, iterate, start
 from xplanes.decomposition.schedule import Norms, Penalty, Schedule
-from xplanes.decomposition.svt import needs_double, shrinkage_from_gram
+from xplanes.decomposition.svt import (
+    Step,
+    Workspace,
+    finish,
+    iterate,
+    needs_double,
+    shrinkage_from_gram,
+    start,
+)
 
 _CHECK_EVERY = 4
 CHANGE_OVER_TOLERANCE = 10.0

@@ -1,5 +1,7 @@
 """Singular value thresholding of tall matrices through their small Gram matrix."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -82,3 +84,145 @@ def singular_value_threshold(
     basis, factors, _ = shrinkage_from_gram(gram, threshold)
     weights = ((basis * factors) @ basis.mT).to(matrix.dtype)
     return matrix @ weights, len(factors)
+
+
+_NARROW_FROM_COLUMNS = 96
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one iteration needs to know besides the arrays.
+
+    Attributes:
+        basis: Right singular vectors kept, float64. [T, K]
+        factors: Their shrinkage factors, float64. [K]
+        old_limit: Clip limit under which the stored Z was made.
+        limit: Clip limit of this iteration.
+        rescale: Last penalty over this one.
+        next_rescale: This penalty over the next one.
+        relaxation: Over-relaxation of the low-rank part.
+        double: Multiply the Gram matrix in float64.
+    """
+
+    basis: Tensor
+    factors: Tensor
+    old_limit: float
+    limit: float
+    rescale: float
+    next_rescale: float = 1.0
+    relaxation: float = 1.0
+    double: bool = True
+
+
+class Workspace:
+    """The matrix and its state cut into row blocks, with four block-sized buffers."""
+
+    def __init__(self, matrix: Tensor, state: Tensor) -> None:
+        self.rows = min(block_rows(matrix), len(matrix))
+        self.matrix = matrix
+        self.blocks = list(zip(matrix.split(self.rows), state.split(self.rows), strict=True))
+        columns = matrix.shape[1]
+        by_column = matrix.stride(0) == 1
+        shape = (4, columns, self.rows) if by_column else (4, self.rows, columns)
+        buffers = torch.empty(shape, dtype=matrix.dtype, device=matrix.device)
+        self._buffers = (buffers.mT if by_column else buffers).unbind(0)
+
+    def buffers(self, count: int) -> list[Tensor]:
+        return [buffer[:count] for buffer in self._buffers]
+
+
+def start(work: Workspace) -> Tensor:
+    """Clear the state and return the Gram matrix of Y, in float64 on the CPU. [T, T]"""
+    columns = work.matrix.shape[1]
+    gram = torch.zeros(columns, columns, dtype=torch.float64, device=work.matrix.device)
+    for block, state in work.blocks:
+        add_gram(gram, block, double=True)
+        state.zero_()
+    return gram.cpu()
+
+
+def iterate(
+    work: Workspace, step: Step, *, norms: bool, changes: bool
+) -> tuple[Tensor, list[float]]:
+    """Make one iteration in place.
+
+    Args:
+        work: The blocks; their state is overwritten.
+        step: Parameters of the iteration.
+        norms: Measure the norms of the sparse part and of the multiplier over the penalty.
+        changes: Measure these, the change of the sparse part and ``|L + S - Y|`` too.
+
+    Returns:
+        The Gram matrix of the next X, in float64 on the CPU, and the four norms (zero where
+        not measured). One transfer from the device serves both. [T, T]
+    """
+    matrix, alpha = work.matrix, step.relaxation
+    columns, kept = step.basis.shape
+    totals = torch.zeros(columns * columns + 4, dtype=torch.float64, device=matrix.device)
+    gram = totals[4:].view(columns, columns)
+    forward = (step.basis * (alpha * step.factors)).to(matrix)
+    backward = step.basis.mT.to(matrix)
+    # Two thin products beat one square product only where few of many directions are kept.
+    narrow = columns >= _NARROW_FROM_COLUMNS and 4 * kept <= columns
+    weights = (
+        forward if narrow else ((step.basis * (alpha * step.factors)) @ step.basis.mT).to(matrix)
+    )
+    if not narrow:
+        weights.diagonal().sub_(alpha - 1)
+
+    for y, z in work.blocks:
+        clipped, x, next_clipped, change = work.buffers(len(y))
+        torch.clamp(z, -step.old_limit, step.old_limit, out=clipped)
+        if changes:
+            torch.sub(z, clipped, out=change)
+        torch.sub(y, z, out=x)
+        x.add_(clipped, alpha=1 + step.rescale)
+        # Z = Y - relaxed L - multiplier, where relaxed L = alpha X W + (1 - alpha) (Y - sparse).
+        torch.add(y, clipped, alpha=(2 - alpha) * step.rescale, out=z)
+        if narrow:
+            z.add_(x, alpha=alpha - 1)
+            z.addmm_(x @ forward, backward, alpha=-1)
+        else:
+            z.addmm_(x, weights, alpha=-1)
+        torch.clamp(z, -step.limit, step.limit, out=next_clipped)
+        if norms or changes:
+            torch.sub(z, next_clipped, out=x)
+            totals[0] += _squared(x)
+            totals[1] += _squared(next_clipped)
+        if changes:
+            change.sub_(x)
+            totals[2] += _squared(change)
+            # Undo the relaxation: L + S - Y from the step of the multiplier and the change of S.
+            clipped.mul_(step.rescale).sub_(next_clipped).add_(change, alpha=1 - alpha)
+            totals[3] += _squared(clipped) / alpha**2
+        torch.sub(y, z, out=x)
+        x.add_(next_clipped, alpha=1 + step.next_rescale)
+        add_gram(gram, x, double=step.double)
+
+    totals = totals.cpu()
+    return totals[4:].view(columns, columns), totals[:4].sqrt().tolist()
+
+
+def finish(work: Workspace, low_rank: Tensor, step: Step) -> None:
+    """Make one plain iteration that leaves L in ``low_rank`` and S in place of the state.
+
+    Args:
+        work: The blocks; their state becomes the sparse part.
+        low_rank: Where the low-rank part goes. [M, T]
+        step: Parameters of the iteration.
+    """
+    weights = ((step.basis * step.factors) @ step.basis.mT).to(work.matrix)
+    for (y, z), low in zip(work.blocks, low_rank.split(work.rows), strict=True):
+        clipped, x, next_clipped, _ = work.buffers(len(y))
+        torch.clamp(z, -step.old_limit, step.old_limit, out=clipped)
+        torch.sub(y, z, out=x)
+        x.add_(clipped, alpha=1 + step.rescale)
+        torch.mm(x, weights, out=low)
+        torch.sub(y, low, out=z)
+        z.add_(clipped, alpha=step.rescale)
+        torch.clamp(z, -step.limit, step.limit, out=next_clipped)
+        z.sub_(next_clipped)
+
+
+def _squared(block: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(block).double().square()

@@ -8,7 +8,7 @@ from xplanes.evaluation.perceptual import Metric, UnavailableError, lpips
 from xplanes.evaluation.progress import progress
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.files import write_json
-from xplanes.training.scoring import ViewImages, ViewScore, mean, score_view
+from xplanes.training.evaluation import ViewImages, ViewScore, mean, score_view
 
 DEFAULT_NETWORK = "vgg"
 
@@ -57,7 +57,7 @@ def _lpips(trained: TrainedRun, network: str | None) -> tuple[str, Metric | None
         return "", None, {}
     name = network or DEFAULT_NETWORK
     tag = f"lpips_{name}"
-    side = min(trained.views.height, trained.views.width)
+    side = int(trained.views.intrinsics.size.min())
     device = str(trained.module.device)
     try:
         return tag, lpips(name, side, device, download=network is not None), {}

@@ -9,7 +9,7 @@ from xplanes.evaluation.sweep import RunRow
 from xplanes.evaluation.tabulate import differing, markdown
 
 FILE = "published.csv"
-KEYS = {"model": "model.name", "lrm": "lrm.name", "sampler": "sampler.name"}
+KEYS = {"model": "model.name", "lrm": "lrm.name", "sampler": "model.sampler.name"}
 """Columns of the file that a run must agree with, and its settings of that meaning."""
 
 MEANT = ("data.scene", "seed", "entry")

@@ -2,25 +2,176 @@
 
 import difflib
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from PIL import Image
 from torch import Tensor
 
-from xplanes.config import ConfigError
-from xplanes.evaluation.media import (
-    ELEVATION,
-    check_film,
-    film_times,
-    orbit_poses,
-    render_path,
-    write_film,
-)
+from xplanes.errors import ConfigError
 from xplanes.evaluation.progress import progress
 from xplanes.evaluation.runs import TrainedRun
-from xplanes.files import require_writable
-from xplanes.scenes.views import Views
+from xplanes.files import replacing, require_writable
+from xplanes.optional import require
+from xplanes.rendering.base import RayRenderer
+from xplanes.rendering.box import Field
+from xplanes.rendering.pictures import colour_map, to_bytes
+from xplanes.scenes.cameras import orbit
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.views import Views, camera_rays
+
+ELEVATION = 20.0
+"""Height angle of the turning camera, in degrees."""
+
+
+def orbit_poses(views: Views, frame: Frame, count: int, elevation: float = ELEVATION) -> Tensor:
+    """Cameras around the scene, as far from it as the training cameras are. [count, 4, 4]"""
+    distance = (views.camera_to_world[:, :3, 3] - frame.centre).norm(dim=-1).median()
+    return orbit(count, radius=float(distance), elevation=elevation, target=frame.centre)
+
+
+def film_times(frames: int) -> Tensor:
+    """Times that run forth and back once, so that a repeated film does not jump. [frames]"""
+    phase = torch.arange(frames) / max(frames, 1)
+    return 1 - (2 * phase - 1).abs()
+
+
+def render_path(
+    field: Field,
+    renderer: RayRenderer,
+    frame: Frame,
+    poses: Tensor,
+    times: Tensor,
+    *,
+    focal: float | Tensor,
+    size: int,
+    centre: Tensor | None = None,
+    background: Tensor,
+    what: str = "colour",
+) -> Iterator[Tensor]:
+    """Render square frames along a path of cameras and times, one at a time.
+
+    Args:
+        field: The field.
+        renderer: Renders it.
+        frame: The field's frame.
+        poses: Camera-to-world matrices. [F, 4, 4]
+        times: Time of each frame, from 0 to 1. [F]
+        focal: Focal length in pixels of these frames, or those along x and y. [2]
+        size: Pixels per side.
+        centre: Principal point in pixels; the middle when None. [2]
+        background: Colour behind the scene. [3]
+        what: ``colour``, or ``depth`` as colours whose scale is the same in all frames.
+
+    Yields:
+        Pictures. uint8 [size, size, 3]
+    """
+    device = renderer.device
+    for pose, time in zip(poses, times.tolist(), strict=True):
+        origins, directions = frame.rays(*camera_rays(pose, focal, size, size, centre))
+        rays = origins.to(device), directions.to(device)
+        image = renderer.image(field, *rays, time, background.to(device))
+        picture = image["colour"]
+        if what == "depth":
+            picture = _depth(image, float(origins[0].norm()))
+        yield to_bytes(picture.view(size, size, 3))
+
+
+def _depth(image: dict[str, Tensor], distance: float) -> Tensor:
+    """Depth as colours, near is light; white where there is nothing. [R, 3]
+
+    The scale is the field's cube as seen from ``distance``, not what a frame happens to show: a
+    film would flicker.
+    """
+    colours = colour_map(0.5 + 0.5 * (distance - image["depth"]))
+    return torch.lerp(torch.ones_like(colours), colours, image["opacity"][:, None])
+
+
+def check_film(path: Path, *, frames: int, folder: bool = False) -> None:
+    """Refuse what `write_film` could not write, before anything is rendered.
+
+    Args:
+        path: Where the film is to go.
+        frames: Number of frames.
+        folder: Whether ``path`` is a folder for one PNG per frame.
+
+    Raises:
+        ConfigError: If the ending stands for no format, or files would be mixed.
+        ImportError: For .mp4 without the extra ``video``, naming it.
+    """
+    if folder:
+        if path.is_dir() and any(path.iterdir()):
+            raise ConfigError(f"{path} holds files already: empty it, or name another folder")
+    elif path.suffix == ".mp4":
+        require("imageio_ffmpeg", extra="video")
+        require("imageio.v2", extra="video")
+    elif path.suffix == ".png" and frames > 1:
+        raise ConfigError(
+            f"{path} holds one picture, not {frames}: a folder takes one PNG per frame if its name "
+            f"ends in / ({path.with_suffix('')}/)"
+        )
+    elif path.suffix not in (".webp", ".png"):
+        raise ConfigError(f"{path}: films end in .webp or .mp4, pictures in .png, folders in /")
+
+
+def write_film(path: Path, frames: Iterable[Tensor], *, fps: int, folder: bool = False) -> Path:
+    """Write frames as a film, whole or not at all.
+
+    Args:
+        path: Its ending decides: .webp needs nothing more, .mp4 the extra ``video``, .png takes one
+            frame.
+        frames: uint8 [H, W, 3] each.
+        fps: Frames per second.
+        folder: Write one PNG per frame into the folder ``path`` instead.
+
+    Raises:
+        ConfigError: For another ending.
+        ImportError: For .mp4 without the extra, naming it.
+    """
+    check_film(path, frames=1, folder=folder)
+    if folder:
+        for number, frame in enumerate(frames):
+            _write_png(path / f"frame_{number:04d}.png", frame)
+    elif path.suffix == ".mp4":
+        _write_mp4(path, frames, fps)
+    elif path.suffix == ".png":
+        _write_png(path, next(iter(frames)))
+    else:
+        _write_webp(path, frames, fps)
+    return path
+
+
+def _write_png(path: Path, frame: Tensor) -> None:
+    with replacing(path) as temporary:
+        Image.fromarray(frame.numpy()).save(temporary, format="PNG")
+
+
+def _write_webp(path: Path, frames: Iterable[Tensor], fps: int) -> None:
+    first, *rest = [Image.fromarray(frame.numpy()) for frame in frames]
+    with replacing(path) as temporary:
+        first.save(
+            temporary,
+            format="WEBP",
+            save_all=True,
+            append_images=rest,
+            duration=round(1000 / fps),
+            loop=0,
+            quality=85,
+            method=2,
+        )
+
+
+def _write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> None:
+    imageio = require("imageio.v2", extra="video")
+    # imageio would resize frames to multiples of 16 if it were not told otherwise.
+    options = {"fps": fps, "macro_block_size": 2, "quality": 8}
+    with replacing(path) as temporary, imageio.get_writer(temporary, **options) as writer:
+        for frame in frames:
+            height, width = (side // 2 * 2 for side in frame.shape[:2])
+            writer.append_data(frame[:height, :width].numpy())
+
 
 FRAMES = 48
 LARGEST = 8192
@@ -100,16 +251,17 @@ def film(trained: TrainedRun, options: FilmOptions, out: str | None = None) -> P
     target, folder = destination(trained.path, options, out, trained.checkpoint)
     require_writable(target.parent)
     views = trained.scene.splits["train"]
-    longer = max(views.height, views.width)
-    size = longer if options.size is None else options.size
+    size = max(views.height, views.width) if options.size is None else options.size
+    focal, centre = lens(trained.scene.splits, options.path, size)
     frames = render_path(
         trained.module.field,
         trained.module.renderer,
         trained.frame,
         poses(trained, options),
         times(options.time, options.count),
-        focal=views.focal * size / longer,
+        focal=focal,
         size=size,
+        centre=centre,
         background=trained.scene.background,
         what=options.what,
     )
@@ -121,7 +273,7 @@ def check_out(out: str | None, options: FilmOptions) -> None:
     """Refuse an ``--out`` that could not be written, before the run is loaded.
 
     Raises:
-        ConfigError: As `xplanes.evaluation.media.check_film`.
+        ConfigError: As `xplanes.evaluation.render.check_film`.
         ImportError: For .mp4 without the extra ``video``.
     """
     target, folder = destination(Path(), options, out, "last")
@@ -153,20 +305,43 @@ def poses(trained: TrainedRun, options: FilmOptions) -> Tensor:
     return pose.expand(options.count, 4, 4)
 
 
+def lens(splits: dict[str, Views], path: str, size: int) -> tuple[float | Tensor, Tensor | None]:
+    """Focal length and principal point of square pictures along a path, for `render_path`.
+
+    Those of a view show that view whole; the others show as much as the training views.
+    """
+    if not path.startswith("view:"):
+        return splits["train"].intrinsics.focal_at(size), None
+    views, index = find_view(splits, path.removeprefix("view:"))
+    height, width = views.size(index)
+    longer = max(height, width)
+    room = torch.tensor([longer - width, longer - height]) / 2
+    focal, centre = views.intrinsics.focal[index], views.intrinsics.centre[index]
+    return focal * size / longer, (centre + room) * size / longer
+
+
 def view_pose(splits: dict[str, Views], name: str) -> Tensor:
     """Camera of the view whose file is called ``name``, with or without ending. [4, 4]
 
     Raises:
         ConfigError: If there is none, with similar names.
     """
+    views, index = find_view(splits, name)
+    return views.camera_to_world[index]
+
+
+def find_view(splits: dict[str, Views], name: str) -> tuple[Views, int]:
+    """The view whose file is called ``name``, with or without ending: its split and its number.
+
+    Raises:
+        ConfigError: If there is none, with similar names.
+    """
     known = {
-        file: views.camera_to_world[index]
-        for views in splits.values()
-        for index, file in enumerate(views.files)
+        file: (views, index) for views in splits.values() for index, file in enumerate(views.files)
     }
-    for file, pose in known.items():
+    for file, found in known.items():
         if name in (file, file.rsplit(".", 1)[0]):
-            return pose
+            return found
     near = difflib.get_close_matches(name, list(known), n=3, cutoff=0.3) or list(known)[:3]
     raise ConfigError(
         f"--path view:{name}: no such view in {' or '.join(splits)}. Views are called "

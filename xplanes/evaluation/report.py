@@ -1,34 +1,44 @@
 """What a run says of itself: its first lines, metrics.json, TensorBoard, its last lines."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
+from torch.utils.tensorboard.writer import SummaryWriter
 
 from xplanes import __version__, backend
-from xplanes.config import TrainConfig
+from xplanes.experiment import Experiment
 from xplanes.process import train_command
 from xplanes.rendering.pictures import write_png
-from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene
+from xplanes.training.clock import TrainingClock, find_callback, training_seconds
+from xplanes.training.evaluation import ViewScore, device_memory, log_image, mean
+from xplanes.training.fit import Estimate, Trainer
 from xplanes.training.module import RadianceModule
-from xplanes.training.scorer import device_memory
-from xplanes.training.scoring import ViewScore, mean
+from xplanes.training.plateau import PlateauStop
+from xplanes.training.step_threads import StepThreads
+
+VIDEO_PIXELS = 48 * 200 * 200
+"""Pixels of the video at the end."""
 
 
 def header(
-    config: TrainConfig,
+    experiment: Experiment,
     run: Path,
     scene: Scene,
-    frame: Frame,
     module: RadianceModule,
-    device: torch.device,
-    overrides: list[str],
-    start: str,
+    overrides: Sequence[str],
+    expected: Estimate,
 ) -> str:
-    """The lines printed before training: what is about to happen, on what, from what ``start``."""
+    """The lines printed before training: what is about to happen, on what, from what."""
+    assert module.frame is not None
+    assert module.sampler is not None
+    assert module.initialisation is not None
+    frame, device, trainer = module.frame, experiment.device, experiment.trainer
     counts = " / ".join(f"{len(views)} {name}" for name, views in scene.splits.items())
     train = scene.splits["train"]
     size = sum(views.nbytes for views in scene.splits.values()) / 2**20
@@ -36,36 +46,61 @@ def header(
     frozen = sum(p.numel() for p in module.parameters()) - trainable
     moving = ""
     if not module.field.moves:
-        reason = scene.still or "one moment only"
-        moving = f" · trains as a still one, without planes of time: {reason}"
-    budget = f"{config.trainer.max_steps} steps"
-    if config.trainer.max_seconds is not None:
-        budget += f" or {config.trainer.max_seconds:g} s, whichever comes first"
+        reason = scene.still or "one timestep only"
+        moving = f" · trains as a static one, without time planes: {reason}"
+    budget = f"{trainer.get('max_steps')} steps"
+    if trainer.get("max_seconds") is not None:
+        budget += f" or {trainer['max_seconds']:g} s, whichever comes first"
     lines = {
         "xplanes": f"{__version__} · torch {torch.__version__} · {device} · "
-        f"up to {torch.get_num_threads()} threads · decoder {module.field.precision} · "
+        f"{torch.get_num_threads()} threads · decoder {module.field.precision} · "
         f"{backend.name(device)}",
         "run": str(run),
-        "data": f"{config.data.name} {scene.name} · {counts} views · "
-        f"{train.width}x{train.height} px · {size:.1f} MB · cube {2 / frame.scale:.2f} wide",
-        "model": f"{config.model.name} {module.field.outline} · "
+        "data": f"{experiment.data.name} {scene.name} · {counts} views · "
+        f"{train.outline} · {size:.1f} MB · cube {2 / frame.scale:.2f} wide",
+        "model": f"{experiment.method.model.name} {module.field.outline} · "
         f"{trainable:,} parameters, {frozen:,} frozen{moving}",
-        "start": start,
-        "space": module.sampling.outline,
-        "plan": budget,
+        "from": module.initialisation.words,
+        "samples": module.sampler.outline,
+        "budget": budget,
+        "estimate": _estimated(experiment, scene, expected),
         "changed": " ".join(overrides) or "(nothing)",
     }
     return "\n".join(f"{name:<9}{text}" for name, text in lines.items())
 
 
+def _estimated(experiment: Experiment, scene: Scene, expected: Estimate) -> str:
+    """Seconds and memory that the run is going to take, in words."""
+    trainer = experiment.trainer
+    steps = float(trainer.get("max_steps", -1)) if trainer.get("max_steps", -1) > 0 else math.inf
+    train = min(steps * expected.step, trainer.get("max_seconds") or math.inf)
+    views = scene.splits[experiment.data.eval_split]
+    node = experiment.callbacks.get("evaluation", {})
+    times, count = len(node.get("at", [])), node.get("views") or len(views)
+    pixels = views.height * views.width * (times * min(count, len(views)))
+    if experiment.media:
+        pixels += VIDEO_PIXELS
+    images = pixels / expected.image_rays
+    whole = f"{train + images:.0f} s" if train < math.inf else "no end of training"
+    return (
+        f"at most {whole}, {images:.0f} s of it for scores and images; about "
+        f"{expected.memory / 2**30:.1f} GB of memory"
+    )
+
+
 def summary(
+    trainer: Trainer,
     module: RadianceModule,
-    scores: list[ViewScore],
+    scores: Sequence[ViewScore],
     split: str,
     seconds: dict[str, Any],
     background_skipped: float,
 ) -> dict[str, Any]:
     """The content of metrics.json."""
+    clock = training_seconds(trainer)
+    plateau = find_callback(trainer, PlateauStop)
+    ending = None if plateau is None else plateau.ending
+    threads = find_callback(trainer, StepThreads)
     counts = module.counts
     candidates = max(1, counts["candidates"])
     return {
@@ -75,9 +110,9 @@ def summary(
             "ssim": mean([s.ssim for s in scores]),
         },
         "views": [{"file": s.file, "time": s.time, "psnr": s.psnr, "ssim": s.ssim} for s in scores],
-        "step": module.global_step,
+        "step": trainer.global_step,
         "seconds": seconds,
-        "rays_per_second": counts["rays"] / max(module.clock, 1e-9),
+        "rays_per_second": counts["rays"] / max(clock, 1e-9),
         "samples_per_ray": counts["samples"] / max(1, counts["rays"]),
         "skipped": {
             "empty": counts["empty"] / candidates,
@@ -85,63 +120,72 @@ def summary(
             "gradients": 1 - counts["passed"] / max(1, counts["samples"]),
             "background": background_skipped,
             "static": float(not module.field.moves),
-            "budget": 0.0 if module.ending is None else 1 - module.spent,
+            "budget": 0.0 if ending is None else max(0.0, 1 - spent(trainer)),
         },
-        "converged": None if module.ending is None else module.ending[0],
+        "converged": None if ending is None else ending[0],
         "steps_skipped": module.unusable,
-        "threads": module.threads,
+        "threads": torch.get_num_threads() if threads is None else threads.count,
         "loops": backend.name(module.device),
         "parameters": sum(p.numel() for p in module.parameters()),
         "peak_memory_bytes": device_memory(module.device),
     }
 
 
-def write_start(run: Path, pictures: Mapping[str, Tensor], *, log: bool) -> None:
-    """Write the pictures of what happened before training, if anything did.
+def spent(trainer: Trainer) -> float:
+    """Share of the budget that is used: of steps or of the training clock, the larger."""
+    clock = find_callback(trainer, TrainingClock)
+    steps = trainer.global_step / trainer.max_steps if trainer.max_steps > 0 else 0.0
+    return max(steps, 0.0 if clock is None else clock.progress)
+
+
+def write_pictures(trainer: Trainer, pictures: Mapping[str, Tensor], *, log: bool) -> None:
+    """Write the images of what happened before training, if anything did.
 
     Args:
-        run: The run directory.
+        trainer: Has the run directory and the loggers.
         pictures: By name, colours from 0 to 1. [H, W, 3] each
-        log: Whether they go to TensorBoard too.
+        log: Whether they go to the loggers too.
     """
-    from torch.utils.tensorboard.writer import SummaryWriter
-
     for name, picture in pictures.items():
-        write_png(run / "media" / f"{name}.png", picture)
+        write_png(Path(trainer.default_root_dir) / "media" / f"{name}.png", picture)
         if log:
-            with SummaryWriter(str(run / "tb")) as writer:
-                writer.add_image(name, picture, 0, dataformats="HWC")
+            log_image(trainer, name, picture, 0)
 
 
-def write_hparams(run: Path, config: TrainConfig, metrics: dict[str, Any]) -> None:
-    """One HParams entry per run, with its final scores."""
-    from torch.utils.tensorboard.writer import SummaryWriter
-
+def log_hparams(trainer: Trainer, experiment: Experiment, metrics: dict[str, Any]) -> None:
+    """The settings that runs are compared by, with their final scores."""
+    method, data = experiment.method, experiment.data
+    model: Any = method.model
     parameters = {
-        "scene": config.data.scene,
-        "views": config.data.views or 0,
-        "model": config.model.name,
-        "resolution": config.model.resolution,
-        "channels": config.model.channels,
-        "lrm": config.lrm.name,
-        "seed": config.seed,
-        "learning_rate": getattr(config.model, "learning_rate", config.trainer.plane_lr),
+        "scene": data.scene,
+        "views": data.views or 0,
+        "model": model.name,
+        "resolution": getattr(model, "resolution", 0),
+        "channels": getattr(model, "channels", 0),
+        "lrm": method.lrm.name,
+        "seed": method.seed,
+        "learning_rate": getattr(model, "learning_rate", getattr(model, "plane_lr", 0.0)),
     }
     scores = {f"{metrics['split']}/{name}": value for name, value in metrics["test"].items()}
     scores["time/train_s"] = metrics["seconds"]["train"]
-    with SummaryWriter(str(run / "tb")) as writer:
-        writer.add_hparams(parameters, scores, run_name=".", global_step=metrics["step"])
+    for logger in trainer.loggers:
+        if isinstance(logger, TensorBoardLogger):
+            with SummaryWriter(logger.log_dir) as writer:
+                writer.add_hparams(parameters, scores, run_name=".", global_step=metrics["step"])
+        else:
+            logger.log_hyperparams(parameters)
+            logger.log_metrics(scores, metrics["step"])
 
 
-def closing(run: Path, config: TrainConfig, metrics: dict[str, Any]) -> str:
+def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
     """The lines printed at the end: scores, time, paths, and what to do next."""
     seconds, skipped = metrics["seconds"], metrics["skipped"]
     more = f"trainer.max_steps={2 * metrics['step']}"
-    if config.trainer.max_seconds is not None:
-        more = f"trainer.max_seconds={2 * config.trainer.max_seconds:g}"
+    if (most := experiment.trainer.get("max_seconds")) is not None:
+        more = f"trainer.max_seconds={2 * most:g}"
     plateau = ""
     if metrics["converged"] is not None:
-        more = "trainer.plateau=null"
+        more = "callbacks.plateau.gain=null"
         plateau = (
             f"; {100 * skipped['budget']:.0f}% of the budget, as training had converged at step "
             f"{metrics['converged']}"

@@ -1,24 +1,25 @@
 """Run directories: finding them, and loading them as trained scenes."""
 
 import difflib
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
 
-from xplanes.checks import parse
-from xplanes.config import ConfigError, ModelConfig, TrainConfig, build
+from xplanes import __version__
+from xplanes.errors import ConfigError
+from xplanes.experiment import Experiment
 from xplanes.files import read_json
 from xplanes.process import train_command
-from xplanes.scenes.frame import Frame, read_frame
+from xplanes.scenes.datamodule import found_root
+from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene, Views
-from xplanes.training.builder import build_frame, build_module, build_scene, training_device
 from xplanes.training.checkpoints import load_checkpoint
+from xplanes.training.fit import find_device
 from xplanes.training.module import RadianceModule
-from xplanes.training.resuming import require_same_views
+from xplanes.training.record import require_same_views
 
 OUTPUTS = Path("outputs")
 LISTED = 5
@@ -31,7 +32,7 @@ class TrainedRun:
 
     Attributes:
         path: The run directory.
-        config: Its settings.
+        experiment: Its settings.
         scene: The training views and one split beside them.
         split: Name of that split.
         frame: The field's frame.
@@ -41,7 +42,7 @@ class TrainedRun:
     """
 
     path: Path
-    config: TrainConfig
+    experiment: Experiment
     scene: Scene
     split: str
     frame: Frame
@@ -127,6 +128,7 @@ def load_run(
     checkpoint: str = "last",
     split: str | None = None,
     device: str | None = None,
+    plugins: Sequence[str] = (),
     announce: Callable[[str], None] | None = None,
 ) -> TrainedRun:
     """Load a trained run, exactly as it was when the checkpoint was written.
@@ -136,58 +138,66 @@ def load_run(
         checkpoint: ``last`` or ``best``.
         split: Split to read beside the training views; the run's own when None.
         device: Where to put the field; as ``trainer.accelerator`` says when None.
+        plugins: Modules of the user's own whose classes the run may name.
         announce: Takes the lines that say what is being loaded.
 
     Raises:
         ConfigError, SceneError: If the run or its data are missing, damaged or changed.
     """
-    config = _parsed(run)
-    name = split or config.data.eval_split
-    if device is not None:
-        config.trainer.accelerator = "cpu" if torch.device(device).type == "cpu" else "gpu"
-    elif config.trainer.accelerator == "gpu":
-        config.trainer.accelerator = "auto"  # Trained on a GPU, looked at where there may be none.
-    device = device or str(training_device(config.trainer.accelerator))
-    state = load_checkpoint(run / "checkpoints" / f"{checkpoint}.ckpt")
+    experiment = read_experiment(run, plugins)
+    data = replace(experiment.data, root=found_root(run, experiment.data.root))
+    name = split or data.eval_split
+    if device is None:
+        # Trained on a GPU, looked at where there may be none.
+        wanted = str(experiment.trainer.get("accelerator", "auto"))
+        device = str(find_device("cpu" if wanted == "cpu" else "auto"))
+    path = run / "checkpoints" / f"{checkpoint}.ckpt"
+    state = load_checkpoint(path)
     step = state.get("global_step")
     if not isinstance(step, int) or "state_dict" not in state or "progress" not in state:
-        raise ConfigError(f"{run}/checkpoints/{checkpoint}.ckpt is not a checkpoint of train.py")
+        raise ConfigError(f"{path} is not a checkpoint of xplanes")
     if announce is not None:
         announce(f"run         {run}")
         announce(f"checkpoint  {checkpoint}.ckpt, step {step}, on {device}")
-    config.data.root = _data_root(run, config.data.root)
-    scene = build_scene(config.data, ("train", name))
+    scene = data.read(("train", name))
     require_same_views(run, _record(run), scene.splits["train"])
-    frame = build_frame(config, scene.splits["train"])
-    if (origin := state.get("origin")) is not None:
-        # Planes and decoder were shaped by a source that need not be there any more.
-        config.model, frame = _origin(origin, f"{run}/checkpoints/{checkpoint}.ckpt")
-    module = build_module(config, scene, frame)
-    module.on_load_checkpoint(state)
-    module.load_state_dict(state["state_dict"])
+    module = RadianceModule(experiment.config, plugins)
+    try:
+        module.on_load_checkpoint(state)
+        module.load_state_dict(state["state_dict"])
+    except ConfigError as error:
+        raise ConfigError(f"{path} cannot be used: {error}") from error
     module.to(device).eval()
-    return TrainedRun(run, config, scene, name, frame, module, checkpoint, step)
+    assert module.frame is not None
+    return TrainedRun(
+        run, replace(experiment, data=data), scene, name, module.frame, module, checkpoint, step
+    )
 
 
-def _parsed(run: Path) -> TrainConfig:
-    content = read_config(run)
+def read_experiment(run: Path, plugins: Sequence[str] = ()) -> Experiment:
+    """The settings of a run directory.
+
+    Args:
+        run: The run directory.
+        plugins: Modules of the user's own whose classes they may name.
+
+    Raises:
+        ConfigError: If they are missing, damaged, or from another version.
+    """
+    content, version = read_config(run), _record(run).get("xplanes")
     try:
-        return parse(content)
-    except (KeyError, TypeError, AttributeError) as error:
+        return Experiment.read(content, plugins)
+    except (ConfigError, KeyError, TypeError, AttributeError) as error:
+        if isinstance(version, str) and version != __version__:
+            raise ConfigError(
+                f"{run} was made by xplanes {version}, this is {__version__}, which cannot read "
+                f"its settings ({error}): install that version to use it, or train anew"
+            ) from error
+        if isinstance(error, ConfigError) and not isinstance(error.__cause__, KeyError):
+            raise ConfigError(f"{run}/config.yaml: {error}") from error
         raise ConfigError(
-            f"{run}/config.yaml cannot be used ({type(error).__name__}: {error}): it is damaged, "
-            "or from another version of xplanes"
-        ) from error
-
-
-def _origin(content: Any, name: str) -> tuple[ModelConfig, Frame]:
-    """The model's settings and the frame that a checkpoint carries."""
-    try:
-        return build(ModelConfig, content["model"]), read_frame(content["frame"], name)
-    except (KeyError, TypeError, AttributeError) as error:
-        raise ConfigError(
-            f"{name} cannot be used ({type(error).__name__}: {error}): it is damaged, or from "
-            "another version of xplanes"
+            f"{run}/config.yaml cannot be used ({error}): it is damaged, or from another version "
+            "of xplanes"
         ) from error
 
 
@@ -197,12 +207,3 @@ def _record(run: Path) -> dict[str, Any]:
         return read_json(run / "run.json")
     except (OSError, ValueError):
         return {}
-
-
-def _data_root(run: Path, root: str) -> str:
-    """Where the scenes are: a relative folder may be relative to where training was started."""
-    started = _record(run).get("directory")
-    if Path(root).exists() or not isinstance(started, str):
-        return root
-    there = Path(started) / root
-    return str(there) if there.exists() else root

@@ -12,7 +12,7 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
 from xplanes.evaluation.curves import plot_curves
 from xplanes.evaluation.published import beside
 from xplanes.evaluation.sweep import RunRow, read_rows

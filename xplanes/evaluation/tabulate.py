@@ -11,10 +11,10 @@ from xplanes.evaluation.sweep import MEASURES, RunRow
 SEED = "seed"
 UNLISTED = (
     "resume",
-    "trainer.evaluate_at",
-    "trainer.evaluate_views",
-    "trainer.media",
-    "trainer.log_every",
+    "callbacks.evaluation.at",
+    "callbacks.evaluation.views",
+    "media",
+    "trainer.log_every_n_steps",
 )
 """Settings that say nothing about a result."""
 
@@ -34,14 +34,13 @@ LONGEST = 120
 def align(rows: list[RunRow]) -> list[RunRow]:
     """Settings of jobs without a run, by the names that runs have: ``model`` is ``model.name``."""
     known = {name for row in rows for name in row.settings if name.endswith(".name")}
+
+    def name(key: str) -> str:
+        full = f"{key.replace('/', '.')}.name"
+        return full if full in known else key
+
     return [
-        replace(
-            row,
-            settings={
-                f"{key}.name" if f"{key}.name" in known else key: value
-                for key, value in row.settings.items()
-            },
-        )
+        replace(row, settings={name(key): value for key, value in row.settings.items()})
         for row in rows
     ]
 
@@ -58,10 +57,11 @@ def differing(rows: Sequence[RunRow]) -> list[str]:
         values = {_text(row.settings.get(name)) for row in among if _has(row, name)}
         if len(values) < 2 or name in UNLISTED:
             continue
-        group = f"{name.split('.')[0]}.name"
-        # A baseline brings settings of other groups along.
-        follows = _follows(whole, name, group) or _follows(whole, name, "model.name")
-        if name == group or name in overridden or not follows:
+        parts = name.split(".")
+        groups = [f"{'.'.join(parts[:end])}.name" for end in range(1, len(parts))]
+        # A model brings settings of other groups along.
+        follows = any(_follows(whole, name, group) for group in (*groups, "model.name"))
+        if name in groups or name in overridden or not follows:
             found.append(name)
     return found
 

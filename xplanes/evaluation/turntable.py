@@ -7,40 +7,38 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from xplanes.config import ConfigError, ImageLRMConfig, TrainConfig
-from xplanes.evaluation.media import render_path, write_film
+from xplanes.errors import ConfigError
+from xplanes.evaluation.render import render_path, write_film
+from xplanes.experiment import Experiment
 from xplanes.fields import XPlanes
 from xplanes.fields.xplanes import SPACE_PLANES
 from xplanes.lrm.model import LRM
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.encode import encode
-from xplanes.preparation.reconstruct import load_lrm, picture_crop, wants_bf16
+from xplanes.preparation.reconstruct import ImageLRMSettings, picture_crop
 from xplanes.preparation.sequence import TriplaneSequence, save_triplanes
+from xplanes.rendering.grid_renderer import DIAGONAL, GridRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.rendering.renderer import DIAGONAL, Renderer
-from xplanes.scenes.batches import step_generator
 from xplanes.scenes.cameras import camera_around
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import cube_frame
 from xplanes.scenes.images import load_images
-from xplanes.training.builder import training_device
+from xplanes.streams import Stream, step_generator
 
 FRAMES, FPS, SIDE = 48, 16, 224
 SAMPLES, CELLS = 192, 64
 KINDS = (".png", ".jpg", ".jpeg")
-GRID_STREAM = 1_000_061
-"""Random stream of the points at which the preview's grid is filled."""
 
 
 def write_triplanes(
-    paths: Sequence[Path], out: Path, config: TrainConfig, *, say: Callable[[str], None]
+    paths: Sequence[Path], out: Path, experiment: Experiment, *, say: Callable[[str], None]
 ) -> Path:
     """Turn pictures into triplanes, and write them and a film that goes round them.
 
     Args:
         paths: Pictures, or folders of them.
         out: File to write, .safetensors or .pt; the film lies beside it.
-        config: Settings, of which the model's, the cache and the device count.
+        experiment: Settings, of which the model's, the cache and the device count.
         say: Takes lines about what happens.
 
     Returns:
@@ -52,17 +50,20 @@ def write_triplanes(
     pictures = find_pictures(paths)
     if out.suffix not in (".safetensors", ".pt"):
         raise ConfigError(f"out={out}: must end in .safetensors or .pt")
-    options = config.lrm
-    if not isinstance(options, ImageLRMConfig):
+    options = experiment.method.lrm
+    if not isinstance(options, ImageLRMSettings):
         raise ConfigError(
             f"lrm={options.name} makes no triplanes of pictures: choose a model, such as lrm=small"
         )
-    lrm = load_lrm(options, say=say)
+    lrm = options.load_model(say)
     frames = load_images(pictures, None)
     if bool((frames[..., 3] == 255).all()):
-        say("the pictures have no transparency: the model takes the background for a thing")
-    folder = config.preparation.cache
-    device = training_device(config.trainer.accelerator)
+        say(
+            "the images have no transparency: the model takes the background for a part of the "
+            "object"
+        )
+    folder = experiment.method.preparation.cache
+    device = experiment.device
     encoded = encode(
         lrm.model,
         lrm.key,
@@ -71,7 +72,7 @@ def write_triplanes(
         StageCache(None if folder is None else Path(folder)),
         device,
         batch=options.batch,
-        bf16=wants_bf16(options, device),
+        bf16=options.bf16_on(device),
     )
     decoder = lrm.model.field_decoder()
     sequence = TriplaneSequence(encoded.triplanes, decoder.state_dict(), decoder.options)
@@ -132,8 +133,8 @@ def turntable(triplanes: Tensor, model: LRM, device: torch.device) -> Iterator[T
             field = XPlanes(planes=planes, decoder=decoder, plane_set="three").to(device)
             grid = OccupancyGrid(CELLS, 1, step=DIAGONAL / SAMPLES).to(device)
             with torch.no_grad():
-                grid.sweep(field, step_generator(0, index, GRID_STREAM))
-            renderer, shown = Renderer(grid, SAMPLES), index
+                grid.sweep(field, step_generator(0, index, Stream.TURNTABLE))
+            renderer, shown = GridRenderer(grid, SAMPLES), index
         assert field is not None
         assert renderer is not None
         azimuth = math.degrees(math.atan2(first[1], first[0])) + 360 * number / FRAMES

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from xplanes.evaluation.media import orbit_poses
+from xplanes.evaluation.render import orbit_poses
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.optional import require
 from xplanes.rendering.pictures import depth_picture, to_bytes
@@ -153,7 +153,7 @@ class Viewer:
         start = self.server.initial_camera
         start.position = tuple(orbit_poses(views, frame, 1)[0, :3, 3].tolist())
         start.look_at = tuple(frame.centre.tolist())
-        start.fov = 2 * math.atan(0.5 * views.height / views.focal)
+        start.fov = views.intrinsics.fov_y
 
     def _toggle(self) -> None:
         self.playing = not self.playing

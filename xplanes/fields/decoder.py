@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from xplanes.fields.half import half_rows
+from xplanes.fields.networks import half_rows
 
 Activation = Literal["relu", "silu"]
 DensityActivation = Literal["softplus", "exp"]

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from xplanes.fields.base import ViewDependentField
-from xplanes.fields.encodings import spherical_harmonics
-from xplanes.fields.networks import PaddedMLP, truncated_exponential
+from xplanes.fields.networks import PaddedMLP, spherical_harmonics, truncated_exponential
 from xplanes.fields.products import PlaneProducts
 
 GEOMETRY = 15

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm
 
 from xplanes.fields.base import RadianceField, ViewDependentField
-from xplanes.fields.encodings import octaves
 from xplanes.fields.hierarchy import Compression, HierarchicalPlanes
+from xplanes.fields.networks import octaves
 
 HIDDEN = 3
 """Hidden layers of all networks."""
@@ -76,7 +76,7 @@ def _colour_network(inputs: int, width: int) -> nn.Sequential:
 
 
 class Tensor4D(RadianceField):
-    """Signed distance and colour in canonical space, and the flow from each moment to it.
+    """Signed distance and colour in canonical space, and the flow from each timestep to it.
 
     Args:
         planes: Planes of the canonical space.
@@ -139,7 +139,7 @@ class Tensor4D(RadianceField):
         return (10 * self.steepness).exp().clamp(1e-6, 1e6)
 
     def canonical(self, points: Tensor, times: Tensor) -> Tensor:
-        """Where points of a moment lie in canonical space, that of time 0. [N, 3], [N] -> [N, 3]"""
+        """Where points lie in canonical space, that of time 0. [N, 3], [N] -> [N, 3]"""
         if self.flow is None or self.compression is None or self.flow_planes is None:
             return points
         features = self.compression(self.flow_planes(points, times))
@@ -159,7 +159,7 @@ class Tensor4D(RadianceField):
     def distance_and_slope(
         self, points: Tensor, times: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The distance at a moment and its gradient there, through the flow; all can be trained.
+        """The distance at a timestep and its gradient there, through the flow; all can be trained.
 
         Args:
             points: [N, 3]
@@ -182,7 +182,7 @@ class Tensor4D(RadianceField):
     def colour(
         self, points: Tensor, slopes: Tensor, features: Tensor, directions: Tensor
     ) -> Tensor:
-        """Colour at points of a moment. [N, 3], [N, 3], [N, width], [N, 3] -> [N, 3]"""
+        """Colour at points of a timestep. [N, 3], [N, 3], [N, width], [N, 3] -> [N, 3]"""
         seen = octaves(directions, self.octaves[2])
         return self.tint(torch.cat([points, seen, slopes, features], dim=1))
 

@@ -9,8 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from xplanes.fields.base import ViewDependentField
-from xplanes.fields.encodings import octaves
-from xplanes.fields.networks import layers
+from xplanes.fields.networks import layers, octaves
 
 STRIDES = (1, 2, 4)
 """The grid is read at every cell, every second and every fourth."""

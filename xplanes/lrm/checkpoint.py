@@ -9,12 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from xplanes.lrm.config import LRMConfig, parse_config
+from xplanes.lrm.config import PUBLISHED, LRMConfig, parse_config, published_config
 from xplanes.lrm.errors import LRMError
 from xplanes.lrm.keys import translator
 from xplanes.lrm.model import LRM
 from xplanes.lrm.openlrm import OpenLRM
-from xplanes.lrm.published import PUBLISHED, published_config
 from xplanes.lrm.triposr import TripoSR
 
 NAMED = 4

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from xplanes.fields.decoder import Decoder
-from xplanes.lrm.attention import Attention, feed_forward
 from xplanes.lrm.canonical import OPENLRM_VIEW, canonical_vector
 from xplanes.lrm.config import LRMConfig
 from xplanes.lrm.errors import LRMError
 from xplanes.lrm.model import LRM
+from xplanes.lrm.vit import Attention, feed_forward
 
 EPSILON = 1e-6
 

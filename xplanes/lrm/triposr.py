@@ -4,12 +4,12 @@ import torch
 from torch import Tensor, nn
 
 from xplanes.fields.decoder import Decoder
-from xplanes.lrm.attention import Attention, GatedFeedForward
 from xplanes.lrm.canonical import TRIPOSR_VIEW
 from xplanes.lrm.config import LRMConfig
 from xplanes.lrm.errors import LRMError
 from xplanes.lrm.images import resize_triposr
 from xplanes.lrm.model import LRM
+from xplanes.lrm.vit import Attention, GatedFeedForward
 
 CHORD = 2 * 0.999 * TRIPOSR_VIEW.half_side
 """Length of the axis-aligned way through TripoSR's box, in its frame.

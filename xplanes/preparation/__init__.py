@@ -1,15 +1,5 @@
-"""What happens before training: from a triplane sequence to a field that has begun."""
+"""From a scene or a file to what a field is initialised with, in stages that are kept."""
 
-from xplanes.preparation.cache import StageCache
 from xplanes.preparation.sequence import TriplaneSequence, load_triplanes, save_triplanes
-from xplanes.preparation.start import Start, find_source, prepare
 
-__all__ = [
-    "StageCache",
-    "Start",
-    "TriplaneSequence",
-    "find_source",
-    "load_triplanes",
-    "prepare",
-    "save_triplanes",
-]
+__all__ = ["TriplaneSequence", "load_triplanes", "save_triplanes"]

@@ -3,36 +3,28 @@
 import hashlib
 import logging
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from xplanes.backend import fast_bf16
-from xplanes.config import (
-    BundledLRMConfig,
-    ImageLRMConfig,
-    PretrainedLRMConfig,
-    TrainConfig,
-)
-from xplanes.lrm.alignment import Alignment, align
-from xplanes.lrm.bundled import load_bundled
-from xplanes.lrm.cube import fit_cube
+from xplanes.errors import ConfigError
+from xplanes.lrm.alignment import Alignment, align, fit_cube
 from xplanes.lrm.errors import LRMError
 from xplanes.lrm.images import Crop, foreground_crop, square_crop
 from xplanes.lrm.model import LRM
-from xplanes.lrm.weights import WeightSource, find_weights, load_weights
+from xplanes.models.initialisation import InitialiserSettings, Method, Place
 from xplanes.preparation.cache import StageCache, fingerprint
 from xplanes.preparation.encode import encode
 from xplanes.preparation.fixed_view import FixedView, fixed_view
-from xplanes.preparation.pictures import film_sheet
 from xplanes.preparation.sequence import TriplaneSequence
-from xplanes.scenes.frame import Frame
-from xplanes.scenes.views import Scene
-from xplanes.training.builder import training_device
+from xplanes.preparation.stages import film_sheet
+from xplanes.settings import Count
 
 logger = logging.getLogger(__name__)
 
@@ -74,39 +66,38 @@ class Reconstruction:
     picture: Tensor | None = None
 
 
-def weight_source(config: PretrainedLRMConfig) -> WeightSource:
-    """Where the weights of the settings come from."""
-    return WeightSource(
-        architecture=config.architecture,
-        repository=config.repository,
-        file=config.file,
-        revision=config.revision,
-        licence=config.licence,
-        megabytes=config.megabytes,
-        weights=None if config.weights is None else Path(config.weights),
-        config=None if config.config is None else Path(config.config),
-    )
+@dataclass(frozen=True, kw_only=True)
+class ImageLRMSettings(InitialiserSettings, ABC):
+    """A model, and how it meets the scene's images."""
+
+    weights: str | None  # A local file instead.
+    matching: Literal["scale", "pad"]  # Where focal lengths differ: scale, or pad (exact).
+    crop: bool  # Show the model the object at the size that it was trained with.
+    batch: Count  # Images at a time.
+    precision: Literal["auto", "32", "bf16"]  # auto: bf16 where the hardware has it.
+
+    def check(self) -> None:
+        if self.crop and self.matching == "pad":
+            raise ConfigError(
+                "crop=true with lrm.matching=pad: a crop settles the size already; set one of "
+                "lrm.crop=false and lrm.matching=scale"
+            )
+
+    @abstractmethod
+    def load_model(self, say: Callable[[str], None]) -> LoadedLRM:
+        """Find the weights, downloading them if need be, and load them.
+
+        Raises:
+            LRMError: If no weights can be had, or they do not fit.
+        """
+
+    def bf16_on(self, device: torch.device) -> bool:
+        """Whether the model multiplies in bfloat16."""
+        return self.precision == "bf16" or (self.precision == "auto" and fast_bf16(device))
 
 
-def load_lrm(config: ImageLRMConfig, *, say: Callable[[str], None]) -> LoadedLRM:
-    """Find the weights, downloading them if need be, and load them.
-
-    Raises:
-        LRMError: If no weights can be had, or they do not fit.
-    """
-    began = time.perf_counter()
-    if isinstance(config, BundledLRMConfig):
-        own = None if config.weights is None else Path(config.weights)
-        model, path = (
-            load_bundled(config.bundled) if own is None else load_bundled(own.stem, own.parent)
-        )
-    elif isinstance(config, PretrainedLRMConfig):
-        source = weight_source(config)
-        path = find_weights(source, announce=say)
-        began = time.perf_counter()
-        model = load_weights(source, path, announce=say)
-    else:
-        raise TypeError(f"{type(config).__name__} names no weights")
+def loaded(model: LRM, path: Path, began: float) -> LoadedLRM:
+    """A model that was loaded from a file since ``began``."""
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     key = fingerprint([digest, repr(model.config), repr(model.view)])
@@ -114,39 +105,35 @@ def load_lrm(config: ImageLRMConfig, *, say: Callable[[str], None]) -> LoadedLRM
 
 
 def reconstruct(
-    config: TrainConfig,
-    scene: Scene,
-    frame: Frame,
+    method: Method,
+    options: ImageLRMSettings,
+    place: Place,
     lrm: LoadedLRM,
     cache: StageCache,
-    *,
-    say: Callable[[str], None],
 ) -> Reconstruction:
     """Make the triplane sequence of a scene.
 
     Args:
-        config: The run's settings.
-        scene: The scene.
-        frame: The scene's frame: its cube holds a ball around all that the views show.
+        method: The run's settings.
+        options: Those of the model.
+        place: The scene and its frame, whose cube holds a ball around all that the views show.
         lrm: The model.
         cache: Where finished work is kept.
-        say: Takes a line before something slow begins.
 
     Raises:
         LRMError, SceneError: If the scene's video or camera cannot be used.
     """
-    options, model = config.lrm, lrm.model
-    film = fixed_view(config, scene, frame, model.view, model.image_size, cache, say=say)
-    alignment = place(film, model, options)
-    device = training_device(config.trainer.accelerator)
-    frames = film.views.images
+    model, frame, device = lrm.model, place.frame, place.device
+    video = fixed_view(method, place, model.view, model.image_size, cache)
+    alignment = align_to(video, model, options)
+    frames = video.views.images
     if bool((frames[..., 3] == 255).all()):
         logger.warning(
             "the frames of the fixed view have no transparency: %s takes the background for a "
-            "thing; cut them out (RGBA), or set lrm=none",
+            "part of the object; cut it out (RGBA), or set lrm=none",
             options.name,
         )
-    say(f"lrm: {len(frames)} frames to triplanes")
+    place.say(f"lrm: {len(frames)} frames to triplanes")
     encoded = encode(
         model,
         lrm.key,
@@ -155,7 +142,7 @@ def reconstruct(
         cache,
         device,
         batch=options.batch,
-        bf16=wants_bf16(options, device),
+        bf16=options.bf16_on(device),
     )
     # The cube is to hold the ball around all that the views show.
     offset = float((alignment.frame.centre - frame.centre).norm())
@@ -165,7 +152,7 @@ def reconstruct(
     decoder = model.field_decoder(half_side)
     apart = alignment.mismatch
     report = {
-        "fixed_view": film.words,
+        "fixed_view": video.words,
         "frames": len(frames),
         "distinct": encoded.distinct,
         "cached": encoded.cached,
@@ -174,7 +161,7 @@ def reconstruct(
         "mismatch_pixels": {"largest": apart.largest, "mean": apart.mean},
     }
     words = (
-        f"{options.name} ({model.config.architecture}) on {film.words}, pictures and field up to "
+        f"{options.name} ({model.config.architecture}) on {video.words}, pictures and field up to "
         f"{apart.largest:.1f} px apart"
     )
     return Reconstruction(
@@ -184,34 +171,29 @@ def reconstruct(
             decoder_config=decoder.options,
             frame=placed.field_frame,
         ),
-        seconds={"fixed_view": film.seconds, "lrm": lrm.seconds + encoded.seconds},
+        seconds={"fixed_view": video.seconds, "lrm": lrm.seconds + encoded.seconds},
         report=report,
         words=words,
         picture=film_sheet(frames, alignment.crop, model),
     )
 
 
-def wants_bf16(config: ImageLRMConfig, device: torch.device) -> bool:
-    """Whether the model multiplies in bfloat16."""
-    return config.precision == "bf16" or (config.precision == "auto" and fast_bf16(device))
-
-
-def place(film: FixedView, model: LRM, config: ImageLRMConfig) -> Alignment:
+def align_to(video: FixedView, model: LRM, options: ImageLRMSettings) -> Alignment:
     """Where the model's field lies in the world.
 
     Raises:
-        LRMError: If the film's camera cannot be the model's.
+        LRMError: If the video's camera cannot be the model's.
     """
-    views = film.views
+    views = video.views
     return align(
         views.camera_to_world[0],
-        focal=views.focal,
+        focal=float(views.intrinsics.focal[0, 0]),
         height=views.height,
         width=views.width,
-        target=film.target,
+        target=video.target,
         view=model.view,
-        matching="pad" if config.matching == "pad" else "scale",
-        crop=picture_crop(views.images, crop=True) if config.crop else None,
+        matching=options.matching,
+        crop=picture_crop(views.images, crop=True) if options.crop else None,
     )
 
 

@@ -1,16 +1,73 @@
 """Triplane sequences: what every source of a start supplies, and their files."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
 from xplanes.fields import Decoder
-from xplanes.preparation.tensor_file import read_content, write_content
+from xplanes.files import replacing
 from xplanes.scenes.frame import Frame, check_frame, frame_content, read_frame
+
+MARK = "xplanes"
+"""Key of what is not a tensor in the metadata of a safetensors file."""
+
+
+def write_content(path: Path, content: dict[str, Any]) -> None:
+    """Write a dict of tensors and builtins, dicts of such among them, whole or not at all.
+
+    Args:
+        path: Where to; ``.safetensors`` is written as such.
+        content: Names without dots.
+    """
+    with replacing(path) as temporary:
+        if path.suffix != ".safetensors":
+            torch.save(content, temporary)
+            return
+        from safetensors.torch import save_file
+
+        tensors, rest = _apart(content)
+        tensors = {name: tensor.contiguous() for name, tensor in tensors.items()}
+        save_file(tensors, temporary, metadata={MARK: json.dumps(rest)})
+
+
+def read_content(path: Path) -> Any:
+    """Read what `write_content` wrote; whatever goes wrong is raised as it comes."""
+    if path.suffix != ".safetensors":
+        return torch.load(path, map_location="cpu", weights_only=True)
+    from safetensors import safe_open
+
+    with safe_open(path, "pt") as file:
+        content = json.loads((file.metadata() or {}).get(MARK, "{}"))
+        for name in file.keys():  # noqa: SIM118, the file is no dict
+            node = content
+            *groups, last = name.split(".", 1)
+            for group in groups:
+                node = node.setdefault(group, {})
+            node[last] = file.get_tensor(name)
+    return content
+
+
+def _apart(content: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors by dotted name, and all else in its place."""
+    tensors: dict[str, Tensor] = {}
+    rest: dict[str, Any] = {}
+    for name, value in content.items():
+        if isinstance(value, Tensor):
+            tensors[name] = value
+        elif isinstance(value, dict):
+            inner, other = _apart(value)
+            tensors |= {f"{name}.{key}": tensor for key, tensor in inner.items()}
+            rest[name] = other
+        else:
+            rest[name] = value
+    return tensors, rest
+
 
 DECODER_OPTIONS: dict[str, tuple[type, ...]] = {
     "width": (int,),
@@ -27,11 +84,11 @@ _KEYS = {"triplanes", "decoder", "decoder_config", "frame"}
 
 @dataclass(frozen=True)
 class TriplaneSequence:
-    """One triplane per moment of a scene, and what is needed to read it.
+    """One triplane per timestep of a scene, and what is needed to read it.
 
     Attributes:
-        triplanes: Planes xy, xz, yz of moments that fill [0, 1] evenly; plane "ab" has axis a along
-            the columns, b along the rows, texels as in the field. Any floating type.
+        triplanes: Planes xy, xz, yz of timesteps that fill [0, 1] evenly; plane "ab" has axis a
+            along the columns, b along the rows, texels as in the field. Any floating type.
             [T, 3, C, H, H]
         decoder: Weights of the decoder that reads them, ``Decoder.state_dict()``; None for none.
         decoder_config: Its options, the keys of ``DECODER_OPTIONS``; given with ``decoder``.
@@ -115,7 +172,7 @@ def check_sequence(sequence: TriplaneSequence, name: str) -> None:
     shape = list(planes.shape)
     if len(shape) != 5 or shape[1] != 3 or 0 in shape or shape[3] != shape[4]:
         raise ConfigError(
-            f"{name}: triplanes are {shape}, but must be [T, 3, C, H, H]: moments, planes xy, xz "
+            f"{name}: triplanes are {shape}, but must be [T, 3, C, H, H]: timesteps, planes xy, xz "
             "and yz, channels, rows and as many columns"
         )
     for number, frame in enumerate(planes):

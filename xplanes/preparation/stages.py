@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from xplanes.config import DecompositionConfig, ModelConfig
 from xplanes.decomposition import (
     TIME_ROWS,
     decompose,
@@ -18,12 +18,73 @@ from xplanes.decomposition import (
     unexplained_energy,
 )
 from xplanes.fields.xplanes import SPACE_PLANES, TIME_PLANES
+from xplanes.lrm.images import Crop
+from xplanes.lrm.model import LRM
+from xplanes.models.initialisation import DecompositionSettings
+from xplanes.models.x_planes import XPlanesSettings
 from xplanes.preparation.cache import StageCache
-from xplanes.preparation.pictures import parts_sheet
-from xplanes.scenes.batches import step_generator
+from xplanes.preparation.encode import straight_alpha
+from xplanes.streams import Stream, step_generator
+from xplanes.training.evaluation import spread
 
-NOISE_STREAM = 1_000_039
-"""Random stream of the time planes' noise."""
+
+def parts_sheet(low_rank: Tensor, sparse: Tensor, timesteps: int = 4, side: int = 128) -> Tensor:
+    """Low-rank and sparse part side by side at a few timesteps, three channels as colours.
+
+    Rows are xy, xz, yz; a column is a timestep, its left half the low-rank part, its right half the
+    sparse one, in which grey is zero. Colours have one scale per orientation and part, so that
+    timesteps compare.
+
+    Args:
+        low_rank: What stands still. [T, 3, C, H, W]
+        sparse: What moves. [T, 3, C, H, W]
+        timesteps: Columns, spread evenly over time.
+        side: Pixels per plane.
+
+    Returns:
+        Colours from 0 to 1. [3 (side + 4), M 2 (side + 4), 3]
+    """
+    chosen = spread(timesteps, len(low_rank))
+    still, moving = (_colours(part[chosen]) for part in (low_rank, sparse))
+    still = still - still.mean(dim=(0, 3, 4), keepdim=True)
+    spread_of = 5 * still.std(dim=(0, 3, 4), correction=0, keepdim=True).clamp_min(1e-8)
+    peak = 2 * moving.abs().amax(dim=(0, 2, 3, 4), keepdim=True).clamp_min(1e-8)
+    both = torch.stack([still / spread_of, moving / peak], dim=1) + 0.5  # [M, 2, 3, 3, H, W]
+    tiles = F.interpolate(both.clamp(0, 1).flatten(0, 2), size=(side, side), mode="nearest")
+    tiles = F.pad(tiles, (2, 2, 2, 2), value=1.0)
+    size = side + 4
+    # [timestep, part, orientation, colour, row, column] to orientations below one another
+    sheet = tiles.view(len(chosen), 2, 3, 3, size, size).permute(2, 4, 0, 1, 5, 3)
+    return sheet.reshape(3 * size, len(chosen) * 2 * size, 3)
+
+
+def _colours(planes: Tensor) -> Tensor:
+    """The first three channels, the first again where there are fewer. [M, 3, 3, H, W]"""
+    shown = planes[:, :, :3].detach().float().cpu()
+    missing = 3 - shown.shape[2]
+    return torch.cat([shown, shown[:, :, :1].expand(-1, -1, missing, -1, -1)], dim=2)
+
+
+def film_sheet(
+    frames: Tensor, crop: Crop, model: LRM, timesteps: int = 6, side: int = 160
+) -> Tensor:
+    """A few frames as the model is shown them.
+
+    Args:
+        frames: Premultiplied RGBA. uint8 [T, H, W, 4]
+        crop: What the model is shown of them.
+        model: The model.
+        timesteps: Frames shown, spread evenly.
+        side: Pixels per frame.
+
+    Returns:
+        Colours from 0 to 1, the frames side by side. [side, M side, 3]
+    """
+    chosen = torch.tensor(spread(timesteps, len(frames)))
+    shown = model.prepare(crop.apply(straight_alpha(frames[chosen])))
+    shown = F.interpolate(shown, size=(side, side), mode="bilinear", antialias=True)
+    return shown.permute(2, 0, 3, 1).flatten(1, 2).clamp(0, 1)
+
 
 REPORTED = (
     "rank",
@@ -50,7 +111,7 @@ class Parts:
         sparse: What moves, on the CPU. [T, 3, C, H, H]
         report: For "xy", "xz" and "yz" the entries of `REPORTED`; empty where there was nothing to
             take apart.
-        picture: Both parts at a few moments; None where there was nothing to take apart.
+        picture: Both parts at a few timesteps; None where there was nothing to take apart.
         seconds: Time that it took.
         cached: Whether they came from the cache.
         key: Hash of what they depend on.
@@ -82,7 +143,7 @@ class Planes:
 
 
 def decompose_stage(
-    triplanes: Tensor, config: DecompositionConfig, cache: StageCache, device: torch.device
+    triplanes: Tensor, config: DecompositionSettings, cache: StageCache, device: torch.device
 ) -> Parts:
     """Robust PCA of a sequence; a single triplane is all low rank.
 
@@ -141,8 +202,8 @@ def decompose_stage(
 
 def convert_stage(
     parts: Parts,
-    model: ModelConfig,
-    config: DecompositionConfig,
+    model: XPlanesSettings,
+    config: DecompositionSettings,
     seed: int,
     cache: StageCache,
     device: torch.device,
@@ -168,7 +229,7 @@ def convert_stage(
             resolution=model.resolution,
             time_resolution=model.time_resolution,
             noise=config.noise,
-            generator=step_generator(seed, 0, NOISE_STREAM),
+            generator=step_generator(seed, 0, Stream.NOISE),
         )
 
     def make() -> dict[str, Any]:

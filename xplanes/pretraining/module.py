@@ -2,16 +2,20 @@
 
 import copy
 import math
+import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
-from lightning import LightningModule
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor, nn
 
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
+from xplanes.files import replacing
 from xplanes.lrm.canonical import canonical_vector
 from xplanes.lrm.openlrm import OpenLRM
-from xplanes.pretraining.batches import PretrainingBatch
 from xplanes.pretraining.losses import (
     colour_loss,
     composite,
@@ -19,11 +23,10 @@ from xplanes.pretraining.losses import (
     ray_samples,
     triplane_logits,
 )
-from xplanes.pretraining.settings import BatchConfig, ScheduleConfig
-from xplanes.scenes.batches import step_generator
-
-JITTER_STREAM = 1_000_211
-"""Random stream of the places of samples along rays."""
+from xplanes.pretraining.pool import PretrainingBatch
+from xplanes.pretraining.quick import QuickLook
+from xplanes.pretraining.settings import BatchSettings, ScheduleSettings
+from xplanes.streams import Stream, step_generator
 
 PATIENCE = 20
 """Steps in a row with a loss that is not finite after which training gives up."""
@@ -48,7 +51,13 @@ class PretrainingModule(LightningModule):
     """
 
     def __init__(
-        self, model: OpenLRM, batch: BatchConfig, schedule: ScheduleConfig, seed: int, *, bf16: bool
+        self,
+        model: OpenLRM,
+        batch: BatchSettings,
+        schedule: ScheduleSettings,
+        seed: int,
+        *,
+        bf16: bool,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
@@ -132,7 +141,9 @@ class PretrainingModule(LightningModule):
 
     def _rendered(self, planes: Tensor, batch: PretrainingBatch) -> tuple[Tensor, Tensor]:
         shape = (*batch.ray_hits.shape, self.batch.samples)
-        jitter = torch.rand(shape, generator=step_generator(self.seed, self.steps, JITTER_STREAM))
+        jitter = torch.rand(
+            shape, generator=step_generator(self.seed, self.steps, Stream.PRETRAINING)
+        )
         distances, lengths = ray_samples(
             batch.origins,
             batch.directions,
@@ -177,3 +188,80 @@ class PretrainingModule(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.steps = checkpoint["progress"]["steps"]
         self.clock = checkpoint["progress"]["clock"]
+
+
+LONGEST = 10.0
+"""Seconds that a step counts at most: a process that was stopped for a while did not train."""
+
+
+class Upkeep(Callback):
+    """All that a step needs besides the step.
+
+    Args:
+        path: The checkpoint, written whole or not at all.
+        schedule: How often.
+        look: Scores held-out objects.
+        announce: Takes a line now and then.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        schedule: ScheduleSettings,
+        look: QuickLook,
+        announce: Callable[[str], None],
+    ) -> None:
+        self.path, self.schedule, self.look, self.announce = path, schedule, look, announce
+        self.started = 0.0
+        self.since = {"checkpoint": 0.0, "score": 0.0}
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, PretrainingModule)
+        self.since = dict.fromkeys(self.since, pl_module.clock)
+        self.started = time.perf_counter()
+        trainer.should_stop = pl_module.progress >= 1
+
+    def on_train_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        assert isinstance(pl_module, PretrainingModule)
+        pl_module.clock += min(time.perf_counter() - self.started, LONGEST)
+        done = pl_module.progress >= 1
+        if pl_module.steps % self.schedule.log_every == 0 or done:
+            self._log(trainer, pl_module, pl_module.last)
+        if done or self._due("score", pl_module.clock, self.schedule.score_seconds):
+            self._log(trainer, pl_module, self.look.scores(pl_module.average))
+        if done or self._due("checkpoint", pl_module.clock, self.schedule.checkpoint_seconds):
+            self.save(trainer)
+        trainer.should_stop = done
+        self.started = time.perf_counter()
+
+    def on_exception(
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
+    ) -> None:
+        if isinstance(exception, KeyboardInterrupt):
+            self.save(trainer)
+            self.announce(f"stopped; the same command goes on from {self.path}")
+
+    def save(self, trainer: Trainer) -> None:
+        """Write the checkpoint."""
+        with replacing(self.path) as temporary:
+            trainer.save_checkpoint(temporary)
+
+    def _due(self, what: str, clock: float, every: float) -> bool:
+        if clock - self.since[what] < every:
+            return False
+        self.since[what] = clock
+        return True
+
+    def _log(self, trainer: Trainer, module: PretrainingModule, values: dict[str, float]) -> None:
+        logger = trainer.logger
+        assert isinstance(logger, TensorBoardLogger)
+        logger.log_metrics({**values, "seconds": module.clock}, step=module.steps)
+        shown = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
+        self.announce(f"step {module.steps}  {module.clock:.0f} s  {shown}")

@@ -8,8 +8,7 @@ from xplanes.lrm.canonical import canonical_vector
 from xplanes.lrm.openlrm import OpenLRM
 from xplanes.metrics import psnr
 from xplanes.pretraining.losses import triplane_logits
-from xplanes.pretraining.observe import FOCAL
-from xplanes.pretraining.pool import Pool
+from xplanes.pretraining.pool import FOCAL, Pool
 from xplanes.pretraining.render import render_view
 from xplanes.scenes.demo.film import CAMERA_DISTANCE
 

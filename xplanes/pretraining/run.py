@@ -1,33 +1,83 @@
 """The whole job of `xplanes pretrain-lrm`: pool, training, weights."""
 
+import hashlib
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from lightning import Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
+from safetensors.torch import save_file
+from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
 from xplanes.backend import fast_bf16
-from xplanes.config import ConfigError
-from xplanes.files import read_json, write_json
-from xplanes.lrm import LRMConfig, load
-from xplanes.lrm.config import parse_config
+from xplanes.config import compose_plain
+from xplanes.errors import ConfigError
+from xplanes.files import read_json, replacing, write_json
+from xplanes.lrm import load
+from xplanes.lrm.bundled import CHECKSUM
+from xplanes.lrm.config import LRMConfig, parse_config
+from xplanes.lrm.keys import NAMES
 from xplanes.lrm.openlrm import OpenLRM
-from xplanes.pretraining.batches import PretrainingBatch, PretrainingBatches
-from xplanes.pretraining.export import export
-from xplanes.pretraining.module import PretrainingModule
+from xplanes.pretraining.module import PretrainingModule, Upkeep
 from xplanes.pretraining.objects import HELD_OUT_SEEDS, TRAINING_SEEDS
-from xplanes.pretraining.observe import FOCAL
-from xplanes.pretraining.pool import SHARD, ensure_pool
+from xplanes.pretraining.pool import FOCAL, SHARD, PretrainingBatch, PretrainingBatches, ensure_pool
 from xplanes.pretraining.quick import QuickLook
-from xplanes.pretraining.settings import PretrainConfig, published_sizes
+from xplanes.pretraining.settings import PretrainingSettings, parse_pretraining, published_sizes
 from xplanes.pretraining.start import grow_model, start_model
-from xplanes.pretraining.upkeep import Upkeep
 from xplanes.training.fit import quiet_lightning
 from xplanes.training.interrupt import Interrupt
+
+
+def export(model: OpenLRM, config: dict[str, Any], folder: Path, name: str) -> Path:
+    """Write NAME.safetensors in half precision and NAME.json, its configuration.
+
+    Args:
+        model: The model.
+        config: The content of its config.json.
+        folder: Where to.
+        name: Name of the files.
+
+    Returns:
+        The weights. Their SHA-256 stands in the configuration as ``weights_sha256``.
+    """
+    path = folder / f"{name}.safetensors"
+    state = {key: value.half().contiguous() for key, value in published_state(model).items()}
+    with replacing(path) as temporary:
+        save_file(state, temporary)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    write_json(folder / f"{name}.json", {**config, CHECKSUM: digest})
+    return path
+
+
+def published_state(model: OpenLRM) -> dict[str, Tensor]:
+    """A model's tensors under the names of OpenLRM's checkpoints."""
+    ours = {key: value.detach() for key, value in model.state_dict().items()}
+    config: LRMConfig = model.config
+    layers = max(config.layers, config.encoder.depth, config.decoder_hidden + 1)
+    packed = config.width == config.encoder.width
+    result: dict[str, Tensor] = {}
+    for published, names in NAMES[config.architecture].items():
+        templates = () if names is None else (names,) if isinstance(names, str) else names
+        # Query, key and value of attention to the picture are stacked where widths are equal.
+        of_picture = ".cross_attn." in published and "out_proj" not in published
+        if of_picture and packed != ("in_proj" in published):
+            continue
+        for layer in range(layers):
+            for part in ("weight", "bias"):
+                values = {"i": layer, "p": part, "h": layer, "e": 2 * layer}
+                found = [ours.get(template.format(**values)) for template in templates]
+                tensors = [tensor for tensor in found if tensor is not None]
+                if tensors and len(tensors) == len(templates):
+                    result[published.format(**values)] = (
+                        torch.cat(tensors) if len(tensors) > 1 else tensors[0]
+                    )
+    return result
+
 
 CHECKPOINT = "last.ckpt"
 
@@ -48,7 +98,7 @@ class Steps(IterableDataset):
             yield self.batches.draw(step)
 
 
-def pretrain(plain: dict, config: PretrainConfig, announce: Callable[[str], None]) -> Path:
+def pretrain(plain: dict, config: PretrainingSettings, announce: Callable[[str], None]) -> Path:
     """Train a model to the end of its budget, from its last checkpoint on where there is one.
 
     Args:
@@ -84,13 +134,13 @@ def pretrain(plain: dict, config: PretrainConfig, announce: Callable[[str], None
     )
     loader = DataLoader(Steps(data, lambda: module.steps), batch_size=None)
     checkpoint = str(last) if last.is_file() else None
-    with interrupt.listening():
+    with interrupt.exits():
         trainer.fit(module, loader, ckpt_path=checkpoint, weights_only=True)
     return export(module.average, published_sizes(config.model, FOCAL), run, config.model.name)
 
 
 def assemble(
-    config: PretrainConfig, announce: Callable[[str], None]
+    config: PretrainingSettings, announce: Callable[[str], None]
 ) -> tuple[PretrainingModule, PretrainingBatches, QuickLook]:
     """The module at its start, its batches, and what looks at held-out objects."""
     pool, batch, side = config.pool, config.batch, config.model.image_size
@@ -150,3 +200,25 @@ def _settle(run: Path, plain: dict) -> None:
                     f"{plain[key]}: name another folder, or leave {key} as it was"
                 )
     write_json(path, plain)
+
+
+def compose_pretraining(overrides: Sequence[str]) -> dict:
+    """The configuration as builtins.
+
+    Raises:
+        ConfigError: For a key or option that does not exist.
+    """
+    return compose_plain("pretrain_lrm", overrides)
+
+
+def run_pretraining(overrides: Sequence[str], announce: Callable[[str], None]) -> Path:
+    """Train a small model of our own; returns its weights.
+
+    Raises:
+        ConfigError: If settings cannot work.
+    """
+    plain = compose_pretraining(overrides)
+    config = parse_pretraining(plain)
+    from xplanes.pretraining.run import pretrain
+
+    return pretrain(plain, config, announce)

@@ -14,10 +14,9 @@ from xplanes.lrm import LRM
 from xplanes.metrics import psnr, ssim
 from xplanes.pretraining.losses import triplane_logits
 from xplanes.pretraining.objects import HELD_OUT_SEEDS, procedural_object
-from xplanes.pretraining.observe import FOCAL, camera, film_solids, inside
+from xplanes.pretraining.pool import FOCAL, camera, film_solids, inside, view_cameras
 from xplanes.pretraining.quick import model_pose, overlap, world_to_model
 from xplanes.pretraining.render import render_view
-from xplanes.pretraining.samples import view_cameras
 from xplanes.scenes.demo.film import camera_at, film
 from xplanes.scenes.demo.posed import Posed
 from xplanes.scenes.demo.scenes import DEMO_SCENES, build_demo_scene
@@ -63,7 +62,7 @@ def held_out(count: int) -> Iterator[Subject]:
 
 
 def demo_subjects(time: float = 0.4) -> Iterator[Subject]:
-    """The demo scenes at one moment: from their fixed, level cameras, and from above these.
+    """The demo scenes at one timestep: from their fixed, level cameras, and from above these.
 
     Novel cameras stand beside them, above the horizon.
     """

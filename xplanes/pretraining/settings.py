@@ -1,124 +1,112 @@
 """Every setting of `xplanes pretrain-lrm`, typed. The values live in conf/."""
 
-import math
-from dataclasses import dataclass, field, fields, is_dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
-from omegaconf import MISSING
+from xplanes.errors import ConfigError
+from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
 
-from xplanes.config import ConfigError, build
 
-
-@dataclass
-class SizeConfig:
+@dataclass(frozen=True, kw_only=True)
+class SizeSettings(Settings):
     """Sizes of a small OpenLRM 1.1, and the camera that it believes in."""
 
-    name: str = MISSING  # Name of the model, and of its files.
-    image_size: int = MISSING  # Pixels along each side of the input.
-    patch: int = MISSING  # Pixels along each side of a patch.
-    encoder_depth: int = MISSING  # Blocks of the image encoder.
-    registers: int = MISSING  # Register tokens of the image encoder.
-    width: int = MISSING  # Channels of all tokens.
-    heads: int = MISSING  # Attention heads.
-    layers: int = MISSING  # Blocks of the triplane transformer.
-    low_resolution: int = MISSING  # Tokens along each side of a plane; it has twice the texels.
-    channels: int = MISSING  # Channels of each plane.
-    camera_width: int = MISSING  # Channels of the camera embedding.
-    distance: float = MISSING  # From the camera to the centre of the box [-1, 1]^3.
-    density_scale: float = MISSING  # Factor on the density: one over the length of a step.
+    name: str  # Name of the model, and of its files.
+    image_size: Count  # Pixels along each side of the input.
+    patch: Count  # Pixels along each side of a patch.
+    encoder_depth: Count  # Blocks of the image encoder.
+    registers: Count  # Register tokens of the image encoder.
+    width: Count  # Channels of all tokens.
+    heads: Count  # Attention heads.
+    layers: Count  # Blocks of the triplane transformer.
+    low_resolution: Count  # Tokens along each side of a plane; it has twice the texels.
+    channels: Count  # Channels of each plane.
+    camera_width: Count  # Channels of the camera embedding.
+    distance: Positive  # From the camera to the centre of the box [-1, 1]^3.
+    density_scale: Positive  # Factor on the density: one over the length of a step.
+
+    def check(self) -> None:
+        if self.image_size % self.patch:
+            raise ConfigError(
+                f"image_size={self.image_size}: must be a multiple of model.patch={self.patch}"
+            )
+        if self.width % self.heads:
+            raise ConfigError(f"width={self.width}: must be a multiple of model.heads={self.heads}")
 
 
-@dataclass
-class PoolConfig:
+@dataclass(frozen=True, kw_only=True)
+class PoolSettings(Settings):
     """Objects drawn once and kept on disk."""
 
-    root: str = MISSING  # Folder of the pool.
-    objects: int = MISSING  # Objects to learn from, a multiple of 256.
-    views: int = MISSING  # Pictures of each.
+    root: str  # Folder of the pool.
+    objects: Count  # Objects to learn from, a multiple of 256.
+    views: Count  # Pictures of each.
 
 
-@dataclass
-class BatchConfig:
+@dataclass(frozen=True, kw_only=True)
+class BatchSettings(Settings):
     """What a step looks at."""
 
-    objects: int = MISSING  # Objects of a step, one input picture each.
-    near: int = MISSING  # Points near the surface, per object.
-    volume: int = MISSING  # Points around the object.
-    free: int = MISSING  # Points in front of what a view sees.
-    colour: int = MISSING  # Points at the surface, asked for their colour.
-    rays: int = MISSING  # Rays rendered once rendering has begun.
-    samples: int = MISSING  # Samples of a ray.
+    objects: Count  # Objects of a step, one input picture each.
+    near: Steps  # Points near the surface, per object.
+    volume: Steps  # Points around the object.
+    free: Steps  # Points in front of what a view sees.
+    colour: Steps  # Points at the surface, asked for their colour.
+    rays: Steps  # Rays rendered once rendering has begun.
+    samples: Count  # Samples of a ray.
+
+    def check(self) -> None:
+        if self.rays and self.samples < 4:
+            raise ConfigError(f"samples={self.samples}: a ray needs at least 4")
 
 
-@dataclass
-class ScheduleConfig:
+@dataclass(frozen=True, kw_only=True)
+class ScheduleSettings(Settings):
     """Budget, optimisers and weights of the losses."""
 
-    max_steps: int = MISSING  # Steps at most.
-    max_seconds: float | None = MISSING  # Training clock at most; null for no limit.
-    muon_lr: float = MISSING  # Peak learning rate of the blocks' matrices (Muon).
-    adam_lr: float = MISSING  # Peak learning rate of all else (AdamW).
-    weight_decay: float = MISSING  # Of both.
-    warmup_steps: int = MISSING  # Steps until the peak.
-    decay_share: float = MISSING  # Share of the budget in which the rates fall to zero.
-    clip: float = MISSING  # Norm that gradients are scaled down to.
-    average: float = MISSING  # Decay of the moving average of weights that is shipped.
-    colour_weight: float = MISSING  # Of the colour at the surface.
-    render_weight: float = MISSING  # Of rendered rays, colour and opacity.
-    render_from: float = MISSING  # Share of the budget from which rays are rendered.
-    checkpoint_seconds: float = MISSING  # Between checkpoints.
-    score_seconds: float = MISSING  # Between looks at held-out objects.
-    score_objects: int = MISSING  # Held-out objects looked at.
-    log_every: int = MISSING  # Steps between lines and TensorBoard scalars.
+    max_steps: Count  # Steps at most.
+    max_seconds: Positive | None  # Training clock at most; null for no limit.
+    muon_lr: Positive  # Peak learning rate of the blocks' matrices (Muon).
+    adam_lr: Positive  # Peak learning rate of all else (AdamW).
+    weight_decay: Weight  # Of both.
+    warmup_steps: Steps  # Steps until the peak.
+    decay_share: Share  # Share of the budget in which the rates fall to zero.
+    clip: Positive  # Norm that gradients are scaled down to.
+    average: Share  # Decay of the moving average of weights that is shipped.
+    colour_weight: Weight  # Of the colour at the surface.
+    render_weight: Weight  # Of rendered rays, colour and opacity.
+    render_from: Share  # Share of the budget from which rays are rendered.
+    checkpoint_seconds: Positive  # Between checkpoints.
+    score_seconds: Positive  # Between looks at held-out objects.
+    score_objects: Count  # Held-out objects looked at.
+    log_every: Count  # Steps between lines and TensorBoard scalars.
 
 
-@dataclass
-class PretrainConfig:
+@dataclass(frozen=True, kw_only=True)
+class PretrainingSettings(Settings):
     """The whole configuration of a pretraining."""
 
-    seed: int = MISSING  # Source of all randomness.
-    start: str | None = MISSING  # Weights with coarser planes to go on from; null: none.
-    run: str = MISSING  # Folder of checkpoints and logs; an earlier run in it goes on.
-    model: SizeConfig = field(default_factory=SizeConfig)
-    pool: PoolConfig = field(default_factory=PoolConfig)
-    batch: BatchConfig = field(default_factory=BatchConfig)
-    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    seed: Steps  # Source of all randomness.
+    start: str | None  # Weights with coarser planes to go on from; null: none.
+    run: str  # Folder of checkpoints and logs; an earlier run in it goes on.
+    model: SizeSettings
+    pool: PoolSettings
+    batch: BatchSettings
+    schedule: ScheduleSettings
 
 
-_MAY_BE_ZERO = """seed batch.rays batch.near batch.volume batch.free batch.colour
-schedule.weight_decay schedule.warmup_steps schedule.colour_weight schedule.render_weight
-schedule.render_from schedule.decay_share schedule.average""".split()
-_SHARES = ("schedule.render_from", "schedule.decay_share", "schedule.average")
-
-
-def parse_pretraining(plain: dict[str, Any]) -> PretrainConfig:
+def parse_pretraining(plain: Mapping[str, Any]) -> PretrainingSettings:
     """A plain configuration as typed settings.
 
     Raises:
         ConfigError: If settings are out of range or contradict one another.
     """
-    config: PretrainConfig = build(PretrainConfig, plain)
-    for key, value in _leaves(config):
-        if isinstance(value, str) or value is None:
-            continue
-        if not math.isfinite(value) or value < 0 or (value == 0 and key not in _MAY_BE_ZERO):
-            least = "not be negative" if key in _MAY_BE_ZERO else "be above 0"
-            raise ConfigError(f"{key}={value}: must {least}")
-        if key in _SHARES and value > 1:
-            raise ConfigError(f"{key}={value}: must lie between 0 and 1")
-    model = config.model
-    if model.image_size % model.patch:
-        raise ConfigError(
-            f"model.image_size={model.image_size}: must be a multiple of model.patch={model.patch}"
-        )
-    if model.width % model.heads:
-        raise ConfigError(f"model.width={model.width}: must be a multiple of model.heads")
-    if config.batch.rays and config.batch.samples < 4:
-        raise ConfigError(f"batch.samples={config.batch.samples}: a ray needs at least 4")
-    return config
+    PretrainingSettings.require_names(plain)
+    return PretrainingSettings(**plain)
 
 
-def published_sizes(model: SizeConfig, focal: float) -> dict[str, Any]:
+def published_sizes(model: SizeSettings, focal: float) -> dict[str, Any]:
     """The config.json of a model: OpenLRM 1.1's keys, and those of its own camera and sizes."""
     return {
         "architecture": "openlrm-1.1",
@@ -146,11 +134,3 @@ def published_sizes(model: SizeConfig, focal: float) -> dict[str, Any]:
         "source_focal": focal,
         "density_scale": model.density_scale,
     }
-
-
-def _leaves(node: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    found = []
-    for entry in fields(node):
-        value, key = getattr(node, entry.name), f"{prefix}{entry.name}"
-        found += _leaves(value, f"{key}.") if is_dataclass(value) else [(key, value)]
-    return found

@@ -6,11 +6,22 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from xplanes.scenes.demo.geometry import (
+    Box,
+    Bricks,
+    Capsule,
+    Checker,
+    Cylinder,
+    Ellipsoid,
+    Plain,
+    Primitive,
+    Sectors,
+    Stripes,
+    Surface,
+    Torus,
+)
 from xplanes.scenes.demo.posed import Posed, PosedPart
-from xplanes.scenes.demo.primitives import Box, Capsule, Cylinder, Ellipsoid, Primitive
 from xplanes.scenes.demo.shading import Light
-from xplanes.scenes.demo.surfaces import Bricks, Checker, Plain, Sectors, Stripes, Surface
-from xplanes.scenes.demo.torus import Torus
 
 BOX, ELLIPSOID, CYLINDER, CAPSULE, TORUS = range(5)
 """Kinds of solids. Their sizes are the arguments of the demo's class of that name."""

@@ -81,7 +81,7 @@ class RayRenderer(ABC):
         *,
         chunk: int | None = None,
     ) -> dict[str, Tensor]:
-        """Render any number of rays of one moment, a chunk at a time.
+        """Render any number of rays of one timestep, a chunk at a time.
 
         Returns:
             ``colour`` [R, 3], ``opacity`` [R] and ``depth`` [R], on the rays' device.

@@ -23,7 +23,7 @@ def carve(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
         views: Training views; without alpha nothing is emptied.
         frame: The field's frame.
     """
-    if bool((views.images[..., 3] > 0).all()):
+    if views.is_opaque:
         return
     size, bins = grid.resolution, grid.time_bins
     covers = _views_of_bins(views.times, bins)

@@ -43,7 +43,7 @@ def fill(
     kept = grid.occupied.clone()
     missing = torch.zeros_like(kept)
     for index in range(len(views)):
-        solid = (views.images[index, ..., 3] >= SOLID).flatten()
+        solid = (views.image(index)[..., 3] >= SOLID).flatten()
         origins, directions = (ray[solid] for ray in views.image_rays(index))
         origins, directions = frame.rays(origins, directions)
         origins, directions = origins.to(kept.device), directions.to(kept.device)

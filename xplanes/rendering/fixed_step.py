@@ -1,14 +1,20 @@
 """Rays through a field's box at equal steps; colour only where it counts."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
+from xplanes.errors import ConfigError
+from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.rendering.compositing import composite
 from xplanes.rendering.marching import Samples
+from xplanes.rendering.sampler import Sampler, SamplerSettings, Site, check_range
+from xplanes.scenes.batches import Batch
+from xplanes.settings import Positive, Range, Weight
+from xplanes.streams import TrainingState
 
 
 @dataclass(frozen=True)
@@ -120,4 +126,62 @@ class FixedStepRenderer(RayRenderer):
             candidates=len(ray),
             empty=0,
             occluded=0,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FixedStepSettings(SamplerSettings):
+    """Equal steps through a field's box; samples that add nothing get no colour."""
+
+    near: Weight  # First sample's distance in world units.
+    far: Positive  # Last sample's distance in world units.
+    step: Positive  # Distance between samples, in cells of the field.
+    # Opacity, and weight, at which samples are dropped.
+    threshold: Annotated[float, Range(0, 1, open=True)]
+
+    def check(self) -> None:
+        if self.near >= self.far:
+            raise ConfigError(f"near={self.near}: must be below far={self.far}")
+
+    def require(self, field: RadianceField | type[RadianceField]) -> None:
+        if not hasattr(field, "cell"):
+            raise ConfigError(
+                f"model.sampler.name={self.name}: needs a field of cells, as TiNeuVox's; set "
+                "model/sampler=occupancy or proposal"
+            )
+
+    def build(self, field: RadianceField, site: Site) -> "FixedStepSampler":
+        self.require(field)
+        check_range(site, self.near, self.far)
+        renderer = FixedStepRenderer(
+            field,
+            near=self.near * site.frame.scale,
+            far=self.far * site.frame.scale,
+            step=self.step,
+            threshold=self.threshold,
+        )
+        return FixedStepSampler(renderer)
+
+
+class FixedStepSampler(Sampler):
+    """Nothing to update: samples lie where the box and the cells' size put them, without jitter.
+
+    Args:
+        renderer: Places them.
+    """
+
+    def __init__(self, renderer: FixedStepRenderer) -> None:
+        self._renderer = renderer
+
+    @property
+    def renderer(self) -> FixedStepRenderer:
+        return self._renderer
+
+    @property
+    def outline(self) -> str:
+        return f"samples {self._renderer.step:g} cells apart throughout the field's box"
+
+    def render(self, field: Any, rays: Batch, state: TrainingState) -> FixedStepRendering:
+        return self._renderer.render(
+            field, rays["origins"], rays["directions"], rays["times"], rays["background"]
         )

@@ -6,9 +6,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from xplanes.errors import ConfigError
+from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.rendering.proposal import dense_samples
 from xplanes.rendering.resampling import resample
+from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
+from xplanes.scenes.batches import Batch
+from xplanes.settings import Count, Positive
+from xplanes.streams import TrainingState
 
 TINY = 1e-5
 """Keeps quotients of vanishing opacities finite."""
@@ -160,3 +166,58 @@ class NeusRenderer(RayRenderer):
 def _points(origins: Tensor, directions: Tensor, distances: Tensor) -> Tensor:
     """Points at distances [R, S] along rays. [R S, 3]"""
     return (origins[:, None] + distances[..., None] * directions[:, None]).flatten(0, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeusSettings(SamplerSettings):
+    """Samples near a surface, which a coarse round finds."""
+
+    samples: Count  # Equal steps of the coarse round.
+    more_samples: Count  # Samples that it adds near the surface.
+    coarse_sharpness: Positive  # Sharpness at which it looks for the surface.
+
+    def require(self, field: RadianceField | type[RadianceField]) -> None:
+        if not hasattr(field, "distance_and_slope"):
+            raise ConfigError(
+                f"model.sampler.name={self.name}: needs a field with a surface, as Tensor4D's; set "
+                "model/sampler=occupancy or proposal"
+            )
+
+    def build(self, field: RadianceField, site: Site) -> "NeusSampler":
+        self.require(field)
+        renderer = NeusRenderer(
+            field,
+            samples=self.samples,
+            more=self.more_samples,
+            coarse_sharpness=self.coarse_sharpness,
+        )
+        return NeusSampler(renderer)
+
+
+class NeusSampler(Sampler):
+    """Nothing to update: the field's own distance places the samples.
+
+    Args:
+        renderer: Places them.
+    """
+
+    def __init__(self, renderer: NeusRenderer) -> None:
+        self._renderer = renderer
+
+    @property
+    def renderer(self) -> NeusRenderer:
+        return self._renderer
+
+    @property
+    def outline(self) -> str:
+        return f"{self._renderer.samples} samples a ray, {self._renderer.more} near the surface"
+
+    def render(self, field: Any, rays: Batch, state: TrainingState) -> SurfaceRendering:
+        return self._renderer.render(
+            field,
+            rays["origins"],
+            rays["directions"],
+            rays["times"],
+            rays["background"],
+            rays["jitter"],
+        )

@@ -1,17 +1,32 @@
-"""Rays through a field, sampled where small density fields expect something."""
+"""Samples where small density fields, trained along, expect something."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
+from xplanes.errors import ConfigError
+from xplanes.fields.base import RadianceField
+from xplanes.fields.kplanes import DensityField
+from xplanes.fields.products import PlaneProducts
+from xplanes.fields.regularisers import PlaneTerms
 from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.rendering.box import ray_box, shade
 from xplanes.rendering.compositing import composite
 from xplanes.rendering.marching import Samples
-from xplanes.rendering.resampling import ray_weights, resample, uniform_edges
+from xplanes.rendering.resampling import covering_weights, ray_weights, resample, uniform_edges
+from xplanes.rendering.sampler import Group, Sampler, SamplerSettings, Site, check_range
+from xplanes.scenes.batches import Batch
+from xplanes.settings import Count, Positive, Weight
+from xplanes.streams import Stream, TrainingState, initial_values
+
+ALWAYS = 10
+"""First steps, in each of which the density fields learn."""
+
+SMALLEST = 1e-7
+"""Keeps the histogram term finite where the field sees nothing."""
 
 
 @dataclass(frozen=True)
@@ -184,3 +199,203 @@ def dense_samples(points: Tensor, distances: Tensor) -> Samples:
         empty=0,
         occluded=0,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProposalSettings(SamplerSettings):
+    """Samples where small density fields, trained along, expect something."""
+
+    devices: ClassVar[int | None] = 1
+
+    near: Weight | None  # First sample's distance in world units; null: the cube's.
+    far: Positive | None  # Last sample's distance in world units; null: the cube's.
+    samples: Count  # Samples of a ray that reach the field.
+    proposal_samples: list[Count]  # Samples in each density field, in order.
+    resolutions: list[Count]  # Texels along each space axis of each density field.
+    time_resolution: Count  # Rows of time of the density fields.
+    channels: Count  # Channels of their planes.
+    width: Count  # Neurons of their hidden layer.
+    linear: bool  # Leave out their activation, as the explicit K-Planes does.
+    space_low: float  # Least initial value of their space planes.
+    space_high: float  # Largest one; time planes are initialised to 1.
+    padding: Positive  # Added to each weight before samples are drawn.
+    anneal_steps: Count  # Steps over which the weights' exponent rises to 1.
+    anneal_slope: Positive  # How fast it rises at first.
+    update_every: Count  # Steps between the density fields' updates, later on.
+    update_warmup: Count  # Steps over which they grow this rare.
+    histogram: Weight  # Weight of the bound on the field's weights.
+    variation: Literal["coded", "corrected"]  # Form of the total variation.
+    total_variation: Weight  # Weight of squared differences between texels.
+    time_smoothness: Weight  # Weight of squared second differences along time.
+    time_identity: Weight  # Weight of the time planes' distance from 1.
+    learning_rate: Positive  # Of the density fields.
+
+    def check(self) -> None:
+        for name in ("proposal_samples", "resolutions"):
+            if not getattr(self, name):
+                raise ConfigError(f"{name}=[]: must be one or more numbers above 0")
+        if len(self.proposal_samples) != len(self.resolutions):
+            raise ConfigError(
+                f"proposal_samples={self.proposal_samples} with resolutions={self.resolutions}: "
+                "one number for each density field in both"
+            )
+        if (self.near is None) != (self.far is None):
+            raise ConfigError(
+                f"near={self.near} with far={self.far}: set both in world units, or both to null "
+                "for the field's cube"
+            )
+        if self.near is not None and self.far is not None and self.near >= self.far:
+            raise ConfigError(f"near={self.near}: must be below far={self.far}")
+        if self.space_low > self.space_high:
+            raise ConfigError(
+                f"space_low={self.space_low}: must not be above space_high={self.space_high}"
+            )
+
+    def build(self, field: RadianceField, site: Site) -> "ProposalSampler":
+        bounds = {}
+        if self.near is not None and self.far is not None:
+            check_range(site, self.near, self.far)
+            scale = site.frame.scale
+            bounds = {"near": self.near * scale, "far": self.far * scale}
+        proposals = nn.ModuleList()
+        with initial_values(site.seed, Stream.SAMPLER):
+            for resolution in self.resolutions:
+                products = PlaneProducts(
+                    self.channels,
+                    resolution,
+                    [1],
+                    self.time_resolution if site.moves else None,
+                    low=self.space_low,
+                    high=self.space_high,
+                )
+                proposals.append(
+                    DensityField(
+                        products,
+                        self.width,
+                        linear=self.linear,
+                        unit=site.unit,
+                        precision=site.precision,
+                    )
+                )
+        renderer = ProposalRenderer(
+            proposals, self.proposal_samples, self.samples, padding=self.padding, **bounds
+        )
+        return ProposalSampler(renderer, self)
+
+
+class ProposalSampler(Sampler):
+    """Samples drawn from density fields that train along.
+
+    Args:
+        renderer: Holds the density fields.
+        settings: Schedule, weights and learning rate.
+
+    Source: K-Planes, released code.
+    """
+
+    def __init__(self, renderer: ProposalRenderer, settings: ProposalSettings) -> None:
+        self._renderer, self.settings = renderer, settings
+        renderer.exponent.fill_(self.anneal(0))
+        self.schedule = UpdateSchedule(settings.update_every, settings.update_warmup)
+        self.terms = PlaneTerms(
+            settings.total_variation,
+            settings.variation,
+            settings.time_smoothness,
+            settings.time_identity,
+        )
+
+    @property
+    def renderer(self) -> ProposalRenderer:
+        return self._renderer
+
+    @property
+    def parts(self) -> dict[str, nn.Module]:
+        return {"proposals": self._renderer.proposals}
+
+    @property
+    def outline(self) -> str:
+        counts = " + ".join(str(count) for count in self._renderer.counts)
+        return f"{counts} samples a ray in density fields, {self._renderer.samples} in the field"
+
+    def groups(self) -> list[Group]:
+        parameters = list(self._renderer.proposals.parameters())
+        return [{"params": parameters, "lr": self.settings.learning_rate, "name": "proposals"}]
+
+    def anneal(self, step: int) -> float:
+        """Exponent of the weights that samples are drawn from: from 0 to 1, fast at first."""
+        share = min(step / self.settings.anneal_steps, 1.0)
+        slope = self.settings.anneal_slope
+        return slope * share / ((slope - 1) * share + 1)
+
+    def render(self, field: Any, rays: Batch, state: TrainingState) -> ProposalRendering:
+        # It stays in force for the images after this step.
+        self._renderer.exponent.fill_(self.anneal(state.step))
+        return self._renderer.render(
+            field,
+            rays["origins"],
+            rays["directions"],
+            rays["times"],
+            rays["background"],
+            state.generator(rays["times"].device),
+            learn=self.schedule.learns(state.step),
+        )
+
+    def losses(self, rendering: ProposalRendering) -> dict[str, Tensor]:
+        if not rendering.levels[0].weights.requires_grad:
+            return {}
+        return {"histogram": self.settings.histogram * histogram_loss(rendering.levels)}
+
+    def regularise(self) -> None:
+        for proposal in self._renderer.proposals:
+            assert isinstance(proposal, DensityField)
+            self.terms.add_gradients(proposal.products)
+
+
+class UpdateSchedule:
+    """In which steps density fields learn: all at first, then rarer, a function of the step alone.
+
+    They learn when more than n steps have passed since they last did; n grows from 1 to ``every``.
+
+    Args:
+        every: n in the end.
+        warmup: Steps over which it grows.
+    """
+
+    def __init__(self, every: int, warmup: int) -> None:
+        self.every, self.warmup = every, warmup
+        self._step, self._last = -1, 0
+
+    def learns(self, step: int) -> bool:
+        """Whether they learn in a step."""
+        if step < self._step:
+            self._step, self._last = -1, 0
+        while self._step < step:
+            self._step += 1
+            gap = max(1.0, self.every * min(1.0, self._step / self.warmup))
+            if self._step < ALWAYS or self._step - self._last > gap:
+                self._last = self._step
+        return self._last == step
+
+
+def histogram_loss(levels: Sequence[Level]) -> Tensor:
+    """How far the field's weights rise above what each density field allows.
+
+    For each density field the mean over rays and samples of ``max(0, w - c)^2 / (w + 1e-7)``, w a
+    weight of the field and c the weights of all coarse samples that its sample touches.
+
+    Args:
+        levels: Density fields, which gradients reach; then the field, which they do not.
+
+    Returns:
+        The sum over density fields. []
+
+    Source: Mip-NeRF 360, Eq. 13; K-Planes.
+    """
+    *coarse, fine = levels
+    weights = fine.weights.detach()
+    terms = [
+        (weights - covering_weights(fine.edges, level.edges, level.weights)).clamp_min(0).square()
+        / (weights + SMALLEST)
+        for level in coarse
+    ]
+    return torch.stack([term.mean() for term in terms]).sum()

@@ -1,12 +1,17 @@
 """Ray batches drawn without memory: the step alone decides what is in them."""
 
+from dataclasses import dataclass
+from typing import Literal
+
 import torch
 from torch import Tensor
 
-from xplanes.scenes.cameras import pixel_rays
+from xplanes.scenes.cameras import cast_rays
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.silhouettes import foreground
 from xplanes.scenes.views import Views
+from xplanes.settings import Count, Settings, Share
+from xplanes.streams import step_generator
 
 Batch = dict[str, Tensor]
 
@@ -14,65 +19,49 @@ NEAR_SILHOUETTE = 0.02
 """Share of the image's side around silhouettes that counts as near."""
 
 
-def step_generator(seed: int, step: int, stream: int = 0) -> torch.Generator:
-    """A generator that depends on nothing but its arguments.
+@dataclass(frozen=True, kw_only=True)
+class RaySettings(Settings):
+    """Which rays a training step gets."""
 
-    Args:
-        seed: The run's seed.
-        step: The training step.
-        stream: Tells independent uses apart: the rank of a process, or another purpose.
-    """
-    # Odd constants spread neighbouring triples over 64 bits (splitmix64).
-    key = (
-        seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9 + stream * 0x94D049BB133111EB
-    ) % 2**64
-    key = ((key ^ (key >> 30)) * 0xBF58476D1CE4E5B9) % 2**64
-    key = ((key ^ (key >> 27)) * 0x94D049BB133111EB) % 2**64
-    return torch.Generator().manual_seed(key ^ (key >> 31))
+    per_batch: Count  # Rays of a step at most.
+    samples_per_batch: Count  # Samples of a step at most, on average.
+    accumulate: Count  # Batches per optimiser step.
+    background: Literal["white", "random", "one"]  # Random for each ray, or one for the batch.
+    skip_background: bool  # Draw rays near the silhouettes more often than elsewhere.
+    background_share: Share  # Share of the rays drawn far from the silhouettes.
+    background_jitter: Share  # Share of all time by which their times are moved at most.
 
 
 class RayBatches:
     """Draws training rays as a function of (seed, step, rank).
 
+    With ``skip_background`` rays far from the silhouettes are drawn at ``background_share`` instead
+    of at their share of the pixels. They show nothing but background; a few keep the air clear of
+    floaters. What is far from a silhouette is taken to be empty a moment before and after, too.
+
     Args:
         views: Training views.
         frame: The field's frame, in which rays are served.
-        rays: Rays per batch.
+        settings: Which rays to draw.
         seed: The run's seed.
-        background: Behind rays, in the target too: "white", "random" (another colour for each ray)
-            or "one" (one random colour for the batch).
-        skip_background: Whether rays far from the silhouettes are drawn at ``background_share``
-            instead of at their share of the pixels. They show nothing but background; a few keep
-            the air clear of specks.
-        background_share: Share of a batch drawn far from the silhouettes.
-        background_jitter: Share of all time by which their times are then moved at most. What is
-            far from a silhouette is taken to be empty a moment before and after, too.
         rank: Number of this process among those that split the rays.
     """
 
     def __init__(
-        self,
-        views: Views,
-        frame: Frame,
-        *,
-        rays: int,
-        seed: int,
-        background: str,
-        skip_background: bool,
-        background_share: float,
-        background_jitter: float,
-        rank: int = 0,
+        self, views: Views, frame: Frame, settings: RaySettings, *, seed: int, rank: int = 0
     ) -> None:
         self.views, self.frame = views, frame
-        self.rays, self.seed, self.rank = rays, seed, rank
-        self.background = background
-        margin = max(1, round(NEAR_SILHOUETTE * views.width))
-        near = foreground(views, margin).flatten()
-        self.near, self.far = near.nonzero()[:, 0], (~near).nonzero()[:, 0]
-        natural = len(self.far) / near.numel()
-        skip = skip_background and 0 < natural < 1
-        self.far_share = min(background_share, natural) if skip else natural
-        self.background_jitter = background_jitter if skip and not views.is_still else 0.0
+        self.rays, self.seed, self.rank = settings.per_batch, seed, rank
+        self.background = settings.background
+        widths = views.intrinsics.size[:, 1].tolist()
+        near = foreground(views, [max(1, round(NEAR_SILHOUETTE * width)) for width in widths])
+        far = ~near & views.valid() if views.is_padded else ~near
+        self.near, self.far = (pool.flatten().nonzero()[:, 0] for pool in (near, far))
+        natural = len(self.far) / views.pixels
+        skip = settings.skip_background and 0 < natural < 1
+        self.far_share = min(settings.background_share, natural) if skip else natural
+        jitter = skip and not views.is_still
+        self.background_jitter = settings.background_jitter if jitter else 0.0
         self.skipped = max(0.0, 1 - self.far_share / natural) * natural if skip else 0.0
         """Share of all pixels that uniform drawing would have shown and this one leaves out."""
 
@@ -94,13 +83,12 @@ class RayBatches:
         )
         height, width = self.views.height, self.views.width
         view = pixel // (height * width)
-        origins, directions = pixel_rays(
+        origins, directions = cast_rays(
             self.views.camera_to_world[view],
             (pixel // width % height).float(),
             (pixel % width).float(),
-            focal=self.views.focal,
-            height=height,
-            width=width,
+            focal=self.views.intrinsics.focal[view],
+            centre=self.views.intrinsics.centre[view],
         )
         origins, directions = self.frame.rays(origins, directions)
         colour = self.views.images.view(-1, 4)[pixel].float() / 255

@@ -17,7 +17,7 @@ def focal_length(angle_x: float, width: int) -> float:
 def pixel_rays(
     camera_to_world: Tensor, rows: Tensor, columns: Tensor, *, focal: float, height: int, width: int
 ) -> tuple[Tensor, Tensor]:
-    """Cast one ray through each named pixel.
+    """Cast one ray through each named pixel of a camera with square pixels and a centred image.
 
     Args:
         camera_to_world: Pose of the camera of each ray. [R, 4, 4] or [4, 4]
@@ -30,13 +30,45 @@ def pixel_rays(
     Returns:
         Origins and unit directions in the world. [R, 3], [R, 3]
     """
-    right = (columns + 0.5 - 0.5 * width) / focal
-    up = (0.5 * height - 0.5 - rows) / focal
+    middle = (0.5 * width, 0.5 * height)
+    return cast_rays(camera_to_world, rows, columns, focal=(focal, focal), centre=middle)
+
+
+def cast_rays(
+    camera_to_world: Tensor,
+    rows: Tensor,
+    columns: Tensor,
+    *,
+    focal: Tensor | tuple[float, float],
+    centre: Tensor | tuple[float, float],
+) -> tuple[Tensor, Tensor]:
+    """Cast one ray through each named pixel.
+
+    Args:
+        camera_to_world: Pose of the camera of each ray. [R, 4, 4] or [4, 4]
+        rows: Pixel rows, from 0 at the top; fractions are allowed. [R]
+        columns: Pixel columns, from 0 at the left. [R]
+        focal: Focal lengths along x and y in pixels. [R, 2] or [2]
+        centre: Principal point, x from the left and y from the top, in pixels. [R, 2] or [2]
+
+    Returns:
+        Origins and unit directions in the world. [R, 3], [R, 3]
+    """
+    middle = columns + 0.5
+    focal_x, focal_y = focal.unbind(-1) if isinstance(focal, Tensor) else focal
+    centre_x, centre_y = centre.unbind(-1) if isinstance(centre, Tensor) else centre
+    right = (middle - _like(middle, centre_x)) / _like(middle, focal_x)
+    up = (_like(middle, centre_y - 0.5) - rows) / _like(middle, focal_y)
     local = torch.stack([right, up, -torch.ones_like(right)], dim=-1)
     local = local / local.norm(dim=-1, keepdim=True)
     rotation = camera_to_world[..., :3, :3]
     directions = (rotation @ local[..., None])[..., 0]
     return camera_to_world[..., :3, 3].expand_as(directions), directions
+
+
+def _like(reference: Tensor, value: Tensor | float) -> Tensor | float:
+    """Intrinsics in the precision of rays, which they would widen otherwise."""
+    return value.to(reference) if isinstance(value, Tensor) else value
 
 
 def look_at(position: Tensor, target: Tensor | None = None) -> Tensor:

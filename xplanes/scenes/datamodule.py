@@ -1,61 +1,283 @@
-"""The scene as a LightningDataModule."""
+"""A scene as a LightningDataModule: training rays, and whole views to score."""
 
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+import torch
+import yaml
 from lightning import LightningDataModule
-from torch.utils.data import DataLoader, IterableDataset
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, IterableDataset
 
-from xplanes.scenes.batches import Batch, RayBatches
-from xplanes.scenes.frame import Frame
-from xplanes.scenes.views import Scene
+from xplanes.components import build, plugins
+from xplanes.config import compose_plain
+from xplanes.errors import ConfigError
+from xplanes.files import read_json
+from xplanes.scenes.batches import Batch, RayBatches, RaySettings
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.frame import scene_frame
+from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.views import Scene, Views
+
+HELD_OUT = 8
+"""Where a scene has no validation split, one training view in so many is held out."""
+
+UNIFORM = RaySettings(
+    per_batch=1024,
+    samples_per_batch=8192,
+    accumulate=1,
+    background="white",
+    skip_background=False,
+    background_share=1.0,
+    background_jitter=0.0,
+)
+"""Rays for a LightningModule that says nothing about them."""
+
+
+class SceneDataModule(LightningDataModule):
+    """Reads a scene, checks it, and serves rays to train on and views to score.
+
+    A training batch is what `RayBatches.draw` returns. It is a function of the seed, the number of
+    batches before it and the rank, so that a resumed run draws the very rays of an uninterrupted
+    one. How many rays, and which, the LightningModule says as ``ray_settings`` and ``frame``;
+    without these it gets 1024 rays over all pixels, in the frame of the scene's cube. The batches
+    are endless; an epoch is as many as the training views have pixels.
+
+    A batch of `val_dataloader`, `test_dataloader` and `predict_dataloader` is one whole view of its
+    own size:
+    ``origins`` and unit ``directions`` in the world [H W, 3], ``time`` [], ``target`` in front of
+    the scene's background [H, W, 3], ``background`` [3] and its number ``index``.
+
+    Args:
+        scene: Settings of the scene, or the group ``data`` of a configuration.
+        seed: Source of the rays' randomness.
+        plugins: Modules of the user's own whose classes ``scene`` may name.
+
+    Raises:
+        ConfigError: If a setting cannot work.
+    """
+
+    def __init__(
+        self,
+        scene: SceneSettings | Mapping[str, Any],
+        *,
+        seed: int = 0,
+        plugins: Sequence[str] = (),
+    ) -> None:
+        super().__init__()
+        settings = scene if isinstance(scene, SceneSettings) else _settings(scene, plugins)
+        self._begin(settings, seed)
+        self.save_hyperparameters({"scene": settings.plain(), "seed": seed})
+
+    def _begin(self, settings: SceneSettings, seed: int) -> None:
+        self.settings, self.seed = settings, seed
+        self.first = 0
+        """Batches that training has drawn already."""
+        self._scene: Scene | None = None
+        self._batches: dict[int, RayBatches] = {}
+
+    @classmethod
+    def of(cls, scene: Scene, *, seed: int = 0) -> "SceneDataModule":
+        """The data of a scene that was read already, whatever its source."""
+        data = cls.__new__(cls)
+        LightningDataModule.__init__(data)
+        data._begin(_GivenScene.around(scene), seed)
+        data.scene = scene
+        return data
+
+    @classmethod
+    def compose(cls, *overrides: str, seed: int = 0) -> "SceneDataModule":
+        """The data of the command line's settings: ``compose("data=dnerf", "data.scene=hook")``."""
+        return cls(compose_plain("train", overrides)["data"], seed=seed)
+
+    @classmethod
+    def from_run(cls, run: str | Path, plugins: Sequence[str] = ()) -> "SceneDataModule":
+        """The data of a run directory, its split and resolution included.
+
+        Raises:
+            ConfigError: If the folder holds no run, or it cannot be read.
+        """
+        path = Path(run) / "config.yaml"
+        try:
+            content = yaml.safe_load(path.read_text(encoding="utf-8"))
+            data, seed = content["data"], content["seed"]
+        except (OSError, UnicodeDecodeError, yaml.YAMLError, TypeError, KeyError) as error:
+            raise ConfigError(
+                f"{run} is not a run directory, or its config.yaml is damaged ({error})"
+            ) from error
+        settings = _settings(data, plugins)
+        root = found_root(Path(run), settings.root)
+        return cls(replace(settings, root=root), seed=seed)
+
+    @property
+    def scene(self) -> Scene:
+        """The scene; it is read when it is first asked for.
+
+        Raises:
+            SceneError: If it cannot be used.
+        """
+        if self._scene is None:
+            self._scene = self.settings.read()
+        return self._scene
+
+    @scene.setter
+    def scene(self, scene: Scene) -> None:
+        self._scene = scene
+
+    def prepare_data(self) -> None:
+        self.settings.prepare()
+
+    def setup(self, stage: str) -> None:
+        """Read the splits that a stage needs: ``fit``, ``validate``, ``test`` or ``predict``."""
+        if stage == "fit" and self.trainer is not None:
+            # Where this data trained another module before, the next begins anew.
+            self.first = getattr(self.trainer.lightning_module, "batches", self.first)
+        names = {"test": ("test",), "predict": ("test",)}.get(stage, ())
+        missing = [name for name in names if name not in self.scene.splits]
+        wanted = self.trainer is None or self.trainer.limit_val_batches
+        if stage in ("fit", "validate") and wanted and "val" not in self.scene.splits:
+            missing.append("val")
+        for name in missing:
+            try:
+                found = self.settings.read((name,)).splits[name]
+            except SceneError:
+                if name != "val":
+                    raise
+                # Held out of the training views.
+                train = self.scene.splits["train"]
+                if len(train) < 2 * HELD_OUT:
+                    continue
+                chosen = torch.zeros(len(train), dtype=torch.bool)
+                chosen[train.times.argsort(stable=True)[HELD_OUT // 2 :: HELD_OUT]] = True
+                found = train.subset(chosen.nonzero()[:, 0])
+                rest = train.subset((~chosen).nonzero()[:, 0])
+                self._scene = replace(self.scene, splits=self.scene.splits | {"train": rest})
+                self._batches = {}  # Those before held all of them.
+            if self.scene.still:
+                found = replace(found, times=torch.zeros_like(found.times))
+            self._scene = replace(self.scene, splits=self.scene.splits | {name: found})
+
+    def batches(self, rank: int) -> RayBatches:
+        """The batches of a process, for the module that is being trained."""
+        return self.batches_for(
+            None if self.trainer is None else self.trainer.lightning_module, rank
+        )
+
+    def batches_for(self, module: Any, rank: int) -> RayBatches:
+        """The batches of a process for a LightningModule, or for none that says anything."""
+        if rank not in self._batches:
+            views = self.scene.splits["train"]
+            frame = getattr(module, "frame", None) or scene_frame(views, self.settings.half_side)
+            settings = getattr(module, "ray_settings", UNIFORM)
+            self._batches[rank] = RayBatches(views, frame, settings, seed=self.seed, rank=rank)
+        return self._batches[rank]
+
+    def train_dataloader(self) -> DataLoader:
+        batches = self.batches(self.trainer.global_rank if self.trainer else 0)
+        warnings.filterwarnings("ignore", message=".*`IterableDataset` has `__len__` defined.*")
+        warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+        return DataLoader(_Endless(batches, self), batch_size=None)
+
+    def val_dataloader(self) -> DataLoader | list[DataLoader]:
+        return self._views("val") if "val" in self.scene.splits else []
+
+    def test_dataloader(self) -> DataLoader:
+        return self._views(self.settings.eval_split)
+
+    def predict_dataloader(self) -> DataLoader:
+        return self._views(self.settings.eval_split)
+
+    def _views(self, split: str) -> DataLoader:
+        if split not in self.scene.splits:
+            views = self.settings.read((split,)).splits[split]
+            self._scene = replace(self.scene, splits=self.scene.splits | {split: views})
+        views = self.scene.splits[split]
+        return DataLoader(_WholeViews(views, self.scene.background), batch_size=None)
+
+    def state_dict(self) -> dict[str, Any]:
+        module = None if self.trainer is None else self.trainer.lightning_module
+        return {"batches": getattr(module, "batches", self.first)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.first = state_dict["batches"]
 
 
 class _Endless(IterableDataset):
-    """Batches from a step onwards, for ever."""
+    """Batches from where training is, for ever; its length is that of an epoch."""
 
-    def __init__(self, batches: RayBatches, first: int) -> None:
-        self.batches, self.first = batches, first
+    def __init__(self, batches: RayBatches, data: SceneDataModule) -> None:
+        self.batches, self.data = batches, data
+
+    def __len__(self) -> int:
+        return max(1, self.batches.views.pixels // self.batches.rays)
 
     def __iter__(self) -> Iterator[Batch]:
-        step = self.first
         while True:
+            step = self.data.first
+            self.data.first += 1
             yield self.batches.draw(step)
-            step += 1
 
 
-class RayDataModule(LightningDataModule):
-    """Serves the training rays of a scene.
+class _WholeViews(Dataset):
+    """Views as rays and images."""
 
-    Lightning does not restore the place of an endless data set, so the batch counter is part of
-    this module's state and a resumed run draws the very rays of an uninterrupted one.
+    def __init__(self, views: Views, background: Tensor) -> None:
+        self.views, self.background = views, background
 
-    Args:
-        scene: Images and cameras.
-        frame: The field's frame.
-        batches: From the rank of a process to its batches.
-    """
+    def __len__(self) -> int:
+        return len(self.views)
 
-    def __init__(self, scene: Scene, frame: Frame, batches: Callable[[int], RayBatches]) -> None:
-        super().__init__()
-        self.scene, self.frame = scene, frame
-        self._build = batches
-        self._built: dict[int, RayBatches] = {}
-        self._first = 0
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        origins, directions = self.views.image_rays(index)
+        return {
+            "origins": origins,
+            "directions": directions,
+            "time": self.views.times[index],
+            "target": self.views.composite(index, self.background),
+            "background": self.background,
+            "index": index,
+        }
 
-    def batches(self, rank: int) -> RayBatches:
-        """The batches of a process."""
-        if rank not in self._built:
-            self._built[rank] = self._build(rank)
-        return self._built[rank]
 
-    def train_dataloader(self) -> DataLoader:
-        rank = self.trainer.global_rank if self.trainer else 0
-        return DataLoader(_Endless(self.batches(rank), self._first), batch_size=None)
+@dataclass(frozen=True, kw_only=True)
+class _GivenScene(SceneSettings):
+    """Settings for a scene that was read already."""
 
-    def state_dict(self) -> dict[str, Any]:
-        assert self.trainer is not None
-        return {"batches": self.trainer.lightning_module.batches}
+    @classmethod
+    def around(cls, scene: Scene) -> "_GivenScene":
+        split = "val" if "test" not in scene.splits else "test"
+        return cls(
+            name="given",
+            root=".",
+            scene=scene.name,
+            resolution=None,
+            views=None,
+            train_on_video=False,
+            still=None,
+            eval_split=split,
+            eval_views=None,
+            half_side=None,
+        )
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._first = state_dict["batches"]
+    def load(self, splits: Sequence[str]) -> Scene:
+        raise SceneError(f"{self.scene}: there are no splits {', '.join(splits)} in this scene")
+
+
+def found_root(run: Path, root: str) -> str:
+    """Where a run's scenes are: a relative folder may be relative to where training was started."""
+    try:
+        started = read_json(run / "run.json").get("directory")
+    except (OSError, ValueError):
+        started = None
+    if Path(root).exists() or not isinstance(started, str):
+        return root
+    there = Path(started) / root
+    return str(there) if there.exists() else root
+
+
+def _settings(node: Mapping[str, Any], modules: Sequence[str]) -> SceneSettings:
+    with plugins(modules):
+        return build(node, SceneSettings, "data")

@@ -2,14 +2,17 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from xplanes.scenes.errors import SceneError
-from xplanes.scenes.images import load_images
+from xplanes.scenes.images import read_images
+from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.transforms import Transforms, read_transforms
-from xplanes.scenes.views import Scene, Views
+from xplanes.scenes.views import Intrinsics, Scene, Views
 
 __all__ = ["SceneError", "read_scene"]
 
@@ -17,6 +20,20 @@ GET_DATA = (
     "Set data.root and data.scene to a folder that holds transforms_train.json, get the D-NeRF "
     "scenes with `xplanes download dnerf`, or take the built-in scene with data=demo."
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlenderSettings(SceneSettings):
+    """A scene on disk in the format of D-NeRF or Blender."""
+
+    def load(self, splits: Sequence[str]) -> Scene:
+        return read_scene(
+            self.folder,
+            resolution=self.resolution,
+            splits=splits,
+            views=self.views,
+            eval_views=self.eval_views,
+        )
 
 
 def read_scene(
@@ -31,7 +48,7 @@ def read_scene(
 
     Args:
         folder: Folder of transforms_train.json and the images.
-        resolution: Pixels per side of the (square) images; None keeps the native size.
+        resolution: Pixels per side of the (square) images; None keeps the native sizes.
         splits: Names of the splits to read, such as train, val, test.
         views: Number of views to keep of the train split, spread evenly over time;
             None keeps all.
@@ -140,13 +157,18 @@ def _list_video(folder: Path) -> Transforms | None:
 
 
 def _load(transforms: Transforms, resolution: int | None) -> Views:
-    images = load_images(transforms.paths, resolution)
+    images, native, sizes = read_images(transforms.paths, resolution)
     _warn_of_empty(images, transforms)
+    known = [
+        lens.scaled(file, size)
+        for lens, file, size in zip(transforms.lenses, native, sizes, strict=True)
+    ]
+    focal, centre = torch.tensor(known, dtype=torch.float64).unbind(dim=1)
     return Views(
         images=images,
         camera_to_world=transforms.camera_to_world,
         times=transforms.times,
-        focal=transforms.focal_per_width * images.shape[2],
+        intrinsics=Intrinsics(focal, centre, torch.tensor(sizes)),
         files=transforms.files,
     )
 

@@ -96,13 +96,25 @@ def cube_frame(half_side: float, centre: Tensor) -> Frame:
     return Frame(1 / half_side, torch.eye(3), centre)
 
 
+def backwards(views: Views) -> Tensor:
+    """Unit vectors against which the middle of each image looks. [V, 3]
+
+    They are the cameras' z axes where principal points are centred.
+    """
+    focal, centre, size = views.intrinsics.focal, views.intrinsics.centre, views.intrinsics.size
+    right, down = ((0.5 * size.flip(1) - centre) / focal).unbind(dim=1)
+    local = torch.stack([-right, down, torch.ones_like(right)], dim=1)
+    local = local / local.norm(dim=1, keepdim=True)
+    return (views.camera_to_world[:, :3, :3].double() @ local[..., None])[..., 0].float()
+
+
 def optical_centre(views: Views) -> Tensor:
-    """The point nearest to all optical axes, in the least-squares sense. [3]
+    """The point nearest to all rays through images' middles, in the least-squares sense. [3]
 
     Cameras that all look the same way leave the depth open: it is then that of the world's origin.
     """
     origin = views.camera_to_world[:, :3, 3].double()
-    axis = -views.camera_to_world[:, :3, 2].double()
+    axis = -backwards(views).double()
     projector = torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]
     target = (projector @ origin[..., None])[..., 0].mean(dim=0)
     # Of all points that solve it equally well, the pseudo-inverse takes the one nearest the origin.
@@ -129,9 +141,9 @@ def scene_frame(views: Views, half_side: float | None = None) -> Frame:
     if half_side is not None:
         return cube_frame(half_side, centre)
     offset = views.camera_to_world[:, :3, 3] - centre
-    distance = (offset * views.camera_to_world[:, :3, 2]).sum(dim=-1)
-    extent = 0.5 * max(views.height, views.width) / views.focal
-    half = float((distance.clamp_min(0) * extent).max())
+    depth = (offset * views.camera_to_world[:, :3, 2]).sum(dim=-1)
+    extent = (0.5 * views.intrinsics.size.flip(1) / views.intrinsics.focal).amax(dim=1)
+    half = float((depth.clamp_min(0) * extent.float()).max())
     if not math.isfinite(half) or half <= 0:
         raise SceneError(
             "the cameras look away from one another, so the scene's bounds cannot be found: set "
@@ -140,7 +152,9 @@ def scene_frame(views: Views, half_side: float | None = None) -> Frame:
     spread = _spread(views)
     reach = MARGIN * _reach(views, centre) / spread if spread > 0 else math.inf
     half = min(half, reach)
-    aside = (offset - distance[:, None] * views.camera_to_world[:, :3, 2]).norm(dim=-1)
+    back = backwards(views)
+    distance = (offset * back).sum(dim=-1)
+    aside = (offset - distance[:, None] * back).norm(dim=-1)
     astray = int(((distance <= half) | (aside > half)).sum())
     if 4 * astray > len(views):
         logger.warning(
@@ -159,7 +173,7 @@ def _spread(views: Views) -> float:
     Views from all sides show nearly all of it; views from one side see what lies along their axes
     foreshortened, those of one axis not at all.
     """
-    axis = views.camera_to_world[:, :3, 2].double()
+    axis = backwards(views).double()
     common = torch.linalg.eigh(axis.T @ axis).eigenvectors.T
     cosine = torch.cat([axis, common]) @ axis.T
     shown = (1 - cosine.square()).clamp_min(0).sqrt().amax(dim=1).min()
@@ -170,7 +184,7 @@ def _reach(views: Views, centre: Tensor) -> float:
     """Largest distance from ``centre`` at which a ray through the foreground passes it."""
     largest = 0.0
     for index in range(len(views)):
-        seen = (views.images[index, ..., 3] > 0).flatten()
+        seen = (views.image(index)[..., 3] > 0).flatten()
         origins, directions = (ray[seen] for ray in views.image_rays(index))
         if len(origins):
             offset = centre - origins

@@ -13,6 +13,9 @@ from torch import Tensor
 
 from xplanes.scenes.errors import SceneError
 
+Size = tuple[int, int]
+"""Height and width."""
+
 FORMATS = ("PNG", "JPEG")
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "P", "PA", "1")
 SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I")
@@ -39,15 +42,41 @@ def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
     Raises:
         SceneError: A file cannot be decoded, sizes differ, or the resolution cannot be met.
     """
-    width, height = common_size(paths)
+    common_size(paths)
+    return read_images(paths, resolution)[0]
+
+
+def read_images(
+    paths: Sequence[Path], resolution: int | None
+) -> tuple[Tensor, list[Size], list[Size]]:
+    """Decode images of any sizes and reduce them to ``resolution`` pixels square.
+
+    Args:
+        paths: Image files, PNG or JPEG, at least one. [V]
+        resolution: Pixels per side; None keeps the sizes of the files.
+
+    Returns:
+        Colour, multiplied by alpha before it was averaged, and alpha, smaller images padded with
+        zeros at the bottom and on the right: uint8 [V, H, W, 4]. Then the height and width of each
+        file, and those of each image without padding.
+
+    Raises:
+        SceneError: A file cannot be decoded, or the resolution cannot be met.
+    """
+    native = [(height, width) for width, height in map(_read_size, paths)]
+    sizes = native
     if resolution is not None:
-        check_resolution(paths[0], width, height, resolution)
-        width = height = resolution
-    images = torch.empty(len(paths), height, width, 4, dtype=torch.uint8)
+        for path, (height, width) in zip(paths, native, strict=True):
+            check_resolution(path, width, height, resolution)
+        sizes = [(resolution, resolution)] * len(paths)
+    largest = max(height for height, _ in sizes), max(width for _, width in sizes)
+    same = len(set(sizes)) == 1
+    images = (torch.empty if same else torch.zeros)(len(paths), *largest, 4, dtype=torch.uint8)
 
     def fill(index: int) -> None:
+        height, width = sizes[index]
         pixels = shrink(load_premultiplied(paths[index]), width, height)
-        images[index] = torch.from_numpy(pixels)
+        images[index, :height, :width] = torch.from_numpy(pixels)
 
     # Pillow decodes and resamples without the interpreter lock, so threads are enough.
     pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1, len(paths)))
@@ -55,7 +84,7 @@ def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
         list(pool.map(fill, range(len(paths))))
     finally:
         pool.shutdown(cancel_futures=True)
-    return images
+    return images, native, sizes
 
 
 def common_size(paths: Sequence[Path]) -> tuple[int, int]:
@@ -65,7 +94,7 @@ def common_size(paths: Sequence[Path]) -> tuple[int, int]:
         if size != sizes[0]:
             raise SceneError(
                 f"{path} has {size[0]}x{size[1]} pixels, but {paths[0]} has "
-                f"{sizes[0][0]}x{sizes[0][1]}. All images of a split must have one size: "
+                f"{sizes[0][0]}x{sizes[0][1]}. All images must have one size: "
                 f"export or resize them alike."
             )
     return sizes[0]

@@ -1,5 +1,7 @@
 """What the images' alpha rules out: space that some view shows to be empty."""
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -13,14 +15,21 @@ MOST_VIEWS = 5
 """Views of such a span at most: more rule out little empty space, but ever more of what moves."""
 
 
-def foreground(views: Views, margin: int) -> Tensor:
-    """Pixels with alpha above 0, or within ``margin`` pixels of such. bool [V, H, W]"""
-    near = views.images[..., 3] > 0
-    side = 2 * margin + 1
-    for mask in near:
+def foreground(views: Views, margin: int | Sequence[int]) -> Tensor:
+    """Pixels with alpha above 0, or within ``margin`` pixels of such. bool [V, H, W]
+
+    Args:
+        views: Images; none of their padding is foreground.
+        margin: The same for all images, or one for each.
+    """
+    near = torch.zeros(views.images.shape[:3], dtype=torch.bool)
+    margins = [margin] * len(views) if isinstance(margin, int) else margin
+    for index, reach in enumerate(margins):
+        alpha = views.image(index)[..., 3]
+        mask, side = near[index, : alpha.shape[0], : alpha.shape[1]], 2 * reach + 1
         # Rows, then columns: the square's pixels number many more.
-        rows = F.max_pool2d(mask.float()[None], (side, 1), stride=1, padding=(margin, 0))
-        mask[:] = F.max_pool2d(rows, (1, side), stride=1, padding=(0, margin))[0] > 0
+        rows = F.max_pool2d((alpha > 0).float()[None], (side, 1), stride=1, padding=(reach, 0))
+        mask[:] = F.max_pool2d(rows, (1, side), stride=1, padding=(0, reach))[0] > 0
     return near
 
 
@@ -39,18 +48,22 @@ def may_hold(views: Views, points: Tensor, *, radius: float) -> Tensor:
     """
     inside = torch.ones(len(views), len(points), dtype=torch.bool)
     for index, pose in enumerate(views.camera_to_world):
+        (height, width), alpha = views.size(index), views.image(index)[..., 3]
+        focal_x, focal_y = views.intrinsics.focal[index].tolist()
+        centre_x, centre_y = views.intrinsics.centre[index].tolist()
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         depth = -local[:, 2]
-        column = (local[:, 0] / depth * views.focal + 0.5 * views.width).floor()
-        row = (-local[:, 1] / depth * views.focal + 0.5 * views.height).floor()
-        seen = (depth > radius) & (column >= 0) & (column < views.width)
-        seen &= (row >= 0) & (row < views.height)
+        column = (local[:, 0] / depth * focal_x + centre_x).floor()
+        row = (-local[:, 1] / depth * focal_y + centre_y).floor()
+        seen = (depth > radius) & (column >= 0) & (column < width)
+        seen &= (row >= 0) & (row < height)
         if not seen.any():
             continue
         # How far a ball of this radius reaches from the pixel of its centre, on either axis.
         slant = torch.hypot(depth, local[:, :2].abs().amax(dim=-1))
-        margin = (views.focal * radius * slant / (depth * (depth - radius))).ceil()[seen]
-        steps = _steps_to_foreground(views.images[index, ..., 3] > 0, int(margin.max()))
+        focal = max(focal_x, focal_y)
+        margin = (focal * radius * slant / (depth * (depth - radius))).ceil()[seen]
+        steps = _steps_to_foreground(alpha > 0, int(margin.max()))
         inside[index, seen] = steps[row[seen].long(), column[seen].long()] <= margin
     return inside
 

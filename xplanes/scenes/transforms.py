@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -16,8 +16,56 @@ from xplanes.scenes.errors import SceneError
 
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 RIGID_TOLERANCE = 1e-3
-LENS_TOLERANCE = 0.01
+PIXELS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
+OTHER_MODELS = ("FISHEYE", "EQUIRECTANGULAR", "ORTHO")
+
+
+@dataclass(frozen=True)
+class Lens:
+    """What a file tells about the camera of one image, as instant-ngp and nerfstudio write it.
+
+    Attributes:
+        per_width: Focal length in image widths; None where ``fl_x`` tells it.
+        fl_x: Focal length along x in pixels of an image of ``w`` x ``h``.
+        fl_y: The same along y; None for square pixels.
+        cx: Principal point, from the left; None for the middle.
+        cy: Principal point, from the top; None for the middle.
+        w: Width of the image that these numbers speak of; None for that of the image file.
+        h: Its height.
+    """
+
+    per_width: float | None = None
+    fl_x: float | None = None
+    fl_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    w: float | None = None
+    h: float | None = None
+
+    def scaled(
+        self, native: tuple[int, int], size: tuple[int, int]
+    ) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Focal lengths and principal point of the image in its final size.
+
+        Args:
+            native: Height and width of the image file.
+            size: Those after it was resized.
+        """
+        (rows, columns), (height, width) = native, size
+        # Of an image of another size only one side may be told.
+        wide = self.w or (columns if self.h is None else columns * self.h / rows)
+        high = self.h or (rows if self.w is None else rows * self.w / columns)
+        per_width = self.per_width if self.fl_x is None else self.fl_x / wide
+        assert per_width is not None
+        focal_x = per_width * width
+        if self.fl_y is not None:
+            focal_y = self.fl_y / high * height
+        else:
+            focal_y = focal_x * ((height / rows) / (width / columns))
+        centre_x = 0.5 * width if self.cx is None else self.cx / wide * width
+        centre_y = 0.5 * height if self.cy is None else self.cy / high * height
+        return (focal_x, focal_y), (centre_x, centre_y)
 
 
 @dataclass(frozen=True)
@@ -29,7 +77,7 @@ class Transforms:
         files: The same files by their names within the scene's folder. [V]
         camera_to_world: Rigid camera poses. [V, 4, 4]
         times: Time of each image, from 0 to 1; all 0 for a static scene. [V]
-        focal_per_width: Focal length in image widths.
+        lenses: Focal length and principal point of each image, as far as they are told. [V]
         timed: Whether the file tells the times.
     """
 
@@ -37,7 +85,7 @@ class Transforms:
     files: tuple[str, ...]
     camera_to_world: Tensor
     times: Tensor
-    focal_per_width: float
+    lenses: tuple[Lens, ...]
     timed: bool
 
     def subset(self, indices: Sequence[int]) -> "Transforms":
@@ -48,7 +96,7 @@ class Transforms:
             tuple(self.files[i] for i in chosen),
             self.camera_to_world[chosen],
             self.times[chosen],
-            self.focal_per_width,
+            tuple(self.lenses[i] for i in chosen),
             self.timed,
         )
 
@@ -92,7 +140,10 @@ def read_transforms(path: Path) -> Transforms:
         files=tuple(image.relative_to(folder).as_posix() for image in paths),
         camera_to_world=torch.from_numpy(poses).float(),
         times=torch.tensor(times or [0.0] * len(frames), dtype=torch.float32),
-        focal_per_width=_focal_per_width(path, content, frames),
+        lenses=tuple(
+            _lens(str(path), content, label, frame)
+            for label, frame in zip(labels, frames, strict=True)
+        ),
         timed=bool(times),
     )
 
@@ -208,50 +259,74 @@ def _refuse_repeats(
             )
 
 
-def _focal_per_width(path: Path, content: dict[str, Any], frames: list[dict[str, Any]]) -> float:
-    """Focal length in image widths, from camera_angle_x or fl_x and w."""
-    _refuse_other_lenses(path, content, frames)
-    if "camera_angle_x" in content:
-        angle = content["camera_angle_x"]
-        if not _is_positive(angle) or angle >= math.pi:
-            raise SceneError(
-                f"{path}: camera_angle_x is {_short(angle)}; it must lie between 0 and pi radians."
-            )
-        return focal_length(angle, 1)
-    if not (_is_positive(content.get("fl_x")) and _is_positive(content.get("w"))):
+def _lens(where: str, content: Mapping[str, Any], label: str, frame: Mapping[str, Any]) -> Lens:
+    """The lens of a frame: its own keys, those of the file where it has none."""
+    for name, keys in ((where, content), (label, frame)):
+        _refuse_other_lenses(name, keys)
+    shared, own = _pixels(where, content), _pixels(label, frame)
+    name, keys = where, content
+    if "camera_angle_x" in frame and "fl_x" not in own:
+        # Focal lengths of the file are not those of this frame.
+        shared = {key: value for key, value in shared.items() if key not in ("fl_x", "fl_y")}
+        name, keys = label, frame
+    known = shared | own
+    if "fl_x" in known:
+        return Lens(**known)
+    if "camera_angle_x" not in keys:
         raise SceneError(
-            f'{path} has no "camera_angle_x" (horizontal field of view in radians). Add it, or '
+            f'{where} has no "camera_angle_x" (horizontal field of view in radians). Add it, or '
             f"fl_x and w (focal length and image width in pixels, both above 0)."
         )
-    return content["fl_x"] / content["w"]
+    angle = keys["camera_angle_x"]
+    if not _is_positive(angle) or angle >= math.pi:
+        raise SceneError(
+            f"{name}: camera_angle_x is {_short(angle)}; it must lie between 0 and pi radians."
+        )
+    return Lens(per_width=focal_length(angle, 1), **known)
 
 
-def _refuse_other_lenses(path: Path, content: dict[str, Any], frames: list[dict[str, Any]]) -> None:
-    """Refuse what one focal length and a centred, undistorted image cannot stand for."""
-    problems = [key for key in DISTORTIONS if content.get(key)]
-    for key, other, expected in (("fl_y", "fl_x", 1), ("cx", "w", 0.5), ("cy", "h", 0.5)):
-        value, reference = content.get(key), content.get(other)
-        if value is None or reference is None:
+def _pixels(name: str, keys: Mapping[str, Any]) -> dict[str, float]:
+    """The keys in pixels that are given; null, and 0 where it can be no size, stand for none."""
+    if all(keys.get(key) is None for key in PIXELS[:4]):
+        # A size alone says nothing: whatever it is, it is not looked at.
+        return {key: keys[key] for key in ("w", "h") if _is_positive(keys.get(key))}
+    found = {}
+    for key in PIXELS:
+        value = keys.get(key)
+        middle = key in ("cx", "cy")
+        if value is None or (value == 0 and not middle):
             continue
-        if not (_is_positive(value) and _is_positive(reference)) or (
-            abs(value / reference - expected) > LENS_TOLERANCE
-        ):
-            problems.append(key)
-    problems += [
-        f"{key} of single frames"
-        for key in ("camera_angle_x", "fl_x")
-        if any(key in frame and frame[key] != content.get(key) for frame in frames)
-    ]
+        if not (_is_number(value) if middle else _is_positive(value)):
+            raise SceneError(
+                f"{name}: {key} is {_short(value)}; it must be a number"
+                f"{'' if middle else ' above 0'}, in pixels, or be left out."
+            )
+        found[key] = float(value)
+    return found
+
+
+def _refuse_other_lenses(name: str, keys: Mapping[str, Any]) -> None:
+    """Refuse what no pinhole can stand for."""
+    problems = [f"{key}={_short(keys[key])}" for key in DISTORTIONS if keys.get(key)]
+    model = str(keys.get("camera_model", ""))
+    if any(word in model.upper() for word in OTHER_MODELS):
+        problems.append(f"camera_model={model}")
+    if keys.get("is_fisheye"):
+        problems.append("is_fisheye")
     if problems:
         raise SceneError(
-            f"{path}: {', '.join(problems)} describe a camera that is not read here. Cameras have "
-            f"one focal length, a centred image and no distortion: undistort the images first."
+            f"{name}: {', '.join(problems)} describe a distorted image, which is not read here. "
+            f"Cameras are pinholes: undistort the images first."
         )
+
+
+def _is_number(value: Any) -> bool:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and math.isfinite(value)
 
 
 def _is_positive(value: Any) -> bool:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number and math.isfinite(value) and value > 0
+    return _is_number(value) and value > 0
 
 
 def _short(value: Any) -> str:

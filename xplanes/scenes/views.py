@@ -1,48 +1,159 @@
 """Posed, timed images of a scene, held in memory as bytes."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from xplanes.scenes.cameras import pixel_rays
-from xplanes.scenes.errors import SceneError
+from xplanes.scenes.cameras import cast_rays
+
+SAME_CAMERA = 1e-4
+"""Share by which intrinsics of one camera differ at most."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """What the cameras of some images see, in pixels; pixel centres lie at +0.5.
+
+    Attributes:
+        focal: Focal lengths along x and y. float64 [V, 2]
+        centre: Principal points, x from the left and y from the top; half of width and height where
+            images are centred. float64 [V, 2]
+        size: Height and width of each image. int64 [V, 2]
+    """
+
+    focal: Tensor
+    centre: Tensor
+    size: Tensor
+
+    def __post_init__(self) -> None:
+        for name in ("focal", "centre", "size"):
+            value = getattr(self, name)
+            if value.shape != (len(self.size), 2):
+                raise ValueError(f"intrinsics.{name} is {list(value.shape)}, but must be [V, 2]")
+            # Wider than rays, so that sizes and angles made of them are as exact as the files.
+            kind = torch.int64 if name == "size" else torch.float64
+            object.__setattr__(self, name, value.to(kind))
+
+    def __len__(self) -> int:
+        return len(self.size)
+
+    @classmethod
+    def shared(cls, focal: float, height: int, width: int, count: int) -> "Intrinsics":
+        """Those of ``count`` centred images of one camera with square pixels."""
+        return cls(
+            torch.full((count, 2), focal, dtype=torch.float64),
+            torch.tensor([0.5 * width, 0.5 * height], dtype=torch.float64).repeat(count, 1),
+            torch.tensor([height, width]).repeat(count, 1),
+        )
+
+    def subset(self, indices: Tensor) -> "Intrinsics":
+        """Those of the images at ``indices``, in that order. [K]"""
+        return Intrinsics(self.focal[indices], self.centre[indices], self.size[indices])
+
+    def joined(self, other: "Intrinsics") -> "Intrinsics":
+        """These, then those of ``other``."""
+        return Intrinsics(
+            torch.cat([self.focal, other.focal]),
+            torch.cat([self.centre, other.centre]),
+            torch.cat([self.size, other.size]),
+        )
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether all images have the same, as those of one camera."""
+        room = SAME_CAMERA * self.size.max()
+        return (
+            bool((self.size == self.size[0]).all())
+            and bool(((self.focal / self.focal[0] - 1).abs() <= SAME_CAMERA).all())
+            and bool(((self.centre - self.centre[0]).abs() <= room).all())
+        )
+
+    @property
+    def fov_y(self) -> float:
+        """Vertical field of view of the median image, in radians."""
+        return 2 * math.atan(float((0.5 * self.size[:, 0] / self.focal[:, 1]).median()))
+
+    def focal_at(self, size: int) -> float:
+        """Focal length of a picture ``size`` pixels wide that shows as much as the median image."""
+        longer = self.size.amax(dim=1)
+        return float((self.focal.mean(dim=1) * size / longer).median())
 
 
 @dataclass(frozen=True)
 class Views:
     """The images of one split with their cameras.
 
+    Images may differ in size: smaller ones are padded with zeros at the bottom and on the right,
+    which nothing may take for pixels. `image`, `composite` and `image_rays` leave the padding out.
+
     Attributes:
         images: Colour, already multiplied by alpha, and alpha. uint8 [V, H, W, 4]
         camera_to_world: Rigid camera poses. [V, 4, 4]
         times: Time of each image, from 0 to 1. [V]
-        focal: Focal length in pixels, equal on both axes.
+        intrinsics: Focal lengths, principal points and sizes. A number stands for centred images
+            of size H x W that share this focal length in pixels.
         files: Name of each image, relative to the scene's folder.
     """
 
     images: Tensor
     camera_to_world: Tensor
     times: Tensor
-    focal: float
+    intrinsics: Intrinsics
     files: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        count, height, width = self.images.shape[:3]
+        if not isinstance(self.intrinsics, Intrinsics):
+            shared = Intrinsics.shared(float(self.intrinsics), height, width, count)
+            object.__setattr__(self, "intrinsics", shared)
+        size = self.intrinsics.size
+        if len(size) != count or (count and size.amax(dim=0).tolist() != [height, width]):
+            raise ValueError(
+                f"views.images is {list(self.images.shape)}, which does not fit "
+                f"{len(size)} images of at most {size.amax(dim=0).tolist() if len(size) else 0} "
+                "pixels, as views.intrinsics says"
+            )
 
     def __len__(self) -> int:
         return len(self.files)
 
     @property
     def height(self) -> int:
-        """Rows of every image."""
+        """Rows of the highest image."""
         return self.images.shape[1]
 
     @property
     def width(self) -> int:
-        """Columns of every image."""
+        """Columns of the widest image."""
         return self.images.shape[2]
 
     @property
+    def is_padded(self) -> bool:
+        """Whether images differ in size, so that smaller ones have padding."""
+        return bool((self.intrinsics.size != self.intrinsics.size[:1]).any())
+
+    @property
+    def pixels(self) -> int:
+        """Pixels of all images, without padding."""
+        return int(self.intrinsics.size.prod(dim=1).sum())
+
+    @property
+    def is_opaque(self) -> bool:
+        """Whether no pixel lets the background through whole: alpha says nothing then."""
+        return all(bool((self.image(index)[..., 3] > 0).all()) for index in range(len(self)))
+
+    @property
+    def outline(self) -> str:
+        """The images' size, in words."""
+        return f"{'up to ' if self.is_padded else ''}{self.width}x{self.height} px"
+
+    @property
     def is_still(self) -> bool:
-        """Whether all views show one moment, so that nothing can move."""
+        """Whether all views show one timestep, so that nothing can move."""
         return bool((self.times == self.times[0]).all())
 
     @property
@@ -50,46 +161,80 @@ class Views:
         """Bytes that the images take in memory."""
         return self.images.numel()
 
+    def size(self, index: int) -> tuple[int, int]:
+        """Height and width of image ``index``."""
+        height, width = self.intrinsics.size[index].tolist()
+        return height, width
+
+    def image(self, index: int) -> Tensor:
+        """Image ``index`` without padding, not copied. uint8 [h, w, 4]"""
+        height, width = self.size(index)
+        return self.images[index, :height, :width]
+
+    def valid(self) -> Tensor:
+        """Which pixels are no padding. bool [V, H, W]"""
+        height, width = self.intrinsics.size.unbind(dim=1)
+        rows = torch.arange(self.height) < height[:, None]
+        columns = torch.arange(self.width) < width[:, None]
+        return rows[:, :, None] & columns[:, None, :]
+
     def subset(self, indices: Tensor) -> "Views":
         """The views at ``indices``, in that order. [K]"""
+        intrinsics = self.intrinsics.subset(indices)
+        images = self.images[indices]
+        if len(intrinsics) and self.is_padded:
+            height, width = intrinsics.size.amax(dim=0).tolist()
+            images = images[:, :height, :width].contiguous()
         return Views(
-            self.images[indices],
+            images,
             self.camera_to_world[indices],
             self.times[indices],
-            self.focal,
+            intrinsics,
             tuple(self.files[i] for i in indices.tolist()),
         )
 
     def composite(self, index: int, background: Tensor) -> Tensor:
-        """Image ``index`` as floats in [0, 1] in front of ``background`` [3]. [H, W, 3]"""
-        image = self.images[index].float() / 255
+        """Image ``index`` as floats in [0, 1] in front of ``background`` [3]. [h, w, 3]"""
+        image = self.image(index).float() / 255
         return image[..., :3] + (1 - image[..., 3:]) * background
 
     def image_rays(self, index: int) -> tuple[Tensor, Tensor]:
-        """Rays through every pixel of image ``index``, row by row. [H W, 3], [H W, 3]"""
-        return camera_rays(self.camera_to_world[index], self.focal, self.height, self.width)
+        """Rays through every pixel of image ``index``, row by row. [h w, 3], [h w, 3]"""
+        height, width = self.size(index)
+        focal, centre = self.intrinsics.focal[index], self.intrinsics.centre[index]
+        return camera_rays(self.camera_to_world[index], focal, height, width, centre)
+
+
+def pad_images(images: Sequence[Tensor]) -> Tensor:
+    """Images in one tensor, smaller ones padded at the bottom and on the right.
+
+    Args:
+        images: uint8 [h, w, 4] each.
+
+    Returns:
+        uint8 [V, H, W, 4], H and W the largest sizes.
+    """
+    height = max(image.shape[0] for image in images)
+    width = max(image.shape[1] for image in images)
+    return torch.stack([_padded(image, height, width) for image in images])
 
 
 def joined(first: Views, second: Views) -> Views:
-    """The views of both.
-
-    Raises:
-        SceneError: If their sizes or focal lengths differ.
-    """
-    for what in ("height", "width", "focal"):
-        one, other = getattr(first, what), getattr(second, what)
-        if abs(one - other) > 1e-4 * one:
-            raise SceneError(
-                f"{first.files[0]} and {second.files[0]} cannot be trained on together: {what} "
-                f"{one:g} and {other:g} pixels; set data.train_on_video=false"
-            )
+    """The views of both."""
+    height, width = max(first.height, second.height), max(first.width, second.width)
     return Views(
-        torch.cat([first.images, second.images]),
+        torch.cat([_padded(views.images, height, width) for views in (first, second)]),
         torch.cat([first.camera_to_world, second.camera_to_world]),
         torch.cat([first.times, second.times]),
-        first.focal,
+        first.intrinsics.joined(second.intrinsics),
         first.files + second.files,
     )
+
+
+def _padded(images: Tensor, height: int, width: int) -> Tensor:
+    """Images with zeros at the bottom and on the right. [..., h, w, 4] -> [..., H, W, 4]"""
+    rows, columns = height - images.shape[-3], width - images.shape[-2]
+    return F.pad(images, (0, 0, 0, columns, 0, rows)) if rows or columns else images
 
 
 @dataclass(frozen=True)
@@ -112,19 +257,33 @@ class Scene:
 
 
 def camera_rays(
-    camera_to_world: Tensor, focal: float, height: int, width: int
+    camera_to_world: Tensor,
+    focal: float | Tensor,
+    height: int,
+    width: int,
+    centre: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Rays through every pixel of one camera, row by row. [H W, 3], [H W, 3]"""
+    """Rays through every pixel of one camera, row by row.
+
+    Args:
+        camera_to_world: Its pose. [4, 4]
+        focal: Focal length in pixels, or those along x and y. [2]
+        height: Rows.
+        width: Columns.
+        centre: Principal point, x from the left and y from the top; the middle when None. [2]
+
+    Returns:
+        Origins and unit directions in the world. [H W, 3], [H W, 3]
+    """
     rows, columns = torch.meshgrid(
         torch.arange(height, dtype=torch.float32),
         torch.arange(width, dtype=torch.float32),
         indexing="ij",
     )
-    return pixel_rays(
+    return cast_rays(
         camera_to_world,
         rows.flatten(),
         columns.flatten(),
-        focal=focal,
-        height=height,
-        width=width,
+        focal=focal if isinstance(focal, Tensor) else (focal, focal),
+        centre=(0.5 * width, 0.5 * height) if centre is None else centre,
     )

@@ -5,55 +5,55 @@ import time
 from typing import Any, TextIO
 
 from lightning import LightningModule, Trainer
-from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.callbacks import ProgressBar
 
+from xplanes.training.clock import TrainingClock, find_callback, training_seconds
 from xplanes.training.module import RadianceModule
 
 LIVE_SECONDS = 0.2
 PIPED_SECONDS = 30.0
 
 
-class StepBar(Callback):
+class StepBar(ProgressBar):
     """Steps, rays per second, PSNR and time left.
 
     On a terminal one line is redrawn; elsewhere a plain line appears every 30 s, without control
     codes.
 
     Args:
-        max_steps: Steps at most.
-        max_seconds: Training clock at most; None for no limit.
-        split: Split whose score is shown.
-        stream: Where to write.
+        stream: Where to write; the terminal's output when None.
     """
 
-    def __init__(
-        self, max_steps: int, max_seconds: float | None, split: str, stream: TextIO = sys.stdout
-    ) -> None:
-        self.max_steps, self.max_seconds, self.split = max_steps, max_seconds, split
-        self.stream = stream
-        self.live = stream.isatty()
+    def __init__(self, stream: TextIO | None = None) -> None:
+        super().__init__()
+        self.stream = stream or sys.stdout
+        self.live = self.stream.isatty()
+        self._shown = True
         self._due = 0.0
         self._width = 0
         self._seen = (0.0, 0)
 
+    def disable(self) -> None:
+        self._shown = False
+
+    def enable(self) -> None:
+        self._shown = True
+
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, RadianceModule)
         self._due = time.monotonic() + (0 if self.live else PIPED_SECONDS)
-        self._seen = (pl_module.clock, pl_module.counts["rays"])
+        self._seen = _clock_and_rays(trainer, pl_module)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        assert isinstance(pl_module, RadianceModule)
-        if not trainer.is_global_zero or time.monotonic() < self._due:
+        if not self._shown or not trainer.is_global_zero or time.monotonic() < self._due:
             return
         self._due = time.monotonic() + (LIVE_SECONDS if self.live else PIPED_SECONDS)
-        self._write(self.line(trainer.global_step, pl_module))
+        self._write(self.line(trainer, pl_module))
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, RadianceModule)
-        if trainer.is_global_zero:
-            self._write(self.line(trainer.global_step, pl_module), last=True)
+        if self._shown and trainer.is_global_zero:
+            self._write(self.line(trainer, pl_module), last=True)
 
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
@@ -61,21 +61,25 @@ class StepBar(Callback):
         if self.live and self._width:
             self.stream.write("\n")
 
-    def line(self, step: int, module: RadianceModule) -> str:
+    def line(self, trainer: Trainer, module: LightningModule) -> str:
         """The line for the present state."""
-        clock, rays = module.clock, module.counts["rays"]
-        rate = (rays - self._seen[1]) / max(clock - self._seen[0], 1e-9)
-        left = clock * (1 / max(module.progress, 1e-6) - 1)
+        assert isinstance(module, RadianceModule)
+        seconds, rays = _clock_and_rays(trainer, module)
+        clock = find_callback(trainer, TrainingClock)
+        most = None if clock is None else clock.max_seconds
+        rate = (rays - self._seen[1]) / max(seconds - self._seen[0], 1e-9)
+        left = seconds * (1 / max(module.progress, 1e-6) - 1)
         parts = [
-            f"step {step}/{self.max_steps}",
-            f"{clock:.0f}/{self.max_seconds:.0f} s" if self.max_seconds else f"{clock:.0f} s",
+            f"step {trainer.global_step}/{trainer.max_steps}",
+            f"{seconds:.0f}/{most:.0f} s" if most else f"{seconds:.0f} s",
             f"{100 * module.progress:.0f}%",
             f"{rate / 1000:.1f}k rays/s",
         ]
         if "psnr" in module.last:
             parts.append(f"train psnr {module.last['psnr']:.2f}")
-        if f"{self.split}/psnr" in module.last:
-            parts.append(f"{self.split} psnr {module.last[f'{self.split}/psnr']:.2f}")
+        for name, value in module.last.items():
+            if name.endswith("/psnr"):
+                parts.append(f"{name.replace('/', ' ')} {value:.2f}")
         parts.append(f"{int(left) // 60}:{int(left) % 60:02d} left")
         return "  ".join(parts)
 
@@ -86,3 +90,8 @@ class StepBar(Callback):
             self.stream.write("\r" + line.ljust(self._width) + ("\n" if last else ""))
             self._width = len(line)
         self.stream.flush()
+
+
+def _clock_and_rays(trainer: Trainer, module: LightningModule) -> tuple[float, int]:
+    assert isinstance(module, RadianceModule)
+    return training_seconds(trainer), module.counts["rays"]

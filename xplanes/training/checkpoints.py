@@ -8,11 +8,13 @@ from typing import Any
 
 import torch
 from lightning import LightningModule, Trainer
-from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
 from xplanes.files import replacing
-from xplanes.training.clock import TrainingClock
+from xplanes.training.clock import find_callback, off_clock
+from xplanes.training.evaluation import Evaluation
 from xplanes.training.interrupt import Stopped
 from xplanes.training.module import RadianceModule
 
@@ -21,37 +23,53 @@ logger = logging.getLogger(__name__)
 LAST, BEST = "last.ckpt", "best.ckpt"
 
 
-class Checkpoints(Callback):
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes checkpoints whole or not at all, and loads them as data, checksums included."""
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
+    ) -> None:
+        with replacing(Path(path)) as temporary:
+            super().save_checkpoint(checkpoint, temporary, storage_options)
+
+    def load_checkpoint(self, path: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        return load_checkpoint(Path(path))
+
+
+class Checkpoints(Checkpoint):
     """Writes ``last.ckpt`` every so many steps and at the end, ``best.ckpt`` at a better score.
 
+    They go to ``checkpoints`` in the trainer's ``default_root_dir``; writing them is off the
+    training clock. The best is what `Evaluation` scored highest. Lightning's ModelCheckpoint works
+    as well, but its triggers by time and steps do not go together with manual optimisation.
+
     Args:
-        folder: Where they go.
         every: Steps between checkpoints.
-        clock: Paused after each.
     """
 
-    def __init__(self, folder: Path, every: int, clock: TrainingClock) -> None:
-        self.folder, self.every, self.clock = folder, every, clock
-        self._written = -1
+    def __init__(self, every: int = 1000) -> None:
+        if every < 1:
+            raise ConfigError(f"every={every}: must be above 0")
+        self.every = every
+        self._last, self._best = -1, -1
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._save_best(trainer, pl_module)
+        self._save_best(trainer)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         # The best comes first: a run that is killed in between scores the model again, but would
         # not write it again if the last one said that it was written.
-        self._save_best(trainer, pl_module)
-        assert isinstance(pl_module, RadianceModule)
+        self._save_best(trainer)
         step = trainer.global_step
-        due = step and step % self.every == 0 and step != self._written
+        due = step and step % self.every == 0 and step != self._last
         # Gradients of batches that wait for others are in no checkpoint.
-        if due and pl_module.between_updates:
+        if due and getattr(pl_module, "between_updates", True):
             self._save_last(trainer, pl_module)
-            self._written = step
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._save_best(trainer)
         self._save_last(trainer, pl_module)
 
     def on_exception(
@@ -59,35 +77,28 @@ class Checkpoints(Callback):
     ) -> None:
         # Any other interrupt may have come in the middle of a step.
         if isinstance(exception, Stopped) and trainer.global_step:
+            self._save_best(trainer)  # Lightning puts these callbacks last, after `Interrupt`.
             self._save_last(trainer, pl_module)
 
-    def finish(self, trainer: Trainer, module: LightningModule) -> None:
-        """Keep the final model as the best, if it is."""
-        self._save_best(trainer, module)
-
-    def _save_best(self, trainer: Trainer, module: LightningModule) -> None:
+    def _save_best(self, trainer: Trainer) -> None:
         """Keep the model if its score is the best so far."""
-        assert isinstance(module, RadianceModule)
+        evaluation = find_callback(trainer, Evaluation)
+        step = -1 if evaluation is None else evaluation.best_step
         # All ranks take part in saving, but only the first knows the scores.
-        if trainer.strategy.reduce_boolean_decision(module.improved, all=False):
-            self.save(trainer, BEST)
-        module.improved = False
-        if trainer.world_size > 1:
-            self.clock.pause()  # The others have waited while the first scored.
+        better = step > self._best and step == trainer.global_step
+        if trainer.strategy.reduce_boolean_decision(better, all=False):
+            self._save(trainer, BEST)
+            self._best = step
 
     def _save_last(self, trainer: Trainer, module: LightningModule) -> None:
-        assert isinstance(module, RadianceModule)
-        module.require_finite()
-        self.save(trainer, LAST)
+        if isinstance(module, RadianceModule):
+            module.require_finite()
+        self._save(trainer, LAST)
+        self._last = trainer.global_step
 
-    def save(self, trainer: Trainer, name: str) -> None:
-        """Write the state of training to ``name``; all ranks must call it."""
-        if trainer.is_global_zero:
-            with replacing(self.folder / name) as temporary:
-                trainer.save_checkpoint(temporary)
-        else:
-            trainer.save_checkpoint(self.folder / name)
-        self.clock.pause()
+    def _save(self, trainer: Trainer, name: str) -> None:
+        with off_clock(trainer):
+            trainer.save_checkpoint(Path(trainer.default_root_dir) / "checkpoints" / name)
 
 
 def find_resumable(folder: Path) -> Path | None:
@@ -97,7 +108,7 @@ def find_resumable(folder: Path) -> Path | None:
         folder: Where they lie.
 
     Returns:
-        ``last.ckpt``; None where there is none, so that training begins anew.
+        ``last.ckpt``; None where there is none, so that training starts afresh.
 
     Raises:
         ConfigError: If neither can be read.
@@ -112,7 +123,7 @@ def find_resumable(folder: Path) -> Path | None:
             step = load_checkpoint(best)["global_step"]
         except (ConfigError, KeyError, TypeError):
             raise ConfigError(f"{problem}; or delete {last} to begin anew") from problem
-        logger.warning("%s. Going on from %s, step %d", problem, best, step)
+        logger.warning("%s. Continuing from %s, step %d", problem, best, step)
         with replacing(last) as temporary:
             shutil.copyfile(best, temporary)
     return last
@@ -127,10 +138,10 @@ def load_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
     if not path.is_file():
         raise ConfigError(
             f"{path} does not exist: the run stopped before its first checkpoint "
-            "(trainer.checkpoint_every)"
+            "(callbacks.checkpoints.every)"
         )
     try:
-        # torch reads changed bytes without a murmur, though it keeps their checksums.
+        # torch reads changed bytes silently, though it keeps their checksums.
         with zipfile.ZipFile(path) as archive:
             if (name := archive.testzip()) is not None:
                 raise zipfile.BadZipFile(f"wrong checksum of {name}")

@@ -1,51 +1,101 @@
 """The training clock, and the end of training by it."""
 
 import time
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
 
 import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
-from xplanes.training.module import RadianceModule
+C = TypeVar("C", bound=Callback)
 
 
 class TrainingClock(Callback):
-    """Counts the seconds spent on training steps into ``module.clock`` and stops at the budget.
+    """Counts the seconds spent on training, and ends training when they are used up.
 
-    Drawing rays counts; scoring, pictures and checkpoints do not: callbacks that take their time
-    call `pause` when they are done. Must be the first callback.
+    Drawing rays counts; validation, scores, images and checkpoints do not: whoever does such work
+    does it inside `off_clock`. Works in any Trainer.
 
     Args:
         max_seconds: Seconds after which training ends; None for no limit.
+
+    Attributes:
+        seconds: Seconds counted so far, those before a resume included.
     """
 
-    def __init__(self, max_seconds: float | None) -> None:
+    def __init__(self, max_seconds: float | None = None) -> None:
         self.max_seconds = max_seconds
+        self.seconds = 0.0
         self._mark = 0.0
 
+    @property
+    def progress(self) -> float:
+        """Share of the seconds that is used up."""
+        return 0.0 if self.max_seconds is None else self.seconds / self.max_seconds
+
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, RadianceModule)
-        if self.max_seconds is not None and pl_module.clock >= self.max_seconds:
+        if self.max_seconds is not None and self.seconds >= self.max_seconds:
             trainer.should_stop = True
-        self.pause()
+        self._mark = time.perf_counter()
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        assert isinstance(pl_module, RadianceModule)
         now = time.perf_counter()
         spent = now - self._mark
         if trainer.world_size > 1:
             # All ranks must agree on when to stop and on the learning rate.
             shared = torch.tensor(spent, device=pl_module.device)
             spent = float(trainer.strategy.reduce(shared, reduce_op="mean"))
-        pl_module.clock += spent
+        self.seconds += spent
         self._mark = now
-        over = self.max_seconds is not None and pl_module.clock >= self.max_seconds
-        if over and pl_module.between_updates:
+        over = self.max_seconds is not None and self.seconds >= self.max_seconds
+        # Modules that gather batches for an update say where one is whole.
+        if over and getattr(pl_module, "between_updates", True):
             trainer.should_stop = True
 
-    def pause(self) -> None:
-        """Leave out what happened since the last step."""
-        self._mark = time.perf_counter()
+    @contextmanager
+    def off(self) -> Iterator[None]:
+        """Leave out what happens inside."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._mark += time.perf_counter() - began
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._left = time.perf_counter()
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._mark += time.perf_counter() - self._left
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"seconds": self.seconds}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.seconds = state_dict["seconds"]
+
+
+def find_callback(trainer: Trainer, kind: type[C]) -> C | None:
+    """The first callback of a kind that a trainer has, if any."""
+    callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+    return next((callback for callback in callbacks if isinstance(callback, kind)), None)
+
+
+@contextmanager
+def off_clock(trainer: Trainer) -> Iterator[None]:
+    """Keep what happens inside off the training clock."""
+    clock = find_callback(trainer, TrainingClock)
+    if clock is None:
+        yield
+        return
+    with clock.off():
+        yield
+
+
+def training_seconds(trainer: Trainer) -> float:
+    """Seconds of the training clock; 0 without one."""
+    clock = find_callback(trainer, TrainingClock)
+    return 0.0 if clock is None else clock.seconds

@@ -1,119 +1,251 @@
-"""Setting up Lightning's trainer and running it."""
+"""Lightning's Trainer with our budget, and fields that are trained on the way to something else."""
 
 import logging
+import time
 import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
+import lightning
 import torch
-from lightning import Trainer
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.callbacks import Callback, ProgressBar
+from lightning.pytorch.plugins.io import CheckpointIO
 
 from xplanes.backend import cpu_loops
-from xplanes.config import TrainConfig
-from xplanes.scenes.datamodule import RayDataModule
-from xplanes.training.bar import StepBar
-from xplanes.training.builder import training_device
-from xplanes.training.checkpoints import Checkpoints, find_resumable
-from xplanes.training.clock import TrainingClock
+from xplanes.errors import ConfigError
+from xplanes.rendering.warming import warming_up
+from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.views import Scene
+from xplanes.settings import Count, Positive, Steps
+from xplanes.training.checkpoints import AtomicCheckpointIO, Checkpoints, find_resumable
+from xplanes.training.clock import TrainingClock, find_callback
+from xplanes.training.evaluation import Evaluation, device_memory
 from xplanes.training.interrupt import Interrupt
 from xplanes.training.module import RadianceModule
-from xplanes.training.plateau import PlateauStop
-from xplanes.training.scalars import Scalars
-from xplanes.training.scorer import Scorer
-from xplanes.training.step_threads import StepThreads
-from xplanes.training.warming import warming_up
 
 
-def fit(
-    config: TrainConfig, module: RadianceModule, data: RayDataModule, run: Path, *, resume: bool
-) -> Scorer:
-    """Train to the end of the budget, or from the last checkpoint on.
+class Trainer(lightning.Trainer):
+    """Lightning's Trainer with a limit in seconds, and devices that a field can be trained on.
 
     Args:
-        config: The run's settings.
-        module: The module to train, changed in place.
-        data: Its rays.
-        run: The run directory.
-        resume: Whether to go on from the last checkpoint.
-
-    Returns:
-        The scorer, whose ``latest`` holds the final scores on rank 0.
+        max_steps: Steps after which training ends; -1 for no limit.
+        max_seconds: Seconds of the training clock after which training ends; None for no limit.
+        accelerator: auto (CUDA where there is a GPU, else the CPU), cpu, or gpu.
+        devices: Processes; rays are split between them.
+        deterministic: The same digits each time; CPU only, with a budget in steps.
+        log_every_n_steps: Steps from one log to the next; 0 for none.
+        callbacks: Callbacks; a `TrainingClock` and an `Interrupt` are added.
+        plugins: Lightning's; checkpoints are written atomically unless one of them writes them.
+        **others: As for Lightning's Trainer.
 
     Raises:
-        ConfigError: If no checkpoint of the run to go on with can be read.
-        TrainingError: If numbers stopped being finite.
+        ConfigError: If the machine has not what is asked for.
     """
-    quiet_lightning()
-    options = config.trainer
-    split = config.data.eval_split
-    clock, interrupt = TrainingClock(options.max_seconds), Interrupt()
-    scorer = Scorer(
-        data.scene.splits[split],
-        split,
-        data.frame,
-        data.scene.background,
-        at=options.evaluate_at,
-        count=options.evaluate_views,
-        run=run,
-        clock=clock,
-        interrupt=interrupt,
-    )
-    plateau = [] if options.plateau is None else [PlateauStop(options.plateau)]
-    checkpoints = Checkpoints(run / "checkpoints", options.checkpoint_every, clock)
-    bar = StepBar(options.max_steps, options.max_seconds, split)
+
+    def __init__(
+        self,
+        *,
+        max_steps: Count | Literal[-1] = -1,
+        max_seconds: Positive | None = None,
+        accelerator: str = "auto",
+        devices: Count = 1,
+        deterministic: bool | Literal["warn"] = False,
+        log_every_n_steps: Steps | None = None,
+        callbacks: Sequence[Callback] = (),
+        plugins: Any = None,
+        **others: Any,
+    ) -> None:
+        if max_seconds is not None and not max_seconds > 0:
+            raise ConfigError(f"max_seconds={max_seconds}: must be above 0, or null for no limit")
+        clip = others.get("gradient_clip_val")
+        accumulate = others.get("accumulate_grad_batches", 1)
+        if clip is not None or accumulate != 1:
+            raise ConfigError(
+                f"gradient_clip_val={clip} with accumulate_grad_batches={accumulate}: optimisation "
+                "is manual, so that neither applies; leave both out, or set model.rays.accumulate"
+            )
+        device = find_device(accelerator)
+        if device.type == "cuda":
+            if deterministic:
+                raise ConfigError(
+                    "deterministic=true: sums on a GPU come out in any order; set "
+                    "trainer.accelerator=cpu, or do without"
+                )
+            if isinstance(devices, int) and devices > (found := torch.cuda.device_count()):
+                raise ConfigError(
+                    f"devices={devices}: {found} GPUs found; set trainer.devices={found}, or "
+                    "trainer.accelerator=cpu"
+                )
+        own = list(plugins) if isinstance(plugins, list | tuple) else [plugins] * bool(plugins)
+        if not any(isinstance(plugin, CheckpointIO) for plugin in own):
+            own.append(AtomicCheckpointIO())
+        used = list(callbacks)
+        if not others.get("enable_progress_bar", True):
+            used = [callback for callback in used if not isinstance(callback, ProgressBar)]
+        self.interrupt = Interrupt()
+        quiet_lightning()
+        super().__init__(
+            accelerator="gpu" if device.type == "cuda" else "cpu",
+            devices=devices,
+            deterministic=deterministic,
+            max_steps=max_steps,
+            log_every_n_steps=log_every_n_steps,
+            callbacks=[TrainingClock(max_seconds), *used, self.interrupt],
+            plugins=own,
+            **others,
+        )
+
+    def train(
+        self, module: RadianceModule, data: SceneDataModule, checkpoint: Path | None = None
+    ) -> None:
+        """Fit a module whose field is built, from a checkpoint on where one is given.
+
+        Raises:
+            KeyboardInterrupt: If the user stopped it; the state is saved.
+            TrainingError: If numbers stopped being finite.
+        """
+        device = self.strategy.root_device
+        warm_up(module, data, device)
+        with self.interrupt.exits():
+            self.fit(module, data, ckpt_path=None if checkpoint is None else str(checkpoint))
+        module.to(device)  # Lightning leaves it on the CPU.
+        evaluation = find_callback(self, Evaluation)
+        if evaluation is not None and evaluation.step != self.global_step:
+            # Lightning calls no hooks where no step was left, though the end may not be scored yet.
+            evaluation.on_train_end(self, module)
+            for callback in self.checkpoint_callbacks:
+                if isinstance(callback, Checkpoints):
+                    callback.on_train_end(self, module)
+
+
+def find_device(accelerator: str) -> torch.device:
+    """The device of ``trainer.accelerator``: a CUDA GPU where there is one, else the CPU.
+
+    Raises:
+        ConfigError: If a GPU is asked for and none is found, or for another accelerator.
+    """
+    if accelerator not in ("auto", "cpu", "gpu", "cuda"):
+        raise ConfigError(f"accelerator={accelerator}: must be one of auto, cpu, gpu")
+    if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
+        raise ConfigError(
+            f"accelerator={accelerator}: no GPU found; set trainer.accelerator=cpu or auto"
+        )
+    if accelerator == "cpu" or not torch.cuda.is_available():
+        return torch.device("cpu")
+    return torch.device("cuda")
+
+
+def fit_quietly(
+    module: RadianceModule,
+    scene: Scene,
+    folder: Path,
+    *,
+    device: torch.device,
+    max_steps: int,
+    max_seconds: float,
+    checkpoint_every: int,
+) -> None:
+    """Train a field that is built on a scene, from its last checkpoint in a folder on.
+
+    Args:
+        module: Changed in place.
+        scene: The scene.
+        folder: Where checkpoints lie.
+        device: Where to train.
+        max_steps: Steps at most.
+        max_seconds: Seconds at most.
+        checkpoint_every: Steps between checkpoints.
+    """
     trainer = Trainer(
-        accelerator="gpu" if training_device(options.accelerator).type == "cuda" else "cpu",
-        devices=options.devices,
-        strategy=options.strategy,
-        max_steps=options.max_steps,
-        default_root_dir=run,
-        callbacks=[
-            clock,
-            StepThreads(options, training_device(options.accelerator)),
-            *plateau,
-            Scalars(options.log_every),
-            scorer,
-            checkpoints,
-            bar,
-            interrupt,
-        ],
-        logger=TensorBoardLogger(run, name="", version="tb"),
-        enable_checkpointing=False,
+        accelerator="gpu" if device.type == "cuda" else "cpu",
+        max_steps=max_steps,
+        max_seconds=max_seconds,
+        # A Trainer sets this for the whole process, and the run's own was there first.
+        deterministic=device.type == "cpu" and torch.are_deterministic_algorithms_enabled(),
+        callbacks=[Checkpoints(checkpoint_every)],
+        default_root_dir=folder,
+        logger=False,
         enable_progress_bar=False,
         enable_model_summary=False,
-        deterministic=options.deterministic,
-        log_every_n_steps=10**9,
-        use_distributed_sampler=False,
+        limit_val_batches=0,
     )
-    _warm_up(module, data, trainer.strategy.root_device)
-    last = find_resumable(run / "checkpoints") if resume else None
-    with interrupt.listening():
-        trainer.fit(
-            module,
-            data,
-            ckpt_path=None if last is None else str(last),
-            weights_only=True,
-        )
-        # Lightning leaves the module on the CPU.
-        module.to(trainer.strategy.root_device)
-        scorer.finish(trainer, module)
-        checkpoints.finish(trainer, module)
-    return scorer
+    data = SceneDataModule.of(scene, seed=module.method.seed)
+    trainer.train(module, data, find_resumable(folder / "checkpoints"))
 
 
-def _warm_up(module: RadianceModule, data: RayDataModule, device: torch.device) -> None:
+def warm_up(module: RadianceModule, data: SceneDataModule, device: torch.device) -> None:
     """Run all loops once on a few rays, so that compiling them is not on the training clock."""
     if device.type == "cuda":
         # The kernels are tried where they will run; Lightning would move the module a little later.
         module.to(device)
     elif not cpu_loops(next(module.field.parameters())):
         return
-    rays = {name: value[:8].to(device) for name, value in data.batches(0).draw(0).items()}
+    assert module.sampler is not None
+    batches = data.batches_for(module, 0)
+    rays = {name: value[:8].to(device) for name, value in batches.draw(0).items()}
     with warming_up():
-        rendering = module.sampling.render(module.field, rays, module.moment)
+        rendering = module.sampler.render(module.field, rays, module.state)
         rendering.colour.sum().backward()
-        module.sampling.pass_on(rendering, module.moment)
+        module.sampler.pass_on(rendering, module.state)
         module.zero_grad(set_to_none=True)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a run is going to take, from its first rays.
+
+    Attributes:
+        step: Seconds of a step.
+        image_rays: Rays of images that are rendered in a second.
+        memory: Bytes of memory in training, at most.
+    """
+
+    step: float
+    image_rays: float
+    memory: int
+
+
+def estimate(module: RadianceModule, data: SceneDataModule, split: str) -> Estimate:
+    """Time a step and some rays of a scored view; fields become faster as empty space is skipped.
+
+    Args:
+        module: The module, its loops compiled.
+        data: Its data.
+        split: The split that is scored.
+    """
+    assert module.sampler is not None
+    assert module.frame is not None
+    device = next(module.field.parameters()).device
+    batch = data.batches_for(module, 0).draw(0)
+    rays = {name: value[: module.rays].to(device) for name, value in batch.items()}
+    seconds = []
+    for _ in range(2):
+        began = time.perf_counter()
+        rendering = module.sampler.render(module.field, rays, module.state)
+        rendering.colour.sum().backward()
+        module.sampler.pass_on(rendering, module.state)
+        module.zero_grad(set_to_none=True)
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - began)
+    views = data.scene.splits[split]
+    ends = module.frame.rays(*views.image_rays(0))
+    chosen = torch.linspace(0, len(ends[0]) - 1, min(2048, len(ends[0]))).long()
+    began = time.perf_counter()
+    origins, directions = (part[chosen].to(device) for part in ends)
+    module.renderer_now.image(
+        module.field,
+        origins,
+        directions,
+        float(views.times[0]),
+        data.scene.background.to(device),
+    )
+    rate = len(chosen) / (time.perf_counter() - began)
+    # Gradients and Adam's two moments are still to come.
+    coming = 3 * sum(p.numel() * p.element_size() for p in module.parameters() if p.requires_grad)
+    return Estimate(min(seconds), rate, device_memory(device) + coming)
 
 
 def quiet_lightning() -> None:
@@ -131,5 +263,7 @@ def quiet_lightning() -> None:
         ".*litlogger.*",
         ".*`IterableDataset` has `__len__` defined.*",
         ".*Checkpoint directory .* exists and is not empty.*",
+        ".*`training_step` returned `None`.*",
+        ".*defined a `validation_step` but.*",
     ):
         warnings.filterwarnings("ignore", message=message)

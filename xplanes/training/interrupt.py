@@ -10,6 +10,8 @@ from typing import Any
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
+from xplanes.training.clock import find_callback
+
 
 class Stopped(KeyboardInterrupt):
     """Training was asked to stop, and did so where its state is whole."""
@@ -20,6 +22,7 @@ class Interrupt(Callback):
 
     def __init__(self) -> None:
         self.asked = False
+        self._before: dict[int, Any] = {}
 
     def check(self) -> None:
         """Stop here if asked to; call it where the state is whole.
@@ -40,27 +43,47 @@ class Interrupt(Callback):
         if getattr(pl_module, "between_updates", True):
             self.check()
 
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._listen()
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        self._restore()
+
     @contextmanager
-    def listening(self) -> Iterator[None]:
-        """Take the signals for the time of the block; helper threads cannot, and leave them be."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        signals = (signal.SIGINT, signal.SIGTERM)
-        before = {number: signal.signal(number, self._note) for number in signals}
+    def exits(self) -> Iterator[None]:
+        """Turn Lightning's exit after an interrupt back into `KeyboardInterrupt`.
+
+        Lightning ends the process with code 1; the run's record must be written first.
+        """
         try:
             yield
             self.check()  # For a signal that came after the last step.
         except SystemExit:
-            # Lightning ends the process after an interrupt; the run record must be written first.
             if not self.asked:
                 raise
             raise KeyboardInterrupt from None
         finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+            self._restore()
+
+    def _listen(self) -> None:
+        """Take the signals; threads other than the main one cannot, and leave them be."""
+        if self._before or threading.current_thread() is not threading.main_thread():
+            return
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._note)
+
+    def _restore(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         if self.asked:
             raise KeyboardInterrupt
         self.asked = True
+
+
+def check_interrupt(trainer: Trainer) -> None:
+    """Stop here if a signal asked the trainer's `Interrupt` to; the state must be whole."""
+    if (interrupt := find_callback(trainer, Interrupt)) is not None:
+        interrupt.check()

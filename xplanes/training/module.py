@@ -1,19 +1,69 @@
 """The LightningModule: one field, trained on rays."""
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, cast
 
 import torch
 from lightning import LightningModule
 from lightning.pytorch.core.optimizer import LightningOptimizer
+from torch import Tensor, nn
 
-from xplanes.config import ConfigError, TrainerConfig
+from xplanes.backend import fast_bf16
+from xplanes.components import build, plugins
+from xplanes.config import compose_plain
+from xplanes.errors import ConfigError
+from xplanes.fields.base import RadianceField
+from xplanes.metrics import psnr, ssim
+from xplanes.models.base import Model, ModelSettings, colour_error
+from xplanes.models.initialisation import Initialisation, Method, Place
 from xplanes.rendering.base import RayRenderer, Rendering
-from xplanes.scenes.batches import Batch
-from xplanes.training.health import all_usable, not_finite, unusable_gradients
-from xplanes.training.methods.base import Method
-from xplanes.training.sampling.base import Moment, Sampling
+from xplanes.rendering.sampler import Sampler, Site
+from xplanes.scenes.batches import Batch, RaySettings
+from xplanes.scenes.frame import Frame, frame_content, read_frame
+from xplanes.scenes.views import Scene
+from xplanes.streams import TrainingState
+from xplanes.training.clock import training_seconds
+
+NamedTensors = Iterable[tuple[str, Tensor]]
+
+
+def usable(gradient: Tensor) -> bool:
+    """Whether an optimiser can take in a gradient: the sum of its squares is finite.
+
+    Adam keeps the squares. One that overflows its type would stay infinite for ever and hold its
+    parameter where it is, without a NaN anywhere.
+    """
+    if gradient.is_contiguous():
+        flat = gradient.view(-1)
+        return bool(torch.dot(flat, flat).isfinite())
+    return bool(torch.linalg.vector_norm(gradient).isfinite())
+
+
+def all_usable(parameters: Iterable[nn.Parameter]) -> bool:
+    """Whether all gradients are `usable`; one pass over each, and one wait for the device."""
+    gradients = [p.grad for p in parameters if p.grad is not None]
+    if not gradients or gradients[0].device.type == "cpu":
+        return all(usable(gradient) for gradient in gradients)
+    return usable_together(gradients)
+
+
+def usable_together(gradients: Iterable[Tensor]) -> bool:
+    """Whether all of some gradients, at least one, are `usable`, with one wait for the device."""
+    norms = [torch.linalg.vector_norm(gradient, dtype=torch.float32) for gradient in gradients]
+    return bool(torch.stack(norms).square().isfinite().all())
+
+
+def unusable_gradients(named: Iterable[tuple[str, nn.Parameter]]) -> list[str]:
+    """Names of the parameters whose gradient is not `usable`."""
+    return [name for name, p in named if p.grad is not None and not usable(p.grad)]
+
+
+def not_finite(named: NamedTensors) -> list[str]:
+    """Names of the tensors that hold a NaN or an infinity."""
+    # NaN and infinity survive a product with 0 as NaN; the sum of finite numbers may overflow.
+    return [name for name, tensor in named if not bool((tensor.detach() * 0).sum() == 0)]
+
 
 PATIENCE = 20
 """Steps in a row with a loss or gradient that is not finite after which training gives up."""
@@ -30,106 +80,209 @@ class TrainingError(RuntimeError):
 class RadianceModule(LightningModule):
     """Trains a field on rays against the images' colours.
 
-    Optimisation is manual, so that a step is what this file says and nothing else.
+    The field is built in `setup`, when the scene is known: the LRM is run there, if there is one.
+    What data and LRM decide about the field travels in checkpoints, so that
+    ``RadianceModule.load_from_checkpoint(path)`` needs nothing but the file. Optimisation is
+    manual, so that a step is what this file says and nothing else; the Trainer's gradient clipping
+    and accumulation do not apply (``model.rays.accumulate`` does).
 
     Args:
-        method: The field with its losses and learning rates.
-        sampling: Renders the rays of a step.
-        trainer: Budget.
-        seed: The run's seed.
-        origin: What load_run needs to build this module again where its start was not random, kept
-            in checkpoints: the model's settings and the frame, tensors and builtins.
+        config: The groups ``seed``, ``model``, ``lrm``, ``preparation``, ``decomposition`` and
+            ``losses`` of a configuration, as builtins; others are ignored.
+        plugins: Modules of the user's own whose classes the configuration may name.
+
+    Raises:
+        ConfigError: If a setting cannot work.
     """
 
-    def __init__(
-        self,
-        method: Method,
-        sampling: Sampling,
-        *,
-        trainer: TrainerConfig,
-        seed: int,
-        origin: dict[str, Any] | None = None,
-    ) -> None:
+    field: RadianceField
+
+    def __init__(self, config: Mapping[str, Any], plugins: Sequence[str] = ()) -> None:
         super().__init__()
         self.automatic_optimization = False
-        self.field = method.field
-        for name, part in sampling.parts.items():
-            self.add_module(name, part)
-        self.method, self.sampling = method, sampling
-        self.options, self.seed, self.origin = trainer, seed, origin
+        self.method = _read(config, plugins)
+        kept = {name: config[name] for name in Method.GROUPS if name in config}
+        self.save_hyperparameters({"config": kept, "plugins": list(plugins)})
+        self.model: Model | None = None
+        self.sampler: Sampler | None = None
+        self.site: Site | None = None
+        self.initialisation: Initialisation | None = None
         self.batches = 0
-        self.clock = 0.0
-        self.threads = torch.get_num_threads()
-        self.rays = sampling.first_rays(trainer.rays_per_batch)
+        self.rays = 0
         self.counts = dict.fromkeys(COUNTS, 0)
         self.unusable = 0
         self.unusable_in_a_row = 0
         self.last: dict[str, float] = {}
-        self.improved = False
+        """Loss and PSNR of the last batch, and the last scores of views."""
+        self._steps = math.inf
+        self._loaded_step = 0
+        self._schedules: list[Any] = []
         self._peaks: list[float] = []
-        self.ending: tuple[int, float, int] | None = None
-        """Step and progress at which training was told to end early, and the step of the end."""
+
+    @classmethod
+    def compose(cls, *overrides: str) -> "RadianceModule":
+        """The module of the command line's settings: ``compose("model=nine_planes")``."""
+        return cls(compose_plain("train", overrides))
+
+    @classmethod
+    def of(cls, method: Method) -> "RadianceModule":
+        """The module of settings that were read already."""
+        return cls(method.plain())
+
+    # Building
+
+    def setup(self, stage: str) -> None:
+        if self.model is not None:
+            return
+        data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
+        if data is None:
+            raise ConfigError(
+                "a RadianceModule trains with a SceneDataModule: hand one over as datamodule="
+            )
+        self.build(
+            data.scene,
+            half_side=data.settings.half_side,
+            device=self.trainer.strategy.root_device,
+            devices=self.trainer.world_size,
+        )
+
+    def build(
+        self,
+        scene: Scene,
+        frame: Frame | None = None,
+        *,
+        half_side: float | None = None,
+        device: torch.device | None = None,
+        devices: int = 1,
+        initialise: Callable[[Method, Place], Initialisation] | None = None,
+        say: Callable[[str], None] = print,
+    ) -> None:
+        """Build the field for a scene, initialised as the settings say.
+
+        Args:
+            scene: The scene.
+            frame: The field's frame; the model's choice when None.
+            half_side: Half the side of the scene's cube in world units; None finds it.
+            device: Where the field is going to be trained; the CPU when None.
+            devices: Processes that share the run.
+            initialise: Makes the initialisation; found by the settings when None.
+            say: Takes a line before something slow begins.
+
+        Raises:
+            ConfigError, SceneError, LRMError: If settings, scene and source do not fit.
+        """
+        views, method = scene.splits["train"], self.method
+        device = device or torch.device("cpu")
+        if frame is None:
+            frame = method.model.frame(views, half_side)
+        if initialise is None and (source := method.lrm.load(say)) is not None:
+            initialise = source.initialise
+        found = Initialisation(method.model, frame)
+        if initialise is not None:
+            found = initialise(method, Place(scene, frame, device, devices, say))
+        still = getattr(found.model, "plane_set", None) == "three"
+        site = Site(
+            frame=found.frame,
+            # In a field without time planes all views are of one timestep.
+            times=torch.zeros_like(views.times) if still else views.times,
+            seed=method.seed,
+            precision=_precision(found.model, device),
+            bounds=found.model.bounds(views),
+            views=views,
+            initialised=found.values is not None,
+            device=device,
+        )
+        self.initialisation = found
+        self._assemble(found.model, site)
+
+    def _assemble(self, settings: ModelSettings, site: Site) -> None:
+        values = None if self.initialisation is None else self.initialisation.values
+        self.model = settings.build(site, values)
+        self.field = self.model.field
+        self.sampler = settings.sampler.build(self.field, site)
+        for name, part in self.sampler.parts.items():
+            self.add_module(name, part)
+        self.site, self._settings = site, settings
+        self.rays = self.sampler.first_rays(settings.rays.per_batch)
 
     @property
-    def spent(self) -> float:
-        """Share of the budget that is spent: of steps or of the training clock, the larger."""
-        share = self.global_step / self.options.max_steps
-        if self.options.max_seconds is not None:
-            share = max(share, self.clock / self.options.max_seconds)
-        return min(1.0, share)
+    def frame(self) -> Frame | None:
+        """The field's frame; None before it is built."""
+        return None if self.site is None else self.site.frame
 
     @property
-    def progress(self) -> float:
-        """Share of training that is done: of the budget, or of what is left of it."""
-        if self.ending is None:
-            return self.spent
-        begin, done, end = self.ending
-        share = (self.global_step - begin) / (end - begin)
-        return min(1.0, max(self.spent, done + (1 - done) * share))
-
-    @property
-    def between_updates(self) -> bool:
-        """Whether no gradients of batches wait for others (``trainer.accumulate``)."""
-        return self.batches % self.options.accumulate == 0
-
-    def end_after(self, steps: int) -> None:
-        """Let training run out over ``steps``, or with its budget if that comes first."""
-        self.ending = (self.global_step, self.spent, self.global_step + steps)
+    def ray_settings(self) -> RaySettings:
+        """Which rays a training step gets."""
+        return self.method.model.rays
 
     @property
     def renderer(self) -> RayRenderer:
         """Renders images of the field."""
-        return self.sampling.renderer
+        return self._parts[1].renderer
 
     @property
     def renderer_now(self) -> RayRenderer:
         """The same for the field as far as it is trained."""
-        return self.sampling.renderer_at(self.global_step)
+        return self._parts[1].renderer_at(max(self.global_step, self._loaded_step))
 
     @property
-    def moment(self) -> Moment:
-        """Where training stands."""
-        return Moment(self.seed, self.global_step, self.batches, self.global_rank)
+    def _parts(self) -> tuple[Model, Sampler]:
+        if self.model is None or self.sampler is None:
+            raise ConfigError(
+                "the field is not built yet: fit with a SceneDataModule, or load a checkpoint"
+            )
+        return self.model, self.sampler
+
+    # Training
+
+    @property
+    def progress(self) -> float:
+        """Share of training that is done: of its steps, or as callbacks with ``progress`` say."""
+        share = self.global_step / self._steps
+        return min(1.0, max([share, *(callback.progress for callback in self._schedules)]))
+
+    @property
+    def between_updates(self) -> bool:
+        """Whether no gradients of batches wait for others (``model.rays.accumulate``)."""
+        return self.batches % self.ray_settings.accumulate == 0
+
+    @property
+    def state(self) -> TrainingState:
+        """How far training is."""
+        return TrainingState(self.method.seed, self.global_step, self.batches, self.global_rank)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        groups = [*self.method.groups(), *self.sampling.groups()]
+        model, sampler = self._parts
+        groups = [*model.groups(), *sampler.groups()]
         # Not part of the optimiser, whose state a resumed run takes over: settings may change.
         self._peaks = [group["lr"] for group in groups]
-        return self.method.optimizer(groups)
+        return model.optimizer(groups)
+
+    def on_fit_start(self) -> None:
+        # Callbacks ask for `progress` in their on_train_start, which is before this module's.
+        trainer = self.trainer
+        steps = trainer.max_steps if trainer.max_steps > 0 else trainer.estimated_stepping_batches
+        self._steps = max(1, steps)
+        callbacks: list[Any] = trainer.callbacks  # type: ignore[attr-defined]
+        self._schedules = [c for c in callbacks if isinstance(getattr(c, "progress", None), float)]
+        self.method.require_devices(trainer.world_size)
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        self._set_learning_rates()
+        factor = self._parts[0].rate(self.global_step, self.progress)
+        groups = cast(LightningOptimizer, self.optimizers()).param_groups
+        for group, peak in zip(groups, self._peaks, strict=True):
+            group["lr"] = factor * peak
 
     def training_step(self, batch: Batch, batch_idx: int) -> None:
-        optimizer = self.optimizers()
-        assert isinstance(optimizer, LightningOptimizer)
-        moment = self.moment
-        self.method.before_step(moment, optimizer.optimizer)
+        model, sampler = self._parts
+        optimizer = cast(LightningOptimizer, self.optimizers())
+        state = self.state
+        model.before_step(state, optimizer.optimizer)
         rays = {name: value[: self.rays] for name, value in batch.items()}
-        rendering = self.sampling.render(self.field, rays, moment)
-        loss, error = self.method.loss(rendering, rays, moment)
-        if (term := self.sampling.loss(rendering)) is not None:
-            loss = loss + term
+        rendering = sampler.render(self.field, rays, state)
+        terms = self._terms(rendering, rays, state)
+        loss = sum(terms.values())
+        assert isinstance(loss, Tensor)
         value = float(loss.detach())
         self.batches += 1
         # All ranks must skip a step together: one that waits for the others' gradients would hang.
@@ -138,18 +291,30 @@ class RadianceModule(LightningModule):
             optimizer.zero_grad()  # Of the batches before it, for the same update.
             self._refuse(f"the loss was {value}", not_finite(self.named_parameters()), rendering)
             return
-        self.manual_backward(loss / self.options.accumulate)
-        self.counts["passed"] += self.sampling.pass_on(rendering, moment)
-        self.sampling.observe(rendering)
+        self.manual_backward(loss / self.ray_settings.accumulate)
+        self.counts["passed"] += sampler.pass_on(rendering, state)
+        sampler.observe(rendering)
         self._count(rendering.samples, len(rays["times"]))
-        error = value if error is loss else float(error.detach())
-        self.last = {"loss": value, "psnr": -10 * math.log10(max(error, 1e-10))}
+        error = float(colour_error(rendering, rays).detach())
+        self.last |= {"loss": value, "psnr": -10 * math.log10(max(error, 1e-10))}
+        self._log_terms(terms, state)
         if self.between_updates:
-            self._update(optimizer, moment, rendering)
+            self._update(optimizer, state, rendering)
 
-    def _update(self, optimizer: LightningOptimizer, moment: Moment, rendering: Rendering) -> None:
-        self.method.regularise(moment)
-        self.sampling.regularise()
+    def _terms(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
+        """All terms of the loss that need the rays, weighted, by name."""
+        model, sampler = self._parts
+        terms = model.losses(rendering, rays, state) | sampler.losses(rendering)
+        for name, term in self.method.losses.items():
+            terms[name] = term.weight * term.value(self.field, rendering, rays, state)
+        return terms
+
+    def _update(
+        self, optimizer: LightningOptimizer, state: TrainingState, rendering: Rendering
+    ) -> None:
+        model, sampler = self._parts
+        model.regularise(state)
+        sampler.regularise()
         usable = all_usable(self.parameters())
         if not self.trainer.strategy.reduce_boolean_decision(usable, all=True):
             broken = [f"gradient of {name}" for name in unusable_gradients(self.named_parameters())]
@@ -159,14 +324,27 @@ class RadianceModule(LightningModule):
         self.unusable_in_a_row = 0
         optimizer.step()
         optimizer.zero_grad()
-        self.sampling.keep_up(self.field, moment)
+        sampler.update(self.field, state)
 
-    def _set_learning_rates(self) -> None:
-        factor = self.method.rate(self.global_step, self.progress)
-        optimizer = self.optimizers()
-        assert isinstance(optimizer, LightningOptimizer)
-        for group, peak in zip(optimizer.param_groups, self._peaks, strict=True):
-            group["lr"] = factor * peak
+    def _log_terms(self, terms: Mapping[str, Tensor], state: TrainingState) -> None:
+        """Log every term of the loss, weighted, where the Trainer wants logs of this step."""
+        every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if not every or self.batches % every or not self.trainer.loggers:
+            return
+        model, sampler = self._parts
+        values = {name: float(term.detach()) for name, term in terms.items()}
+        values |= model.regularisers(state)
+        entries = {f"train/{name}": value for name, value in values.items()}
+        entries |= {"train/loss": sum(values.values()), "train/psnr": self.last["psnr"]}
+        entries |= {"train/steps_skipped": float(self.unusable), "step": float(state.step)}
+        groups = cast(LightningOptimizer, self.optimizers()).param_groups
+        entries |= {f"lr/{group['name']}": group["lr"] for group in groups}
+        entries["sampler/samples_per_ray"] = self.counts["samples"] / max(1, self.counts["rays"])
+        seconds = training_seconds(self.trainer)
+        if seconds:
+            entries["time/rays_per_s"] = self.counts["rays"] / seconds
+            entries["time/train_s"] = seconds
+        self.log_dict(entries | sampler.scalars() | model.scalars(), batch_size=1)
 
     def _count(self, samples: Any, rays: int) -> None:
         for name in ("candidates", "empty", "occluded"):
@@ -174,8 +352,9 @@ class RadianceModule(LightningModule):
         self.counts["rays"] += rays
         self.counts["samples"] += len(samples)
         # Rays of the next batch: as many as keep its samples near the target.
-        room = self.options.samples_per_batch * rays / max(1, len(samples))
-        self.rays = max(64, min(self.options.rays_per_batch, int(room)))
+        settings = self.ray_settings
+        room = settings.samples_per_batch * rays / max(1, len(samples))
+        self.rays = max(64, min(settings.per_batch, int(room)))
 
     def _refuse(self, what: str, broken: list[str], rendering: Rendering) -> None:
         """Leave a step out, and give up after `PATIENCE` of them in a row."""
@@ -207,22 +386,110 @@ class RadianceModule(LightningModule):
         if self.global_step == 0:
             largest = max(float(p.detach().abs().max()) for p in self.field.parameters())
             return (
-                f"No step was done yet, so the start is to blame, whose largest value is "
-                f"{largest:.3g}: set lrm=none, or make the start anew"
+                f"No step was done yet, so the initialisation is to blame, whose largest value is "
+                f"{largest:.3g}: set lrm=none, or make it anew"
             )
-        precision = "" if self.field.precision == "32" else ", or set trainer.precision=32"
-        return f"{self.method.advice}{precision}; resume= goes on from the last checkpoint"
+        precision = "" if self.field.precision == "32" else ", or set model.precision=32"
+        return f"{self._parts[0].advice}{precision}; resume= continues from the last checkpoint"
 
-    def _require_frame(self, trained: dict[str, Any] | None) -> None:
-        """Refuse planes that were trained in another frame than the start lies in now."""
-        if trained is None or self.origin is None:
+    # Scores
+
+    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
+        return self._score(batch, "val")
+
+    def test_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
+        return self._score(batch, "test")
+
+    def predict_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
+        """One view: ``colour`` [H, W, 3], ``opacity`` and ``depth`` [H, W]."""
+        return self._view(batch)
+
+    def _score(self, batch: dict[str, Any], stage: str) -> dict[str, Tensor]:
+        image, truth = self._view(batch), batch["target"]
+        colour = image["colour"].float().clamp(0, 1)
+        scores = {
+            f"{stage}/psnr": psnr(colour.cpu(), truth.cpu()),
+            f"{stage}/ssim": ssim(colour.cpu(), truth.cpu()),
+        }
+        self.log_dict(scores, on_epoch=True, prog_bar=True, batch_size=1, sync_dist=True)
+        return image
+
+    @torch.no_grad()
+    def _view(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        assert self.frame is not None
+        height, width = batch["target"].shape[:2]
+        frame = Frame(
+            self.frame.scale,
+            self.frame.rotation.to(batch["origins"]),
+            self.frame.centre.to(batch["origins"]),
+        )
+        origins, directions = frame.rays(batch["origins"], batch["directions"])
+        image = self.renderer_now.image(
+            self.field, origins, directions, float(batch["time"]), batch["background"]
+        )
+        return {name: value.view(height, width, *value.shape[1:]) for name, value in image.items()}
+
+    # Checkpoints
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["progress"] = {
+            "batches": self.batches,
+            "rays": self.rays,
+            "counts": dict(self.counts),
+            "unusable": self.unusable,
+        }
+        if self.site is not None:
+            checkpoint["site"] = {
+                "model": self._settings.plain(),
+                "frame": frame_content(self.site.frame),
+                "times": self.site.times,
+                "bounds": self.site.bounds,
+                "initialised": self.site.initialised,
+            }
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        try:
+            site, progress = checkpoint["site"], checkpoint["progress"]
+            frame = read_frame(site["frame"], "the checkpoint")
+            if self.model is None:
+                self._rebuild(site, frame)
+            else:
+                self._require_frame(site, frame)
+            self._loaded_step = checkpoint["global_step"]
+            self.batches, self.unusable = progress["batches"], progress["unusable"]
+            self.rays, self.counts = progress["rays"], dict(progress["counts"])
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ConfigError(
+                f"the checkpoint cannot be used ({type(error).__name__}: {error}): it is damaged, "
+                "or from another version of xplanes"
+            ) from error
+
+    def _rebuild(self, content: Mapping[str, Any], frame: Frame) -> None:
+        """Build the field without its data, for weights that are about to be loaded."""
+        with plugins(self.hparams["plugins"]):
+            settings = build(content["model"], ModelSettings, "model")
+        if not content["initialised"] or settings.name != self.method.model.name:
+            settings = self.method.model  # Weights of another one will not fit.
+        site = Site(
+            frame=frame,
+            times=content["times"],
+            seed=self.method.seed,
+            precision=_precision(settings, torch.device("cpu")),
+            bounds=content["bounds"],
+        )
+        self._assemble(settings, site)
+
+    def _require_frame(self, content: Mapping[str, Any], trained: Frame) -> None:
+        """Refuse planes that were trained in another frame than the initialisation lies in now."""
+        assert self.site is not None
+        if not (self.site.initialised and content["initialised"]):
             return
-        for name, now in self.origin["frame"].items():
-            before = torch.as_tensor(trained["frame"][name])
+        for name, now in frame_content(self.site.frame).items():
+            before = torch.as_tensor(getattr(trained, name))
             if not torch.allclose(before, torch.as_tensor(now), rtol=1e-4, atol=1e-5):
                 raise TrainingError(
-                    f"the start was made anew, and its frame is not the checkpoint's ({name} "
-                    f"{before.tolist()}, now {torch.as_tensor(now).tolist()}): what "
+                    f"the initialisation was made anew, and its frame is not the checkpoint's "
+                    f"({name} {before.tolist()}, now {torch.as_tensor(now).tolist()}): what "
                     "preparation.cache kept is gone. Bring it back, or train anew in another folder"
                 )
 
@@ -239,27 +506,21 @@ class RadianceModule(LightningModule):
         except RuntimeError as error:
             problem = str(error).splitlines()[-1].strip().rstrip(".")
             raise ConfigError(
-                f"the checkpoint does not fit these settings ({problem}): go on with those that "
+                f"the checkpoint does not fit these settings ({problem}): continue with those that "
                 "the run began with, or train anew in another folder"
             ) from error
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint["progress"] = {
-            "batches": self.batches,
-            "clock": self.clock,
-            "rays": self.rays,
-            "counts": dict(self.counts),
-            "unusable": self.unusable,
-            "ending": self.ending,
-        }
-        if self.origin is not None:
-            checkpoint["origin"] = self.origin
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        self._require_frame(checkpoint.get("origin"))
-        progress = checkpoint["progress"]
-        self.batches, self.clock = progress["batches"], progress["clock"]
-        self.rays, self.counts = progress["rays"], dict(progress["counts"])
-        self.unusable = progress["unusable"]
-        # A run that goes on without the rule trains through its budget.
-        self.ending = None if self.options.plateau is None else progress["ending"]
+def _read(config: Mapping[str, Any], modules: Sequence[str]) -> Method:
+    with plugins(modules):
+        try:
+            return Method.read(config)
+        except KeyError as error:
+            raise ConfigError(f"the configuration lacks the group {error}") from error
+
+
+def _precision(settings: ModelSettings, device: torch.device) -> str:
+    """The precision of products, settled for a device where the settings say auto."""
+    if settings.precision == "auto":
+        return "bf16" if fast_bf16(device) else "32"
+    return settings.precision

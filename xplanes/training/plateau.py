@@ -7,6 +7,7 @@ import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
+from xplanes.errors import ConfigError
 from xplanes.training.module import RadianceModule
 
 BLOCK = 50
@@ -23,28 +24,46 @@ class PlateauStop(Callback):
     """Ends training once the last doubling of its batches has gained little on their own rays.
 
     No scored view is looked at. The learning rates then fall over a last quarter, because an end at
-    full rates would be worth less than training had reached.
+    full rates would lose what training had reached.
 
     Args:
-        gain: PSNR in dB below which a doubling counts as little.
+        gain: PSNR in dB below which a doubling counts as little; None never ends training.
+
+    Attributes:
+        ending: Step and progress at which training was told to end early, and the step of the end.
     """
 
-    def __init__(self, gain: float) -> None:
+    def __init__(self, gain: float | None = None) -> None:
+        if gain is not None and not gain > 0:
+            raise ConfigError(f"gain={gain}: must be above 0, or null for no early end")
         self.gain = gain
+        self.ending: tuple[int, float, int] | None = None
         self._errors: list[float] = []
         self._block: list[float] = []
+        self._step = 0
+
+    @property
+    def progress(self) -> float:
+        """Share of training that is done, once it was told to end; 0 before."""
+        if self.ending is None:
+            return 0.0
+        begin, done, end = self.ending
+        return done + (1 - done) * (self._step - begin) / (end - begin)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, RadianceModule)
-        if pl_module.ending is not None and pl_module.progress >= 1:
+        self._step = trainer.global_step
+        if self.progress >= 1:
             trainer.should_stop = True
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         assert isinstance(pl_module, RadianceModule)
-        if pl_module.ending is not None:
-            trainer.should_stop |= pl_module.progress >= 1
+        self._step = trainer.global_step
+        if self.gain is None:
+            return
+        if self.ending is not None:
+            trainer.should_stop |= self.progress >= 1
             return
         self._block.append(10 ** (-0.1 * pl_module.last.get("psnr", 0.0)))
         if len(self._block) < BLOCK:
@@ -56,13 +75,17 @@ class PlateauStop(Callback):
         self._errors.append(float(error))
         self._block = []
         if converged(self._errors, self.gain):
-            pl_module.end_after(max(1, round(COOLING * trainer.global_step)))
+            steps = max(1, round(COOLING * self._step))
+            self.ending = (self._step, pl_module.progress, self._step + steps)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"errors": list(self._errors), "block": list(self._block)}
+        return {"errors": self._errors, "block": self._block, "ending": self.ending}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self._errors, self._block = list(state_dict["errors"]), list(state_dict["block"])
+        # A run that continues without the rule trains through its budget.
+        ending = None if self.gain is None else state_dict["ending"]
+        self.ending = None if ending is None else tuple(ending)
 
 
 def converged(errors: list[float], gain: float) -> bool:

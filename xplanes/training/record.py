@@ -5,17 +5,70 @@ import os
 import platform
 import subprocess
 import time
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
 from xplanes import __version__
-from xplanes.config import ConfigError
+from xplanes.errors import ConfigError
 from xplanes.files import read_json, write_json
 from xplanes.process import train_command
+from xplanes.scenes.views import Views
 
 logger = logging.getLogger(__name__)
+
+KEPT = """model.name lrm.name model.sampler.name data.name data.scene data.seed data.resolution
+data.views data.train_views data.train_on_video data.still data.half_side""".split()
+"""Settings on which the planes, their frame and what they show depend. Files may have moved."""
+
+
+def require_same_settings(run: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Refuse settings that a checkpoint cannot go on with.
+
+    Args:
+        run: The run directory.
+        before: The settings that it began with; those that are not there are not compared.
+        now: The settings that it is to go on with.
+
+    Raises:
+        ConfigError: Naming the first that differs.
+    """
+    for key in KEPT:
+        was, wanted = (_value(content, key) for content in (before, now))
+        if was is not None and wanted is not None and was != wanted:
+            raise ConfigError(
+                f"resume={run} with {key}={wanted}: its checkpoint was trained with {key}={was}. "
+                "Leave it out, or train anew in another folder"
+            )
+
+
+def require_same_views(run: Path, record: Mapping[str, Any], views: Views) -> None:
+    """Refuse other training views than the run's: the frame and the field's size depend on them.
+
+    Args:
+        run: The run directory.
+        record: The content of its run.json; one that lists no files refuses nothing.
+        views: The scene's training views.
+
+    Raises:
+        ConfigError: If they are others, or in another order.
+    """
+    files = record.get("files")
+    recorded = files.get("train") if isinstance(files, Mapping) else None
+    if isinstance(recorded, list) and recorded != list(views.files):
+        raise ConfigError(
+            f"{run} was trained on {len(recorded)} views, but the scene now lists "
+            f"{len(views.files)} others or in another order: restore the scene's files"
+        )
+
+
+def _value(content: Any, key: str) -> Any:
+    for name in key.split("."):
+        content = content.get(name) if isinstance(content, Mapping) else None
+    return content
+
 
 Status = Literal["running", "finished", "failed", "interrupted"]
 
@@ -97,12 +150,14 @@ def run_status(run: Path) -> str | None:
 
 
 def claim(run: Path, *, resume: bool) -> None:
-    """Refuse a folder that holds a run, unless it is to be resumed.
+    """Refuse a folder that holds a run with a checkpoint, unless it is to be resumed.
 
     Raises:
         ConfigError: If there is a run and ``resume`` is off, or none and it is on.
     """
     status = run_status(run)
+    if not resume and not (run / "checkpoints" / "last.ckpt").is_file() and status != "finished":
+        return  # It ended before its first checkpoint: nothing would be lost.
     if status is not None and not resume:
         raise ConfigError(
             f"{run} holds a run already ({status}). Go on with it: {train_command()} resume={run}; "

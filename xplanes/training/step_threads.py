@@ -1,7 +1,8 @@
-"""How many threads share a training step: as many as do it soonest."""
+"""How many threads share a training step: the number with which it is fastest."""
 
 import logging
 import statistics
+import time
 from typing import Any
 
 import torch
@@ -9,8 +10,7 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
 from xplanes.backend import use_threads
-from xplanes.config import TrainerConfig
-from xplanes.training.module import RadianceModule
+from xplanes.errors import ConfigError
 
 logger = logging.getLogger(__name__)
 
@@ -112,55 +112,51 @@ class ThreadChoice:
 
 
 class StepThreads(Callback):
-    """Sets torch's and the loops' threads before each step. Must come right after the clock.
+    """Chooses the number of threads by timing steps: ``callbacks=threads``.
 
-    Sums may come out otherwise with another number of threads, in their last digits. Where these
-    are to be kept, by ``deterministic`` or a budget of steps alone, all threads work, as on GPUs
-    and in several processes.
+    Sums come out differently with another number of threads, in their last digits, so that runs
+    with it are not deterministic. Does nothing on GPUs and in several processes.
 
-    Args:
-        options: Of the trainer.
-        device: Where the field is trained.
+    Attributes:
+        count: Threads of the steps so far.
     """
 
-    def __init__(self, options: TrainerConfig, device: torch.device) -> None:
-        self._all = torch.get_num_threads()
-        wanted = (
-            device.type == "cpu"
-            and self._all > 1
-            and options.devices == 1
-            and options.max_seconds is not None
-            and not options.deterministic
-        )
-        self.choice = ThreadChoice(self._all) if wanted else None
-        self._clock = 0.0
+    def __init__(self) -> None:
+        self._all = self.count = torch.get_num_threads()
+        self.choice: ThreadChoice | None = None
+        self._mark = 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, RadianceModule)
-        self._clock = pl_module.clock
-        pl_module.threads = self._all
+        if torch.are_deterministic_algorithms_enabled():
+            raise ConfigError(
+                "trainer.deterministic=true with callbacks=threads: sums differ in their last "
+                "digits with another number of threads; leave one of them out"
+            )
+        wanted = pl_module.device.type == "cpu" and trainer.world_size == 1 and self._all > 1
+        self.choice = ThreadChoice(self._all) if wanted else None
+        self._mark = time.perf_counter()
+
+    def on_train_batch_start(
+        self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
+    ) -> None:
+        self._mark = time.perf_counter()
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        assert isinstance(pl_module, RadianceModule)
         if self.choice is None:
             return
-        seconds, self._clock = pl_module.clock - self._clock, pl_module.clock
-        if self.choice.took(seconds) and self.choice.count != pl_module.threads:
-            pl_module.threads = self.choice.count
+        took = time.perf_counter() - self._mark
+        if self.choice.took(took) and self.choice.count != self.count:
+            self.count = self.choice.count
             each = ", ".join(f"{1000 * s:.3g} ms with {n}" for n, s in self.choice.medians.items())
-            logger.info("threads: %d from here on; a step took %s", self.choice.count, each)
+            logger.info("threads: %d from here on; a step took %s", self.count, each)
         use_threads(self.choice.next())
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._restore()
+        use_threads(self._all)
 
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
-        self._restore()
-
-    def _restore(self) -> None:
-        if self.choice is not None:
-            use_threads(self._all)
+        use_threads(self._all)

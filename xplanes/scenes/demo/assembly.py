@@ -8,11 +8,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from xplanes.scenes.demo.geometry import Primitive, Surface
 from xplanes.scenes.demo.motions import Motion
 from xplanes.scenes.demo.posed import Hits, Posed, PosedPart
-from xplanes.scenes.demo.primitives import Primitive
 from xplanes.scenes.demo.shading import Light
-from xplanes.scenes.demo.surfaces import Surface
 
 Vector = tuple[float, float, float]
 

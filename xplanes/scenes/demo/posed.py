@@ -7,9 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from xplanes.scenes.demo.primitives import MISS, Box, Primitive
+from xplanes.scenes.demo.geometry import MISS, Box, Primitive, Surface
 from xplanes.scenes.demo.shading import Light
-from xplanes.scenes.demo.surfaces import Surface
 
 CHUNK = 16384
 """Rays handled at a time, so that temporaries stay in the cache."""
@@ -66,7 +65,7 @@ class Hits(NamedTuple):
 
 @dataclass(frozen=True)
 class Posed:
-    """An assembly at one moment.
+    """An assembly at one timestep.
 
     Attributes:
         parts: The parts at their places.

@@ -7,8 +7,9 @@ import random
 import secrets
 import shutil
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from time import time as now
 from typing import Any
@@ -20,6 +21,11 @@ from xplanes.backend import threads
 from xplanes.scenes.demo.assembly import Assembly
 from xplanes.scenes.demo.film import CAMERA_ANGLE_X, camera_at, film, hemisphere_cameras
 from xplanes.scenes.demo.scenes import build_demo_scene, demo_scene
+from xplanes.scenes.dnerf import read_scene
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.views import Scene
+from xplanes.settings import Count, Steps
 
 VERSION = 2
 """Raised when the same scene would come out as other pictures."""
@@ -207,3 +213,43 @@ def _publish(fresh: Path, folder: Path, record: dict[str, Any]) -> None:
             continue
         finally:
             shutil.rmtree(stale, ignore_errors=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoSettings(SceneSettings):
+    """A procedural scene, rendered on first use."""
+
+    seed: Steps  # Varies colours, motion and cameras.
+    train_views: Count  # Training views, each at its own time.
+    test_views: Count  # Test views, at times of their own.
+    val_views: Count  # Validation views.
+
+    @property
+    def folder(self) -> Path:
+        return ensure_demo_scene(
+            Path(self.root),
+            self.scene,
+            resolution=self.resolution or 128,
+            seed=self.seed,
+            train_views=self.train_views,
+            val_views=self.val_views,
+            test_views=self.test_views,
+        )
+
+    def prepare(self) -> None:
+        _ = self.folder
+
+    def load(self, splits: Sequence[str]) -> Scene:
+        folder = self.folder
+        try:
+            return read_scene(
+                folder,
+                resolution=self.resolution,
+                splits=splits,
+                views=self.views,
+                eval_views=self.eval_views,
+            )
+        except SceneError as problem:
+            raise SceneError(
+                f"{problem} This is a demo scene: delete {folder}, and it is rendered again"
+            ) from problem

@@ -1,0 +1,162 @@
+"""What the choice of a baseline brings along, and who has the last word."""
+
+import functools
+import itertools
+
+import yaml
+
+from xplanes.config import CONF, compose_plain
+from xplanes.evaluation.sweep import RunRow, flatten
+from xplanes.evaluation.tabulate import differing
+from xplanes.experiment import Experiment
+
+PUBLISHED = {
+    "kplanes": ("proposal", 4096, 30000),
+    "kplanes_explicit": ("proposal", 4096, 30000),
+    "tineuvox_s": ("fixed_step", 4096, 20000),
+    "tineuvox_b": ("fixed_step", 4096, 20000),
+    "tensor4d": ("neus", 512, 200000),
+}
+
+
+SETTINGS = yaml.safe_load("""
+kplanes:
+  model: {half_side: 1.3, resolution: 64, scales: [1, 2, 4, 8], time_resolution: null, channels: 32,
+    space_low: 0.1, space_high: 0.5, width: 64, learning_rate: 0.01, warmup_steps: 512}
+  rays: {background: one}
+  loss: {variation: coded, total_variation: 0.0001, time_smoothness: 0.01, time_identity: 0.0001}
+  sampler: {near: 2, far: 6, proposal_samples: [256, 128], samples: 48, resolutions: [64, 128],
+    time_resolution: 50, channels: 8, width: 64, linear: false, space_low: 0.1, space_high: 0.15,
+    padding: 0.01, anneal_steps: 1000, anneal_slope: 10, update_every: 5, update_warmup: 5000,
+    histogram: 1, variation: coded, total_variation: 0.0001, time_smoothness: 0.001,
+    time_identity: 0.0001, learning_rate: 0.01}
+kplanes_explicit:
+  model: {width: 128}
+  sampler: {linear: true}
+tineuvox_s:
+  model: {near: 2, far: 6, margin: 1.05, resolution: 100, channels: 4, width: 64,
+    alpha_start: 0.01, point_octaves: 10, time_octaves: 8, direction_octaves: 4,
+    feature_octaves: 2, grow_at: [2000, 4000, 6000], grid_learning_rate: 0.08,
+    deformation_learning_rate: 0.0006, network_learning_rate: 0.0008, decay_steps: 20000}
+  rays: {background: white}
+  loss: {entropy: 0.001, sample_colour: 0.01}
+  sampler: {near: 2, far: 6, step: 0.5, threshold: 0.0001}
+tineuvox_b:
+  model: {resolution: 160, channels: 6, width: 256, alpha_start: 0.001}
+tensor4d:
+  model: {resolution: 128, fine_resolution: 512, time_resolution: 128, channels: 32,
+    fine_channels: 16, width: 256, point_octaves: 8, time_octaves: 6, direction_octaves: 3,
+    fine_from: 5000, blur_until: 7500, blur_resolution: 64, learning_rate: 0.0005,
+    plane_learning_rate: 0.0025, warmup_steps: 2000, final_rate: 0.1, radius: 0.5, sharpness: 0.3}
+  loss: {masked: true, eikonal: 0.2, opacity: 0.3, smoothness: 0.01, smoothness_distance: 0.001}
+  sampler: {samples: 64, more_samples: 65, coarse_sharpness: 64}
+""")
+"""Settings of the released code."""
+
+
+OURS = (
+    "model.rays.per_batch=1024",
+    "model.rays.samples_per_batch=8192",
+    "model.rays.skip_background=true",
+    "model.rays.background=white",
+)
+"""The rays of X-Planes, for models that bring others."""
+
+
+@functools.cache
+def composed(*overrides):
+    return compose_plain("train", overrides)
+
+
+def test_a_baseline_brings_its_published_steps():
+    for model, experiment in itertools.product(PUBLISHED, ([], ["experiment=published"])):
+        case = model, *experiment
+        config = Experiment.read(composed(f"model={model}", *experiment))
+        sampler, rays, steps = PUBLISHED[model]
+        found = config.method.model
+        assert (found.sampler.name, found.rays.per_batch) == (sampler, rays), case
+        assert config.method.lrm.name == "none", case
+        assert not found.rays.skip_background, case
+        assert (config.trainer["max_seconds"] is None) == bool(experiment), case
+        if experiment:
+            assert config.trainer["max_steps"] == steps, case
+            longer = composed(f"model={model}", *experiment, "trainer.max_steps=7")
+            assert longer["trainer"]["max_steps"] == 7, case
+
+
+def test_a_baseline_has_its_published_settings():
+    for model, groups in SETTINGS.items():
+        config = composed(f"model={model}")["model"]
+        for group, settings in groups.items():
+            part = config if group == "model" else config[group]
+            found = {key: part[key] for key in settings}
+            assert found == settings, (model, group)
+
+
+def test_a_baseline_can_be_trained_on_the_rays_of_others():
+    ours, plain = composed(), composed("model=kplanes", *OURS)
+    assert plain["trainer"] == ours["trainer"]
+    assert plain["data"] == ours["data"]
+    assert plain["model"]["rays"] == ours["model"]["rays"]
+
+
+def test_the_command_line_has_the_last_word():
+    rays = composed("model=kplanes", "model.rays.per_batch=7", "model.rays.background=white")
+    rays = rays["model"]["rays"]
+    assert rays["per_batch"] == 7
+    assert rays["background"] == "white"
+
+
+def row(config, *overridden):
+    return RunRow("run", flatten(config), frozenset(overridden))
+
+
+def test_tables_leave_out_what_follows_from_the_model():
+    models = ("six_planes", "kplanes", "tineuvox_s")
+    names = {"model.sampler.name", "model.name"}
+    rows = [row(composed("lrm=none", f"model={model}")) for model in models]
+    assert set(differing(rows)) == names
+    typed = "model.rays.background"
+    rows[1] = row(composed("model=kplanes", "model.rays.background=white"), typed)
+    assert set(differing(rows)) == names
+    rows[2] = row(composed("model=tineuvox_s", "model.rays.background=random"), typed)
+    assert set(differing(rows)) == {*names, typed}
+
+
+def test_tables_leave_out_what_follows_from_the_sampler():
+    samplers = ([], ["model/sampler=occupancy"])
+    rows = [row(composed("model=kplanes", *choice)) for choice in samplers]
+    assert set(differing(rows)) == {"model.sampler.name"}
+
+
+ENTRIES = sorted(path.stem for path in (CONF / "entry").glob("*.yaml"))
+
+
+def check_name(entry, config):
+    """An entry of a comparison is what it is called."""
+    method = config.method
+    model, lrm = method.model.name, method.lrm.name
+    extra = "_occupancy" if entry.endswith("_occupancy") else ""
+    planes = f"_{lrm}" if model in ("six_planes", "nine_planes") else ""
+    assert entry == f"{model}{extra}{planes}"
+    assert (method.model.sampler.name == "occupancy") >= bool(extra), entry
+
+
+def test_comparisons_give_all_models_the_same_and_name_them_right():
+    left = set(ENTRIES)
+    for name in ("table1", "lego_models"):
+        text = yaml.safe_load((CONF / "experiment" / f"{name}.yaml").read_text())
+        entries = text["hydra"]["sweeper"]["params"]["entry"].split(",")
+        assert set(entries) <= set(ENTRIES), name
+        for entry in entries:
+            plain = composed(f"experiment={name}", "data.scene=lego", f"entry={entry}")
+            check_name(entry, Experiment.read(plain))
+            for group, keys in (
+                ("trainer", ("max_seconds", "max_steps")),
+                ("data", ("resolution", "eval_split")),
+            ):
+                for key in keys:
+                    assert plain[group][key] == text[group][key], (name, entry, key)
+        left -= set(entries)
+    for entry in left:
+        check_name(entry, Experiment.read(composed(f"entry={entry}")))

@@ -1,0 +1,355 @@
+"""From a triplane sequence to planes, parts and reports."""
+
+import logging
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import get_args, get_type_hints
+
+import pytest
+import torch
+
+from tests.preparation.sequences import blob, moving_sequence, still_features
+from tests.refusals import assert_refused
+from tests.synthetic import ball_scene
+from tests.training.runs import small_config
+from xplanes import decomposition, pipeline
+from xplanes.decomposition import TIME_ROWS, unexplained_energy
+from xplanes.decomposition.conversion import DYNAMIC, STATIC
+from xplanes.decomposition.rpca import METHODS, SCALES
+from xplanes.errors import ConfigError
+from xplanes.fields import Decoder
+from xplanes.models.initialisation import STAGES, DecompositionSettings, Initialisation, Method
+from xplanes.preparation import TriplaneSequence, save_triplanes
+from xplanes.preparation import stages as stages_module
+from xplanes.scenes.frame import Frame, cube_frame
+from xplanes.training.module import RadianceModule
+
+FRAME = cube_frame(1.5, torch.zeros(3))
+OPTIONS = {
+    "width": 12,
+    "hidden": 1,
+    "activation": "silu",
+    "density": "exp",
+    "density_scale": 2.0,
+    "colour_margin": 0.0,
+}
+
+
+def settings(folder: Path, *overrides: str) -> Method:
+    cache = f"preparation.cache={folder}/cache"
+    return Method.read(small_config(folder, "lrm=file", cache, *overrides))
+
+
+def built(method: Method, *, moving: bool = True, devices: int = 1) -> RadianceModule:
+    """A field for a scene whose frame is known."""
+    module = RadianceModule.of(method)
+    module.build(ball_scene(moving=moving), FRAME, devices=devices)
+    return module
+
+
+def initialised(
+    folder: Path,
+    sequence: TriplaneSequence,
+    *overrides: str,
+    moving: bool = True,
+    devices: int = 1,
+) -> tuple[Initialisation, RadianceModule]:
+    """An initialisation from a file, and the field that it builds."""
+    path = folder / "triplanes.pt"
+    save_triplanes(path, sequence)
+    method = settings(folder, f"lrm.triplanes={path}", *overrides)
+    module = built(method, moving=moving, devices=devices)
+    return module.initialisation, module
+
+
+SEQUENCE = TriplaneSequence(moving_sequence())
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> tuple[Path, Initialisation, RadianceModule]:
+    """An initialisation whose stages are kept: its folder, itself, and the field that it built."""
+    folder = tmp_path_factory.mktemp("initialised")
+    return folder, *initialised(folder, SEQUENCE)
+
+
+def test_no_source_is_a_random_initialisation_that_touches_nothing(tmp_path: Path):
+    method = Method.read(small_config(tmp_path, f"preparation.cache={tmp_path}/cache"))
+    assert method.lrm.load() is None
+    module = built(method)
+    found = module.initialisation
+    assert found == Initialisation(method.model, FRAME)
+    assert (found.values, found.report) == (None, {})
+    assert found.seconds == dict.fromkeys(STAGES, 0.0)
+    assert not (tmp_path / "cache").exists()
+    assert (module.model.product, module.site.initialised) == (None, False)
+
+
+def test_a_rank_one_initialisation_explains_what_moves(finished):
+    folder, *_ = finished
+    for model, (resolution, rows) in product(
+        ("six_planes", "nine_planes"), ((16, 8), (24, 8), (9, 5))
+    ):
+        case = f"{model} of {resolution} texels, {rows} rows"
+        found, module = initialised(
+            folder,
+            SEQUENCE,
+            f"model={model}",
+            f"model.resolution={resolution}",
+            f"model.time_resolution={rows}",
+        )
+        field = module.field
+        count = len(TIME_ROWS[field.plane_set][-1]) * 3 if model == "nine_planes" else 3
+        assert field.space.shape == (3, resolution, resolution, 8), case
+        assert field.time.shape == (count, rows, resolution, 8), case
+        unexplained = found.report["unexplained"]
+        assert unexplained["before"] == pytest.approx(1, abs=0.05), case
+        # With fewer texels and rows than the blob needs, less of it can be held.
+        assert unexplained["after"] < (0.3 if resolution >= 16 else 0.8), case
+        again = unexplained_energy(field.time, found.values.sparse, rows=field.rows)
+        assert again == pytest.approx(unexplained["after"], rel=1e-5), case
+
+
+def test_left_open_rows_of_time_frame_and_decoder_are_those_of_a_random_initialisation(
+    finished, tmp_path: Path
+):
+    _, found, module = finished
+    random = built(Method.read(small_config(tmp_path)))
+    assert module.field.time.shape[1] == random.field.time.shape[1] == 3
+    assert found.frame is FRAME
+    assert found.values.decoder is None
+    assert len(module.field.decoder.layers) == 4
+
+
+def test_the_field_shows_what_stands_still_where_nothing_moves(tmp_path: Path):
+    # With few frames the automatic weight takes peaks of what stands still for motion.
+    sequence = TriplaneSequence(moving_sequence(frames=40))
+    found, module = initialised(tmp_path, sequence, "model.resolution=16")
+    truth, moved = still_features(), blob().abs().amax(dim=0)
+    for index, name in enumerate(("xy", "xz", "yz")):
+        untouched = moved[index] < 1e-3
+        assert untouched.float().mean() > 0.1
+        error = (found.values.planes[name] - truth[index])[untouched]
+        assert error.norm() < 0.01 * truth[index][untouched].norm()
+        assert torch.equal(module.field.planes[name], found.values.planes[name])
+
+
+def test_reports_and_seconds_are_whole(finished):
+    _, found, _ = finished
+    assert set(found.report) == {"xy", "xz", "yz", "unexplained"}
+    for name in ("xy", "xz", "yz"):
+        report = found.report[name]
+        assert set(report) == set(stages_module.REPORTED)
+        assert report["converged"]
+        assert 1 <= report["rank"] <= 8
+        assert 0 < report["sparsity"] < 1
+        assert report["residual"] <= 0.003
+    assert set(found.seconds) == set(STAGES)
+    assert found.seconds["fixed_view"] == 0
+    assert all(found.seconds[name] > 0 for name in STAGES[1:])
+    assert found.pictures["decomposition"].shape == (3 * 132, 8 * 132, 3)
+    assert found.pictures["decomposition"].min() >= 0
+    assert found.pictures["decomposition"].max() <= 1
+
+
+def test_a_second_initialisation_comes_from_the_cache(finished, monkeypatch):
+    folder, first, _ = finished
+
+    def refuse(*_args, **_options):
+        raise AssertionError("computed again")
+
+    monkeypatch.setattr(stages_module, "decompose", refuse)
+    monkeypatch.setattr(stages_module, "time_planes", refuse)
+    again, _ = initialised(folder, SEQUENCE)
+    assert again.report == first.report
+    for stage in ("decomposition", "convert"):
+        assert again.seconds[stage] == first.seconds[stage]
+    assert torch.equal(again.values.sparse, first.values.sparse)
+    assert all(
+        torch.equal(again.values.planes[name], plane) for name, plane in first.values.planes.items()
+    )
+    assert "cached" in again.words
+    with pytest.raises(AssertionError, match="computed again"):
+        initialised(folder, SEQUENCE, "decomposition.tolerance=0.001")
+
+
+def test_the_cache_can_be_switched_off(tmp_path: Path, monkeypatch):
+    calls = []
+    original = stages_module.decompose
+    monkeypatch.setattr(
+        stages_module, "decompose", lambda *a, **o: calls.append(1) or original(*a, **o)
+    )
+    for count, override in enumerate(("preparation.cache=null", "decomposition.cache=false"), 1):
+        for _ in range(2):
+            initialised(tmp_path, SEQUENCE, override)
+        assert not list(tmp_path.glob("cache/decomposition-*")), override
+        assert len(calls) == 2 * count, override
+
+
+def test_channels_decoder_and_frame_of_the_file_prevail(tmp_path: Path):
+    decoder = Decoder(4, **OPTIONS)
+    frame = Frame(0.5, torch.eye(3), torch.tensor([0.1, 0.2, 0.3]))
+    sequence = TriplaneSequence(
+        moving_sequence(channels=4), decoder.state_dict(), dict(OPTIONS), frame
+    )
+    found, module = initialised(tmp_path, sequence, "model.precision=32")
+    assert found.model.channels == 4
+    assert "4 channels (not model.channels=8)" in found.words
+    assert found.frame.scale == 0.5
+    points, times = torch.rand(20, 3) * 2 - 1, torch.rand(20)
+    features = module.field.features(points, times)
+    for ours, theirs in zip(module.field.decoder(features), decoder(features), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_options_that_no_decoder_has_are_refused(tmp_path: Path):
+    options = OPTIONS | {"activation": "sine"}
+    decoder = Decoder(8, **OPTIONS).state_dict()
+    with pytest.raises(ConfigError, match=r"triplanes\.pt does not fit.*activation=sine"):
+        initialised(tmp_path, TriplaneSequence(SEQUENCE.triplanes, decoder, options))
+
+
+def test_a_scene_of_one_moment_takes_the_low_rank_part_alone(tmp_path: Path):
+    found, module = initialised(tmp_path, SEQUENCE, moving=False)
+    assert set(found.values.planes) == {"xy", "xz", "yz"}
+    assert module.field.time is None
+    assert (found.values.sparse, module.model.product) == (None, None)
+    assert "no time planes" in found.words
+    assert set(found.report) == {"xy", "xz", "yz"}
+
+
+def test_one_triplane_is_the_space_planes(tmp_path: Path, caplog):
+    sequence = TriplaneSequence(moving_sequence(frames=1))
+    for moving in (True, False):
+        caplog.clear()
+        with caplog.at_level(logging.WARNING):
+            found, module = initialised(tmp_path, sequence, "model.resolution=16", moving=moving)
+        assert ("trains as a static one" in caplog.text) == moving
+        assert module.field.time is None
+        assert (found.report, found.pictures, found.values.sparse) == ({}, {}, None)
+        for index, name in enumerate(("xy", "xz", "yz")):
+            assert torch.equal(found.values.planes[name], sequence.triplanes[0, index]), name
+
+
+def test_a_sequence_that_stands_still_is_initialised_with_noise_in_time(tmp_path: Path):
+    still = still_features().expand(40, -1, -1, -1, -1).contiguous()
+    found, module = initialised(tmp_path, TriplaneSequence(still), "model.resolution=16")
+    assert float(module.field.time.detach().std()) == pytest.approx(0.01, rel=0.1)
+    assert found.values.planes["xy"].sub(still[0, 0]).norm() < 0.1 * still[0, 0].norm()
+
+
+def test_every_floating_type_gives_single_precision_planes(tmp_path: Path):
+    for kind in (torch.float16, torch.bfloat16, torch.float64):
+        found, module = initialised(tmp_path, TriplaneSequence(SEQUENCE.triplanes.to(kind)))
+        assert module.field.space.dtype == torch.float32, kind
+        assert found.report["xy"]["converged"], kind
+
+
+def test_seeds_change_the_noise_alone(finished):
+    folder, first, _ = finished
+    other, _ = initialised(folder, SEQUENCE, "seed=1")
+    assert torch.equal(first.values.planes["xy"], other.values.planes["xy"])
+    gap = (first.values.planes["xt"] - other.values.planes["xt"]).std()
+    assert float(gap) == pytest.approx(0.01 * 2**0.5, rel=0.1)
+
+
+def test_an_open_decomposition_is_said_once_also_from_the_cache(tmp_path: Path, caplog, recwarn):
+    for _ in range(2):
+        caplog.clear()
+        with caplog.at_level(logging.WARNING):
+            initialised(tmp_path, SEQUENCE, "decomposition.max_iterations=3")
+        said = [r.getMessage() for r in caplog.records if "converge" in r.getMessage()]
+        assert len(said) == 1
+        assert "xy (residual" in said[0]
+        assert "decomposition.max_iterations=3" in said[0]
+    assert not [w for w in recwarn if "robust PCA" in str(w.message)]
+
+
+def test_no_weight_needs_no_sparse_part(finished):
+    folder, *_ = finished
+    found, module = initialised(folder, SEQUENCE, "model.loss.sparse_weight=0")
+    assert (found.values.sparse, module.model.product) == (None, None)
+    assert module.field.time is not None
+
+
+def test_the_papers_choices_run(tmp_path: Path):
+    found, _ = initialised(
+        tmp_path, SEQUENCE, "decomposition=paper", "decomposition.max_iterations=50"
+    )
+    assert found.report["unexplained"]["before"] == found.report["unexplained"]["after"]
+
+
+def test_a_source_that_is_not_there_is_refused_first(tmp_path: Path):
+    for overrides, words in (
+        ((), "lrm=file needs lrm.triplanes=FILE"),
+        (("lrm.triplanes=nowhere.pt",), "lrm.triplanes=nowhere.pt: there is no such file"),
+    ):
+        lrm = settings(tmp_path, *overrides).lrm
+        assert_refused(ConfigError, words, lrm.load, overrides)
+
+
+def test_settings_of_the_decomposition_are_checked(tmp_path: Path):
+    weight = "decomposition.sparsity_weight"
+    for override, words in (
+        (f"{weight}=often", f"^{weight}=often: must be one of auto or a number"),
+        (f"{weight}=0", f"^{weight}=0.0: must be above 0"),
+        (f"{weight}=-0.1", f"^{weight}=-0.1: must be above 0"),
+        (
+            "decomposition={dynamic: random, noise: 0}",
+            r"^decomposition\.noise=0.*products of two zeros have no gradient",
+        ),
+    ):
+        assert_refused(ConfigError, words, partial(settings, tmp_path, override), override)
+    for given, kept in (("auto", "auto"), ("0.009", 0.009), ("1", 1.0)):
+        method = settings(tmp_path, f"{weight}={given}")
+        assert method.decomposition.sparsity_weight == kept
+
+
+def test_choices_are_those_of_the_decomposition():
+    hints = get_type_hints(DecompositionSettings)
+    for name, known in (
+        ("method", METHODS),
+        ("scale", SCALES),
+        ("static", STATIC),
+        ("dynamic", DYNAMIC),
+    ):
+        assert set(get_args(hints[name])) == set(known), name
+    assert decomposition.ORIENTATIONS == ("xy", "xz", "yz")
+
+
+def test_processes_share_an_initialisation_through_a_folder_that_takes_files(tmp_path: Path):
+    (tmp_path / "file").write_text("")
+    for cache, words in (
+        (tmp_path / "file" / "cache", r"cannot be written, and the 2 processes share"),
+        ("null", r"preparation\.cache=null with lrm=file and trainer\.devices=2"),
+    ):
+        override = f"preparation.cache={cache}"
+        call = partial(initialised, tmp_path, SEQUENCE, override, devices=2)
+        assert_refused(ConfigError, words, call, override)
+    initialised(tmp_path, SEQUENCE, devices=2)
+
+
+def test_the_video_of_a_run_shows_the_field_in_its_own_frame(tmp_path: Path, monkeypatch):
+    frame = Frame(0.4, torch.eye(3), torch.tensor([0.1, 0.2, 0.3]))
+    save_triplanes(tmp_path / "a.pt", TriplaneSequence(moving_sequence(), frame=frame))
+    shown, original = [], pipeline.render_path
+
+    def render(field, renderer, frame, *others, **options):
+        shown.append(frame)
+        return original(field, renderer, frame, *others, **options)
+
+    monkeypatch.setattr(pipeline, "render_path", render)
+    monkeypatch.setattr(pipeline, "FILM_FRAMES", 2)
+    plain = small_config(
+        tmp_path,
+        "lrm=file",
+        f"lrm.triplanes={tmp_path}/a.pt",
+        "preparation.cache=null",
+        "trainer.max_steps=1",
+        "media=true",
+        "logger=none",
+    )
+    pipeline.run(plain, tmp_path / "run", [], resume=False)
+    (found,) = shown
+    assert found.scale == frame.scale
+    assert torch.equal(found.centre, frame.centre)

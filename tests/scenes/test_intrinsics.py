@@ -1,0 +1,668 @@
+"""Images of different cameras and sizes: rays, padding, and files that tell of them."""
+
+import json
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.refusals import assert_refused
+from tests.synthetic import ball_views, inside_ball, surrounding
+from xplanes.evaluation.render import lens
+from xplanes.metrics import psnr
+from xplanes.models.tineuvox import frusta_box
+from xplanes.preparation.fixed_view import check_camera
+from xplanes.rendering.carving import carve
+from xplanes.rendering.filling import fill
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.scenes.batches import RayBatches, RaySettings
+from xplanes.scenes.cameras import focal_length
+from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.dnerf import read_scene
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.frame import cube_frame, optical_centre, scene_frame
+from xplanes.scenes.silhouettes import foreground, may_hold
+from xplanes.scenes.source import stands_still
+from xplanes.scenes.views import Intrinsics, Scene, Views, camera_rays, joined, pad_images
+from xplanes.training.evaluation import score_view
+
+RADIUS = 0.5
+COLOUR = [200, 100, 50, 255]
+# Height, width, focal lengths along x and y, principal point from the left and from the top.
+WIDE = (30, 44, 41.0, 36.5, 25.25, 13.5)
+UPRIGHT = (38, 26, 55.0, 58.0, 12.0, 21.75)
+
+
+def rays_of(pose, height, width, focal_x, focal_y, centre_x, centre_y):
+    """Independent reference: one ray per pixel, row by row. float64 [h w, 3], [h w, 3]"""
+    pose = np.asarray(pose, dtype=np.float64)
+    directions = []
+    for row in range(height):
+        for column in range(width):
+            right = (column + 0.5 - centre_x) / focal_x
+            down = (row + 0.5 - centre_y) / focal_y
+            world = right * pose[:3, 0] - down * pose[:3, 1] - pose[:3, 2]
+            directions.append(world / math.sqrt(world @ world))
+    return np.tile(pose[:3, 3], (height * width, 1)), np.array(directions)
+
+
+def pixel_of(point, pose, focal_x, focal_y, centre_x, centre_y):
+    """Independent reference: row and column, with fractions, at which a world point is seen."""
+    pose = np.asarray(pose, dtype=np.float64)
+    right, up, back = (np.asarray(point, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3]
+    assert back < 0
+    return centre_y - focal_y * up / -back, centre_x + focal_x * right / -back
+
+
+def film(cameras, poses, times=None, centre=(0.0, 0.0, 0.0)):
+    """A ball before cameras of which each has its own size and intrinsics."""
+    images = []
+    for camera, pose in zip(cameras, poses, strict=True):
+        origins, directions = rays_of(pose, *camera)
+        offset = np.array(centre) - origins
+        along = (offset * directions).sum(axis=1)
+        hit = (offset**2).sum(axis=1) - along**2 < RADIUS**2
+        image = np.zeros((camera[0] * camera[1], 4), np.uint8)
+        image[hit] = COLOUR
+        images.append(torch.from_numpy(image.reshape(camera[0], camera[1], 4)))
+    count = len(images)
+    known = torch.tensor(cameras, dtype=torch.float64)
+    return Views(
+        pad_images(images),
+        poses,
+        torch.linspace(0, 1, count) if times is None else times,
+        Intrinsics(known[:, 2:4], known[:, 4:], known[:, :2].long()),
+        tuple(f"{number:03d}.png" for number in range(count)),
+    )
+
+
+def mixed(count=8, **options):
+    """Views of two cameras in turn."""
+    return film([(WIDE, UPRIGHT)[i % 2] for i in range(count)], surrounding(count, 4.0), **options)
+
+
+def soiled(views, value):
+    """The same with padding that holds something."""
+    images = views.images.clone()
+    images[~views.valid()] = value
+    return replace(views, images=images)
+
+
+def opaque(views):
+    """The same with pixels of nothing but content; padding stays."""
+    images = views.images.clone()
+    images[views.valid()] = 255
+    return replace(views, images=images)
+
+
+RAYS = RaySettings(
+    per_batch=500,
+    samples_per_batch=4096,
+    accumulate=1,
+    background="random",
+    skip_background=True,
+    background_share=0.1,
+    background_jitter=0.0,
+)
+
+
+# What views are
+
+
+def test_a_number_stands_for_centred_images_of_one_camera():
+    views = ball_views(3, RADIUS, size=20, angle=0.7)
+    focal = focal_length(0.7, 20)
+    assert views.intrinsics.focal.tolist() == [[focal, focal]] * 3
+    assert views.intrinsics.centre.tolist() == [[10, 10]] * 3
+    assert views.intrinsics.size.tolist() == [[20, 20]] * 3
+    assert views.intrinsics.is_shared
+    assert not views.is_padded
+    assert views.outline == "20x20 px"
+    cut = replace(views, images=views.images[:, 5:12], intrinsics=focal)
+    assert cut.intrinsics.centre.tolist() == [[10, 3.5]] * 3
+    assert cut.size(1) == (7, 20)
+
+
+def test_sizes_that_are_not_those_of_the_images_are_refused():
+    views = mixed(4)
+    for images in (views.images[:, 1:], views.images[:3], torch.zeros(4, 40, 60, 4)):
+        with pytest.raises(ValueError, match="does not fit"):
+            replace(views, images=images)
+    with pytest.raises(ValueError, match=r"intrinsics\.focal"):
+        Intrinsics(torch.ones(3, 2), torch.ones(4, 2), torch.ones(4, 2))
+
+
+def test_an_image_has_its_own_size():
+    views = mixed(4)
+    assert views.images.shape == (4, 38, 44, 4)
+    assert (views.height, views.width) == (38, 44)
+    assert [views.size(i) for i in range(4)] == [(30, 44), (38, 26)] * 2
+    assert views.pixels == 2 * 30 * 44 + 2 * 38 * 26 == int(views.valid().sum())
+    assert views.outline == "up to 44x38 px"
+    assert not views.intrinsics.is_shared
+    for index in range(4):
+        height, width = views.size(index)
+        assert views.image(index).shape == (height, width, 4)
+        assert views.composite(index, torch.ones(3)).shape == (height, width, 3)
+        assert len(views.image_rays(index)[0]) == height * width
+        assert views.valid()[index, :height, :width].all()
+        assert not views.images[index][~views.valid()[index]].any()
+
+
+def test_views_taken_out_lose_the_padding_that_they_need_no_more():
+    views = mixed(6)
+    upright = views.subset(torch.tensor([5, 1]))
+    assert upright.images.shape == (2, 38, 26, 4)
+    assert not upright.is_padded
+    assert upright.intrinsics.is_shared
+    assert torch.equal(upright.images[1], views.image(1))
+    both = views.subset(torch.tensor([1, 2]))
+    assert both.images.shape == (2, 38, 44, 4)
+    assert torch.equal(both.image(1), views.image(2))
+
+
+def test_views_of_different_cameras_are_joined():
+    views, square = mixed(4), ball_views(3, RADIUS, size=40, angle=0.9, seed=1)
+    both = joined(views, square)
+    assert both.images.shape == (7, 40, 44, 4)
+    assert both.files == views.files + square.files
+    for index in range(7):
+        part, own = (views, index) if index < 4 else (square, index - 4)
+        assert torch.equal(both.image(index), part.image(own)), index
+        assert both.times[index] == part.times[own]
+        for mine, theirs in zip(both.image_rays(index), part.image_rays(own), strict=True):
+            assert torch.equal(mine, theirs), index
+    assert not both.images[~both.valid()].any()
+
+
+def test_one_camera_is_one_within_rounding():
+    shared = Intrinsics.shared(30.0, 20, 40, 3)
+    assert replace(shared, focal=shared.focal * torch.tensor([[1], [1 + 1e-6], [1]])).is_shared
+    for name, change in (("focal", 0.5), ("centre", 0.5), ("size", 1)):
+        for column in (0, 1):
+            value = getattr(shared, name).clone()
+            value[1, column] += change
+            assert not replace(shared, **{name: value}).is_shared, (name, column)
+
+
+# Rays
+
+
+def test_rays_are_those_of_the_formula():
+    views = mixed(4)
+    for index, camera in enumerate([WIDE, UPRIGHT] * 2):
+        origins, directions = rays_of(views.camera_to_world[index], *camera)
+        found = views.image_rays(index)
+        assert [part.dtype for part in found] == [torch.float32] * 2
+        assert np.abs(found[0].numpy() - origins).max() < 1e-6
+        assert np.abs(found[1].numpy() - directions).max() < 1e-6, index
+
+
+def test_rays_of_the_pixels_that_show_the_ball_meet_it_and_no_others():
+    views = mixed(6)
+    for index in range(6):
+        shown = (views.image(index)[..., 3] > 0).flatten()
+        assert 0.03 < shown.float().mean() < 0.9
+        origins, directions = (part.double() for part in views.image_rays(index))
+        along = -(origins * directions).sum(dim=1, keepdim=True)
+        apart = (origins + along * directions).norm(dim=1)
+        assert (apart[shown] < RADIUS + 1e-5).all(), index
+        assert (apart[~shown] > RADIUS - 1e-5).all(), index
+
+
+def test_a_cropped_image_keeps_its_rays():
+    whole = film([WIDE], surrounding(1, 4.0))
+    height, width, *focal, centre_x, centre_y = WIDE
+    cut = film([(height - 9, width - 15, *focal, centre_x - 11, centre_y - 5)], surrounding(1, 4.0))
+    left = torch.zeros(height, width, dtype=torch.bool)
+    left[5 : height - 4, 11 : width - 4] = True
+    torch.testing.assert_close(cut.image_rays(0)[1], whole.image_rays(0)[1][left.flatten()])
+    assert torch.equal(cut.image(0), whole.image(0)[5 : height - 4, 11 : width - 4])
+
+
+def test_batches_draw_all_pixels_and_no_padding():
+    views = mixed(4)
+    generator = torch.Generator().manual_seed(0)
+    images = torch.randint(0, 256, views.images.shape, generator=generator, dtype=torch.uint8)
+    images[..., 3] = views.images[..., 3]
+    images[..., :3] = torch.minimum(images[..., :3], images[..., 3:])
+    views = soiled(replace(views, images=images), 255)
+    frame = cube_frame(1.4, torch.zeros(3))
+    for skip in (True, False):
+        batches = RayBatches(views, frame, replace(RAYS, skip_background=skip), seed=0)
+        drawn = torch.zeros(views.images.shape[:3], dtype=torch.long)
+        for step in range(60):
+            batch = batches.draw(step)
+            if step > 1:
+                pixel = batches_pixels(batch, views, frame)
+            else:  # Each ray by the formula.
+                pixel = [place_of(batch, views, frame, ray) for ray in range(len(batch["times"]))]
+                pixel = torch.tensor(pixel).T
+            view, row, column = pixel
+            assert views.valid()[view, row, column].all(), (skip, step)
+            seen = views.images[view, row, column].float() / 255
+            expected = seen[:, :3] + (1 - seen[:, 3:]) * batch["background"]
+            assert torch.allclose(batch["target"], expected, atol=1e-6), (skip, step)
+            drawn.view(-1).index_add_(
+                0, (view * 38 + row) * 44 + column, torch.ones(len(view), dtype=torch.long)
+            )
+        if not skip:
+            assert (drawn[views.valid()] > 0).float().mean() > 0.99
+            expected = 60 * 500 / views.pixels
+            chi_squared = float(((drawn[views.valid()] - expected) ** 2 / expected).sum())
+            assert abs(chi_squared - views.pixels) < 5 * (2 * views.pixels) ** 0.5
+
+
+def place_of(batch, views, frame, ray):
+    """View, row and column of a ray."""
+    origin, point = (
+        frame.to_world(p[ray]) for p in (batch["origins"], batch["origins"] + batch["directions"])
+    )
+    (view,) = (views.times == batch["times"][ray]).nonzero().flatten().tolist()
+    torch.testing.assert_close(origin, views.camera_to_world[view, :3, 3], atol=1e-5, rtol=0)
+    camera = (WIDE, UPRIGHT)[view % 2]
+    row, column = pixel_of(point, views.camera_to_world[view], *camera[2:])
+    assert abs(row % 1 - 0.5) < 1e-2
+    assert abs(column % 1 - 0.5) < 1e-2
+    assert 0 <= row < camera[0]
+    assert 0 <= column < camera[1]
+    return view, int(row), int(column)
+
+
+def batches_pixels(batch, views, frame):
+    """The same for all rays: the pixels whose rays are the nearest."""
+    found = torch.empty(3, len(batch["times"]), dtype=torch.long)
+    for view, time in enumerate(views.times):
+        mine = batch["times"] == time
+        near = (batch["directions"][mine] @ views.image_rays(view)[1].T).argmax(dim=1)
+        width = views.size(view)[1]
+        found[:, mine] = torch.stack([torch.full_like(near, view), near // width, near % width])
+    return found
+
+
+def test_background_and_near_rays_are_shares_of_what_is_no_padding():
+    views = mixed(6)
+    frame = cube_frame(1.4, torch.zeros(3))
+    batches = RayBatches(views, frame, RAYS, seed=0)
+    assert len(batches.near) + len(batches.far) == views.pixels
+    alone = [RayBatches(views.subset(torch.tensor([i])), frame, RAYS, seed=0) for i in range(6)]
+    for pool in ("near", "far"):
+        count = sum(len(getattr(one, pool)) for one in alone)
+        assert len(getattr(batches, pool)) == count, pool
+    natural = len(batches.far) / views.pixels
+    assert batches.skipped == pytest.approx(natural - 0.1)
+    # Images of nothing but padding and content have no background.
+    assert len(RayBatches(opaque(views), frame, RAYS, seed=0).far) == 0
+
+
+# What is seen in them
+
+
+@pytest.mark.parametrize("value", [1, 255])
+def test_padding_is_nothing_whatever_it_holds(value):
+    views = mixed(8, times=torch.zeros(8))
+    dirty, frame = soiled(views, value), cube_frame(1.4, torch.zeros(3))
+    assert not torch.equal(views.images, dirty.images)
+    points = inside_ball(2000, 2.0)
+    assert torch.equal(may_hold(dirty, points, radius=0.05), may_hold(views, points, radius=0.05))
+    assert torch.equal(foreground(dirty, 3), foreground(views, 3))
+    assert not foreground(dirty, 3)[~views.valid()].any()
+    assert scene_frame(dirty).scale == scene_frame(views).scale
+    assert torch.equal(frusta_box(dirty, 2, 6, 1.0), frusta_box(views, 2, 6, 1.0))
+    grids = [OccupancyGrid(12, 1, step=0.05) for _ in range(2)]
+    for grid, those in zip(grids, (views, dirty), strict=True):
+        carve(grid, those, frame)
+        fill(
+            grid,
+            lambda points, _: (points, torch.zeros(len(points))),
+            those,
+            frame,
+            step=0.05,
+            generator=torch.Generator().manual_seed(0),
+        )
+    assert 0 < grids[0].occupied.float().mean() < 1
+    assert torch.equal(grids[0].occupied, grids[1].occupied)
+    one, other = (RayBatches(those, frame, RAYS, seed=0).draw(3) for those in (views, dirty))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_cameras_together_see_what_each_sees():
+    views = mixed(6)
+    points = inside_ball(1500, 2.5)
+    alone = [may_hold(views.subset(torch.tensor([i])), points, radius=0.03) for i in range(6)]
+    assert torch.equal(may_hold(views, points, radius=0.03), torch.cat(alone))
+    for index, camera in enumerate([WIDE, UPRIGHT] * 3):
+        height, width = camera[:2]
+        held = may_hold(views, points, radius=0.0)[index]
+        for point, there in zip(points, held, strict=True):
+            row, column = pixel_of(point, views.camera_to_world[index], *camera[2:])
+            if min(abs(row - round(row)), abs(column - round(column))) < 1e-3:
+                continue
+            seen = 0 <= row < height and 0 <= column < width
+            expected = not seen or views.image(index)[int(row), int(column), 3] > 0
+            assert bool(there) == bool(expected), (index, point)
+
+
+def test_carving_by_different_cameras_keeps_the_ball_and_empties_the_rest():
+    centre = (0.15, -0.1, 0.05)
+    # Views of neighbouring times are joined where there are enough of them.
+    for times in (torch.zeros(24), torch.linspace(0, 1, 60)):
+        views = mixed(len(times), times=times, centre=centre)
+        frame, grid = cube_frame(1.4, torch.zeros(3)), OccupancyGrid(24, 4, step=0.05)
+        carve(grid, views, frame)
+        x, y, z = (
+            ((frame.points(inside_ball(4000, RADIUS) + torch.tensor(centre)) + 1) / 2 * 24)
+            .floor()
+            .long()
+            .unbind(dim=-1)
+        )
+        for cells in (grid.allowed, grid.occupied):
+            assert cells.view(4, 24, 24, 24)[:, z, y, x].all()
+        assert grid.occupied.float().mean() < (0.2 if views.is_still else 0.35)
+
+
+def test_images_without_alpha_carve_nothing_though_padding_has_none():
+    views = mixed(6)
+    assert not views.is_opaque
+    assert opaque(views).is_opaque
+    grid = OccupancyGrid(12, 2, step=0.05)
+    carve(grid, opaque(views), cube_frame(1.4, torch.zeros(3)))
+    assert grid.allowed.all()
+
+
+def test_the_cube_of_different_cameras_holds_the_ball_closely():
+    for centre in ((0.0, 0.0, 0.0), (0.15, -0.2, 0.1)):
+        views = mixed(24, centre=centre)
+        frame = scene_frame(views)
+        points = frame.points(inside_ball(3000, RADIUS) + torch.tensor(centre))
+        assert points.abs().max() <= 1, centre
+        assert 1 / frame.scale < RADIUS + 0.45, centre
+    assert scene_frame(mixed(4), 2.0).scale == 0.5
+
+
+def test_without_alpha_the_cube_is_what_the_widest_camera_sees():
+    poses = surrounding(12, 3.0)
+    cameras = [(10, 10, 12.0, 12.0, 5.0, 5.0), (20, 24, 24.0, 21.0, 12.0, 10.0)] * 6
+    half = 1 / scene_frame(opaque(film(cameras, poses))).scale
+    assert half == pytest.approx(1.5)  # half of 24 pixels at a focal length of 24, 3 away
+
+
+def test_images_cropped_around_a_thing_look_at_it():
+    """Each optical axis passes the thing; the middle of each image shows it."""
+    place = torch.tensor([0.6, -0.5, 0.4])
+    cameras, poses = [], surrounding(20, 4.0)
+    for pose in poses:
+        row, column = pixel_of(place, pose, 90.0, 90.0, 50.0, 50.0)
+        top, left = round(row) - 16, round(column) - 16
+        cameras.append((32, 32, 90.0, 90.0, 50.0 - left, 50.0 - top))
+    views = film(cameras, poses, centre=tuple(place.tolist()))
+    assert (optical_centre(views) - place).norm() < 0.03
+    frame = scene_frame(views)
+    assert frame.points(inside_ball(3000, RADIUS) + place).abs().max() <= 1
+    assert 1 / frame.scale < RADIUS + 0.35
+
+
+def test_the_box_of_the_frusta_is_that_of_all_cameras():
+    views = mixed(4)
+    ends = []
+    for index, camera in enumerate([WIDE, UPRIGHT] * 2):
+        origins, directions = rays_of(views.camera_to_world[index], *camera)
+        ends += [origins + distance * directions for distance in (2.0, 6.0)]
+    low, high = np.concatenate(ends).min(axis=0), np.concatenate(ends).max(axis=0)
+    expected = np.stack([low - 0.05 * (high - low), high + 0.05 * (high - low)])
+    assert np.abs(frusta_box(views, 2.0, 6.0, 1.1).numpy() - expected).max() < 1e-5
+
+
+class Ball:
+    """Stands for a renderer of a field that shows the ball."""
+
+    device = torch.device("cpu")
+
+    def image(self, field, origins, directions, time, background):
+        along = -(origins * directions).sum(dim=1, keepdim=True)
+        hit = (origins + along * directions).norm(dim=1) < RADIUS
+        colour = torch.where(hit[:, None], torch.tensor(COLOUR[:3]) / 255, background)
+        return {"colour": colour, "opacity": hit.float(), "depth": along[:, 0] * hit}
+
+
+def test_views_are_scored_at_their_own_size():
+    views, world = mixed(4), cube_frame(1.0, torch.zeros(3))
+    for index in range(4):
+        for those in (views, soiled(views, 255)):
+            score, images = score_view(None, Ball(), world, those, index, torch.ones(3))
+            assert images.truth.shape[:2] == images.depth.shape == views.size(index)
+            assert score.psnr == psnr(images.truth, images.truth) == 100, index
+            assert score.ssim == pytest.approx(1), index
+
+
+def test_the_data_module_serves_views_at_their_own_size():
+    views = mixed(6)
+    data = SceneDataModule.of(Scene("ball", {"train": views, "test": mixed(3)}))
+    assert len(data.train_dataloader()) == views.pixels // 1024
+    for index, batch in enumerate(data.test_dataloader()):
+        height, width = views.size(index)
+        assert batch["target"].shape == (height, width, 3)
+        assert batch["origins"].shape == batch["directions"].shape == (height * width, 3)
+
+
+def test_frames_of_different_lenses_do_not_stand_still():
+    views = film([WIDE] * 3, surrounding(1, 4.0).repeat(3, 1, 1))
+    assert stands_still(views)
+    focal = views.intrinsics.focal.clone()
+    focal[2] *= 1.02
+    assert not stands_still(replace(views, intrinsics=replace(views.intrinsics, focal=focal)))
+
+
+# Pictures of them
+
+
+def test_a_film_shows_as_much_as_the_views():
+    square = ball_views(3, RADIUS, size=20, angle=0.7)
+    assert square.intrinsics.focal_at(50) == pytest.approx(focal_length(0.7, 50))
+    assert square.intrinsics.fov_y == pytest.approx(0.7)
+    assert lens({"train": square}, "orbit", 50) == (square.intrinsics.focal_at(50), None)
+    views = mixed(5)  # three of them wide
+    assert views.intrinsics.focal_at(88) == pytest.approx((41.0 + 36.5) / 2 * 2)
+    assert views.intrinsics.fov_y == pytest.approx(2 * math.atan(15 / 36.5))
+
+
+def test_a_picture_from_a_view_shows_it_whole():
+    views = mixed(4)
+    for index in (0, 1):
+        height, width = views.size(index)
+        longer = max(height, width)
+        for factor in (1, 3):
+            size = factor * longer
+            focal, centre = lens({"train": views}, f"view:{views.files[index]}", size)
+            _, found = camera_rays(views.camera_to_world[index], focal, size, size, centre)
+            found = found.view(size, size, 3)[factor // 2 :: factor, factor // 2 :: factor]
+            top, left = (longer - height) // 2, (longer - width) // 2
+            inside = found[top : top + height, left : left + width].reshape(-1, 3)
+            torch.testing.assert_close(inside, views.image_rays(index)[1], atol=1e-6, rtol=0)
+
+
+def test_a_video_that_models_cannot_take_is_refused():
+    square = Intrinsics.shared(30.0, 20, 40, 3)
+    video = Views(
+        torch.zeros(3, 20, 40, 4, dtype=torch.uint8),
+        surrounding(1, 4.0).repeat(3, 1, 1),
+        torch.linspace(0, 1, 3),
+        square,
+        ("a", "b", "c"),
+    )
+    check_camera(video)
+    for name, column, change, words in (
+        ("focal", 0, 0.4, r"30\.4 and 30 pixels along x and y.*square pixels"),
+        ("focal", 1, -0.4, r"30 and 29\.6 pixels"),
+        ("centre", 0, 0.9, r"principal point is at 20\.9, 10 of 40x20 pixels"),
+        ("centre", 1, -0.9, r"principal point is at 20, 9\.1"),
+    ):
+        for part in (1.0, 0.5):
+            value = getattr(square, name).clone()
+            value[:, column] += part * change
+            other = replace(video, intrinsics=replace(square, **{name: value}))
+            if part < 1:
+                check_camera(other)
+                continue
+            words = rf"(?s){words}.*preparation\.fixed_view=train"
+            assert_refused(SceneError, words, partial(check_camera, other), name)
+    focal = square.focal.clone()
+    focal[1] += 1
+    zoomed = replace(video, intrinsics=replace(square, focal=focal))
+    assert_refused(SceneError, "differ in focal length", partial(check_camera, zoomed), "zoom")
+
+
+# Files
+
+
+ANGLE = 0.7
+
+
+def write(folder, sizes, *, split="train", shared=None, frames=None):
+    """A scene on disk: images of some widths and heights, keys of the file and of each frame."""
+    (folder / split).mkdir(parents=True, exist_ok=True)
+    content = {"camera_angle_x": ANGLE} if shared is None else dict(shared)
+    content["frames"] = []
+    poses = surrounding(len(sizes), 4.0).double().tolist()
+    for index, (width, height) in enumerate(sizes):
+        pixels = np.random.default_rng(index).integers(0, 256, (height, width, 4), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / split / f"{index}.png")
+        content["frames"].append(
+            {
+                "file_path": f"./{split}/{index}",
+                "time": index / (len(sizes) - 1),
+                "transform_matrix": poses[index],
+                **(frames[index] if frames else {}),
+            }
+        )
+    (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+    return folder
+
+
+def read(folder, resolution=None):
+    return read_scene(folder, resolution=resolution, splits=("train",)).splits["train"]
+
+
+def test_a_scene_that_tells_every_frames_camera_equals_one_that_tells_an_angle(tmp_path):
+    sizes, focal = [(12, 12)] * 4, focal_length(ANGLE, 12)
+    keys = {"fl_x": focal, "fl_y": focal, "cx": 6.0, "cy": 6.0, "w": 12, "h": 12}
+    plain = write(tmp_path / "plain", sizes)
+    folders = {
+        "frames": write(tmp_path / "frames", sizes, shared={}, frames=[keys] * 4),
+        "file": write(tmp_path / "file", sizes, shared=keys),
+        "both": write(tmp_path / "both", sizes, frames=[keys] * 4),
+        "fl_x": write(tmp_path / "fl_x", sizes, shared={"fl_x": focal}),
+        "other size": write(
+            tmp_path / "other",
+            sizes,
+            shared={key: 10 * value for key, value in keys.items()},
+        ),
+        "one side": write(tmp_path / "one", sizes, shared={"fl_x": 5 * focal, "h": 60, "cx": 30}),
+    }
+    for resolution in (None, 6, 5):
+        expected = read(plain, resolution)
+        for name, folder in folders.items():
+            found = read(folder, resolution)
+            assert torch.equal(found.images, expected.images), name
+            for part in ("focal", "centre", "size"):
+                mine, theirs = (getattr(v.intrinsics, part) for v in (found, expected))
+                assert torch.allclose(mine.double(), theirs.double(), rtol=1e-12, atol=0), name
+            for index in range(4):
+                for mine, theirs in zip(
+                    found.image_rays(index), expected.image_rays(index), strict=True
+                ):
+                    assert torch.allclose(mine, theirs, rtol=0, atol=1e-6), (name, resolution)
+
+
+def test_a_frames_own_keys_go_before_the_files(tmp_path):
+    frames = [
+        {},
+        {"fl_x": 20.0},
+        {"fl_x": 20.0, "fl_y": 22.0, "cx": 5.0, "cy": 7.5},
+        {"camera_angle_x": 0.5},
+        {"w": 24, "h": 36},
+    ]
+    shared = {"camera_angle_x": ANGLE, "fl_x": 30.0, "fl_y": 33.0, "cx": 6.5, "w": 12, "h": 18}
+    views = read(write(tmp_path, [(12, 18)] * 5, shared=shared, frames=frames))
+    narrow = focal_length(0.5, 12)
+    expected = [[30, 33], [20, 33], [20, 22], [narrow, narrow], [15, 16.5]]
+    torch.testing.assert_close(
+        views.intrinsics.focal, torch.tensor(expected, dtype=torch.float64), rtol=1e-6, atol=0
+    )
+    expected = [[6.5, 9], [6.5, 9], [5, 7.5], [6.5, 9], [3.25, 9]]
+    assert views.intrinsics.centre.tolist() == expected
+
+
+def test_images_of_different_sizes_are_read(tmp_path):
+    sizes = [(12, 12), (8, 8), (12, 12), (20, 20)]
+    folder = write(tmp_path / "square", sizes)
+    views = read(folder)
+    assert views.images.shape == (4, 20, 20, 4)
+    assert [views.size(i) for i in range(4)] == sizes
+    assert not views.images[~views.valid()].any()
+    for index, (width, _) in enumerate(sizes):
+        focal = focal_length(ANGLE, width)
+        assert views.intrinsics.focal[index].tolist() == pytest.approx([focal] * 2)
+        with Image.open(folder / views.files[index]) as picture:
+            alpha = np.asarray(picture)[..., 3]
+        assert np.array_equal(views.image(index)[..., 3].numpy(), alpha), index
+    shrunk = read(folder, resolution=4)
+    assert shrunk.images.shape == (4, 4, 4, 4)
+    assert shrunk.intrinsics.is_shared
+    assert shrunk.intrinsics.focal[3, 1] == pytest.approx(focal_length(ANGLE, 4))
+
+
+def test_intrinsics_shrink_with_images_of_different_sizes(tmp_path):
+    frames = [
+        {"fl_x": 15.0, "fl_y": 14.0, "cx": 5.0, "cy": 7.0, "w": 12, "h": 12},
+        {"fl_x": 30.0, "cx": 8.0, "w": 16, "h": 16},  # of a file half that size
+        {"fl_x": 25.0, "fl_y": 20.0, "cy": 11.0},
+    ]
+    views = read(write(tmp_path, [(12, 12), (8, 8), (20, 20)], shared={}, frames=frames), 4)
+    expected = [[5, 14 / 3], [7.5, 7.5], [5, 4]]
+    torch.testing.assert_close(views.intrinsics.focal, torch.tensor(expected, dtype=torch.float64))
+    expected = [[5 / 3, 7 / 3], [2, 2], [2, 2.2]]
+    torch.testing.assert_close(views.intrinsics.centre, torch.tensor(expected, dtype=torch.float64))
+
+
+def test_images_need_not_be_square_where_they_differ(tmp_path):
+    views = read(write(tmp_path, [(12, 6), (6, 10)], shared={"fl_x": 9.0, "cx": 5.0}))
+    assert views.images.shape == (2, 10, 12, 4)
+    assert views.intrinsics.size.tolist() == [[6, 12], [10, 6]]
+    assert views.intrinsics.centre.tolist() == [[5, 3], [5, 5]]
+    assert views.intrinsics.focal.tolist() == [[9, 9], [9, 9]]
+
+
+def test_harmless_keys_refuse_no_scene(tmp_path):
+    plain = read(write(tmp_path / "plain", [(12, 12)] * 3))
+    harmless = {
+        "w": 900,
+        "h": "auto",
+        "fl_x": None,
+        "cx": None,
+        "k1": 0,
+        "k2": 0.0,
+        "p1": None,
+        "camera_model": "OPENCV",
+        "is_fisheye": False,
+        "camera_angle_y": "wide",
+        "aabb_scale": 16,
+        "rotation": 0.01,
+        "colmap_im_id": 3,
+        "sharpness": 30.5,
+        "applied_transform": [[1, 0, 0, 0]],
+        "ply_file_path": "sparse_pc.ply",
+    }
+    shared = {"camera_angle_x": ANGLE, **harmless}
+    for name, folder in {
+        "file": write(tmp_path / "file", [(12, 12)] * 3, shared=shared),
+        "frames": write(tmp_path / "frames", [(12, 12)] * 3, frames=[harmless] * 3),
+    }.items():
+        views = read(folder)
+        assert torch.equal(views.images, plain.images), name
+        assert torch.equal(views.intrinsics.focal, plain.intrinsics.focal), name
+        assert torch.equal(views.intrinsics.centre, plain.intrinsics.centre), name

@@ -1,0 +1,155 @@
+"""The command line is Hydra's own: every option of its manual, and its own errors."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.training.runs import small_config
+from xplanes.config import compose_plain
+from xplanes.errors import ConfigError
+from xplanes.launch import prepare
+from xplanes.pipeline import run
+
+ROOT = Path(__file__).resolve().parents[1]
+
+QUICK = """
+import sys
+from xplanes.cli import main
+code = 0
+try:
+    main(["train", *sys.argv[1:]])
+except SystemExit as end:
+    code = end.code
+heavy = {"torch", "lightning", "numba", "numpy"} & set(sys.modules)
+sys.exit(f"loaded {heavy}" if heavy else code)
+"""
+
+
+def train(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """The command line up to where a job would begin, which must load nothing heavy."""
+    return subprocess.run(
+        [sys.executable, "-c", QUICK, *arguments],
+        cwd=cwd,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--help",), "Configuration groups"),
+        (("--cfg=job",), "plane_set: six"),
+        (("--cfg", "job", "--package", "model"), "plane_set: six"),
+        (("--config-name=pretrain_lrm", "--cfg", "job"), "muon_lr"),
+        (("--info", "defaults"), "callbacks/default"),
+        (("-sc", "install=bash"), "hydra_bash_completion"),
+        (("model=nine_planes", "lrm=xlarge", "--cfg", "job"), "openlrm-large-1.1"),
+    ],
+    ids=str,
+)
+def test_options_of_hydra_work(arguments, words, tmp_path: Path) -> None:
+    done = train(*arguments, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert words in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("override", "near"),
+    [
+        ("data.resolutoin=3", "data.resolution"),
+        ("sampler.samples=3", "model.sampler.samples"),
+        ("trainer.plane_lr=3", "model.plane_lr"),
+        ("model.sampler.sampels=3", "model.sampler.samples"),
+    ],
+)
+def test_unknown_keys_get_hydras_error_and_near_names(override, near, tmp_path: Path) -> None:
+    done = train(override, cwd=tmp_path)
+    assert done.returncode == 1
+    key = override.partition("=")[0]
+    assert f"Could not override '{key}'" in done.stderr
+    assert f"Did you mean {near}" in done.stderr or f" or {near}" in done.stderr
+    with pytest.raises(ConfigError, match=f"Could not override(.|\n)*{near}"):
+        compose_plain("train", [override])
+
+
+def test_unknown_options_are_listed_by_hydra(tmp_path: Path) -> None:
+    done = train("model=six_plane", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "Could not find 'model/six_plane'" in done.stderr
+    assert "nine_planes" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "extra",
+    [
+        ("+trainer.fast_dev_run=true",),
+        ("trainer.profiler=simple", "trainer.max_steps=3"),
+        ("trainer.enable_progress_bar=false", "logger=none", "trainer.max_steps=3"),
+        (
+            "+callbacks.rate._target_=lightning.pytorch.callbacks.LearningRateMonitor",
+            "callbacks.progress=null",
+            "trainer.max_steps=3",
+        ),
+    ],
+    ids=str,
+)
+def test_arguments_of_lightnings_trainer_and_its_callbacks_work(extra, tmp_path: Path) -> None:
+    base = small_config(tmp_path / "scenes")
+    kept = [f"data.root={base['data']['root']}"]
+    from tests.training.runs import SMALL
+
+    config = compose_plain("train", [*SMALL, *kept, "callbacks.evaluation.at=[1]", *extra])
+    run(config, tmp_path / "run", [], resume=False)
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["step"] == (1 if "fast" in extra[0] else 3)
+
+
+def test_misfits_of_the_trainer_are_said_in_words(tmp_path: Path) -> None:
+    cases = [
+        ({"gradient_clip_val": 1.0}, "gradient_clip_val=1.0"),
+        ({"accumulate_grad_batches": 2}, "accumulate_grad_batches"),
+        ({"max_secnds": 3}, "max_secnds"),
+        ({"accelerator": "tpu"}, "trainer.accelerator=tpu: must be one of auto, cpu, gpu"),
+        ({"max_seconds": -1}, "trainer.max_seconds=-1: must be above 0"),
+    ]
+    for more, words in cases:
+        config = small_config(tmp_path / "scenes")
+        config["trainer"] |= more
+        with pytest.raises(ConfigError) as caught:
+            run(config, tmp_path / f"run_{words[:12]}", [], resume=False)
+        assert words in str(caught.value), words
+
+
+def test_a_run_of_an_earlier_version_is_refused_with_its_version(tmp_path: Path) -> None:
+    (tmp_path / "overrides.txt").write_text("loss.every=4\n")
+    (tmp_path / "run.json").write_text(json.dumps({"xplanes": "0.1.0", "status": "interrupted"}))
+    with pytest.raises(ConfigError, match=r"made by xplanes 0\.1\.0.*train anew"):
+        prepare([f"resume={tmp_path}"])
+
+
+def test_a_run_that_failed_before_its_first_checkpoint_blocks_nothing(tmp_path: Path) -> None:
+    config = small_config(tmp_path / "scenes", "trainer.max_steps=3")
+    broken = small_config(tmp_path / "scenes", "data.scene=excavator", "data.views=999")
+    with pytest.raises(Exception, match=r"data\.views=999"):
+        run(broken, tmp_path / "run", [], resume=False)
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "failed"
+    run(config, tmp_path / "run", [], resume=False)
+    with pytest.raises(ConfigError, match="holds a run already"):
+        run(config, tmp_path / "run", [], resume=False)
+
+
+def test_the_header_estimates_time_and_memory(tmp_path: Path, capsys) -> None:
+    config = small_config(tmp_path / "scenes", "trainer.max_steps=3")
+    run(config, tmp_path / "run", [], resume=False)
+    printed = capsys.readouterr().out
+    line = next(line for line in printed.splitlines() if line.startswith("estimate"))
+    assert "at most" in line
+    assert "GB of memory" in line
+    assert printed.index("estimate") < printed.index("step 3/3")

@@ -1,0 +1,202 @@
+"""With nothing but Lightning: its own Trainer, loggers, callbacks and checkpoints."""
+
+import csv
+import re
+import shutil
+from pathlib import Path
+
+import lightning
+import pytest
+import torch
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger
+
+from tests.training.runs import small_config
+from xplanes import RadianceModule, SceneDataModule
+from xplanes.errors import ConfigError
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    return small_config(tmp_path_factory.mktemp("scenes"), "model.rays.per_batch=1024")
+
+
+def trainer(folder: Path, **options) -> lightning.Trainer:
+    given = {
+        "accelerator": "cpu",
+        "max_steps": 45,
+        "default_root_dir": folder,
+        "logger": CSVLogger(folder, name="", version="csv"),
+        "log_every_n_steps": 5,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+    }
+    return lightning.Trainer(**given | options)
+
+
+def logged(folder: Path) -> dict[str, list[float]]:
+    found: dict[str, list[float]] = {}
+    for row in csv.DictReader((folder / "csv" / "metrics.csv").open()):
+        for name, value in row.items():
+            if value:
+                found.setdefault(name, []).append(float(value))
+    return found
+
+
+@pytest.fixture(scope="module")
+def fitted(config: dict, tmp_path_factory: pytest.TempPathFactory) -> tuple:
+    folder = tmp_path_factory.mktemp("plain")
+    module, data = RadianceModule(config), SceneDataModule(config["data"])
+    checkpoints = ModelCheckpoint(folder, filename="best", monitor="val/psnr", mode="max")
+    used = trainer(folder, callbacks=[checkpoints, LearningRateMonitor()])
+    used.fit(module, data)
+    return folder, module, data, used
+
+
+def test_fit_logs_every_term_of_the_loss_validates_and_keeps_the_best(fitted: tuple) -> None:
+    folder, module, _, used = fitted
+    values = logged(folder)
+    terms = {"colour", "time_smoothness", "time_magnitude"}
+    assert terms <= {name.removeprefix("train/") for name in values}
+    total = sum(values[f"train/{name}"][-1] for name in terms)
+    assert values["train/loss"][-1] == pytest.approx(total, rel=1e-5)
+    assert values["train/loss"][0] > values["train/loss"][-1]
+    # An epoch is as many rays as the views have pixels.
+    assert len(values["val/psnr"]) == 45 // (10 * 32 * 32 // 1024)
+    assert values["val/psnr"][-1] > values["val/psnr"][0] + 1
+    assert used.callback_metrics["val/psnr"] == pytest.approx(values["val/psnr"][-1])
+    assert (folder / "best.ckpt").is_file()
+    assert module.global_step == 45
+    assert any(name.startswith("lr-") or name.startswith("lr/") for name in values)
+
+
+def test_validate_and_test_score_their_own_splits(fitted: tuple) -> None:
+    _, module, data, used = fitted
+    found = used.validate(module, data, verbose=False)[0]
+    assert set(found) == {"val/psnr", "val/ssim"}
+    tested = used.test(module, data, verbose=False)[0]
+    assert set(tested) == {"test/psnr", "test/ssim"}
+    assert found["val/psnr"] != tested["test/psnr"]
+    images = used.predict(module, data)
+    assert images is not None
+    assert [image["colour"].shape for image in images] == [(32, 32, 3)] * 3
+
+
+def test_a_checkpoint_alone_gives_the_field_back(fitted: tuple) -> None:
+    folder, _, data, used = fitted
+    path = folder / "last.ckpt"
+    used.save_checkpoint(path)
+    again = RadianceModule.load_from_checkpoint(path)
+    tested = used.test(fitted[1], data, verbose=False)[0]
+    fresh = trainer(folder, logger=False)
+    assert fresh.test(again, SceneDataModule(data.settings), verbose=False)[0] == tested
+
+
+class SaveAt(lightning.Callback):
+    """Writes one checkpoint in the middle of an epoch."""
+
+    def __init__(self, step: int, path: Path) -> None:
+        self.step, self.path = step, path
+
+    def on_train_batch_end(self, trainer, module, *rest) -> None:
+        if trainer.global_step == self.step:
+            trainer.save_checkpoint(self.path)
+
+
+def test_a_resumed_fit_ends_with_the_same_numbers(config: dict, tmp_path: Path) -> None:
+    path = tmp_path / "half.ckpt"
+
+    def fit(checkpoint: Path | None = None, *callbacks: lightning.Callback) -> dict:
+        used = trainer(
+            tmp_path,
+            max_steps=23,
+            logger=False,
+            enable_checkpointing=False,
+            limit_val_batches=0,
+            callbacks=list(callbacks),
+        )
+        module = RadianceModule(config)
+        used.fit(module, SceneDataModule(config["data"]), ckpt_path=checkpoint)
+        assert used.global_step == 23
+        return module.state_dict()
+
+    whole, resumed = fit(None, SaveAt(13, path)), fit(path)
+    assert whole.keys() == resumed.keys()
+    for name, value in whole.items():
+        assert torch.equal(resumed[name], value), name
+
+
+def test_clipping_and_accumulation_are_refused_in_words(config: dict, tmp_path: Path) -> None:
+    for options in ({"gradient_clip_val": 1.0}, {"accumulate_grad_batches": 2}):
+        with pytest.raises(MisconfigurationException, match="manual optimization"):
+            trainer(tmp_path, logger=False, **options).fit(
+                RadianceModule(config), SceneDataModule(config["data"])
+            )
+
+
+def test_views_are_held_out_where_there_is_no_validation_split(
+    config: dict, tmp_path: Path
+) -> None:
+    made = SceneDataModule({**config["data"], "train_views": 24, "val_views": 2})
+    folder = tmp_path / "scene"
+    shutil.copytree(made.settings.folder, folder)
+    (folder / "transforms_val.json").unlink()
+    names = ("seed", "train_views", "test_views", "val_views")
+    settings = {name: value for name, value in config["data"].items() if name not in names}
+    target = "xplanes.scenes.dnerf.BlenderSettings"
+    settings |= {"_target_": target, "root": str(tmp_path), "scene": "scene"}
+    data = SceneDataModule(settings)
+    data.setup("fit")
+    train, val = data.scene.splits["train"], data.scene.splits["val"]
+    assert (len(train), len(val)) == (21, 3)
+    assert not set(train.files) & set(val.files)
+
+
+def test_a_module_without_data_says_what_it_needs(config: dict, tmp_path: Path) -> None:
+    loader = torch.utils.data.DataLoader([0])
+    with pytest.raises(ConfigError, match="trains with a SceneDataModule"):
+        trainer(tmp_path, logger=False).fit(RadianceModule(config), loader)
+
+
+class Other(lightning.LightningModule):
+    """Somebody else's module on our data."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.colour = torch.nn.Parameter(torch.zeros(3))
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.5)
+
+    def training_step(self, batch: dict, index: int) -> torch.Tensor:
+        return (self.colour - batch["target"]).square().mean()
+
+
+def test_the_data_serve_other_modules(config: dict, tmp_path: Path) -> None:
+    module = Other()
+    trainer(tmp_path, logger=False, limit_val_batches=0).fit(
+        module, SceneDataModule(config["data"])
+    )
+    assert float(module.colour.min()) > 0.5  # Most of the images is white.
+
+
+def test_the_script_of_the_docs_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
+    (script,) = re.findall(r"```python\n(import lightning.*?)```", page, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    small = SceneDataModule.compose(
+        "data.resolution=32", "data.train_views=10", "data.val_views=2", "data.test_views=2"
+    )
+    small.prepare_data()
+    folder = small.settings.folder
+    script = script.replace('"data.root=data/dnerf"', f'"data.root={folder.parent.resolve()}"')
+    script = script.replace(
+        '"data.scene=lego"', f'"data.scene={folder.name}", "data.resolution=null"'
+    )
+    script = script.replace("max_steps=2000", "max_steps=20")
+    exec(compile(script, "recipes.md", "exec"), {})
+    assert (tmp_path / "field.ckpt").is_file()
+    assert (tmp_path / "view.png").is_file()

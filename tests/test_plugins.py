@@ -1,0 +1,106 @@
+"""Models, samplers, data formats and losses from outside the package, chosen by configuration."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.training.runs import small_config
+from xplanes import RadianceModule, SceneDataModule
+from xplanes.errors import ConfigError
+from xplanes.evaluation.runs import load_run
+from xplanes.pipeline import run
+
+BLOB = {
+    "_target_": "tests.plugins.gaussian_blob.BlobSettings",
+    "name": "blob",
+    "width": 0.4,
+    "learning_rate": 0.1,
+    "precision": "auto",
+}
+SAMPLER = {
+    "_target_": "tests.plugins.random_sampler.RandomSamplerSettings",
+    "name": "random",
+    "samples": 12,
+}
+DATA = {
+    "_target_": "tests.plugins.shell_format.DiscSettings",
+    "name": "disc",
+    "scene": "disc",
+    "count": 6,
+    "resolution": 16,
+}
+LOSS = {"_target_": "tests.plugins.opacity_loss.OpacityLoss", "weight": 0.5}
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> dict:
+    found = small_config(tmp_path, "trainer.log_every_n_steps=5", "logger=csv")
+    rays = found["model"]["rays"]
+    found["model"] = {**BLOB, "sampler": SAMPLER, "rays": rays}
+    dropped = ("seed", "train_views", "test_views", "val_views", "_target_")
+    kept = {name: value for name, value in found["data"].items() if name not in dropped}
+    found["data"] = kept | DATA
+    return found | {"losses": {"opacity": LOSS}, "plugins": ["tests.plugins"]}
+
+
+def test_all_four_train_log_and_load_again(config: dict, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    run(config, folder, [], resume=False)
+    curve = list(csv.DictReader((folder / "curve.csv").open()))
+    assert float(curve[-1]["psnr"]) > float(curve[0]["psnr"]) + 1
+    logged = list(csv.DictReader((folder / "csv" / "metrics.csv").open()))
+    opacity = [float(row["train/opacity"]) for row in logged if row.get("train/opacity")]
+    assert opacity[0] > opacity[-1] > 0
+    trained = load_run(folder, plugins=["tests.plugins"])
+    assert trained.module.field.outline == "one blob"
+    again = RadianceModule.load_from_checkpoint(folder / "checkpoints" / "last.ckpt")
+    assert again.field.width == BLOB["width"]
+    views = SceneDataModule.from_run(folder, plugins=["tests.plugins"]).scene.splits["train"]
+    assert len(views) == DATA["count"]
+    assert json.loads((folder / "metrics.json").read_text())["step"] == 40
+
+
+def test_a_run_of_somebody_else_names_no_classes_by_itself(config: dict, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    with pytest.raises(ConfigError, match=r"model\._target_=tests.*plugins=\[MODULE\]"):
+        load_run(folder)
+    with pytest.raises(ConfigError, match=r"data\._target_=tests.*plugins=\[MODULE\]"):
+        SceneDataModule.from_run(folder)
+
+
+@pytest.mark.parametrize(
+    ("target", "words"),
+    [
+        ("os.system", "only classes of xplanes, lightning, torchmetrics, tests.plugins"),
+        ("tests.plugins.opacity_loss.OpacityLoss", "must be a class derived from .*ModelSettings"),
+        ("tests.plugins.opacity_loss.Nothing", "there is no such class"),
+        ("xplanes.models.base.torch", "must be a class derived from"),
+        ("tests.plugins.gaussian_blob.RadianceField", "must be a class derived from"),
+    ],
+)
+def test_classes_that_may_not_stand_there_are_refused(
+    config: dict, tmp_path: Path, target: str, words: str
+) -> None:
+    config["model"]["_target_"] = target
+    with pytest.raises(ConfigError, match=rf"model\._target_={target}: .*{words}"):
+        run(config, tmp_path / "run", [], resume=False)
+    assert not (tmp_path / "run" / "run.json").exists()
+
+
+def test_settings_of_plugins_are_checked_alike(config: dict, tmp_path: Path) -> None:
+    config["model"]["width"] = -1.0
+    with pytest.raises(ConfigError, match=r"model\.width=-1\.0: must be above 0"):
+        run(config, tmp_path / "run", [], resume=False)
+    config["model"] |= {"width": 1, "widht": 2}
+    with pytest.raises(ConfigError, match=r"model\.widht: there is no such .* mean width"):
+        run(config, tmp_path / "run", [], resume=False)
+
+
+def test_a_module_that_is_not_there_is_said(config: dict, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"plugins: not_here cannot be imported.*PYTHONPATH"):
+        run(config | {"plugins": ["not_here"]}, tmp_path / "run", [], resume=False)

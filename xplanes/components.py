@@ -1,0 +1,113 @@
+"""From nodes of a configuration to objects: the one place where classes are chosen by name."""
+
+import importlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, TypeVar
+
+from xplanes.errors import ConfigError
+from xplanes.settings import Settings, check_arguments
+
+T = TypeVar("T")
+
+TRUSTED = ("xplanes", "lightning", "torchmetrics")
+"""Packages whose classes any configuration may name."""
+
+_plugins: ContextVar[tuple[str, ...]] = ContextVar("plugins", default=())
+
+
+@contextmanager
+def plugins(modules: Sequence[str]) -> Iterator[None]:
+    """Let configurations name classes of the user's own modules, too.
+
+    Args:
+        modules: Names of modules or packages that the user asked for. They are imported.
+
+    Raises:
+        ConfigError: If one cannot be imported.
+    """
+    if isinstance(modules, str):
+        raise ConfigError(f"plugins={modules}: must be a list, plugins=[{modules}]")
+    for name in modules:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise ConfigError(
+                f"plugins: {name} cannot be imported ({error}): it must lie on Python's path "
+                "(PYTHONPATH=FOLDER)"
+            ) from error
+    token = _plugins.set((*_plugins.get(), *modules))
+    try:
+        yield
+    finally:
+        _plugins.reset(token)
+
+
+def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
+    """The object that a node describes.
+
+    Args:
+        node: Its class as ``_target_``, and its arguments. Settings without alternatives may leave
+            ``_target_`` out.
+        kind: What the class must be derived from.
+        key: Where the node stands, for messages.
+        **more: Further arguments.
+
+    Raises:
+        ConfigError: If the class is not one that may stand here, or refuses its arguments.
+    """
+    from hydra.errors import InstantiationException
+    from hydra.utils import instantiate
+
+    if not isinstance(node, Mapping):
+        raise ConfigError(f"{key}={node}: must be a mapping")
+    target = node.get("_target_")
+    if target is None:
+        if not issubclass(kind, Settings):
+            raise ConfigError(f"{key}._target_: it is not set; name a class as module.Class")
+        cls: type = kind
+    else:
+        cls = _class(target, kind, f"{key}._target_")
+    arguments = {name: value for name, value in node.items() if name != "_target_"}
+    try:
+        if issubclass(cls, Settings):
+            cls.require_names([*arguments, *more])
+        elif cls.__module__.startswith("xplanes."):
+            check_arguments(cls.__init__, arguments)
+        # Arguments may be called as those of `instantiate` are, such as config.
+        whole = {**arguments, "_target_": cls, "_recursive_": False, "_convert_": "all"}
+        return instantiate(whole, **more)
+    except ConfigError as error:
+        raise ConfigError(f"{key}.{error}") from None
+    except InstantiationException as error:
+        cause = error.__cause__
+        if isinstance(cause, ConfigError):
+            raise ConfigError(f"{key}.{cause}") from None
+        raise ConfigError(f"{key}: {cause or error}") from error
+
+
+def _class(target: Any, kind: type, key: str) -> type:
+    """The class of a dotted name, if it may stand in its place."""
+    name = str(target)
+    allowed = (*TRUSTED, *_plugins.get())
+    if not any(name == root or name.startswith(f"{root}.") for root in allowed):
+        raise ConfigError(
+            f"{key}={name}: only classes of {', '.join(allowed)} may stand here; name a module of "
+            "your own with plugins=[MODULE]"
+        )
+    module, _, attribute = name.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"{key}={name}: there is no such class ({error})") from error
+    if not (isinstance(found, type) and issubclass(found, kind)):
+        raise ConfigError(
+            f"{key}={name}: must be a class derived from {kind.__module__}.{kind.__qualname__}"
+        )
+    # A trusted module also holds names that it only imported.
+    if not any(f"{found.__module__}.".startswith(f"{root}.") for root in allowed):
+        raise ConfigError(
+            f"{key}={name}: it is defined in {found.__module__}, which is not allowed"
+        )
+    return found

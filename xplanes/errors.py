@@ -1,0 +1,5 @@
+"""Errors whose message says all: the thing, the value and the way out."""
+
+
+class ConfigError(ValueError):
+    """A setting that cannot work; the message names the key, the value and the way out."""

@@ -1,0 +1,121 @@
+"""A whole run: its method, data, trainer, callbacks and logger, from a configuration."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import Logger
+
+from xplanes.components import build, plugins
+from xplanes.errors import ConfigError
+from xplanes.models.initialisation import Method
+from xplanes.scenes.source import SceneSettings
+from xplanes.training.fit import Trainer, find_device
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """The settings of a run, checked.
+
+    Attributes:
+        config: The configuration that they come from.
+        method: How the field is made and trained.
+        data: The scene.
+        trainer: Arguments of the Trainer.
+        callbacks: Callbacks by name.
+        logger: Loggers; empty for none.
+        media: Whether a video is rendered at the end.
+    """
+
+    config: Mapping[str, Any]
+    method: Method
+    data: SceneSettings
+    trainer: Mapping[str, Any]
+    callbacks: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    logger: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    media: bool = True
+
+    @classmethod
+    def read(cls, config: Mapping[str, Any], modules: Sequence[str] | None = None) -> "Experiment":
+        """The experiment of a configuration.
+
+        Args:
+            config: The resolved configuration, builtins only.
+            modules: Modules of the user's own whose classes it may name; those that the
+                configuration names when None. Files from others must not choose them.
+
+        Raises:
+            ConfigError: If settings are missing, out of range, or contradict one another.
+        """
+        asked = config.get("plugins") or [] if modules is None else modules
+        if not isinstance(media := config.get("media", True), bool):
+            raise ConfigError(f"media={media}: must be true or false")
+        with plugins(asked):
+            try:
+                experiment = cls(
+                    config,
+                    Method.read(config),
+                    build(config["data"], SceneSettings, "data"),
+                    dict(config["trainer"]),
+                    _nodes(config.get("callbacks")),
+                    _nodes(config.get("logger")),
+                    media,
+                )
+            except KeyError as error:
+                raise ConfigError(f"the configuration lacks the group {error}") from error
+        experiment.method.require_devices(experiment.devices)
+        return experiment
+
+    @property
+    def device(self) -> torch.device:
+        """Where the field is trained.
+
+        Raises:
+            ConfigError: If the machine has not what is asked for.
+        """
+        try:
+            return find_device(str(self.trainer.get("accelerator", "auto")))
+        except ConfigError as error:
+            raise ConfigError(f"trainer.{error}") from None
+
+    @property
+    def devices(self) -> int:
+        """Processes that share the run."""
+        devices = self.trainer.get("devices", 1)
+        return devices if isinstance(devices, int) and devices > 0 else 1
+
+    def build_trainer(self, run: Path) -> Trainer:
+        """The Trainer, with callbacks and loggers, for a run directory.
+
+        Raises:
+            ConfigError: If one of them refuses its arguments.
+        """
+        if self.devices > 1 and self.trainer.get("strategy", "auto") == "auto":
+            raise ConfigError(
+                f"trainer.devices={self.devices} with trainer.strategy=auto: several devices need "
+                "trainer=ddp"
+            )
+        with plugins(self.config.get("plugins") or []):
+            callbacks = [
+                build(node, Callback, f"callbacks.{name}") for name, node in self.callbacks.items()
+            ]
+            loggers = [
+                build(node, Logger, f"logger.{name}", save_dir=str(run))
+                for name, node in self.logger.items()
+            ]
+            return build(
+                self.trainer,
+                Trainer,
+                "trainer",
+                callbacks=callbacks,
+                logger=loggers,
+                default_root_dir=str(run),
+            )
+
+
+def _nodes(content: Any) -> dict[str, Mapping[str, Any]]:
+    """Components by name; those that were set to null are left out."""
+    return {str(name): node for name, node in (content or {}).items() if node is not None}

@@ -1,0 +1,1 @@
+"""One file a method: its field, losses, parameter groups and schedule."""

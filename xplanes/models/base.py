@@ -1,0 +1,152 @@
+"""What training asks of a model: a field, its losses, its learning rates."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from xplanes.fields.base import RadianceField
+from xplanes.rendering.base import Rendering
+from xplanes.rendering.sampler import Group, SamplerSettings, Site, scene_cube
+from xplanes.scenes.batches import Batch, RaySettings
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.views import Views
+from xplanes.settings import Settings, Weight
+from xplanes.streams import TrainingState
+
+
+@dataclass(frozen=True)
+class InitialValues:
+    """What a field starts from, where that is not random.
+
+    Attributes:
+        planes: Planes by name. [C, rows, columns] each
+        decoder: Weights of the decoder; None for a fresh one.
+        sparse: The sparse part to which L_r ties the time planes; None leaves L_r out.
+            [T, 3, C, H, H]
+    """
+
+    planes: Mapping[str, Tensor]
+    decoder: Mapping[str, Tensor] | None = None
+    sparse: Tensor | None = None
+
+
+class Model(ABC):
+    """A field with what its training consists of.
+
+    Attributes:
+        advice: What to change when the loss is not finite.
+    """
+
+    advice: str
+
+    @property
+    @abstractmethod
+    def field(self) -> RadianceField:
+        """What is trained."""
+
+    @abstractmethod
+    def groups(self) -> list[Group]:
+        """The field's trainable parameters."""
+
+    def optimizer(self, groups: list[Group]) -> torch.optim.Optimizer:
+        """The optimiser of the field's and the sampler's parameters."""
+        return torch.optim.Adam(groups, eps=1e-15, fused=True)
+
+    @abstractmethod
+    def rate(self, step: int, progress: float) -> float:
+        """Factor on all learning rates.
+
+        Args:
+            step: Optimiser steps done.
+            progress: Share of the budget that is spent.
+        """
+
+    def losses(self, rendering: Any, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
+        """Weighted terms of the loss that need the rays, by name; their sum is minimised."""
+        return {"colour": colour_error(rendering, rays)}
+
+    def regularise(self, state: TrainingState) -> None:
+        """Add the gradients of the terms that need no rays to ``.grad``."""
+        return
+
+    def regularisers(self, state: TrainingState) -> dict[str, float]:
+        """Weighted values of the terms that `regularise` adds, by name, for the logger."""
+        return {}
+
+    def before_step(self, state: TrainingState, optimizer: torch.optim.Optimizer) -> None:
+        """Change the field as its schedule asks, before a batch is rendered."""
+        return
+
+    def scalars(self) -> dict[str, float]:
+        """Further values for the logger."""
+        return {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSettings(Settings, ABC):
+    """Base of the settings of models."""
+
+    takes_initialisation: ClassVar[bool] = False
+    """Whether an LRM can initialise the field."""
+    devices: ClassVar[int | None] = 1
+    """Devices that it can be trained on at most; None for any number."""
+    field_class: ClassVar[type[RadianceField] | None] = None
+    """What is built, so that samplers can refuse it early; None leaves that to them."""
+
+    name: str  # Name in run directories and tables.
+    precision: Literal["auto", "32", "bf16"]  # Of products; auto: bf16 where it is fast.
+    rays: RaySettings
+    sampler: SamplerSettings
+
+    @abstractmethod
+    def build(self, site: Site, initial: InitialValues | None = None) -> Model:
+        """The model for a scene."""
+
+    def frame(self, views: Views, half_side: float | None) -> Frame:
+        """The frame in which the field lives: the scene's cube, if the model has none of its own.
+
+        Args:
+            views: Training views.
+            half_side: Half the side of the scene's cube in world units; None finds it.
+        """
+        return scene_cube(views, half_side)
+
+    def bounds(self, views: Views) -> Tensor | None:
+        """Box in world units that the field covers, where it needs one. [2, 3]"""
+        return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LossTerm(Settings, ABC):
+    """A further term of the loss, for any model: ``+losses.NAME={_target_: module.Class, ...}``."""
+
+    weight: Weight  # Factor on its value.
+
+    @abstractmethod
+    def value(
+        self, field: RadianceField, rendering: Any, rays: Batch, state: TrainingState
+    ) -> Tensor:
+        """The term without its weight, differentiable. []
+
+        Args:
+            field: The field.
+            rendering: What the rays of this step see.
+            rays: The rays, with their ``target`` colours.
+            state: How far training is.
+        """
+
+
+def colour_error(rendering: Rendering, rays: Batch) -> Tensor:
+    """Mean squared error of the rays' colours. []"""
+    return (rendering.colour - rays["target"]).square().mean()
+
+
+def warm_cosine(step: int, progress: float, *, warmup: int, final: float) -> float:
+    """A linear rise over ``warmup`` steps on half a cosine from 1 to ``final``."""
+    warm = min(1.0, (step + 1) / max(1, warmup))
+    return warm * (final + (1 - final) * 0.5 * (1 + math.cos(math.pi * progress)))

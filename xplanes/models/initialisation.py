@@ -1,0 +1,241 @@
+"""What a field is initialised from: an LRM, a file of triplanes, or nothing."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from xplanes.components import build
+from xplanes.config import CONF
+from xplanes.errors import ConfigError
+from xplanes.models.base import InitialValues, LossTerm, ModelSettings
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.views import Scene
+from xplanes.settings import Count, Positive, Range, Settings
+
+STAGES = ("fixed_view", "lrm", "decomposition", "convert")
+
+
+def no_time() -> dict[str, float]:
+    """Seconds of each stage, all 0."""
+    return dict.fromkeys(STAGES, 0.0)
+
+
+def nothing_skipped() -> dict[str, float]:
+    """Shares of the work that was left out, all 0."""
+    return {"frames": 0.0, "directions": 0.0}
+
+
+@dataclass(frozen=True)
+class Initialisation:
+    """What a field starts from, and how it was made.
+
+    Attributes:
+        model: The model's settings as the field is to be built: the source decides about channels,
+            decoder and whether there are planes of time.
+        frame: The field's frame: the source's own, or the scene's.
+        values: Planes, decoder and sparse part; None for a random initialisation.
+        report: The decomposition for metrics.json: per orientation, and as ``unexplained`` the
+            share of the sparse part's energy that the time planes leave, ``before`` (at random) and
+            ``after`` (as they are initialised).
+        seconds: Seconds of each stage; of one from the cache those that it took to make.
+        words: The initialisation in one line.
+        pictures: By name, colours from 0 to 1: the two parts at a few timesteps, and what the model
+            was shown. [H, W, 3] each
+        lrm: What the model made of the scene, for metrics.json.
+        skipped: For metrics.json: shares of the ``frames`` that equal others and did not pass
+            through the model, and of the singular ``directions`` that were not formed.
+    """
+
+    model: ModelSettings
+    frame: Frame
+    values: InitialValues | None = None
+    report: dict[str, Any] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=no_time)
+    words: str = "random planes"
+    pictures: dict[str, Tensor] = field(default_factory=dict)
+    lrm: dict[str, Any] = field(default_factory=dict)
+    skipped: dict[str, float] = field(default_factory=nothing_skipped)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where and for what an initialisation is made.
+
+    Attributes:
+        scene: The scene.
+        frame: The frame of the scene, for sources that bring none.
+        device: Where it is computed.
+        devices: Processes that share the run.
+        say: Takes a line before something slow begins.
+    """
+
+    scene: Scene
+    frame: Frame
+    device: torch.device
+    devices: int = 1
+    say: Callable[[str], None] = print
+
+
+class Initialiser(ABC):
+    """A source that is ready: its files are found, its weights loaded."""
+
+    @abstractmethod
+    def initialise(self, method: "Method", place: Place) -> Initialisation:
+        """Make the initialisation of a field.
+
+        Raises:
+            ConfigError, SceneError, LRMError: If the source is damaged or does not fit the settings
+                or the scene.
+        """
+
+
+@dataclass(frozen=True, kw_only=True)
+class InitialiserSettings(Settings, ABC):
+    """Base of the settings in the group ``lrm``."""
+
+    name: str  # Name in run directories and tables.
+
+    @abstractmethod
+    def load(self, say: Callable[[str], None] = print) -> Initialiser | None:
+        """Find the source, before anything slow begins; None for a random initialisation.
+
+        Args:
+            say: Takes a line before anything is downloaded.
+
+        Raises:
+            ConfigError: If a file is missing or not named.
+            LRMError: If the weights of a model cannot be had, or do not fit.
+        """
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomSettings(InitialiserSettings):
+    """Planes are initialised at random."""
+
+    def load(self, say: Callable[[str], None] = print) -> None:
+        return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparationSettings(Settings):
+    """What happens before training, for an initialisation that is not random."""
+
+    cache: str | None  # Folder for finished stages; null computes them anew.
+    frames: Count  # Timesteps of the fixed-view video.
+    fixed_view: Literal["auto", "video", "train"]  # The scene's video, or one that a field renders.
+    fixed_view_model: str  # The model that renders it: a file of conf/model.
+    fixed_view_seconds: Positive  # Training clock of the field that renders it.
+    fixed_view_steps: Count  # Its steps at most.
+    azimuth: float | None  # The camera that renders it, degrees from x to y; null: an axis.
+    elevation: Annotated[float, Range(-90, 90)]  # Its height angle in degrees.
+
+    def check(self) -> None:
+        models = sorted(path.stem for path in (CONF / "model").glob("*.yaml"))
+        if self.fixed_view_model not in models:
+            raise ConfigError(
+                f"fixed_view_model={self.fixed_view_model}: must be one of {', '.join(models)}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecompositionSettings(Settings):
+    """From a triplane sequence to low-rank and sparse parts, and from these to planes."""
+
+    name: str  # Name of the settings.
+    method: Literal["adaptive", "growing", "admm", "exact"]  # admm: the paper's; exact: slow.
+    sparsity_weight: Positive | Literal["auto"]  # Weight of the sparse part; auto fits the size.
+    penalty: Positive  # Penalty of ADMM; where adaptive starts.
+    scale: Literal["rms", "none"]  # Unit of the penalty: rms of the features, or none.
+    tolerance: Positive  # Relative residual at which it stops.
+    max_iterations: Count  # Iterations at most.
+    static: Literal["middle", "median", "mean"]  # Space planes from the low-rank part.
+    dynamic: Literal["random", "rank1"]  # Time planes: rank1 fits the sparse part.
+    noise: Annotated[float, Range(0)]  # Standard deviation of the time planes' noise.
+    cache: bool  # Keep the parts in preparation.cache (twice the triplanes' size).
+
+    def check(self) -> None:
+        if self.dynamic == "random" and self.noise == 0:
+            raise ConfigError(
+                "noise=0 with decomposition.dynamic=random: time planes of zeros never learn, as "
+                "products of two zeros have no gradient; set decomposition.noise=0.01"
+            )
+
+
+@dataclass(frozen=True)
+class Method:
+    """How a field is made and trained: all settings that do not depend on the data or the machine.
+
+    Attributes:
+        seed: Source of all randomness.
+        model: Field, sampler, losses and learning rates.
+        lrm: What the field is initialised from.
+        preparation: How an initialisation is made.
+        decomposition: How triplanes become planes.
+        losses: Further terms of the loss by name.
+    """
+
+    seed: int
+    model: ModelSettings
+    lrm: InitialiserSettings
+    preparation: PreparationSettings
+    decomposition: DecompositionSettings
+    losses: Mapping[str, LossTerm] = field(default_factory=dict)
+
+    GROUPS: ClassVar = ("seed", "model", "lrm", "preparation", "decomposition", "losses")
+
+    @classmethod
+    def read(cls, config: Mapping[str, Any]) -> "Method":
+        """The method of a configuration, checked.
+
+        Raises:
+            ConfigError: If settings are missing, out of range, or contradict one another.
+        """
+        seed = config.get("seed")
+        if type(seed) is not int or not 0 <= seed < 2**32:
+            raise ConfigError(
+                f"seed={seed}: must be a whole number, not negative and below 4294967296 (2^32)"
+            )
+        model = build(config["model"], ModelSettings, "model")
+        lrm = build(config["lrm"], InitialiserSettings, "lrm")
+        if not (isinstance(lrm, RandomSettings) or model.takes_initialisation):
+            raise ConfigError(
+                f"lrm={lrm.name} with model={model.name}: triplanes initialise X-Planes alone; set "
+                "lrm=none, or model=six_planes or model=nine_planes"
+            )
+        if model.field_class is not None:
+            model.sampler.require(model.field_class)
+        losses = config.get("losses") or {}
+        return cls(
+            seed,
+            model,
+            lrm,
+            build(config["preparation"], PreparationSettings, "preparation"),
+            build(config["decomposition"], DecompositionSettings, "decomposition"),
+            {name: build(node, LossTerm, f"losses.{name}") for name, node in losses.items()},
+        )
+
+    def require_devices(self, count: int) -> None:
+        """Refuse more devices than model and sampler can train on.
+
+        Raises:
+            ConfigError: If there are more.
+        """
+        model, sampler = self.model, self.model.sampler
+        most = min((n for n in (model.devices, sampler.devices) if n), default=count)
+        if count > most:
+            raise ConfigError(
+                f"trainer.devices={count} with model={model.name} and model/sampler="
+                f"{sampler.name}: they train on one device; set trainer.devices=1"
+            )
+
+    def plain(self) -> dict[str, Any]:
+        """The same as builtins, as `read` takes it."""
+        return {
+            "seed": self.seed,
+            **{name: getattr(self, name).plain() for name in self.GROUPS[1:-1]},
+            "losses": {name: term.plain() for name, term in self.losses.items()},
+        }

@@ -1,0 +1,113 @@
+"""K-Planes (Fridovich-Keil et al., CVPR 2023), hybrid and explicit, as in the released code."""
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+
+from xplanes.errors import ConfigError
+from xplanes.fields.kplanes import ExplicitDecoder, HybridDecoder, KPlanes
+from xplanes.fields.products import PlaneProducts
+from xplanes.fields.regularisers import PlaneTerms, Variation
+from xplanes.models.base import InitialValues, Model, ModelSettings, warm_cosine
+from xplanes.rendering.sampler import Group, Site, origin_cube, scene_cube
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.views import Views
+from xplanes.settings import Count, Positive, Settings, Steps, Weight
+from xplanes.streams import Stream, TrainingState, initial_values
+
+
+@dataclass(frozen=True, kw_only=True)
+class KPlanesLoss(Settings):
+    """Weights of the terms of the loss beyond the colour's mean squared error."""
+
+    variation: Variation  # Form of the total variation: coded, or corrected (as in the paper).
+    total_variation: Weight  # Of squared differences between texels.
+    time_smoothness: Weight  # Of squared second differences along time.
+    time_identity: Weight  # Of the time planes' distance from 1.
+
+
+@dataclass(frozen=True, kw_only=True)
+class KPlanesSettings(ModelSettings):
+    """K-Planes: products of planes at several scales, and a small decoder."""
+
+    field_class: ClassVar = KPlanes
+
+    variant: Literal["hybrid", "explicit"]  # MLPs; or linear, colour bases by direction.
+    half_side: Positive | None  # Half its cube's side, about the origin; null: the scene's.
+    resolution: Count  # Texels along each space axis, at the first scale.
+    scales: list[Count]  # Factors on the resolution; the time axis keeps its rows.
+    time_resolution: Count | None  # Rows of time; null: half the training views.
+    channels: Count  # Channels of each plane and scale.
+    space_low: float  # Least initial value of the space planes.
+    space_high: float  # Largest one; time planes are initialised to 1.
+    width: Count  # Neurons of the hidden layers.
+    learning_rate: Positive  # Of all parameters.
+    warmup_steps: Steps  # Steps until the full learning rate; then half a cosine to 0.
+    loss: KPlanesLoss
+
+    def check(self) -> None:
+        if not self.scales:
+            raise ConfigError("scales=[]: must be one or more numbers above 0")
+        if self.space_low > self.space_high:
+            raise ConfigError(
+                f"space_low={self.space_low}: must not be above space_high={self.space_high}"
+            )
+
+    def frame(self, views: Views, half_side: float | None) -> Frame:
+        if self.half_side is None:
+            return scene_cube(views, half_side)
+        return origin_cube(self.half_side, views, half_side)
+
+    def build(self, site: Site, initial: InitialValues | None = None) -> "KPlanesModel":
+        decoder = {"hybrid": HybridDecoder, "explicit": ExplicitDecoder}[self.variant]
+        with initial_values(site.seed, Stream.BASELINE_FIELD):
+            products = PlaneProducts(
+                self.channels,
+                self.resolution,
+                self.scales,
+                (self.time_resolution or site.time_rows) if site.moves else None,
+                low=self.space_low,
+                high=self.space_high,
+            )
+            decode = decoder(products.features, self.width, precision=site.precision)
+        return KPlanesModel(self, KPlanes(products, decode, site.unit))
+
+
+class KPlanesModel(Model):
+    """The colour's error, smooth planes, and time planes near 1 where nothing moves.
+
+    Args:
+        settings: Learning rate and weights.
+        field: The field.
+    """
+
+    def __init__(self, settings: KPlanesSettings, field: KPlanes) -> None:
+        self._field, self.settings = field, settings
+        loss = settings.loss
+        self.terms = PlaneTerms(
+            loss.total_variation, loss.variation, loss.time_smoothness, loss.time_identity
+        )
+        self.advice = f"Lower model.learning_rate={settings.learning_rate}"
+
+    @property
+    def field(self) -> KPlanes:
+        return self._field
+
+    def groups(self) -> list[Group]:
+        rate = self.settings.learning_rate
+        return [
+            {"params": list(part.parameters()), "lr": rate, "name": name}
+            for name, part in self._field.named_children()
+        ]
+
+    def rate(self, step: int, progress: float) -> float:
+        return warm_cosine(step, progress, warmup=self.settings.warmup_steps, final=0.0)
+
+    def regularise(self, state: TrainingState) -> None:
+        self.terms.add_gradients(self._field.products)
+
+    @torch.no_grad()
+    def regularisers(self, state: TrainingState) -> dict[str, float]:
+        values = self.terms.values(self._field.products)
+        return {name: getattr(self.terms, name) * float(value) for name, value in values.items()}

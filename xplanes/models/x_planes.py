@@ -1,0 +1,241 @@
+"""X-Planes: feature planes initialised from an LRM, and the LRM's decoder (the paper's Section 3).
+
+A point (x, y, z) at time t is read from space planes and space-time planes (Eq. 14, 15); its
+features go through the decoder to colour and density; rays are composited and compared with the
+images. Beside the colour's error the loss holds smoothness of the planes and L_r, which ties
+products of the space-time planes to the sparse part of the LRM's triplanes (Eq. 17).
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from xplanes.decomposition.sparse_loss import SparseProduct
+from xplanes.fields.decoder import Decoder
+from xplanes.fields.regularisers import (
+    add_distance_gradient,
+    add_time_smoothness_gradient,
+    add_total_variation_gradient,
+    time_smoothness,
+    total_variation,
+)
+from xplanes.fields.xplanes import XPlanes, random_planes
+from xplanes.models.base import InitialValues, Model, ModelSettings, warm_cosine
+from xplanes.rendering.sampler import Group, Site
+from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
+from xplanes.streams import Stream, TrainingState, step_generator
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecoderSettings(Settings):
+    """The MLP from features to colour and density."""
+
+    width: Count  # Neurons of each hidden layer.
+    hidden: Steps  # Hidden layers.
+    activation: Literal["relu", "silu"]  # Between layers.
+    density: Literal["softplus", "exp"]  # Activation of the density.
+    density_scale: Positive  # Factor on the density.
+    density_bias: float  # Initial bias of the density logit; lower is emptier.
+    colour_margin: Weight  # How far colours may pass 0 and 1.
+    freeze: bool  # Keep the decoder as it is initialised.
+
+
+@dataclass(frozen=True, kw_only=True)
+class XPlanesLoss(Settings):
+    """Weights of the terms of the loss beyond the colour's mean squared error."""
+
+    total_variation: Weight  # Of squared differences between texels.
+    time_smoothness: Weight  # Of squared second differences along time.
+    time_magnitude: Weight  # Of squared values of the time planes.
+    sparse_weight: Weight  # Of L_r: time planes' products near the sparse part (Eq. 17).
+    sparse_frames: Count  # Random timesteps per application of L_r.
+    initial_weight: Weight  # Of the distance from initialised planes, over the views squared.
+    initial_steps: Count | None  # Steps times views until L_r and that fade out; null: never.
+    every: Count  # Steps between applications of these, at as many times the weight.
+
+
+@dataclass(frozen=True, kw_only=True)
+class XPlanesSettings(ModelSettings):
+    """X-Planes with six or nine planes (three without time)."""
+
+    takes_initialisation: ClassVar[bool] = True
+    devices: ClassVar[int | None] = None
+    field_class: ClassVar = XPlanes
+
+    plane_set: Literal["six", "nine", "three"]
+    resolution: Count  # Texels along each space axis.
+    time_resolution: Count | None  # Rows of time; null: half as many as distinct times.
+    channels: Count  # Channels of each plane.
+    space_scale: Weight  # Standard deviation of the space planes at a random initialisation.
+    time_scale: Weight  # Standard deviation of the time planes at a random initialisation.
+    decoder: DecoderSettings
+    loss: XPlanesLoss
+    plane_lr: Positive  # Learning rate of the space planes.
+    time_lr: Positive  # Learning rate of the time planes.
+    decoder_lr: Positive  # Learning rate of the decoder.
+    warmup_steps: Steps  # Steps until the full learning rate.
+    final_lr: Share  # Share of the learning rate left at the end.
+
+    def build(self, site: Site, initial: InitialValues | None = None) -> "XPlanesModel":
+        return XPlanesModel(self, self.build_field(site, initial), site, initial)
+
+    def build_field(self, site: Site, initial: InitialValues | None = None) -> XPlanes:
+        """The field: planes and decoder from what is given, the rest of it random."""
+        plane_set = self.plane_set if site.moves else "three"
+        generator = step_generator(site.seed, 0, Stream.INITIAL_FIELD)
+        planes: Mapping[str, Tensor]
+        if initial is not None:
+            planes = initial.planes
+        else:
+            planes = random_planes(
+                plane_set,
+                channels=self.channels,
+                resolution=self.resolution,
+                time_resolution=self.time_resolution or site.time_rows,
+                space_scale=self.space_scale,
+                time_scale=self.time_scale,
+                generator=generator,
+            )
+        options = self.decoder
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(generator.initial_seed())
+            decoder = Decoder(
+                self.channels,
+                width=options.width,
+                hidden=options.hidden,
+                activation=options.activation,
+                density=options.density,
+                density_scale=options.density_scale,
+                precision="bf16" if site.precision == "bf16" else "32",
+                colour_margin=options.colour_margin,
+            )
+        if initial is not None and initial.decoder is not None:
+            decoder.load_state_dict(dict(initial.decoder))
+        else:
+            with torch.no_grad():
+                decoder.layers[-1].bias[0] += options.density_bias  # type: ignore[index]
+        decoder.requires_grad_(not options.freeze)
+        return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set)
+
+
+class XPlanesModel(Model):
+    """The colour's error, smooth planes, and products of time planes near what moves.
+
+    Args:
+        settings: Weights and learning rates.
+        field: The field.
+        site: What it was built for.
+        initial: What it starts from; None for random planes.
+    """
+
+    def __init__(
+        self,
+        settings: XPlanesSettings,
+        field: XPlanes,
+        site: Site,
+        initial: InitialValues | None = None,
+    ) -> None:
+        self._field, self.settings, self.weights = field, settings, settings.loss
+        views = len(site.times)
+        steps = self.weights.initial_steps
+        self.fade = None if steps is None else steps / views
+        self.product: SparseProduct | None = None
+        self.initial_weight, self._initial = 0.0, []
+        if initial is not None:
+            self.initial_weight = self.weights.initial_weight / views**2
+            if initial.sparse is not None and field.time is not None and self.weights.sparse_weight:
+                frames = self.weights.sparse_frames
+                self.product = SparseProduct(initial.sparse, field.rows, frames)
+        if self.initial_weight:
+            self._initial = [plane.detach().clone() for plane in self._planes]
+        self.advice = (
+            f"Lower model.plane_lr={settings.plane_lr} or model.decoder_lr={settings.decoder_lr}"
+        )
+
+    @property
+    def field(self) -> XPlanes:
+        return self._field
+
+    @property
+    def _planes(self) -> list[Tensor]:
+        return [p for p in (self._field.space, self._field.time) if p is not None]
+
+    def groups(self) -> list[Group]:
+        field, settings = self._field, self.settings
+        groups: list[Group] = [{"params": [field.space], "lr": settings.plane_lr, "name": "space"}]
+        if field.time is not None:
+            groups.append({"params": [field.time], "lr": settings.time_lr, "name": "time"})
+        decoder = [p for p in field.decoder.parameters() if p.requires_grad]
+        if decoder:
+            groups.append({"params": decoder, "lr": settings.decoder_lr, "name": "decoder"})
+        return groups
+
+    def rate(self, step: int, progress: float) -> float:
+        settings = self.settings
+        return warm_cosine(step, progress, warmup=settings.warmup_steps, final=settings.final_lr)
+
+    def regularise(self, state: TrainingState) -> None:
+        every, field, weights = self.weights.every, self._field, self.weights
+        if state.step % every or field.space.grad is None:
+            return
+        fading = self._fading(state.step)
+        if not fading:
+            self._initial, self.product = [], None  # Large, and of no more use.
+        elif self.initial_weight:
+            # The field may have moved to another device since.
+            self._initial = [plane.to(field.space.device) for plane in self._initial]
+            weight = fading * self.initial_weight * every
+            for plane, initial in zip(self._planes, self._initial, strict=True):
+                if plane.grad is not None:
+                    add_distance_gradient(plane.grad, plane, initial, weight)
+        if weight := weights.total_variation * every:
+            add_total_variation_gradient(field.space.grad, field.space, (1, 2), weight)
+        if field.time is None or field.time.grad is None:
+            return
+        if weight:
+            add_total_variation_gradient(field.time.grad, field.time, (2,), weight)
+        if weight := weights.time_smoothness * every:
+            add_time_smoothness_gradient(field.time.grad, field.time, weight)
+        if weight := weights.time_magnitude * every:
+            scale = 2 * weight / field.time.numel()
+            field.time.grad.add_(field.time.detach(), alpha=scale)
+        if self.product is not None:
+            # The same frames on all ranks: their planes must stay equal.
+            generator = step_generator(state.seed, state.step, Stream.FRAMES)
+            weight = fading * weights.sparse_weight * every
+            self.product.add_gradient(field.time.grad, field.time, weight, generator)  # Eq. 17
+
+    @torch.no_grad()
+    def regularisers(self, state: TrainingState) -> dict[str, float]:
+        weights, field, fading = self.weights, self._field, self._fading(state.step)
+        terms: dict[str, tuple[float, Callable[[], Any]]] = {
+            "total_variation": (
+                weights.total_variation,
+                lambda: (
+                    total_variation(field.space, (1, 2))
+                    + (0.0 if field.time is None else total_variation(field.time, (2,)))
+                ),
+            )
+        }
+        if self._initial:
+            terms["initialisation"] = (fading * self.initial_weight, self._distance)
+        if (time := field.time) is not None:
+            terms["time_smoothness"] = (weights.time_smoothness, lambda: time_smoothness(time))
+            terms["time_magnitude"] = (weights.time_magnitude, lambda: time.square().mean())
+            if (product := self.product) is not None:
+                terms["l_r"] = (fading * weights.sparse_weight, lambda: product.value(time))
+        return {name: weight * float(value()) for name, (weight, value) in terms.items() if weight}
+
+    def _distance(self) -> float:
+        """Sum over the planes' stacks of the mean squared distance from their initial values."""
+        pairs = zip(self._planes, self._initial, strict=True)
+        return sum(
+            float((plane - initial.to(plane.device)).square().mean()) for plane, initial in pairs
+        )
+
+    def _fading(self, step: int) -> float:
+        """Share of the weights that is left of what ties the field to its initialisation."""
+        return 1.0 if self.fade is None else max(0.0, 1 - step / self.fade)

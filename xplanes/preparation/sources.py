@@ -1,0 +1,282 @@
+"""Sources of an initialisation: published LRMs, those in the package, and files of triplanes."""
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import cast
+
+from xplanes.errors import ConfigError
+from xplanes.lrm.bundled import load_bundled
+from xplanes.lrm.weights import WeightSource, find_weights, load_weights
+from xplanes.models.base import InitialValues
+from xplanes.models.initialisation import (
+    Initialisation,
+    Initialiser,
+    InitialiserSettings,
+    Method,
+    Place,
+    no_time,
+    nothing_skipped,
+)
+from xplanes.models.x_planes import XPlanesSettings
+from xplanes.preparation.cache import StageCache
+from xplanes.preparation.reconstruct import ImageLRMSettings, LoadedLRM, loaded, reconstruct
+from xplanes.preparation.sequence import TriplaneSequence, load_triplanes
+from xplanes.preparation.stages import Parts, convert_stage, decompose_stage
+from xplanes.rendering.sampler import time_rows
+from xplanes.scenes.views import Views
+from xplanes.settings import Count
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BundledLRMSettings(ImageLRMSettings):
+    """A model of the package, or with ``weights`` one of the same form."""
+
+    bundled: str  # Name of its files in the package.
+
+    def load_model(self, say: Callable[[str], None]) -> LoadedLRM:
+        began = time.perf_counter()
+        own = None if self.weights is None else Path(self.weights)
+        model, path = (
+            load_bundled(self.bundled) if own is None else load_bundled(own.stem, own.parent)
+        )
+        return loaded(model, path, began)
+
+    def load(self, say: Callable[[str], None] = print) -> "LRMInitialiser":
+        return LRMInitialiser(self, self.load_model(say))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishedLRMSettings(ImageLRMSettings):
+    """A published model."""
+
+    architecture: str  # One of openlrm-{small,base,large}-{1.0,1.1} and triposr.
+    repository: str  # On the Hugging Face hub.
+    file: str  # Name of the weights there.
+    revision: str  # Branch, tag or commit there.
+    licence: str  # Of the weights.
+    megabytes: Count  # Size of the file.
+    config: str | None  # A config.json or config.yaml for weights of other sizes.
+
+    @property
+    def source(self) -> WeightSource:
+        """Where the weights come from."""
+        return WeightSource(
+            architecture=self.architecture,
+            repository=self.repository,
+            file=self.file,
+            revision=self.revision,
+            licence=self.licence,
+            megabytes=self.megabytes,
+            weights=None if self.weights is None else Path(self.weights),
+            config=None if self.config is None else Path(self.config),
+        )
+
+    def load_model(self, say: Callable[[str], None]) -> LoadedLRM:
+        path = find_weights(self.source, announce=say)
+        began = time.perf_counter()
+        return loaded(load_weights(self.source, path, announce=say), path, began)
+
+    def load(self, say: Callable[[str], None] = print) -> "LRMInitialiser":
+        return LRMInitialiser(self, self.load_model(say))
+
+
+class LRMInitialiser(Initialiser):
+    """Triplanes of a fixed-view video, by an LRM.
+
+    Args:
+        settings: How the model meets the scene's images.
+        lrm: The model.
+    """
+
+    def __init__(self, settings: ImageLRMSettings, lrm: LoadedLRM) -> None:
+        self.settings, self.lrm = settings, lrm
+
+    def initialise(self, method: Method, place: Place) -> Initialisation:
+        cache = _cache(method, place)
+        made = reconstruct(method, self.settings, place, self.lrm, cache)
+        found = from_sequence(
+            made.sequence, method, place, cache, source=made.words, seconds=made.seconds
+        )
+        shown = {} if made.picture is None else {"fixed_view": made.picture}
+        twins = 1 - made.report["distinct"] / made.report["frames"]
+        return replace(
+            found,
+            pictures=shown | found.pictures,
+            lrm=made.report,
+            skipped=found.skipped | {"frames": twins},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TriplaneFileSettings(InitialiserSettings):
+    """A triplane sequence that was computed before, from a file."""
+
+    triplanes: str | None  # File written by save_triplanes.
+
+    def load(self, say: Callable[[str], None] = print) -> "FileInitialiser":
+        if self.triplanes is None:
+            raise ConfigError("lrm=file needs lrm.triplanes=FILE, a file written by save_triplanes")
+        if not Path(self.triplanes).is_file():
+            raise ConfigError(f"lrm.triplanes={self.triplanes}: there is no such file")
+        return FileInitialiser(Path(self.triplanes))
+
+
+class FileInitialiser(Initialiser):
+    """Triplanes from a file.
+
+    Args:
+        path: The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def initialise(self, method: Method, place: Place) -> Initialisation:
+        began = time.perf_counter()
+        sequence = load_triplanes(self.path)
+        seconds = {"lrm": time.perf_counter() - began}
+        cache = _cache(method, place)
+        return from_sequence(sequence, method, place, cache, source=str(self.path), seconds=seconds)
+
+
+def _cache(method: Method, place: Place) -> StageCache:
+    folder = method.preparation.cache
+    if place.devices > 1 and folder is None:
+        raise ConfigError(
+            f"preparation.cache=null with lrm={method.lrm.name} and trainer.devices="
+            f"{place.devices}: the processes share the initialisation through the cache; name a "
+            "folder"
+        )
+    cache = StageCache(None if folder is None else Path(folder))
+    if place.devices > 1 and not cache.writable:
+        raise ConfigError(
+            f"preparation.cache={folder} cannot be written, and the {place.devices} processes "
+            "share the initialisation through it: name another folder"
+        )
+    return cache
+
+
+def from_sequence(
+    sequence: TriplaneSequence,
+    method: Method,
+    place: Place,
+    cache: StageCache,
+    *,
+    source: str,
+    seconds: Mapping[str, float],
+) -> Initialisation:
+    """From a triplane sequence of any source to an initialisation.
+
+    Args:
+        sequence: The sequence, checked.
+        method: The run's settings.
+        place: The scene, and its frame for a sequence that brings none.
+        cache: Where finished stages are kept.
+        source: What messages call the sequence.
+        seconds: Seconds of the stages that made it.
+    """
+    views = place.scene.splits["train"]
+    model = _settled(method, sequence, views, source=source)
+    if len(sequence.triplanes) == 1 and not views.is_still:
+        logger.warning(
+            "nothing moves in the only triplane of %s: the field gets no time planes and trains as "
+            "a static one",
+            source,
+        )
+    device = place.device
+    parts = decompose_stage(sequence.triplanes, method.decomposition, cache, device)
+    _warn(parts, method)
+    planes = convert_stage(parts, model, method.decomposition, method.seed, cache, device)
+    tied = model.plane_set != "three" and model.loss.sparse_weight > 0
+    values = InitialValues(planes.planes, sequence.decoder, parts.sparse if tied else None)
+    return Initialisation(
+        model=model,
+        frame=sequence.frame or place.frame,
+        values=values,
+        report=parts.report | ({"unexplained": planes.unexplained} if planes.unexplained else {}),
+        seconds=no_time()
+        | dict(seconds)
+        | {"decomposition": parts.seconds, "convert": planes.seconds},
+        words=_words(sequence, method, parts, planes.unexplained, source),
+        pictures={} if parts.picture is None else {"decomposition": parts.picture},
+        skipped=nothing_skipped() | {"directions": _left_out(parts)},
+    )
+
+
+def _left_out(parts: Parts) -> float:
+    """Share of the singular directions below the threshold, over all orientations."""
+    if not parts.report:
+        return 0.0
+    kept = sum(report["rank"] for report in parts.report.values())
+    return 1 - kept / (len(parts.report) * len(parts.low_rank))
+
+
+def _settled(
+    method: Method, sequence: TriplaneSequence, views: Views, *, source: str
+) -> XPlanesSettings:
+    """The model's settings with what the sequence decides."""
+    frames, _, channels = sequence.triplanes.shape[:3]
+    model = replace(cast(XPlanesSettings, method.model), channels=channels)
+    if views.is_still or frames == 1:
+        model = replace(model, plane_set="three")
+    if model.plane_set != "three":
+        model = replace(model, time_resolution=model.time_resolution or time_rows(views.times))
+    if sequence.decoder_config is not None:
+        try:
+            decoder = replace(model.decoder, **dict(sequence.decoder_config))
+        except ConfigError as error:
+            raise ConfigError(f"{source} does not fit: model.decoder.{error}") from error
+        model = replace(model, decoder=decoder)
+    return model
+
+
+def _warn(parts: Parts, method: Method) -> None:
+    """Say once which orientations did not converge."""
+    open_ones = [
+        f"{name} (residual {report['residual']:.1e}, last step {report['change']:.1e})"
+        for name, report in parts.report.items()
+        if not report["converged"]
+    ]
+    if open_ones:
+        logger.warning(
+            "the decomposition of %s did not converge within decomposition.max_iterations=%d to "
+            "decomposition.tolerance=%g (ten times that for the last step): raise one of them",
+            ", ".join(open_ones),
+            method.decomposition.max_iterations,
+            method.decomposition.tolerance,
+        )
+
+
+def _words(
+    sequence: TriplaneSequence,
+    method: Method,
+    parts: Parts,
+    unexplained: Mapping[str, float],
+    source: str,
+) -> str:
+    frames, _, channels, size = sequence.triplanes.shape[:4]
+    words = [f"{frames} triplanes of {source}, {size} x {size} with {channels} channels"]
+    own = cast(XPlanesSettings, method.model).channels
+    if channels != own:
+        words[0] += f" (not model.channels={own})"
+    if parts.report:
+        ranks = "/".join(str(report["rank"]) for report in parts.report.values())
+        share = max(report["sparsity"] for report in parts.report.values())
+        words.append(
+            f"rank {ranks}, up to {100 * share:.0f}% sparse" + (", cached" if parts.cached else "")
+        )
+    if unexplained:
+        words.append(
+            f"time planes {method.decomposition.dynamic}, {100 * unexplained['after']:.0f}% of the "
+            f"sparse part unexplained ({100 * unexplained['before']:.0f}% with random planes)"
+        )
+    else:
+        words.append("no time planes")
+    words.append("its decoder" if sequence.decoder is not None else "a fresh decoder")
+    words.append("its frame" if sequence.frame is not None else "the scene's frame")
+    return " · ".join(words)

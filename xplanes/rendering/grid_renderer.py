@@ -1,0 +1,259 @@
+"""Equal steps through occupied cells: rendering, and the occupancy grid in training."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
+
+import torch
+from torch import Tensor, distributed, nn
+
+from xplanes.errors import ConfigError
+from xplanes.fields.base import RadianceField
+from xplanes.rendering.base import RayRenderer, Rendering
+from xplanes.rendering.box import Field, shade
+from xplanes.rendering.carving import carve
+from xplanes.rendering.compositing import composite
+from xplanes.rendering.filling import fill
+from xplanes.rendering.marching import march
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
+from xplanes.rendering.thinning import Cut
+from xplanes.rendering.warming import render_one_ray
+from xplanes.scenes.batches import Batch
+from xplanes.settings import Count, Range, Share, Steps, Weight
+from xplanes.streams import Stream, TrainingState, step_generator
+
+DIAGONAL = 2 * math.sqrt(3)
+"""Longest way through the field's cube."""
+
+
+@dataclass(frozen=True)
+class GridRenderer(RayRenderer):
+    """Renders rays through a field, skipping what cannot be seen.
+
+    Attributes:
+        grid: Which cells hold something, and when.
+        samples: Steps along the diagonal of the field's cube.
+        skip_empty: Skip samples in empty cells.
+        occlusion: Skip samples behind surfaces that leave less light than this; 0 skips none.
+        thinning: Where gradients are wanted, samples whose own is below this times the mean may be
+            left out, see `Cut.pass_on`; 0 leaves none out.
+    """
+
+    grid: OccupancyGrid
+    samples: int
+    skip_empty: bool = True
+    occlusion: float = 0.001
+    thinning: float = 0.0
+
+    @property
+    def device(self) -> torch.device:
+        return self.grid.density.device
+
+    @property
+    def step(self) -> float:
+        """Distance between samples in the field's frame."""
+        return DIAGONAL / self.samples
+
+    def render(
+        self,
+        field: Field,
+        origins: Tensor,
+        directions: Tensor,
+        times: Tensor,
+        background: Tensor,
+        jitter: Tensor | None = None,
+    ) -> Rendering:
+        """Render rays.
+
+        Args:
+            field: From points and times to colour and density.
+            origins: Ray origins in the field's frame. [R, 3]
+            directions: Unit directions. [R, 3]
+            times: Time of each ray, from 0 to 1. [R]
+            background: Colour behind the scene. [3] or [R, 3]
+            jitter: Place of each ray's samples within their steps; the middle when None. [R]
+
+        Returns:
+            One value per ray; gradients reach the field, with `thinning` once ``cut`` passes them
+            on.
+        """
+        samples = march(
+            origins,
+            directions,
+            times,
+            torch.full_like(times, 0.5) if jitter is None else jitter,
+            self.grid,
+            step=self.step,
+            skip_empty=self.skip_empty,
+            occlusion=self.occlusion,
+        )
+
+        def ask(chosen: Tensor | slice) -> tuple[Tensor, Tensor]:
+            points, ray = samples.points[chosen], samples.ray[chosen]
+            return shade(field, points, times, directions, ray)
+
+        thin = self.thinning > 0 and torch.is_grad_enabled()
+        cut = Cut.of(ask, self.thinning) if thin else None
+        colour, density = (cut.colour, cut.density) if cut else ask(slice(None))
+        total, _ = composite(
+            density * self.step, colour, samples.distances, samples.ray, samples.starts
+        )
+        opacity = total[:, 3]
+        return Rendering(
+            colour=total[:, :3] + (1 - opacity)[:, None] * background,
+            opacity=opacity,
+            depth=(total[:, 4] / opacity.clamp_min(1e-6)).detach(),
+            density=density.detach(),
+            samples=samples,
+            cut=cut,
+        )
+
+
+Fraction = Annotated[float, Range(0, 1, open=True)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OccupancySettings(SamplerSettings):
+    """Where rays are sampled, and which samples are never computed."""
+
+    samples: Count  # Steps along the diagonal of the cube in training.
+    render_samples: Count  # The same in images, for scores and videos.
+    grid_resolution: Count  # Cells of the occupancy grid along each side.
+    time_bins: Count  # Bins of the occupancy grid along time.
+    threshold: Fraction  # Opacity of one step below which a cell is empty.
+    decay: Share  # Factor on a cell's density at each update.
+    skip_empty: bool  # Skip samples in empty cells.
+    skip_occluded: bool  # Skip samples behind opaque surfaces.
+    occlusion: Annotated[float, Range(0, 1)]  # Transmittance below which a surface is opaque.
+    thinning: Weight  # Gradients below this times the mean are passed on at random; 0: all are.
+    silhouettes: bool  # Rule out cells that the images' alpha shows to be empty.
+    fill: bool  # Empty cells in which an initialised field shows nothing.
+    coarse_steps: Steps  # First steps, in which samples lie twice as far apart.
+    sweep_at: list[int]  # Steps at which all occupied cells are updated.
+    sweep_every: Count  # Steps between such sweeps later on.
+    update_every: Count  # Steps between updates of cells that no sample may reach.
+    update_cells: Count  # Cells per update at most.
+
+    def check(self) -> None:
+        if self.occlusion >= 1:
+            raise ConfigError(
+                f"occlusion={self.occlusion}: must be below 1, or no light counts as seen; 1e-5 is "
+                "the default, skip_occluded=false skips nothing"
+            )
+        if self.grid_resolution**3 * self.time_bins > 2**28:
+            raise ConfigError(
+                f"grid_resolution={self.grid_resolution} with time_bins={self.time_bins}: more "
+                "than 268 million cells; lower one of them"
+            )
+
+    def build(self, field: RadianceField, site: Site) -> "OccupancySampler":
+        grid = OccupancyGrid(
+            self.grid_resolution,
+            self.time_bins if site.moves else 1,
+            step=DIAGONAL / self.samples,
+            threshold=self.threshold,
+            decay=self.decay,
+        )
+        renderer = GridRenderer(
+            grid,
+            self.samples,
+            skip_empty=self.skip_empty,
+            occlusion=self.occlusion if self.skip_occluded else 0.0,
+        )
+        if site.views is not None:
+            if self.silhouettes:
+                carve(grid, site.views, site.frame)
+            if site.initialised and self.fill:
+                _fill(renderer, field, site)
+        return OccupancySampler(renderer, self)
+
+    def for_video(self) -> "OccupancySettings":
+        return replace(self, render_samples=self.samples)
+
+
+def _fill(renderer: GridRenderer, field: RadianceField, site: Site) -> None:
+    """Fill the grid of an initialised field on the device where it is going to be trained."""
+    assert site.views is not None
+    parts = field, renderer.grid
+    for part in parts:
+        part.to(site.device or "cpu")
+    render_one_ray(field, renderer)
+    generator = step_generator(site.seed, 0, Stream.FILL)
+    fill(renderer.grid, field, site.views, site.frame, step=renderer.step, generator=generator)
+    for part in parts:
+        part.to("cpu")
+
+
+class OccupancySampler(Sampler):
+    """Equal steps through occupied cells; the grid is kept up to date here.
+
+    Args:
+        renderer: Its grid is changed in place.
+        settings: Upkeep of the grid.
+    """
+
+    def __init__(self, renderer: GridRenderer, settings: OccupancySettings) -> None:
+        self.settings, self.grid = settings, renderer.grid
+        self._training = replace(renderer, thinning=settings.thinning)
+        self._coarse = replace(self._training, samples=math.ceil(renderer.samples / 2))
+        self._images = replace(renderer, samples=settings.render_samples)
+
+    @property
+    def renderer(self) -> GridRenderer:
+        return self._images
+
+    @property
+    def parts(self) -> dict[str, nn.Module]:
+        return {"grid": self.grid}
+
+    @property
+    def outline(self) -> str:
+        return f"{100 * self.grid.occupied_fraction:.0f}% of the cube may be occupied"
+
+    def first_rays(self, most: int) -> int:
+        return min(most, 256)
+
+    def renderer_at(self, step: int) -> GridRenderer:
+        # At first the grid hides little, and images of all samples would take longer than steps.
+        return self._coarse if step < self.settings.coarse_steps else self._images
+
+    def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
+        coarse = state.step < self.settings.coarse_steps
+        return (self._coarse if coarse else self._training).render(
+            field,
+            rays["origins"],
+            rays["directions"],
+            rays["times"],
+            rays["background"],
+            rays["jitter"],
+        )
+
+    def pass_on(self, rendering: Rendering, state: TrainingState) -> int:
+        if rendering.cut is None:
+            return len(rendering.samples)
+        return rendering.cut.pass_on(state.generator(rendering.density.device, Stream.THINNING))
+
+    def observe(self, rendering: Rendering) -> None:
+        self.grid.observe(rendering.samples.cells, rendering.density)
+
+    def update(self, field: Any, state: TrainingState) -> None:
+        step, settings = state.step, self.settings
+        sweeping = step in settings.sweep_at or (step > 0 and step % settings.sweep_every == 0)
+        if not sweeping and step % settings.update_every:
+            return
+        self._agree()
+        generator = step_generator(state.seed, step, Stream.GRID)
+        if sweeping:
+            self.grid.sweep(field, generator)
+        else:
+            self.grid.update(field, settings.update_cells, generator)
+
+    def _agree(self) -> None:
+        """Go on with the first process's grid: each has seen the samples of its own rays."""
+        if distributed.is_available() and distributed.is_initialized():
+            for part in (self.grid.density, self.grid.occupied):
+                distributed.broadcast(part, src=0)
+
+    def scalars(self) -> dict[str, float]:
+        return {"sampler/occupied": self.grid.occupied_fraction}

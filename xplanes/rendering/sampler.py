@@ -1,0 +1,217 @@
+"""What training asks of a sampler, and what fields and samplers are built for."""
+
+import logging
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from xplanes.errors import ConfigError
+from xplanes.fields.base import RadianceField
+from xplanes.rendering.base import RayRenderer, Rendering
+from xplanes.scenes.batches import Batch
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.frame import Frame, cube_frame, scene_frame
+from xplanes.scenes.views import Views
+from xplanes.settings import Settings
+from xplanes.streams import TrainingState
+
+logger = logging.getLogger(__name__)
+
+Group = dict[str, Any]
+"""Parameters of one learning rate: ``params``, ``lr`` and ``name``."""
+
+
+@dataclass(frozen=True)
+class Site:
+    """What a field is built for.
+
+    Attributes:
+        frame: The field's frame.
+        times: Times of the training views. [V]
+        seed: The run's seed.
+        precision: Of matrix products: "32" or "bf16".
+        bounds: Box in world units that some fields cover; None for those that need none. [2, 3]
+        views: Training views; None where a checkpoint is loaded without its data.
+        initialised: Whether the field starts from something that it shows.
+        device: Where it is going to be trained; the CPU when None.
+    """
+
+    frame: Frame
+    times: Tensor
+    seed: int
+    precision: str
+    bounds: Tensor | None = None
+    views: Views | None = None
+    initialised: bool = False
+    device: torch.device | None = None
+
+    @property
+    def unit(self) -> float:
+        """World units per unit of the frame."""
+        return 1 / self.frame.scale
+
+    @property
+    def moves(self) -> bool:
+        """Whether there are views of more than one time."""
+        return len(self.times.unique()) > 1
+
+    @property
+    def time_rows(self) -> int:
+        """Rows of time where the settings leave them open."""
+        return time_rows(self.times)
+
+
+def time_rows(times: Tensor) -> int:
+    """Rows of time where the settings leave them open: one for two distinct times. [V]"""
+    return max(2, math.ceil(len(times.unique()) / 2))
+
+
+class Sampler(ABC):
+    """How a step places samples, what that adds to the loss, and the upkeep between steps."""
+
+    @property
+    @abstractmethod
+    def renderer(self) -> RayRenderer:
+        """Renders images."""
+
+    @property
+    def parts(self) -> dict[str, nn.Module]:
+        """Modules that belong into checkpoints, by name."""
+        return {}
+
+    @property
+    def outline(self) -> str:
+        """What the sampler does, in a few words."""
+        return ""
+
+    def groups(self) -> list[Group]:
+        """Parameters that train along."""
+        return []
+
+    def first_rays(self, most: int) -> int:
+        """Rays of the first batch, of ``most`` at most."""
+        return most
+
+    def renderer_at(self, step: int) -> RayRenderer:
+        """Renders images when so many steps are done."""
+        return self.renderer
+
+    @abstractmethod
+    def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
+        """Render the rays of a batch, with jitter."""
+
+    def pass_on(self, rendering: Any, state: TrainingState) -> int:
+        """Take gradients to the field where rendering cut them off.
+
+        Returns:
+            Number of samples that the field got gradients of.
+        """
+        return len(rendering.samples)
+
+    def losses(self, rendering: Any) -> dict[str, Tensor]:
+        """The sampler's own terms of the loss, weighted, by name. [] each"""
+        return {}
+
+    def regularise(self) -> None:
+        """Add gradients of the sampler's own parameters."""
+        return
+
+    def observe(self, rendering: Rendering) -> None:
+        """Learn from what a batch showed."""
+        return
+
+    def update(self, field: Any, state: TrainingState) -> None:
+        """Do what is due after an optimiser step."""
+        return
+
+    def scalars(self) -> dict[str, float]:
+        """Values for the logger."""
+        return {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplerSettings(Settings, ABC):
+    """Base of the settings of samplers."""
+
+    devices: ClassVar[int | None] = None
+    """Devices that it can train on at most; None for any number."""
+
+    name: str  # Name in tables.
+
+    def require(self, field: RadianceField | type[RadianceField]) -> None:
+        """Refuse a field, or a class of fields, that cannot be sampled so.
+
+        Raises:
+            ConfigError: With the samplers that can.
+        """
+
+    @abstractmethod
+    def build(self, field: RadianceField, site: Site) -> Sampler:
+        """The sampler for a field.
+
+        Raises:
+            ConfigError: If it cannot serve this field or these cameras.
+        """
+
+    def for_video(self) -> "SamplerSettings":
+        """These settings where a model looks at few pixels of what is rendered."""
+        return self
+
+
+def scene_cube(views: Views, half_side: float | None) -> Frame:
+    """The scene's own cube; ``half_side`` in world units, found from the views when None."""
+    return scene_frame(views, half_side)
+
+
+def origin_cube(half_side: float, views: Views, given: float | None = None) -> Frame:
+    """A cube around the world's origin; says so where the scene looks to be of another size.
+
+    Args:
+        half_side: Half the side of the cube, in world units.
+        views: Training views.
+        given: Half the side of the scene's cube, which the settings must leave open.
+
+    Raises:
+        ConfigError: If both are given.
+    """
+    if given is not None:
+        raise ConfigError(
+            f"data.half_side={given} with model.half_side={half_side}: two cubes; set "
+            "model.half_side=null to use the former, or leave data.half_side out"
+        )
+    try:
+        scene = scene_frame(views, None)
+    except SceneError:
+        return cube_frame(half_side, torch.zeros(3))
+    reach = 1 / scene.scale + float(scene.centre.norm())
+    # A scene that fills the cube's corners reaches sqrt(3) times as far as its sides.
+    if not half_side / 4 < reach < half_side * 3**0.5:
+        logger.warning(
+            "model.half_side=%g: the scene reaches %.3g world units from the origin; set it to "
+            "about that, or to null for the scene's own cube",
+            half_side,
+            reach,
+        )
+    return cube_frame(half_side, torch.zeros(3))
+
+
+def check_range(site: Site, near: float, far: float) -> None:
+    """Refuse distances between which the cameras do not see the centre of the field's cube.
+
+    Raises:
+        ConfigError: With the cameras' distances.
+    """
+    if site.views is None:
+        return
+    away = (site.views.camera_to_world[:, :3, 3] - site.frame.centre).norm(dim=-1)
+    nearest, farthest = float(away.min()), float(away.max())
+    if nearest <= near or farthest >= far:
+        raise ConfigError(
+            f"model.sampler.near={near} with model.sampler.far={far}: the cameras stand "
+            f"{nearest:.3g} to {farthest:.3g} world units from the centre of the field's cube; set "
+            "both to numbers around these"
+        )

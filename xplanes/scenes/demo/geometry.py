@@ -1,0 +1,468 @@
+"""The torus, hit by rays where a quartic polynomial first changes its sign."""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+MISS = math.inf
+
+
+class Primitive(ABC):
+    """A closed solid; ``inside`` is strict, the surface itself is outside."""
+
+    @property
+    @abstractmethod
+    def extent(self) -> tuple[float, float, float]:
+        """Half sides of the tightest box around the shape, along its own axes."""
+
+    @property
+    @abstractmethod
+    def radius_around(self) -> float:
+        """Radius of the smallest ball around the shape's centre that holds it."""
+
+    @abstractmethod
+    def hit(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """Distance along each ray to the surface, inf where the ray misses.
+
+        Args:
+            origins: Where the rays start; from inside, the ray hits where it leaves. [N, 3]
+            directions: Unit directions. [N, 3]
+
+        Returns:
+            Distances above 0 to the first crossing of the surface. [N]
+        """
+
+    @abstractmethod
+    def normal(self, points: Tensor) -> Tensor:
+        """Outward unit normals at points on the surface. [N, 3]"""
+
+    @abstractmethod
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """Distance to the surface, negative inside. [N]"""
+
+    def inside(self, points: Tensor) -> Tensor:
+        """Whether points lie inside. bool [N]"""
+        return self.signed_distance(points) < 0
+
+    def intersect(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """First hit of each ray: distance (inf where missed) and normal (0 where missed).
+
+        Args:
+            origins: Where the rays start. [N, 3]
+            directions: Unit directions. [N, 3]
+
+        Returns:
+            Distances and outward unit normals. [N], [N, 3]
+        """
+        distance = self.hit(origins, directions)
+        found = distance.isfinite()
+        normal = torch.zeros_like(directions)
+        points = origins[found] + distance[found, None] * directions[found]
+        normal[found] = self.normal(points)
+        return distance, normal
+
+
+@dataclass(frozen=True)
+class Box(Primitive):
+    """A box with the given half sides."""
+
+    half: tuple[float, float, float]
+
+    @property
+    def extent(self) -> tuple[float, float, float]:
+        return self.half
+
+    @property
+    def radius_around(self) -> float:
+        return math.hypot(*self.half)
+
+    def hit(self, origins: Tensor, directions: Tensor) -> Tensor:
+        near, far = zip(
+            *(
+                _slab(origins[:, axis], directions[:, axis], half)
+                for axis, half in enumerate(self.half)
+            ),
+            strict=True,
+        )
+        return _first(
+            torch.maximum(torch.maximum(near[0], near[1]), near[2]),
+            torch.minimum(torch.minimum(far[0], far[1]), far[2]),
+        )
+
+    def normal(self, points: Tensor) -> Tensor:
+        axis = (points.abs() - points.new_tensor(self.half)).argmax(dim=-1, keepdim=True)
+        return torch.zeros_like(points).scatter(-1, axis, points.gather(-1, axis).sign())
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        return _corner_distance(points.abs() - points.new_tensor(self.half))
+
+
+@dataclass(frozen=True)
+class Ellipsoid(Primitive):
+    """An ellipsoid with the given radii; equal radii make a ball."""
+
+    radii: tuple[float, float, float]
+
+    @property
+    def extent(self) -> tuple[float, float, float]:
+        return self.radii
+
+    @property
+    def radius_around(self) -> float:
+        return max(self.radii)
+
+    def hit(self, origins: Tensor, directions: Tensor) -> Tensor:
+        radii = origins.new_tensor(self.radii)
+        stretched = directions / radii
+        length = stretched.norm(dim=-1, keepdim=True)
+        near, far = _ball(origins / radii, stretched / length, 1.0)
+        return _first(near / length[:, 0], far / length[:, 0])
+
+    def normal(self, points: Tensor) -> Tensor:
+        return normalize(points / points.new_tensor(self.radii).square(), dim=-1)
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """Sign and zero are exact, elsewhere a first-order estimate of the distance. [N]"""
+        radii = points.new_tensor(self.radii)
+        scaled = (points / radii).norm(dim=-1).clamp_min(1e-6)
+        slope = (points / radii.square()).norm(dim=-1).clamp_min(1e-6 / min(self.radii))
+        return scaled * (scaled - 1) / slope
+
+
+@dataclass(frozen=True)
+class Cylinder(Primitive):
+    """A capped cylinder."""
+
+    radius: float
+    half_height: float
+
+    @property
+    def extent(self) -> tuple[float, float, float]:
+        return self.radius, self.radius, self.half_height
+
+    @property
+    def radius_around(self) -> float:
+        return math.hypot(self.radius, self.half_height)
+
+    def hit(self, origins: Tensor, directions: Tensor) -> Tensor:
+        return _first(*cylinder_span(origins, directions, self.radius, self.half_height))
+
+    def normal(self, points: Tensor) -> Tensor:
+        side = points[:, :2].norm(dim=-1) - self.radius
+        on_cap = (points[:, 2].abs() - self.half_height > side)[:, None]
+        flat = points * points.new_tensor([1.0, 1.0, 0.0])
+        cap = points.sign() * points.new_tensor([0.0, 0.0, 1.0])
+        return torch.where(on_cap, cap, normalize(flat, dim=-1))
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        side = points[:, :2].norm(dim=-1) - self.radius
+        return _corner_distance(torch.stack([side, points[:, 2].abs() - self.half_height], dim=-1))
+
+
+@dataclass(frozen=True)
+class Capsule(Primitive):
+    """A cylinder of the given half height with half balls on both ends."""
+
+    radius: float
+    half_height: float
+
+    @property
+    def extent(self) -> tuple[float, float, float]:
+        return self.radius, self.radius, self.half_height + self.radius
+
+    @property
+    def radius_around(self) -> float:
+        return self.half_height + self.radius
+
+    def hit(self, origins: Tensor, directions: Tensor) -> Tensor:
+        near, far = cylinder_span(origins, directions, self.radius, self.half_height)
+        for end in (-self.half_height, self.half_height):
+            centre = origins.new_tensor([0.0, 0.0, end])
+            enter, leave = _ball(origins - centre, directions, self.radius)
+            near, far = torch.minimum(near, enter), torch.maximum(far, leave)
+        return _first(near, far)
+
+    def normal(self, points: Tensor) -> Tensor:
+        return normalize(self._from_axis(points), dim=-1)
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        return self._from_axis(points).norm(dim=-1) - self.radius
+
+    def _from_axis(self, points: Tensor) -> Tensor:
+        along = points[:, 2].clamp(-self.half_height, self.half_height)
+        return torch.cat([points[:, :2], (points[:, 2] - along)[:, None]], dim=-1)
+
+
+def _first(near: Tensor, far: Tensor) -> Tensor:
+    """The first crossing ahead of a ray that is inside a convex shape from near to far. [N]"""
+    ahead = torch.where(near > 0, near, far)
+    return torch.where((near <= far) & (ahead > 0), ahead, MISS)
+
+
+def _slab(origins: Tensor, directions: Tensor, half: float) -> tuple[Tensor, Tensor]:
+    """Where rays enter and leave the layer between -half and half of one axis. [N], [N]"""
+    tiny = directions.abs() < 1e-12
+    inverse = 1 / directions.masked_fill(tiny, 1e-12)
+    middle, reach = -origins * inverse, half * inverse.abs()
+    return middle - reach, middle + reach
+
+
+def _ball(origins: Tensor, directions: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+    """Where rays enter and leave a ball; inf and -inf where they miss it. [N], [N]"""
+    along = (origins * directions).sum(dim=-1)
+    # The foot of the perpendicular keeps the digits that |o|^2 - r^2 would lose far away.
+    foot = origins - along[:, None] * directions
+    spare = radius * radius - foot.square().sum(dim=-1)
+    reach = spare.clamp_min(0).sqrt()
+    hit = spare >= 0
+    return torch.where(hit, -along - reach, MISS), torch.where(hit, -along + reach, -MISS)
+
+
+def cylinder_span(
+    origins: Tensor, directions: Tensor, radius: float, half_height: float
+) -> tuple[Tensor, Tensor]:
+    """Where rays enter and leave a capped cylinder; inf and -inf where they miss it. [N], [N]"""
+    flat, flat_origins = directions[:, :2], origins[:, :2]
+    square = flat.square().sum(dim=-1)
+    upright = square < 1e-12
+    square = square.masked_fill(upright, 1.0)
+    along = ((flat_origins * flat).sum(dim=-1) / square).masked_fill(upright, 0.0)
+    foot = flat_origins - along[:, None] * flat
+    spare = radius * radius - foot.square().sum(dim=-1)
+    reach = (spare.clamp_min(0) / square).sqrt().masked_fill(upright, MISS)
+    near, far = _slab(origins[:, 2], directions[:, 2], half_height)
+    near, far = torch.maximum(near, -along - reach), torch.minimum(far, -along + reach)
+    hit = (spare >= 0) & (near <= far)
+    return torch.where(hit, near, MISS), torch.where(hit, far, -MISS)
+
+
+def _corner_distance(out: Tensor) -> Tensor:
+    """Signed distance from how far a point sticks out along orthogonal directions. [N]"""
+    return out.clamp_min(0).norm(dim=-1) + out.amax(dim=-1).clamp_max(0)
+
+
+Colour = tuple[float, float, float]
+
+
+def rgb(code: str) -> Colour:
+    """The colour of an HTML code such as ``#f0b400``."""
+    value = int(code.removeprefix("#"), 16)
+    return (value >> 16 & 255) / 255, (value >> 8 & 255) / 255, (value & 255) / 255
+
+
+class Surface(ABC):
+    """A colour for every point of a part."""
+
+    @abstractmethod
+    def colour(self, points: Tensor) -> Tensor:
+        """Colours at points in the part's own coordinates. [N, 3]"""
+
+
+@dataclass(frozen=True)
+class Plain(Surface):
+    """One colour, mottled by soft waves of the given strength and wave length."""
+
+    paint: Colour
+    mottle: float = 0.0
+    wave: float = 0.25
+
+    def colour(self, points: Tensor) -> Tensor:
+        paint = points.new_tensor(self.paint).expand_as(points)
+        if not self.mottle:
+            return paint
+        x, y, z = (points * (2 * math.pi / self.wave)).unbind(-1)
+        waves = (x + 0.9 * (0.7 * y).sin()).sin() * (y + 0.9 * (0.6 * z).sin()).cos()
+        waves = waves + 0.6 * (1.7 * z + 0.8 * x).sin() * (1.3 * y - 0.5 * x).cos()
+        return (paint * (1 + self.mottle * waves[:, None])).clamp(0, 1)
+
+
+@dataclass(frozen=True)
+class Stripes(Surface):
+    """Bands of equal width across one axis (0, 1, 2), the colours taken in turn."""
+
+    paints: tuple[Colour, ...]
+    axis: int
+    width: float
+    shift: float = 0.0
+
+    def colour(self, points: Tensor) -> Tensor:
+        return _pick(self.paints, _cell(points[:, self.axis] + self.shift, self.width))
+
+
+@dataclass(frozen=True)
+class Checker(Surface):
+    """Cubes of two or more colours."""
+
+    paints: tuple[Colour, ...]
+    cell: tuple[float, float, float]
+
+    def colour(self, points: Tensor) -> Tensor:
+        cells = sum(_cell(points[:, axis], size) for axis, size in enumerate(self.cell))
+        return _pick(self.paints, torch.as_tensor(cells))
+
+
+@dataclass(frozen=True)
+class Sectors(Surface):
+    """Slices of an orange around z, the colours taken in turn."""
+
+    paints: tuple[Colour, ...]
+    count: int
+
+    def colour(self, points: Tensor) -> Tensor:
+        turn = torch.atan2(points[:, 1], points[:, 0]) / (2 * math.pi) + 0.5
+        return _pick(self.paints, (turn * self.count).floor())
+
+
+@dataclass(frozen=True)
+class Bricks(Surface):
+    """Rows of bricks with joints between them, every brick in its own tone.
+
+    Attributes:
+        paint: Colour of the bricks.
+        joint_paint: Colour of the joints.
+        length: Length of a brick.
+        height: Height of a row, along z.
+        joint: Width of the joints.
+        around: Radius of a round wall whose bricks run around z; 0 for straight walls.
+        tone: How much the tones of the bricks differ.
+    """
+
+    paint: Colour
+    joint_paint: Colour
+    length: float
+    height: float
+    joint: float
+    around: float = 0.0
+    tone: float = 0.2
+
+    def colour(self, points: Tensor) -> Tensor:
+        x, y, z = (points * _INWARD).unbind(-1)
+        if self.around:
+            along, length = torch.atan2(y, x) * self.around, self.length
+            length = 2 * math.pi * self.around / max(round(2 * math.pi * self.around / length), 1)
+        else:
+            # On a face of constant x or y the sum runs along the wall.
+            along, length = x + y, self.length
+        row = (z / self.height).floor()
+        along = along / length + 0.5 * row.remainder(2)
+        column = along.floor()
+        if self.around:
+            column = column.remainder(round(2 * math.pi * self.around / length))
+        in_joint = ((along - along.floor()) * length < self.joint) | (
+            z - row * self.height < self.joint
+        )
+        noise = ((row * 12.9898 + column * 78.233).sin() * 437.585).frac()
+        bricks = points.new_tensor(self.paint) * (1 + self.tone * noise[:, None])
+        joints = points.new_tensor(self.joint_paint)
+        return torch.where(in_joint[:, None], joints, bricks.clamp(0, 1))
+
+
+# Patterns are read a little below the surface: a face that lies exactly on the border between
+# two cells would otherwise take the colour of either at random.
+_INWARD = 0.998
+
+
+def _cell(values: Tensor, width: float) -> Tensor:
+    return (values * (_INWARD / width)).floor()
+
+
+def _pick(paints: tuple[Colour, ...], cells: Tensor) -> Tensor:
+    """The colour of each numbered cell, taken in turn. [N, 3]"""
+    return cells.new_tensor(paints)[cells.remainder(len(paints)).long()]
+
+
+_HALVINGS = 44
+"""Halvings of a bracket no wider than the torus, down to the precision of float64."""
+
+
+@dataclass(frozen=True)
+class Torus(Primitive):
+    """A ring around z: the circle of radius ``ring`` in the xy plane, made ``tube`` thick."""
+
+    ring: float
+    tube: float
+
+    @property
+    def extent(self) -> tuple[float, float, float]:
+        return self.ring + self.tube, self.ring + self.tube, self.tube
+
+    @property
+    def radius_around(self) -> float:
+        return self.ring + self.tube
+
+    def hit(self, origins: Tensor, directions: Tensor) -> Tensor:
+        start, stop = cylinder_span(origins, directions, self.radius_around, self.tube)
+        distance = torch.full_like(start, MISS)
+        rays = ((start <= stop) & (stop > 0)).nonzero()[:, 0]
+        # Seen from the foot of the perpendicular the quartic has no cubic term and no digits are
+        # lost to the distance of the camera.
+        origin, direction = origins[rays].double(), directions[rays].double()
+        foot = (origin * direction).sum(dim=-1)
+        origin = origin - foot[:, None] * direction
+        # From a little before the cylinder around the torus, which touches it.
+        start = (start[rays].double() - 1e-6).clamp_min(0) + foot
+        stop = stop[rays].double() + 1e-6 + foot
+        root = _first_change(self._quartic(origin, direction), start, stop) - foot
+        distance[rays] = root.to(distance)
+        return distance
+
+    def normal(self, points: Tensor) -> Tensor:
+        flat = points * points.new_tensor([1.0, 1.0, 0.0])
+        return normalize(points - self.ring * normalize(flat, dim=-1), dim=-1)
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        return torch.hypot(points[:, :2].norm(dim=-1) - self.ring, points[:, 2]) - self.tube
+
+    def _quartic(self, foot: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Factors (a, b, c) of t^4 + a t^2 + b t + c, negative inside the torus. [N] each"""
+        flat, across = foot[:, :2], direction[:, :2]
+        bulk = foot.square().sum(dim=-1) + self.ring**2 - self.tube**2
+        four = 4 * self.ring**2
+        return (
+            2 * bulk - four * across.square().sum(dim=-1),
+            -2 * four * (flat * across).sum(dim=-1),
+            bulk.square() - four * flat.square().sum(dim=-1),
+        )
+
+
+def _first_change(factors: tuple[Tensor, Tensor, Tensor], start: Tensor, stop: Tensor) -> Tensor:
+    """First root of t^4 + a t^2 + b t + c from start to stop that it passes through, or inf. [N]"""
+    a, b, c = factors
+
+    def value(t: Tensor) -> Tensor:
+        return ((t * t + a) * t + b) * t + c
+
+    # Between its extrema the quartic is monotone: at most one change of sign in each piece.
+    extrema = torch.minimum(torch.maximum(_cubic_roots(a / 2, b / 4), start), stop)
+    ends = torch.cat([start[None], extrema, stop[None]])
+    outside = value(ends) >= 0
+    first = outside[0]
+    changed = outside[1:] != first
+    piece = changed.to(torch.uint8).argmax(dim=0, keepdim=True)
+    low, high = ends.gather(0, piece)[0], ends.gather(0, piece + 1)[0]
+    found = changed.any(dim=0).nonzero()[:, 0]
+    a, b, c, first, low, high = (part[found] for part in (a, b, c, first, low, high))
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        before = (value(middle) >= 0) == first
+        low, high = torch.where(before, middle, low), torch.where(before, high, middle)
+    return torch.full_like(start, MISS).index_copy(0, found, 0.5 * (low + high))
+
+
+def _cubic_roots(p: Tensor, q: Tensor) -> Tensor:
+    """Rising real roots of t^3 + p t + q, a single one repeated. [3, N]"""
+    spare = (q / 2).square() + (p / 3) ** 3
+    # One root: Cardano's formula, by the sum that does not cancel.
+    cube = -torch.copysign(q.abs() / 2 + spare.clamp_min(0).sqrt(), q)
+    large = torch.copysign(cube.abs() ** (1 / 3), cube)
+    single = large - torch.where(large == 0, 0.0, p / (3 * large))
+    # Three roots: Viete's cosines.
+    reach = 2 * (-p / 3).clamp_min(0).sqrt()
+    turn = (3 * q / (p * reach)).nan_to_num(0.0).clamp(-1, 1).acos() / 3
+    steps = torch.tensor([2.0, 1.0, 0.0], dtype=p.dtype, device=p.device)[:, None]
+    three = reach * (turn - steps * (2 * math.pi / 3)).cos()
+    return torch.where(spare > 0, single, three)

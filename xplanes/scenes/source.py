@@ -1,0 +1,104 @@
+"""What all sources of scenes share: their settings, and what is done with what they read."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.views import Scene, Views, joined
+from xplanes.settings import Count, Positive, Settings
+
+SAME = 2
+"""Steps of 1/255 by which a pixel that stands still may differ between frames."""
+
+
+def stands_still(video: Views) -> bool:
+    """Whether all frames of a fixed camera, at two timesteps or more, show the same."""
+    first = video.images[0].to(torch.int16)
+    fixed = video.intrinsics.is_shared and not video.is_still
+    return fixed and all(
+        int((frame.to(torch.int16) - first).abs().max()) <= SAME for frame in video.images[1:]
+    )
+
+
+def at_one_moment(scene: Scene, reason: str) -> Scene:
+    """The scene with all views at time 0, and one frame of its video.
+
+    Args:
+        scene: The scene.
+        reason: How it is known that nothing moves, for the header of a run.
+    """
+    splits = {
+        name: replace(views, times=torch.zeros_like(views.times))
+        for name, views in scene.splits.items()
+    }
+    video = scene.video
+    if video is not None:
+        video = video.subset(torch.zeros(1, dtype=torch.long))
+        video = replace(video, times=torch.zeros(1))
+    return replace(scene, splits=splits, video=video, still=reason)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSettings(Settings, ABC):
+    """Base of the settings in the group ``data``: one subclass for each format."""
+
+    name: str  # Name of the format in run directories and tables.
+    root: str  # Folder that holds the scenes.
+    scene: str  # Folder of the scene, or name of the demo scene.
+    resolution: Count | None  # Pixels per side; null keeps the native size.
+    views: Count | None  # Training views kept, spread over time; null keeps all.
+    train_on_video: bool  # Train on the frames of the scene's fixed camera too.
+    still: bool | None  # Nothing moves; null: where the fixed camera's frames are equal.
+    eval_split: Literal["test", "val"]  # Split that is scored.
+    eval_views: Count | None  # Views of it, spread over time; null takes all.
+    half_side: Positive | None  # Half the side of the scene's cube; null finds it.
+
+    @property
+    def folder(self) -> Path:
+        """The scene's folder."""
+        return Path(self.root) / self.scene
+
+    def prepare(self) -> None:
+        """Fetch or make what is not on disk yet; one process of each machine does it.
+
+        Raises:
+            SceneError: If it cannot be had.
+        """
+
+    @abstractmethod
+    def load(self, splits: Sequence[str]) -> Scene:
+        """Read some splits, and the video of a fixed camera where there is one.
+
+        Raises:
+            SceneError: Anything is missing, damaged or inconsistent; the message says what to do.
+        """
+
+    def read(self, splits: Sequence[str] | None = None) -> Scene:
+        """The scene as these settings want it.
+
+        Args:
+            splits: Splits to read; the training views and the scored split when None.
+
+        Raises:
+            SceneError: If it cannot be used.
+        """
+        scene = self.load(tuple(splits or ("train", self.eval_split)))
+        parts = dict(scene.splits)
+        if self.train_on_video and "train" in parts:
+            if scene.video is None:
+                raise SceneError(
+                    f"data.train_on_video=true: {self.folder} has no video of a fixed camera "
+                    "(transforms_video.json); set it to false"
+                )
+            parts["train"] = joined(parts["train"], scene.video)
+        scene = replace(scene, name=self.scene, splits=parts)
+        if self.still:
+            return at_one_moment(scene, "data.still=true")
+        if self.still is None and scene.video is not None and stands_still(scene.video):
+            return at_one_moment(scene, f"the fixed camera's {len(scene.video)} frames are equal")
+        return scene

@@ -1,1 +1,0 @@
-"""Settings of models, losses and samplers beyond X-Planes' own, typed."""

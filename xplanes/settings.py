@@ -1,0 +1,232 @@
+"""Typed settings: dataclasses whose types, ranges and choices are checked where they are built.
+
+A component of a run is such a class and a YAML file that names it as ``_target_``. Must stay quick
+to import: it knows neither torch nor Hydra.
+"""
+
+import difflib
+import math
+import types
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import cache
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from xplanes.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Range:
+    """Bounds of a number.
+
+    Attributes:
+        low: Least value, or the value above which it must lie.
+        high: Largest value, or the value below which it must lie.
+        open: Whether the bounds themselves are excluded.
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    open: bool = False
+
+    def __contains__(self, value: float) -> bool:
+        if self.open:
+            return self.low < value < self.high
+        return self.low <= value <= self.high
+
+    def __str__(self) -> str:
+        if self.low == 0 and self.high == math.inf:
+            return "must be above 0" if self.open else "must not be negative"
+        if self.high == math.inf:
+            return f"must be {'above' if self.open else 'at least'} {self.low:g}"
+        if self.low == -math.inf:
+            return f"must be {'below' if self.open else 'at most'} {self.high:g}"
+        return f"must lie between {self.low:g} and {self.high:g}"
+
+
+ABOVE_0, FROM_0, SHARE = Range(0, open=True), Range(0), Range(0, 1)
+
+Count = Annotated[int, ABOVE_0]
+"""A whole number above 0."""
+Positive = Annotated[float, ABOVE_0]
+"""A number above 0."""
+Weight = Annotated[float, FROM_0]
+"""A number from 0 on."""
+Steps = Annotated[int, FROM_0]
+"""A whole number from 0 on."""
+Share = Annotated[float, SHARE]
+"""A number from 0 to 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Base of all settings. Subclasses are frozen dataclasses with keyword arguments.
+
+    Plain values of nested settings are read, and all values checked, when an object is made.
+    """
+
+    def __post_init__(self) -> None:
+        for entry, hint in _hints(type(self)):
+            value = _converted(entry, getattr(self, entry), hint)
+            object.__setattr__(self, entry, value)
+            _check(entry, value, hint)
+        self.check()
+
+    def check(self) -> None:
+        """Refuse settings that contradict one another.
+
+        Raises:
+            ConfigError: With the setting, its value and the way out.
+        """
+
+    @classmethod
+    def require_names(cls, names: Iterable[str]) -> None:
+        """Refuse names that are not those of this class's settings.
+
+        Raises:
+            ConfigError: For a name that does not exist, or one that is missing.
+        """
+        known = {entry.name: entry for entry in fields(cls)}
+        given = list(names)
+        for name in given:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=3)
+                hint = f". Did you mean {' or '.join(near)}?" if near else ""
+                raise ConfigError(f"{name}: there is no such setting{hint}")
+        for name, entry in known.items():
+            if name not in given and entry.default is entry.default_factory is MISSING:
+                raise ConfigError(f"{name}: it is not set")
+
+    def plain(self) -> dict[str, Any]:
+        """The same as builtins, with the class as ``_target_``."""
+        content: dict[str, Any] = {"_target_": f"{type(self).__module__}.{type(self).__qualname__}"}
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            content[entry.name] = value.plain() if isinstance(value, Settings) else value
+        return content
+
+
+def leaves(settings: Settings, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names and values of all settings."""
+    for entry in fields(settings):
+        value = getattr(settings, entry.name)
+        if isinstance(value, Settings):
+            yield from leaves(value, f"{prefix}{entry.name}.")
+        else:
+            yield f"{prefix}{entry.name}", value
+
+
+def check_arguments(function: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
+    """Refuse plain values that are not of the types and ranges of a function's annotations.
+
+    Raises:
+        ConfigError: With the argument, its value and what is allowed.
+    """
+    hints = get_type_hints(function, include_extras=True)
+    for name, value in arguments.items():
+        if name in hints:
+            _check(name, value, hints[name])
+
+
+@cache
+def _hints(cls: type) -> tuple[tuple[str, Any], ...]:
+    hints = get_type_hints(cls, include_extras=True)
+    return tuple((entry.name, hints[entry.name]) for entry in fields(cls))
+
+
+def _converted(name: str, value: Any, hint: Any) -> Any:
+    """A plain value in the form of a type: settings built, numbers as floats or as text."""
+    kinds, _ = _kinds(hint)
+    if isinstance(value, Mapping):
+        for kind in kinds:
+            if isinstance(kind, type) and issubclass(kind, Settings):
+                from xplanes.components import build
+
+                return build(value, kind, name)
+    if float in kinds and int not in kinds and type(value) is int:
+        return float(value)
+    if type(value) in (int, float) and not {int, float} & set(kinds):
+        # The command line reads 32 as a number also where text is wanted.
+        choices = [choice for kind in kinds for choice in get_args(kind)]
+        if str in kinds or str(value) in choices:
+            return str(value)
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _kinds(hint: Any) -> tuple[list[Any], list[Range]]:
+    """Alternatives of a type hint, and the ranges that it carries."""
+    ranges: list[Range] = []
+    if get_origin(hint) is Annotated:
+        inner, *extras = get_args(hint)
+        ranges = [extra for extra in extras if isinstance(extra, Range)]
+        kinds, more = _kinds(inner)
+        return kinds, ranges + more
+    if get_origin(hint) in (Union, types.UnionType):
+        kinds = []
+        for part in get_args(hint):
+            found, more = _kinds(part)
+            kinds += found
+            ranges += more
+        return kinds, ranges
+    return [hint], ranges
+
+
+def _check(name: str, value: Any, hint: Any) -> None:
+    kinds, ranges = _kinds(hint)
+    if value is None and type(None) in kinds:
+        return
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{name}={value}: must be a finite number")
+    choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+    if choices and value in choices:
+        return
+    if not any(_fits(value, kind) for kind in kinds if get_origin(kind) is not Literal):
+        if choices:
+            named = ", ".join(map(str, choices))
+            other = " or a number" if {int, float} & set(kinds) else ""
+            raise ConfigError(f"{name}={value}: must be one of {named}{other}")
+        raise ConfigError(f"{name}={value}: must be {_words(kinds)}")
+    for allowed in ranges:
+        if isinstance(value, int | float) and value not in allowed:
+            raise ConfigError(f"{name}={value}: {allowed}")
+    for kind in kinds:
+        if get_origin(kind) in (list, Sequence) and isinstance(value, list):
+            (inner,) = get_args(kind)
+            for item in value:
+                _check(name, item, inner)
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    if kind is float:
+        return isinstance(value, float) or type(value) is int
+    if kind is int:
+        return type(value) is int
+    if kind is Any:
+        return True
+    origin = get_origin(kind)
+    if origin is Sequence and isinstance(value, str):
+        return False
+    return isinstance(value, origin or kind)
+
+
+_NAMES = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "text",
+    type(None): "null",
+    list: "a list",
+    Sequence: "a list",
+    dict: "a mapping",
+}
+
+
+def _words(kinds: list[Any]) -> str:
+    names = []
+    for kind in kinds:
+        origin = get_origin(kind) or kind
+        if isinstance(origin, type) and is_dataclass(origin):
+            names.append("a mapping")
+        else:
+            names.append(_NAMES.get(origin, str(origin)))
+    return " or ".join(dict.fromkeys(names))

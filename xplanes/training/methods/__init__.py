@@ -1,1 +1,0 @@
-"""Methods: what each family of models adds to a training step."""

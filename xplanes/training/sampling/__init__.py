@@ -1,1 +1,0 @@
-"""Samplers in training: rendering with jitter, terms of their own, and upkeep."""

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 
 from tests.training.runs import small_config
@@ -56,7 +57,8 @@ def test_all_four_train_log_and_load_again(config: dict, tmp_path: Path) -> None
     assert opacity[0] > opacity[-1] > 0
     trained = load_run(folder, plugins=["tests.plugins"])
     assert trained.module.field.outline == "one blob"
-    again = RadianceModule.load_from_checkpoint(folder / "checkpoints" / "last.ckpt")
+    path = folder / "checkpoints" / "last.ckpt"
+    again = RadianceModule.load_from_checkpoint(path, plugins=["tests.plugins"])
     assert again.field.width == BLOB["width"]
     views = SceneDataModule.from_run(folder, plugins=["tests.plugins"]).scene.splits["train"]
     assert len(views) == DATA["count"]
@@ -71,6 +73,11 @@ def test_a_run_of_somebody_else_names_no_classes_by_itself(config: dict, tmp_pat
         load_run(folder)
     with pytest.raises(ConfigError, match=r"data\._target_=tests.*plugins=\[MODULE\]"):
         SceneDataModule.from_run(folder)
+    path = tmp_path / "theirs.ckpt"
+    content = {"hyper_parameters": {"config": config}, "state_dict": {}}
+    torch.save(content | {"pytorch-lightning_version": "2.6.4"}, path)
+    with pytest.raises(ConfigError, match=r"model\._target_=tests.*plugins=\[MODULE\]"):
+        RadianceModule.load_from_checkpoint(path)
 
 
 @pytest.mark.parametrize(

@@ -103,6 +103,11 @@ class ModelSettings(Settings, ABC):
     rays: RaySettings
     sampler: SamplerSettings
 
+    @property
+    def is_static(self) -> bool:
+        """Whether these settings leave time out of the field."""
+        return False
+
     @abstractmethod
     def build(self, site: Site, initial: InitialValues | None = None) -> Model:
         """The model for a scene."""

@@ -79,6 +79,10 @@ class XPlanesSettings(ModelSettings):
     warmup_steps: Steps  # Steps until the full learning rate.
     final_lr: Share  # Share of the learning rate left at the end.
 
+    @property
+    def is_static(self) -> bool:
+        return self.plane_set == "three"
+
     def build(self, site: Site, initial: InitialValues | None = None) -> "XPlanesModel":
         return XPlanesModel(self, self.build_field(site, initial), site, initial)
 

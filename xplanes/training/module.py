@@ -82,9 +82,9 @@ class RadianceModule(LightningModule):
 
     The field is built in `setup`, when the scene is known: the LRM is run there, if there is one.
     What data and LRM decide about the field travels in checkpoints, so that
-    ``RadianceModule.load_from_checkpoint(path)`` needs nothing but the file. Optimisation is
-    manual, so that a step is what this file says and nothing else; the Trainer's gradient clipping
-    and accumulation do not apply (``model.rays.accumulate`` does).
+    ``RadianceModule.load_from_checkpoint(path)`` needs nothing but the file (and ``plugins``).
+    Optimisation is manual, so that a step is what this file says and nothing else; the Trainer's
+    gradient clipping and accumulation do not apply (``model.rays.accumulate`` does).
 
     Args:
         config: The groups ``seed``, ``model``, ``lrm``, ``preparation``, ``decomposition`` and
@@ -102,7 +102,9 @@ class RadianceModule(LightningModule):
         self.automatic_optimization = False
         self.method = _read(config, plugins)
         kept = {name: config[name] for name in Method.GROUPS if name in config}
-        self.save_hyperparameters({"config": kept, "plugins": list(plugins)})
+        # Not the plug-ins: a file from somebody else must not choose what is imported.
+        self.save_hyperparameters({"config": kept})
+        self._plugins = tuple(plugins)
         self.model: Model | None = None
         self.sampler: Sampler | None = None
         self.site: Site | None = None
@@ -128,6 +130,15 @@ class RadianceModule(LightningModule):
     def of(cls, method: Method) -> "RadianceModule":
         """The module of settings that were read already."""
         return cls(method.plain())
+
+    @classmethod
+    def load_from_checkpoint(
+        cls, checkpoint_path: Any, *args: Any, weights_only: bool = True, **kwargs: Any
+    ) -> "RadianceModule":
+        """As Lightning does, of tensors and builtins alone: no code in the file is run."""
+        return super().load_from_checkpoint(
+            checkpoint_path, *args, weights_only=weights_only, **kwargs
+        )
 
     # Building
 
@@ -180,11 +191,10 @@ class RadianceModule(LightningModule):
         found = Initialisation(method.model, frame)
         if initialise is not None:
             found = initialise(method, Place(scene, frame, device, devices, say))
-        still = getattr(found.model, "plane_set", None) == "three"
         site = Site(
             frame=found.frame,
             # In a field without time planes all views are of one timestep.
-            times=torch.zeros_like(views.times) if still else views.times,
+            times=torch.zeros_like(views.times) if found.model.is_static else views.times,
             seed=method.seed,
             precision=_precision(found.model, device),
             bounds=found.model.bounds(views),
@@ -466,7 +476,7 @@ class RadianceModule(LightningModule):
 
     def _rebuild(self, content: Mapping[str, Any], frame: Frame) -> None:
         """Build the field without its data, for weights that are about to be loaded."""
-        with plugins(self.hparams["plugins"]):
+        with plugins(self._plugins):
             settings = build(content["model"], ModelSettings, "model")
         if not content["initialised"] or settings.name != self.method.model.name:
             settings = self.method.model  # Weights of another one will not fit.

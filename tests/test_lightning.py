@@ -15,6 +15,7 @@ from lightning.pytorch.loggers import CSVLogger
 from tests.training.runs import small_config
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError
+from xplanes.scenes.errors import SceneError
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -153,6 +154,25 @@ def test_views_are_held_out_where_there_is_no_validation_split(
     train, val = data.scene.splits["train"], data.scene.splits["val"]
     assert (len(train), len(val)) == (21, 3)
     assert not set(train.files) & set(val.files)
+
+
+def test_a_scene_without_a_test_split_is_tested_on_its_validation_views(
+    config: dict, tmp_path: Path
+) -> None:
+    made = SceneDataModule(config["data"])
+    shutil.copytree(made.settings.folder, tmp_path / "scene")
+    (tmp_path / "scene" / "transforms_test.json").unlink()
+    options = ("data=dnerf", f"data.root={tmp_path}", "data.scene=scene", "data.resolution=32")
+    data = SceneDataModule.compose(*options, "data.eval_split=val")
+    used, module = trainer(tmp_path, max_steps=3, logger=False), RadianceModule(config)
+    used.fit(module, data)
+    validated = used.validate(module, data, verbose=False)[0]
+    tested = used.test(module, data, verbose=False)[0]
+    assert tested["test/psnr"] == validated["val/psnr"]
+    # A damaged split is no missing one: nothing is held out in its place.
+    (tmp_path / "scene" / "transforms_val.json").write_text("{")
+    with pytest.raises(SceneError, match="transforms_val"):
+        SceneDataModule.compose(*options, "data.eval_split=val").setup("validate")
 
 
 def test_a_module_without_data_says_what_it_needs(config: dict, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.files import read_json
 from xplanes.scenes.batches import Batch, RayBatches, RaySettings
-from xplanes.scenes.errors import SceneError
+from xplanes.scenes.errors import MissingSplitError
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
@@ -135,7 +135,7 @@ class SceneDataModule(LightningDataModule):
         if stage == "fit" and self.trainer is not None:
             # Where this data trained another module before, the next begins anew.
             self.first = getattr(self.trainer.lightning_module, "batches", self.first)
-        names = {"test": ("test",), "predict": ("test",)}.get(stage, ())
+        names = (self.settings.eval_split,) if stage in ("test", "predict") else ()
         missing = [name for name in names if name not in self.scene.splits]
         wanted = self.trainer is None or self.trainer.limit_val_batches
         if stage in ("fit", "validate") and wanted and "val" not in self.scene.splits:
@@ -143,7 +143,7 @@ class SceneDataModule(LightningDataModule):
         for name in missing:
             try:
                 found = self.settings.read((name,)).splits[name]
-            except SceneError:
+            except MissingSplitError:
                 if name != "val":
                     raise
                 # Held out of the training views.
@@ -263,7 +263,9 @@ class _GivenScene(SceneSettings):
         )
 
     def load(self, splits: Sequence[str]) -> Scene:
-        raise SceneError(f"{self.scene}: there are no splits {', '.join(splits)} in this scene")
+        raise MissingSplitError(
+            f"{self.scene}: there are no splits {', '.join(splits)} in this scene"
+        )
 
 
 def found_root(run: Path, root: str) -> str:

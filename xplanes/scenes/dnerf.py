@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from xplanes.scenes.errors import SceneError
+from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.images import read_images
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.transforms import Transforms, read_transforms
@@ -122,7 +122,8 @@ def _transforms_path(folder: Path, split: str) -> Path:
         )
     if split != "train" and "val" in found:
         way_out = "Evaluate on the validation views with data.eval_split=val, or add the file."
-    raise SceneError(f"{path} does not exist. Splits of this scene: {', '.join(found)}. {way_out}")
+    names = ", ".join(found)
+    raise MissingSplitError(f"{path} does not exist. Splits of this scene: {names}. {way_out}")
 
 
 def _scenes_in(folder: Path) -> list[str]:

@@ -1,5 +1,9 @@
-"""The error that every problem with scene data is reported as."""
+"""Errors that problems with scene data are reported as."""
 
 
 class SceneError(ValueError):
     """Scene data cannot be used; the message says which file, why, and what to do."""
+
+
+class MissingSplitError(SceneError):
+    """A scene has no split of a name."""

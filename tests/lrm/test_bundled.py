@@ -61,3 +61,6 @@ def test_a_model_that_is_not_there_is_named_with_those_that_are(tmp_path: Path):
     ship(tmp_path, "tiny")
     with pytest.raises(LRMError, match=r"huge\.safetensors.*no such model.*there is tiny"):
         load_bundled("huge", tmp_path)
+    (tmp_path / "tiny.json").unlink()
+    with pytest.raises(LRMError, match=r"tiny\.json: no such model.*there is none"):
+        load_bundled("tiny", tmp_path)

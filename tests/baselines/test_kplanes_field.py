@@ -170,6 +170,19 @@ def test_octaves_hold_values_sines_and_cosines():
     torch.testing.assert_close(octaves(values, 3), torch.tensor([expected]))
 
 
+def test_densities_are_exponentials_of_a_shifted_logit_in_units_of_the_frame():
+    torch.manual_seed(0)
+    points, times = 2 * torch.rand(50, 3) - 1, torch.rand(50)
+    proposal = DensityField(PlaneProducts(4, 6, [1], 3, low=0.1, high=0.15), 8, unit=2.5)
+    logit = proposal.network(proposal.products(points, times))[:, 0]
+    torch.testing.assert_close(proposal(points, times), 2.5 * (logit - 1).exp())
+    products = PlaneProducts(4, 6, [1], 3, low=0.1, high=0.5)
+    for decoder in (HybridDecoder(products.features, 8), ExplicitDecoder(products.features, 8)):
+        field = KPlanes(products, decoder, 2.5)
+        logit, _ = decoder.geometry(products(points, times))
+        torch.testing.assert_close(field.geometry(points, times)[0], 2.5 * (logit - 1).exp())
+
+
 def test_every_parameter_gets_a_gradient_and_shapes_fit():
     for decoder in [HybridDecoder, ExplicitDecoder]:
         case = decoder.__name__

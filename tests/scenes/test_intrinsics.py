@@ -27,7 +27,7 @@ from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import cube_frame, optical_centre, scene_frame
 from xplanes.scenes.silhouettes import foreground, may_hold
 from xplanes.scenes.source import stands_still
-from xplanes.scenes.views import Intrinsics, Scene, Views, camera_rays, joined, pad_images
+from xplanes.scenes.views import Intrinsics, Scene, Views, camera_rays, joined
 from xplanes.training.evaluation import score_view
 
 RADIUS = 0.5
@@ -35,6 +35,15 @@ COLOUR = [200, 100, 50, 255]
 # Height, width, focal lengths along x and y, principal point from the left and from the top.
 WIDE = (30, 44, 41.0, 36.5, 25.25, 13.5)
 UPRIGHT = (38, 26, 55.0, 58.0, 12.0, 21.75)
+
+
+def padded(images):
+    """Images in one tensor, zeros at the bottom and on the right. [h, w, 4] each -> [V, H, W, 4]"""
+    height, width = (max(image.shape[axis] for image in images) for axis in (0, 1))
+    whole = torch.zeros(len(images), height, width, 4, dtype=torch.uint8)
+    for place, image in zip(whole, images, strict=True):
+        place[: image.shape[0], : image.shape[1]] = image
+    return whole
 
 
 def rays_of(pose, height, width, focal_x, focal_y, centre_x, centre_y):
@@ -72,7 +81,7 @@ def film(cameras, poses, times=None, centre=(0.0, 0.0, 0.0)):
     count = len(images)
     known = torch.tensor(cameras, dtype=torch.float64)
     return Views(
-        pad_images(images),
+        padded(images),
         poses,
         torch.linspace(0, 1, count) if times is None else times,
         Intrinsics(known[:, 2:4], known[:, 4:], known[:, :2].long()),

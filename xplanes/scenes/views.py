@@ -1,7 +1,6 @@
 """Posed, timed images of a scene, held in memory as bytes."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -203,20 +202,6 @@ class Views:
         height, width = self.size(index)
         focal, centre = self.intrinsics.focal[index], self.intrinsics.centre[index]
         return camera_rays(self.camera_to_world[index], focal, height, width, centre)
-
-
-def pad_images(images: Sequence[Tensor]) -> Tensor:
-    """Images in one tensor, smaller ones padded at the bottom and on the right.
-
-    Args:
-        images: uint8 [h, w, 4] each.
-
-    Returns:
-        uint8 [V, H, W, 4], H and W the largest sizes.
-    """
-    height = max(image.shape[0] for image in images)
-    width = max(image.shape[1] for image in images)
-    return torch.stack([_padded(image, height, width) for image in images])
 
 
 def joined(first: Views, second: Views) -> Views:

@@ -163,7 +163,7 @@ def test_a_scene_without_a_test_split_is_tested_on_its_validation_views(
     shutil.copytree(made.settings.folder, tmp_path / "scene")
     (tmp_path / "scene" / "transforms_test.json").unlink()
     options = ("data=dnerf", f"data.root={tmp_path}", "data.scene=scene", "data.resolution=32")
-    data = SceneDataModule.compose(*options, "data.eval_split=val")
+    data = SceneDataModule.compose(*options)
     used, module = trainer(tmp_path, max_steps=3, logger=False), RadianceModule(config)
     used.fit(module, data)
     validated = used.validate(module, data, verbose=False)[0]
@@ -172,7 +172,18 @@ def test_a_scene_without_a_test_split_is_tested_on_its_validation_views(
     # A damaged split is no missing one: nothing is held out in its place.
     (tmp_path / "scene" / "transforms_val.json").write_text("{")
     with pytest.raises(SceneError, match="transforms_val"):
-        SceneDataModule.compose(*options, "data.eval_split=val").setup("validate")
+        SceneDataModule.compose(*options).setup("validate")
+
+
+def test_test_views_are_scored_in_training_only_where_the_settings_say_so(config: dict) -> None:
+    data = SceneDataModule(config["data"])
+    assert (data.validation_split, data.test_split) == ("val", "test")
+    for split in ("val", "test"):
+        data = SceneDataModule(config["data"] | {"eval_split": split})
+        data.setup("fit")
+        assert (data.validation_split, data.test_split) == (split, split)
+        assert list(data.scene.splits) == ["train", split]
+    assert [batch["target"].shape for batch in data.val_dataloader()] == [(32, 32, 3)] * 3
 
 
 def test_a_module_without_data_says_what_it_needs(config: dict, tmp_path: Path) -> None:

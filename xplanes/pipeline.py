@@ -168,6 +168,7 @@ def train(
     warm = warm_up.seconds
     started = time.monotonic()
     data = SceneDataModule(settings, seed=method.seed)
+    data.setup("fit")
     scene, views = data.scene, data.scene.splits["train"]
     if resume and record is not None and _has_checkpoint(folder):
         require_same_views(folder, record.content, views)
@@ -189,8 +190,8 @@ def train(
             files={name: list(views.files) for name, views in scene.splits.items()},
         )
         warm_up_loops(module, data, device)
-        expected = estimate(module, data, settings.eval_split)
-        text = header(experiment, folder, scene, module, overrides, expected)
+        expected = estimate(module, data)
+        text = header(experiment, folder, data, module, overrides, expected)
         logger.info("\n%s", text)
         say(text + "\n")
         write_pictures(trainer, found.pictures, log=not resume)
@@ -209,7 +210,7 @@ def train(
         "evaluate": scoring,
     }
     skipped = data.batches_for(module, 0).skipped
-    metrics = summary(trainer, module, scores, settings.eval_split, seconds, skipped)
+    metrics = summary(trainer, module, scores, data.test_split, seconds, skipped)
     metrics["skipped"] |= found.skipped
     metrics["decomposition"] = found.report
     metrics["lrm"] = found.lrm

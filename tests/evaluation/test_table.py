@@ -35,7 +35,7 @@ def make(
     config: dict[str, Any] = {
         "seed": seed,
         "resume": None,
-        "data": {"eval_split": "test", "scene": "lego"},
+        "data": {"scene": "lego"},
         "model": {"name": model, "plane_set": model.split("_")[0], "resolution": resolution},
         "lrm": {"name": "none"},
     }
@@ -45,6 +45,7 @@ def make(
     (folder / "run.json").write_text(json.dumps(record))
     if psnr is not None:
         metrics = {
+            "split": "test",
             "test": {"psnr": psnr, "ssim": psnr / 40},
             "step": 300,
             "seconds": {"prepare": {"lrm": 1.5, "convert": 0.5}, "train": 60.25},

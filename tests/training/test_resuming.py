@@ -3,6 +3,7 @@
 import json
 import shutil
 import signal
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,11 @@ from lightning import Trainer
 
 from tests.training.runs import small_config
 from xplanes.errors import ConfigError
+from xplanes.evaluation.runs import load_run
+from xplanes.files import read_rows
 from xplanes.pipeline import run
+from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.training import evaluation
 from xplanes.training.checkpoints import Checkpoints
 from xplanes.training.evaluation import Evaluation
@@ -143,3 +148,29 @@ def test_a_signal_after_the_last_step_is_heard(
     monkeypatch.undo()
     run(small_config(scenes, *FEW), tmp_path / "run", [], resume=True)
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["step"] == 6
+
+
+def test_without_a_validation_split_training_views_are_held_out_or_nothing_is_the_best(
+    scenes: Path, tmp_path: Path
+) -> None:
+    few = (*FEW, "callbacks.evaluation.at=[0]", "media=false", "lrm=none")
+    for views, held_out in ((10, 0), (20, 2)):
+        options = (f"data.train_views={views}", "data.val_views=1", "data.test_views=2")
+        demo = small_config(scenes, *few, *options)
+        made = SceneDataModule(demo["data"]).settings.folder
+        folder = Path(shutil.copytree(made, tmp_path / "scenes" / str(views)))
+        (folder / "transforms_val.json").unlink()
+        target = "xplanes.scenes.dnerf.BlenderSettings"
+        known = {field.name for field in fields(BlenderSettings)}
+        data = {name: value for name, value in demo["data"].items() if name in known}
+        data |= {"_target_": target, "root": str(tmp_path / "scenes"), "scene": str(views)}
+        done = tmp_path / f"run{views}"
+        run(demo | {"data": data}, done, [], resume=False)
+        assert {row["split"] for row in read_rows(done / "curve.csv")} == {
+            "val" if held_out else "test"
+        }
+        assert (done / "checkpoints" / "best.ckpt").is_file() == bool(held_out)
+        trained = load_run(done)
+        assert (len(trained.scene.splits["train"]), trained.split) == (views - held_out, "test")
+        header = (done / "train.log").read_text()
+        assert ("(held out of train)" in header) == bool(held_out)

@@ -64,7 +64,7 @@ def beside(rows: Sequence[RunRow]) -> str | None:
             lines.append([*own, *(entry.get(name, "") for name in names)])
             own = [*key, "", "", ""]
     used = [row for runs in groups.values() for row in runs]
-    scenes, split = _values(used, "data.scene"), _values(used, "data.eval_split")
+    scenes, split = _values(used, "data.scene"), ", ".join(sorted({row.split for row in used}))
     pixels, views = _values(used, "data.resolution", "native"), _values(used, "data.views", "all")
     scored = _values(used, "data.eval_views", "all")
     header = [*KEYS, *(["settings"] if others else []), *HEADER]

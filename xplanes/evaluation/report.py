@@ -14,7 +14,7 @@ from xplanes import __version__, backend
 from xplanes.experiment import Experiment
 from xplanes.process import train_command
 from xplanes.rendering.pictures import write_png
-from xplanes.scenes.views import Scene
+from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.training.clock import TrainingClock, find_callback, training_seconds
 from xplanes.training.evaluation import ViewScore, device_memory, log_image, mean
 from xplanes.training.fit import Estimate, Trainer
@@ -29,7 +29,7 @@ VIDEO_PIXELS = 48 * 200 * 200
 def header(
     experiment: Experiment,
     run: Path,
-    scene: Scene,
+    data: SceneDataModule,
     module: RadianceModule,
     overrides: Sequence[str],
     expected: Estimate,
@@ -38,8 +38,11 @@ def header(
     assert module.frame is not None
     assert module.sampler is not None
     assert module.initialisation is not None
+    scene = data.scene
     frame, device, trainer = module.frame, experiment.device, experiment.trainer
     counts = " / ".join(f"{len(views)} {name}" for name, views in scene.splits.items())
+    if data.held_out:
+        counts += " (held out of train)"
     train = scene.splits["train"]
     size = sum(views.nbytes for views in scene.splits.values()) / 2**20
     trainable = sum(p.numel() for p in module.parameters() if p.requires_grad)
@@ -63,21 +66,24 @@ def header(
         "from": module.initialisation.words,
         "samples": module.sampler.outline,
         "budget": budget,
-        "estimate": _estimated(experiment, scene, expected),
+        "estimate": _estimated(experiment, data, expected),
         "changed": " ".join(overrides) or "(nothing)",
     }
     return "\n".join(f"{name:<9}{text}" for name, text in lines.items())
 
 
-def _estimated(experiment: Experiment, scene: Scene, expected: Estimate) -> str:
+def _estimated(experiment: Experiment, data: SceneDataModule, expected: Estimate) -> str:
     """Seconds and memory that the run is going to take, in words."""
     trainer = experiment.trainer
     steps = float(trainer.get("max_steps", -1)) if trainer.get("max_steps", -1) > 0 else math.inf
     train = min(steps * expected.step, trainer.get("max_seconds") or math.inf)
-    views = scene.splits[experiment.data.eval_split]
+    final = data.scene.splits[data.test_split]
+    views = data.scene.splits[data.validation_split or data.test_split]
     node = experiment.callbacks.get("evaluation", {})
     times, count = len(node.get("at", [])), node.get("views") or len(views)
-    pixels = views.height * views.width * (times * min(count, len(views)))
+    pixels = views.height * views.width * times * min(count, len(views))
+    if final is not views or count < len(views):
+        pixels += final.height * final.width * len(final)
     if experiment.media:
         pixels += VIDEO_PIXELS
     images = pixels / expected.image_rays

@@ -13,7 +13,7 @@ from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
 from xplanes.files import read_json
 from xplanes.process import train_command
-from xplanes.scenes.datamodule import found_root
+from xplanes.scenes.datamodule import SceneDataModule, found_root
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene, Views
 from xplanes.training.checkpoints import load_checkpoint
@@ -136,7 +136,7 @@ def load_run(
     Args:
         run: The run directory.
         checkpoint: ``last`` or ``best``.
-        split: Split to read beside the training views; the run's own when None.
+        split: Split to score; the one that the run was scored on when None.
         device: Where to put the field; as ``trainer.accelerator`` says when None.
         plugins: Modules of the user's own whose classes the run may name.
         announce: Takes the lines that say what is being loaded.
@@ -146,7 +146,6 @@ def load_run(
     """
     experiment = read_experiment(run, plugins)
     data = replace(experiment.data, root=found_root(run, experiment.data.root))
-    name = split or data.eval_split
     if device is None:
         # Trained on a GPU, looked at where there may be none.
         wanted = str(experiment.trainer.get("accelerator", "auto"))
@@ -159,7 +158,11 @@ def load_run(
     if announce is not None:
         announce(f"run         {run}")
         announce(f"checkpoint  {checkpoint}.ckpt, step {step}, on {device}")
-    scene = data.read(("train", name))
+    served = SceneDataModule(data, seed=experiment.method.seed)
+    served.setup("fit")  # As before training: views may have been held out.
+    name = split or served.test_split
+    served.read_split(name)
+    scene = served.scene
     require_same_views(run, _record(run), scene.splits["train"])
     module = RadianceModule(experiment.config, plugins)
     try:

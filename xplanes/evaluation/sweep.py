@@ -72,6 +72,7 @@ class RunRow:
         scores: Numbers by the names of `MEASURES`, as far as they are known.
         status: How it ended, with the reason where it is not ``finished``.
         curve: PSNR on the way.
+        split: The split that `scores` are of; empty where they do not say.
     """
 
     name: str
@@ -80,6 +81,7 @@ class RunRow:
     scores: dict[str, float] = field(default_factory=dict)
     status: str = "finished"
     curve: tuple[Point, ...] = ()
+    split: str = ""
 
 
 def read_rows(folder: Path) -> list[RunRow]:
@@ -149,6 +151,7 @@ def read_run(run: Path, name: str) -> RunRow:
         scores=scores,
         status=status,
         curve=curve,
+        split=str((metrics or {}).get("split", "")),
     )
 
 

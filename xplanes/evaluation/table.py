@@ -71,7 +71,7 @@ def counts(rows: Sequence[RunRow]) -> str:
     """How many runs ended how, and what their scores are of."""
     kinds = [row.status.split(":")[0].split(",")[0].split(";")[0] for row in rows]
     tally = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
-    splits = {row.settings["data.eval_split"] for row in rows if "data.eval_split" in row.settings}
+    splits = {row.split for row in rows if row.split}
     scored = f" Scores of the {splits.pop()} split." if len(splits) == 1 else ""
     return f"{len(rows)} runs: {tally}.{scored}"
 

@@ -76,6 +76,8 @@ class SceneDataModule(LightningDataModule):
         self.settings, self.seed = settings, seed
         self.first = 0
         """Batches that training has drawn already."""
+        self.held_out = 0
+        """Training views that serve for validation, because the scene has no split for it."""
         self._scene: Scene | None = None
         self._batches: dict[int, RayBatches] = {}
 
@@ -135,30 +137,55 @@ class SceneDataModule(LightningDataModule):
         if stage == "fit" and self.trainer is not None:
             # Where this data trained another module before, the next begins anew.
             self.first = getattr(self.trainer.lightning_module, "batches", self.first)
-        names = (self.settings.eval_split,) if stage in ("test", "predict") else ()
-        missing = [name for name in names if name not in self.scene.splits]
-        wanted = self.trainer is None or self.trainer.limit_val_batches
-        if stage in ("fit", "validate") and wanted and "val" not in self.scene.splits:
-            missing.append("val")
-        for name in missing:
-            try:
-                found = self.settings.read((name,)).splits[name]
-            except MissingSplitError:
-                if name != "val":
-                    raise
-                # Held out of the training views.
-                train = self.scene.splits["train"]
-                if len(train) < 2 * HELD_OUT:
-                    continue
-                chosen = torch.zeros(len(train), dtype=torch.bool)
-                chosen[train.times.argsort(stable=True)[HELD_OUT // 2 :: HELD_OUT]] = True
-                found = train.subset(chosen.nonzero()[:, 0])
-                rest = train.subset((~chosen).nonzero()[:, 0])
-                self._scene = replace(self.scene, splits=self.scene.splits | {"train": rest})
-                self._batches = {}  # Those before held all of them.
+        scores = self.trainer is None or self.trainer.limit_val_batches
+        if stage in ("fit", "validate") and scores:
+            if (split := self.validation_split) is None:
+                self._hold_out()
+            else:
+                self.read_split(split)
+        if stage in ("test", "predict"):
+            self.read_split(self.test_split)
+
+    @property
+    def test_split(self) -> str:
+        """The split that a trained field is scored on."""
+        return self.settings.eval_split or ("test" if "test" in self.scene.splits else "val")
+
+    @property
+    def validation_split(self) -> str | None:
+        """The split that is scored during training; None where there are no views for it.
+
+        Never ``test``, unless the settings say so.
+        """
+        return self.settings.eval_split or ("val" if "val" in self.scene.splits else None)
+
+    def read_split(self, name: str) -> Views:
+        """The views of a split, read now if the settings did not ask for it.
+
+        Raises:
+            SceneError: If there is none, or it cannot be used.
+        """
+        if name not in self.scene.splits:
+            found = self.settings.read((name,)).splits[name]
             if self.scene.still:
                 found = replace(found, times=torch.zeros_like(found.times))
             self._scene = replace(self.scene, splits=self.scene.splits | {name: found})
+        return self.scene.splits[name]
+
+    def _hold_out(self) -> None:
+        """Make a validation split of training views, if there are enough of them."""
+        train = self.scene.splits["train"]
+        if len(train) < 2 * HELD_OUT:
+            return
+        chosen = torch.zeros(len(train), dtype=torch.bool)
+        chosen[train.times.argsort(stable=True)[HELD_OUT // 2 :: HELD_OUT]] = True
+        parts = {
+            "train": train.subset((~chosen).nonzero()[:, 0]),
+            "val": train.subset(chosen.nonzero()[:, 0]),
+        }
+        self._scene = replace(self.scene, splits=self.scene.splits | parts)
+        self._batches = {}  # Those before held all of them.
+        self.held_out = len(parts["val"])
 
     def batches(self, rank: int) -> RayBatches:
         """The batches of a process, for the module that is being trained."""
@@ -182,20 +209,18 @@ class SceneDataModule(LightningDataModule):
         return DataLoader(_Endless(batches, self), batch_size=None)
 
     def val_dataloader(self) -> DataLoader | list[DataLoader]:
-        return self._views("val") if "val" in self.scene.splits else []
+        split = self.validation_split
+        return [] if split is None else self._views(split)
 
     def test_dataloader(self) -> DataLoader:
-        return self._views(self.settings.eval_split)
+        return self._views(self.test_split)
 
     def predict_dataloader(self) -> DataLoader:
-        return self._views(self.settings.eval_split)
+        return self._views(self.test_split)
 
     def _views(self, split: str) -> DataLoader:
-        if split not in self.scene.splits:
-            views = self.settings.read((split,)).splits[split]
-            self._scene = replace(self.scene, splits=self.scene.splits | {split: views})
-        views = self.scene.splits[split]
-        return DataLoader(_WholeViews(views, self.scene.background), batch_size=None)
+        views = _WholeViews(self.read_split(split), self.scene.background)
+        return DataLoader(views, batch_size=None)
 
     def state_dict(self) -> dict[str, Any]:
         module = None if self.trainer is None else self.trainer.lightning_module
@@ -248,7 +273,6 @@ class _GivenScene(SceneSettings):
 
     @classmethod
     def around(cls, scene: Scene) -> "_GivenScene":
-        split = "val" if "test" not in scene.splits else "test"
         return cls(
             name="given",
             root=".",
@@ -257,7 +281,7 @@ class _GivenScene(SceneSettings):
             views=None,
             train_on_video=False,
             still=None,
-            eval_split=split,
+            eval_split=None,
             eval_views=None,
             half_side=None,
         )

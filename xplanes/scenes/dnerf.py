@@ -52,7 +52,7 @@ def read_scene(
         splits: Names of the splits to read, such as train, val, test.
         views: Number of views to keep of the train split, spread evenly over time;
             None keeps all.
-        eval_views: The same for every other split.
+        eval_views: The same for every other split, at most.
 
     Returns:
         The scene, with ``video`` where transforms_video.json exists.
@@ -66,6 +66,8 @@ def read_scene(
     listed = {split: read_transforms(path) for split, path in paths.items()}
     for split, transforms in listed.items():
         key, count = ("views", views) if split == "train" else ("eval_views", eval_views)
+        if count is not None and split != "train":
+            count = min(count, len(transforms.files))
         if count is not None:
             listed[split] = _spread(
                 transforms, count, f"data.{key}", f"the {split} split of {folder}"
@@ -121,7 +123,7 @@ def _transforms_path(folder: Path, split: str) -> Path:
             "Move some of its frames into a file of that name: they are scored, not trained on."
         )
     if split != "train" and "val" in found:
-        way_out = "Evaluate on the validation views with data.eval_split=val, or add the file."
+        way_out = "Leave data.eval_split out, set it to val, or add the file."
     names = ", ".join(found)
     raise MissingSplitError(f"{path} does not exist. Splits of this scene: {names}. {way_out}")
 

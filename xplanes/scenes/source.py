@@ -2,13 +2,14 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import torch
 
-from xplanes.scenes.errors import SceneError
+from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.views import Scene, Views, joined
 from xplanes.settings import Count, Positive, Settings
 
@@ -54,8 +55,8 @@ class SceneSettings(Settings, ABC):
     views: Count | None  # Training views kept, spread over time; null keeps all.
     train_on_video: bool  # Train on the frames of the scene's fixed camera too.
     still: bool | None  # Nothing moves; null: where the fixed camera's frames are equal.
-    eval_split: Literal["test", "val"]  # Split that is scored.
-    eval_views: Count | None  # Views of it, spread over time; null takes all.
+    eval_split: Literal["test", "val"] | None  # Scored split; null: val in training, test after it.
+    eval_views: Count | None  # Views of a scored split at most, spread over time; null takes all.
     half_side: Positive | None  # Half the side of the scene's cube; null finds it.
 
     @property
@@ -82,12 +83,13 @@ class SceneSettings(Settings, ABC):
         """The scene as these settings want it.
 
         Args:
-            splits: Splits to read; the training views and the scored split when None.
+            splits: Splits to read; the training views and what is scored when None: `eval_split`,
+                or those of ``val`` and ``test`` that there are.
 
         Raises:
             SceneError: If it cannot be used.
         """
-        scene = self.load(tuple(splits or ("train", self.eval_split)))
+        scene = self.load(tuple(splits)) if splits else self._load_scored()
         parts = dict(scene.splits)
         if self.train_on_video and "train" in parts:
             if scene.video is None:
@@ -102,3 +104,12 @@ class SceneSettings(Settings, ABC):
         if self.still is None and scene.video is not None and stands_still(scene.video):
             return at_one_moment(scene, f"the fixed camera's {len(scene.video)} frames are equal")
         return scene
+
+    def _load_scored(self) -> Scene:
+        """The training views and the splits that are scored."""
+        if self.eval_split is not None:
+            return self.load(("train", self.eval_split))
+        for splits in (("train", "val", "test"), ("train", "val")):
+            with suppress(MissingSplitError):
+                return self.load(splits)
+        return self.load(("train", "test"))

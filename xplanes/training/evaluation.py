@@ -151,7 +151,10 @@ class Curve:
 
 
 class Evaluation(Callback):
-    """Scores views of ``data.eval_split`` at set shares of the budget, off the training clock.
+    """Scores validation views at set shares of the budget, off the training clock.
+
+    These are views of `SceneDataModule.validation_split`. Where there are none it scores test
+    views, and no evaluation counts as the best.
 
     Writes curve.csv and images into the trainer's ``default_root_dir``, and gives scalars and
     images to its loggers. All rows of the curve score the same views.
@@ -221,7 +224,7 @@ class Evaluation(Callback):
 
     def _score(self, trainer: Trainer, module: RadianceModule, renderer: RayRenderer) -> None:
         data: Any = trainer.datamodule  # type: ignore[attr-defined]
-        split = data.settings.eval_split
+        split = data.validation_split or data.test_split
         views, step, run = data.scene.splits[split], trainer.global_step, _folder(trainer)
         if self._curve is None:
             self._curve = Curve(run / "curve.csv", until=step)
@@ -247,7 +250,7 @@ class Evaluation(Callback):
         psnr_now = mean([s.psnr for s in self.latest])
         scores = {f"{split}/psnr": psnr_now, f"{split}/ssim": mean([s.ssim for s in self.latest])}
         module.last.update(scores)
-        if psnr_now > self.best:
+        if psnr_now > self.best and data.validation_split is not None:
             self.best, self.best_step = psnr_now, step
         self._write(trainer, module, run, split, scores, pictures)
         self.seconds += time.perf_counter() - began
@@ -285,7 +288,7 @@ class Evaluation(Callback):
 
 
 def final_scores(trainer: Trainer, module: RadianceModule, data: Any) -> list[ViewScore]:
-    """Scores of all views of the data's ``eval_split`` by the final model.
+    """Scores of all views of the data's ``test_split`` by the final model.
 
     Those of the last evaluation serve where it scored all of them.
 
@@ -294,9 +297,10 @@ def final_scores(trainer: Trainer, module: RadianceModule, data: Any) -> list[Vi
         module: The module.
         data: A `SceneDataModule`.
     """
-    views = data.scene.splits[data.settings.eval_split]
+    views = data.scene.splits[data.test_split]
     evaluation = find_callback(trainer, Evaluation)
-    if evaluation is not None and evaluation.step == trainer.global_step:
+    same = data.test_split == (data.validation_split or data.test_split)
+    if same and evaluation is not None and evaluation.step == trainer.global_step:
         latest = evaluation.latest
         if len(latest) == len(views):
             return latest

@@ -207,13 +207,12 @@ class Estimate:
     memory: int
 
 
-def estimate(module: RadianceModule, data: SceneDataModule, split: str) -> Estimate:
+def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
     """Time a step and some rays of a scored view; fields become faster as empty space is skipped.
 
     Args:
         module: The module, its loops compiled.
         data: Its data.
-        split: The split that is scored.
     """
     assert module.sampler is not None
     assert module.frame is not None
@@ -230,7 +229,7 @@ def estimate(module: RadianceModule, data: SceneDataModule, split: str) -> Estim
         if device.type == "cuda":
             torch.cuda.synchronize()
         seconds.append(time.perf_counter() - began)
-    views = data.scene.splits[split]
+    views = data.scene.splits[data.test_split]
     ends = module.frame.rays(*views.image_rays(0))
     chosen = torch.linspace(0, len(ends[0]) - 1, min(2048, len(ends[0]))).long()
     began = time.perf_counter()

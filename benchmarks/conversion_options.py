@@ -64,11 +64,11 @@ def make(name: str) -> tuple[Tensor, Tensor]:
     grid = (torch.arange(SIZE) + 0.5) / SIZE * 2 - 1
     frames = []
     for frame in range(FRAMES):
-        moment = frame / (FRAMES - 1)
-        centre = trajectory(moment)
-        angle = 2 * math.pi * turning * moment
+        timestep = frame / (FRAMES - 1)
+        centre = trajectory(timestep)
+        angle = 2 * math.pi * turning * timestep
         features = math.cos(angle) * colour + math.sin(angle) * other
-        planes = background + math.sin(2 * math.pi * 1.3 * moment) * flicker
+        planes = background + math.sin(2 * math.pi * 1.3 * timestep) * flicker
         for index, (first, second) in enumerate(AXES):
             distance = (grid - centre[first]) ** 2 + (grid[:, None] - centre[second]) ** 2
             cover = torch.sigmoid(8 * (1 - distance.sqrt() / radius))
@@ -158,7 +158,7 @@ def main() -> None:
         "",
         "The loss is then trained with Adam (0.01), four random frames per step.",
         "",
-        "| sequence | planes | start | seconds | at the start | after 100 steps | after 400 |",
+        "| sequence | planes | initialisation | seconds | step 0 | after 100 steps | after 400 |",
         "|---|---|---|---|---|---|---|",
         *dynamic_rows,
     ]

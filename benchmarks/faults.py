@@ -34,10 +34,10 @@ def page(found: Gatherer) -> str:
         notes += f"\nFailed without a count: {', '.join(found.other_failures)}.\n"
     return f"""# Faults
 
-Runs of 40 steps on a scene of 32 pixels, a checkpoint every 3 steps, random planes or from
+Runs of 40 steps on a scene of 32 pixels, a checkpoint every 3 steps, random initialisation or
 `tiny`, forked from one process that has loaded everything. "Same end": once the fault is gone, the
 run (resumed where one had begun) comes to the parameters, scores and curve of an uninterrupted one,
-bit for bit, and leaves no unfinished file; a curve.csv that was cut short itself loses rows.
+bit-identically, and leaves no unfinished file; a curve.csv that was cut short itself loses rows.
 "Messages": the words that a user saw, checked for the file, the reason and the way out. Cases with
 no end of their own are files and folders that must be refused.
 

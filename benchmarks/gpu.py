@@ -33,7 +33,7 @@ from runner import RESULTS, Measured, command, lego, machine, markdown, measure
 from torch import Tensor
 
 from xplanes.fields.lookup import plane_features_gpu, plane_features_reference
-from xplanes.fields.products import MOVING, plane_product_gpu, plane_product_reference
+from xplanes.fields.products import DYNAMIC, plane_product_gpu, plane_product_reference
 from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 from xplanes.files import read_json, require_writable, write_json, write_rows, write_text
 
@@ -59,7 +59,7 @@ RAY = 32
 """Points of a ray."""
 CPU_MINUTES = 3.0
 RESERVE = 15.0
-"""Seconds of the budget kept for the start and the page."""
+"""Seconds of the budget reserved for start-up and for writing the page."""
 
 
 class Figure(NamedTuple):
@@ -176,7 +176,7 @@ def lookup_case(plane_set: str, sizes: Sizes) -> Case:
 def product_case(sizes: Sizes) -> Case:
     """The product of six planes at one scale (K-Planes)."""
     planes = []
-    for name in MOVING:
+    for name in DYNAMIC:
         shape = (1, sizes.channels, sizes.rows if "t" in name else sizes.texels, sizes.texels)
         plane = 1.3 - torch.rand(shape, device=sizes.device)
         planes.append(plane.contiguous(memory_format=torch.channels_last))
@@ -186,8 +186,8 @@ def product_case(sizes: Sizes) -> Case:
     outer = places.nbytes + 4 * len(places) * sizes.channels
     return Case(
         planes,
-        lambda planes: plane_product_gpu(planes, places, MOVING),
-        lambda planes: plane_product_reference(planes, places, MOVING),
+        lambda planes: plane_product_gpu(planes, places, DYNAMIC),
+        lambda planes: plane_product_reference(planes, places, DYNAMIC),
         (outer + total, outer + 3 * total),
     )
 
@@ -199,8 +199,8 @@ def errors(case: Case) -> dict[str, tuple[float, str]]:
         leaves = [plane.to(precision, copy=True).requires_grad_() for plane in case.planes]
         value = function(leaves)
         weights = torch.linspace(-1, 1, value.numel(), device=value.device, dtype=torch.float64)
-        pull = (1000 * weights).sin().float().to(value.dtype).view_as(value)
-        return [value.detach(), *torch.autograd.grad(value, leaves, pull)]
+        upstream = (1000 * weights).sin().float().to(value.dtype).view_as(value)
+        return [value.detach(), *torch.autograd.grad(value, leaves, upstream)]
 
     exact = values(case.twin, torch.float64)
     found = {}
@@ -243,10 +243,10 @@ def time_case(case: Case, speed: float) -> dict[str, dict[str, tuple[float, str]
         with torch.no_grad():
             forward = microseconds(lambda function=function: function(planes))
         value = function(planes)
-        pull = torch.randn_like(value)
+        upstream = torch.randn_like(value)
 
-        def back(value: Tensor = value, pull: Tensor = pull) -> object:
-            return torch.autograd.grad(value, planes, pull, retain_graph=True)
+        def back(value: Tensor = value, upstream: Tensor = upstream) -> object:
+            return torch.autograd.grad(value, planes, upstream, retain_graph=True)
 
         spent[name] = forward, microseconds(back)
     return {
@@ -397,13 +397,15 @@ class Part:
         return f"{self.section} ({self.row})"
 
 
-def training(row: str, start: str, device: str, precision: str = "32", **options: Any) -> Part:
+def training(
+    row: str, initialisation: str, device: str, precision: str = "32", **options: Any
+) -> Part:
     """A fixed number of steps, the same on both devices."""
     steps = (f"trainer.max_steps={STEPS}", "trainer.max_seconds=null")
     budget = (*steps, "callbacks.evaluation.at=[]")
     # Which samples pass gradients on is drawn on the device, and each draws otherwise: 0.2 dB.
     equal = (f"model.precision={precision}", "model.sampler.thinning=0")
-    given = (start, f"trainer.accelerator={device}", *equal, *budget)
+    given = (initialisation, f"trainer.accelerator={device}", *equal, *budget)
     return Part("training", row, overrides=given, **options)
 
 
@@ -572,13 +574,13 @@ TABLES = {
         f"{STEPS} steps on the GPU and on the CPU",
         "Excavator at 64 px, six planes, 8192 samples a step, the same seed, gradients from all "
         "samples (`model.sampler.thinning=0`: the default draws them on the device), decoder in "
-        'float32 unless noted. "random": random planes (`lrm=none`); "tiny": those of `lrm=tiny`. '
+        'float32 unless noted. Initialisation: "random" (`lrm=none`) or "tiny" (`lrm=tiny`). '
         "PSNR and SSIM are means over the test views. Steps/s and rays/s are of the training "
         "clock. Peak memory is the GPU's; in runs on the CPU, the process's.",
     ),
     "throughput": (
         "Steps per second",
-        f"Excavator at 64 px, {SETTLED} s of training, random planes, default precision. "
+        f"Excavator at 64 px, {SETTLED} s of training, random initialisation, default precision. "
         f"Steps/s leave the first {SHARE * SETTLED:g} s out; rays/s and samples/s are of the whole "
         "run. A step has 8192 samples, large batches 262,144 at most "
         f"(`{' '.join(LARGE)}`); K-Planes has 4096 rays. "
@@ -586,12 +588,12 @@ TABLES = {
     ),
     "lego": (
         "lego at 400 px",
-        f"D-NeRF's lego, val split, random planes, {LEGO_SECONDS} s of training, "
+        f"D-NeRF's lego, val split, random initialisation, {LEGO_SECONDS} s of training, "
         f"`{' '.join(LARGE)}`; PSNR and SSIM are means over the views.",
     ),
 }
 
-STARTS = ("random", "tiny")
+INITIALISATIONS = ("random", "tiny")
 
 Figures = dict[tuple[str, str, str], Figure]
 
@@ -604,10 +606,11 @@ def gathered(outcomes: list[Outcome]) -> Figures:
         if outcome.record is not None
         for figure in outcome.record.figures
     }
-    for start in STARTS:
-        gpu, cpu = (found.get(("training", f"{start}, {name}", "PSNR")) for name in ("GPU", "CPU"))
+    for name in INITIALISATIONS:
+        rows = [f"{name}, {device}" for device in ("GPU", "CPU")]
+        gpu, cpu = (found.get(("training", row, "PSNR")) for row in rows)
         if gpu is not None and cpu is not None:
-            key = "difference", start, "PSNR, GPU minus CPU"
+            key = "difference", name, "PSNR, GPU minus CPU"
             found[key] = Figure(*key, gpu.value - cpu.value, "dB")
     return found
 
@@ -640,8 +643,8 @@ def findings(figures: Figures) -> list[str]:
                 f"Kernels at {POINTS[-1]:,} points, {label}: {min(gains):.1f} to {max(gains):.1f} "
                 "times as fast as torch."
             )
-    for start in STARTS:
-        rows = [("training", f"{start}, {device}") for device in ("GPU", "CPU")]
+    for name in INITIALISATIONS:
+        rows = [("training", f"{name}, {device}") for device in ("GPU", "CPU")]
         if not all((*row, "PSNR") in figures for row in rows):
             continue
         (gpu, cpu), (fast, slow) = (
@@ -649,7 +652,7 @@ def findings(figures: Figures) -> list[str]:
         )
         verdict = "within" if abs(gpu - cpu) <= AGREE else "not within"
         lines.append(
-            f"{STEPS} steps ({start}): {gpu:.2f} dB on the GPU, {cpu:.2f} dB on the CPU. The "
+            f"{STEPS} steps ({name}): {gpu:.2f} dB on the GPU, {cpu:.2f} dB on the CPU. The "
             f"difference of {gpu - cpu:+.2f} dB is {verdict} {AGREE:g} dB. {fast:.1f} against "
             f"{slow:.1f} steps/s."
         )

@@ -1,4 +1,4 @@
-"""PSNR against seconds on D-NeRF's lego, val split, random planes.
+"""PSNR against seconds on D-NeRF's lego, val split, random initialisation.
 
     python benchmarks/lego_curves.py [--lego FOLDER]
 
@@ -48,7 +48,7 @@ def plot(curves: dict[str, list[tuple[float, float]]]) -> None:
     )
     axes.set_xscale("log")
     axes.set(xlabel="training clock in seconds", ylabel="PSNR in dB")
-    axes.set_title(f"lego, random planes; {machine()}", fontsize=9)
+    axes.set_title(f"lego, random initialisation; {machine()}", fontsize=9)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     figure.tight_layout()
@@ -95,7 +95,7 @@ def main() -> None:
                 points += [(pixels, planes, seconds, *point) for point in curve]
     header = ("pixels", "planes", "budget", "seconds", "psnr")
     write_rows(RESULTS / "lego.csv", header, points)
-    page = f"""# lego, val split, random planes
+    page = f"""# lego, val split, random initialisation
 
 Default settings, {machine()}. `{command()}`
 

@@ -94,9 +94,9 @@ def on_front(name: str, curves: dict[str, list[tuple[float, float]]]) -> bool:
     Between two scores a run lies on the line between them; before its first one it has nothing.
     """
     last = max(curve[-1][0] for curve in curves.values())
-    moments = np.geomspace(FIRST, max(last, FIRST), 200)
+    seconds = np.geomspace(FIRST, max(last, FIRST), 200)
     values = {
-        run: np.interp(moments, *zip(*curve, strict=True), left=-np.inf)
+        run: np.interp(seconds, *zip(*curve, strict=True), left=-np.inf)
         for run, curve in curves.items()
     }
     best = np.max(list(values.values()), axis=0)

@@ -92,7 +92,7 @@ def main() -> None:
     write_rows(RESULTS / "rendering.csv", COLUMNS, rows)
     page = f"""# Rendering: seconds per frame against PSNR
 
-{name}, six random planes trained for {args.seconds:g} s at
+{name}, six planes with random initialisation, trained for {args.seconds:g} s at
 {run.scene.splits["train"].width} px with 128 samples along the cube's diagonal; median of {FRAMES}
 views, PSNR their mean, blank where the scene has no images of that size; {machine()}.
 `{command()}`

@@ -29,7 +29,7 @@ SWITCHES = {
     "occlusion off": ("model.sampler.skip_occluded=false",),
     "silhouettes off": ("model.sampler.silhouettes=false",),
     "background off": ("model.rays.skip_background=false",),
-    "coarse start off": ("model.sampler.coarse_steps=0",),
+    "coarse steps off": ("model.sampler.coarse_steps=0",),
     "thinning off": ("model.sampler.thinning=0",),
     "all off": (
         "model.sampler.skip_empty=false",
@@ -44,9 +44,9 @@ SWITCHES = {
 KINDS = ("empty", "occluded", "background", "gradients")
 
 PAIRS = {
-    "planes of time of a still scene": (("data.scene=still",), ("data.still=false",), 1),
+    "time planes of a static scene": (("data.scene=still_life",), ("data.static=false",), 1),
     "grid in bins of time": (("data.scene=balls",), ("model.sampler.time_bins=1",), 1),
-    "grid filled from the start": (
+    "initial grid filled": (
         ("data.scene=excavator", "lrm=tiny"),
         ("model.sampler.fill=false",),
         1,
@@ -134,7 +134,7 @@ def preparation(work: Path) -> list[tuple]:
     """Seconds of the preparation with 16 frames: different ones, equal ones, and kept stages."""
     cases = {
         "16 different frames": ("data.scene=excavator", "preparation.cache=null"),
-        "16 equal frames": ("data.scene=still", "data.still=false", "preparation.cache=null"),
+        "16 equal frames": ("data.scene=still_life", "data.static=false", "preparation.cache=null"),
         "stages kept": ("data.scene=excavator", f"preparation.cache={work / 'cache'}"),
     }
     rows = []
@@ -194,7 +194,7 @@ def main() -> None:
     write_rows(RESULTS / f"{args.name}.csv", COLUMNS, rows)
     page = f"""# Savings, one switched off at a time
 
-{args.steps} steps of 512 rays, {args.resolution} px, six random planes,
+{args.steps} steps of 512 rays, {args.resolution} px, six planes with random initialisation,
 {"one seed" if args.seeds == 1 else f"means of {args.seeds} seeds"}; {machine()}. `{command()}`
 
 empty and occluded: shares of the samples in the box; background: share of the pixels; gradients:

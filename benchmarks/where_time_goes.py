@@ -52,7 +52,7 @@ STAGES = (
     ("checkpoints", "xplanes.training.checkpoints", "Checkpoints._save"),
     ("TensorBoard", "xplanes.training.module", "RadianceModule._log_terms"),
     ("TensorBoard", "lightning.pytorch.loggers.tensorboard", "TensorBoardLogger.log_metrics"),
-    ("film", "xplanes.pipeline", "_video"),
+    ("video", "xplanes.pipeline", "_video"),
     ("Lightning's loop", "xplanes.training.fit", "Trainer.train"),
 )
 """Name of the stage, module and function."""

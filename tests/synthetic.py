@@ -1,4 +1,4 @@
-"""Small scenes whose content is known exactly: a ball, moving or still, filmed all round."""
+"""Small scenes whose content is known exactly: a moving or static ball, seen from all sides."""
 
 import math
 
@@ -7,7 +7,7 @@ import torch
 from xplanes.scenes.cameras import focal_length, look_at
 from xplanes.scenes.views import Scene, Views, camera_rays
 
-STILL = torch.zeros(3)
+STATIC = torch.zeros(3)
 
 
 def surrounding(count, distance, seed=0):
@@ -21,14 +21,14 @@ def surrounding(count, distance, seed=0):
 def ball_views(
     count, radius, *, centre=None, size=40, distance=4.0, angle=0.7, times=None, poses=None, seed=0
 ):
-    """Films a ball; ``centre`` gives its place at a time. Alpha is that of the pixels' centres."""
+    """Render a ball; ``centre`` maps a time to its position. Alpha is sampled at pixel centres."""
     poses = surrounding(count, distance, seed) if poses is None else poses
     times = torch.linspace(0, 1, count) if times is None else times
     focal = focal_length(angle, size)
     images = torch.zeros(count, size * size, 4, dtype=torch.uint8)
     for image, pose, time in zip(images, poses, times.tolist(), strict=True):
         origins, directions = camera_rays(pose, focal, size, size)
-        offset = (STILL if centre is None else centre(time)) - origins
+        offset = (STATIC if centre is None else centre(time)) - origins
         along = (offset * directions).sum(dim=-1)
         image[offset.square().sum(dim=-1) - along.square() < radius**2] = torch.tensor(
             [200, 100, 50, 255], dtype=torch.uint8

@@ -41,7 +41,7 @@ def test_evaluate_as_a_program(trained_run: Path, tmp_path: Path):
 
 
 def test_render(trained_run: Path, tmp_path: Path, capsys):
-    out = tmp_path / "film.webp"
+    out = tmp_path / "video.webp"
     options = ["--path", "fixed", "--time", "sweep", "--frames", "2", "--size", "16"]
     assert main(["render", str(trained_run), *options, "--out", str(out)]) == 0
     assert out.is_file()
@@ -69,7 +69,7 @@ def test_download_says_how_to_go_on(tmp_path: Path, monkeypatch, capsys):
         (["evaluate", "{tmp}/missing"], "does not exist"),
         (["evaluate", "{run}", "--split", "val", "--checkpoint", "best"], None),
         (["render", "{run}", "--time", "7"], "--time 7: must be sweep"),
-        (["render", "{run}", "--out", "a.gif"], "films end in .webp"),
+        (["render", "{run}", "--out", "a.gif"], "a video must end in .webp"),
         (["table", "{tmp}"], "no runs in it"),
         (["view", "{run}", "--port", "70000"], "--port 70000"),
     ],
@@ -94,7 +94,7 @@ def test_a_disk_that_takes_nothing_is_said_before_anything_is_rendered(
 
     monkeypatch.setattr(render, "render_path", lambda *_, **__: pytest.fail("rendered first"))
     (tmp_path / "file").write_text("in the way")
-    target = tmp_path / "file" / "film.webp"
+    target = tmp_path / "file" / "video.webp"
     assert main(["render", str(trained_run), "--out", str(target)]) == 1
     assert capsys.readouterr().err.startswith("error: ")
 

@@ -58,7 +58,7 @@ def test_commands_work_from_an_empty_folder(installed: Path, tmp_path: Path) -> 
     printed = xplanes("train", *SMALL, "trainer.max_steps=5", "hydra.run.dir=outputs/run")
     assert "psnr" in printed
     assert "xplanes train resume=" in printed
-    xplanes("render", "outputs/run", "--frames", "2", "--size", "16", "--out", "film.webp")
-    assert (tmp_path / "film.webp").is_file()
+    xplanes("render", "outputs/run", "--frames", "2", "--size", "16", "--out", "video.webp")
+    assert (tmp_path / "video.webp").is_file()
     assert "1 runs: 1 finished" in xplanes("table", "outputs")
-    assert {path.name for path in tmp_path.iterdir()} == {"data", "outputs", "film.webp"}
+    assert {path.name for path in tmp_path.iterdir()} == {"data", "outputs", "video.webp"}

@@ -92,7 +92,7 @@ def triton_found() -> bool:
 
 
 def gpu_kernels(tensor: Tensor) -> bool:
-    """Whether Triton kernels apply to ``tensor``: on CUDA, where results may vary in the last bits.
+    """Whether Triton kernels apply to ``tensor``: on CUDA, where results are not bit-identical.
 
     Which of several threads adds first to a gradient is chance, so the kernels stay out of runs
     that must be deterministic.

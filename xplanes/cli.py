@@ -178,7 +178,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 
 def _add_render(commands: "argparse._SubParsersAction") -> None:
-    parser = commands.add_parser("render", help="film along a path of cameras and times")
+    parser = commands.add_parser("render", help="render a video along a path of cameras and times")
     _add_run(parser)
     parser.add_argument(
         "--path",
@@ -187,8 +187,8 @@ def _add_render(commands: "argparse._SubParsersAction") -> None:
     )
     parser.add_argument(
         "--time",
-        default="forth-and-back",
-        help="sweep, forth-and-back, or a number from 0 to 1; default: %(default)s",
+        default="back-and-forth",
+        help="sweep, back-and-forth, or a number from 0 to 1; default: %(default)s",
     )
     parser.add_argument("--frames", type=int, help="default: 48, or 1 where nothing moves")
     parser.add_argument("--fps", type=int, default=16, help="default: %(default)s")
@@ -209,9 +209,9 @@ def _add_render(commands: "argparse._SubParsersAction") -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
-    from xplanes.evaluation.render import FilmOptions, check_out, film
+    from xplanes.evaluation.render import VideoOptions, check_out, render_video
 
-    wanted = FilmOptions(
+    wanted = VideoOptions(
         path=options.path,
         time=options.time,
         frames=options.frames,
@@ -227,7 +227,7 @@ def _render(options: argparse.Namespace) -> None:
     size = options.size or max(views.height, views.width)
     camera = f"{options.path} camera, time {options.time}"
     _say(f"frames      {wanted.count} of {size}x{size} px, {options.what}, {camera}\n")
-    _say(f"wrote {film(trained, wanted, options.out)}")
+    _say(f"wrote {render_video(trained, wanted, options.out)}")
 
 
 def _add_view(commands: "argparse._SubParsersAction") -> None:

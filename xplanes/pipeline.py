@@ -16,7 +16,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from xplanes.backend import warm_up
 from xplanes.errors import ConfigError
-from xplanes.evaluation.render import film_times, orbit_poses, render_path, write_film
+from xplanes.evaluation.render import orbit_poses, render_path, video_times, write_video
 from xplanes.evaluation.report import closing, header, log_hparams, summary, write_pictures
 from xplanes.evaluation.runs import read_config
 from xplanes.experiment import Experiment
@@ -58,7 +58,7 @@ KNOWN_ERRORS = (
 )
 """Errors whose message says all; their traceback goes to train.log alone."""
 
-FILM_FRAMES, FILM_FPS, FILM_SIZE = 48, 16, 200
+VIDEO_FRAMES, VIDEO_FPS, VIDEO_SIZE = 48, 16, 200
 
 
 def run(config: dict[str, Any], folder: Path, overrides: list[str], *, resume: bool) -> float:
@@ -232,21 +232,21 @@ def say(text: str) -> None:
 
 
 def _video(module: RadianceModule, frame: Frame, scene: Scene, folder: Path) -> Path:
-    """The scene turning once while its time runs forth and back."""
+    """One camera orbit while time runs from 0 to 1 and back."""
     views = scene.splits["train"]
-    say(f"rendering {FILM_FRAMES} frames of the turning scene ...")
-    size = min(FILM_SIZE, max(views.height, views.width))
+    say(f"rendering {VIDEO_FRAMES} frames of the orbit video ...")
+    size = min(VIDEO_SIZE, max(views.height, views.width))
     frames = render_path(
         module.field,
         module.renderer,
         frame,
-        orbit_poses(views, frame, FILM_FRAMES),
-        film_times(FILM_FRAMES),
+        orbit_poses(views, frame, VIDEO_FRAMES),
+        video_times(VIDEO_FRAMES),
         focal=views.intrinsics.focal_at(size),
         size=size,
         background=scene.background,
     )
-    return write_film(folder / "media" / "orbit.webp", frames, fps=FILM_FPS)
+    return write_video(folder / "media" / "orbit.webp", frames, fps=VIDEO_FPS)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 WAIT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "10000"}
-"""A moment awake, then sleep: threads that spin on waste the cores of a shared machine."""
+"""Threads spin briefly, then sleep: spinning for long wastes the cores of a shared machine."""
 
 
 def waiting(environment: Mapping[str, str]) -> dict[str, str]:

@@ -11,7 +11,7 @@ from tests.baselines.runs import baseline_config
 from tests.refusals import assert_refused
 from xplanes.errors import ConfigError
 from xplanes.evaluation.evaluate import evaluate
-from xplanes.evaluation.render import FilmOptions, film
+from xplanes.evaluation.render import VideoOptions, render_video
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.experiment import Experiment
 from xplanes.pipeline import run
@@ -51,7 +51,7 @@ def check_learns(config: dict, folder: Path, *, gain: float) -> Path:
 def check_resume(
     config: dict, whole: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, *, stop: int
 ) -> None:
-    """A run that broke down and goes on ends where one that did not ends, bit for bit."""
+    """A run that failed and was resumed is bit-identical to an uninterrupted one."""
     original = TrainingClock.on_train_batch_end
 
     def break_down(self, trainer, module, *rest) -> None:
@@ -74,10 +74,10 @@ def check_resume(
 
 
 def check_reload(folder: Path) -> TrainedRun:
-    """The run's field is loaded with its scores, and films."""
+    """The trained run loads, its scores are reproduced, and it renders a video."""
     trained = load_run(folder, device="cpu")
     found = evaluate(trained, "none")
     assert found["test"]["psnr"] == pytest.approx(metrics(folder)["test"]["psnr"], abs=1e-6)
-    path = film(trained, FilmOptions(frames=2, size=8))
+    path = render_video(trained, VideoOptions(frames=2, size=8))
     assert path.stat().st_size > 0
     return trained

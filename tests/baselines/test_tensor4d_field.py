@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.baselines import oracles
-from xplanes.fields.hierarchy import MOVING, STILL, HierarchicalPlanes, Level, bilinear
+from xplanes.fields.hierarchy import DYNAMIC, STATIC, HierarchicalPlanes, Level, bilinear
 from xplanes.fields.tensor4d import SkipNetwork, Tensor4D, Tensor4DDensity
 from xplanes.models.tensor4d import (
     eikonal_error,
@@ -18,7 +18,7 @@ from xplanes.models.tensor4d import (
 from xplanes.rendering.neus import NeusRenderer, section_opacity, weights_of
 
 
-def planes(groups=STILL, *, fine=True, size=6, filled=True):
+def planes(groups=STATIC, *, fine=True, size=6, filled=True):
     torch.manual_seed(0)
     levels = [Level(size, 5, 2)] + ([Level(2 * size, 5, 3)] if fine else [])
     made = HierarchicalPlanes(groups, levels, blur=4)
@@ -32,7 +32,7 @@ def planes(groups=STILL, *, fine=True, size=6, filled=True):
 
 
 def surface(moves=True, width=16, filled=True):
-    flow = planes(MOVING, fine=False, filled=filled) if moves else None
+    flow = planes(DYNAMIC, fine=False, filled=filled) if moves else None
     return Tensor4D(planes(filled=filled), flow, width, octaves=(4, 3, 2))
 
 
@@ -60,7 +60,7 @@ def test_reading_a_plane_has_right_first_and_second_derivatives():
 
 
 def test_features_are_all_planes_side_by_side():
-    for groups in [STILL, MOVING]:
+    for groups in [STATIC, DYNAMIC]:
         case = f"{len(groups)} groups"
         made = planes(groups).double()
         points, times = 2 * torch.rand(9, 3).double() - 1, torch.rand(9).double()
@@ -101,8 +101,8 @@ def test_planes_are_read_coarsely_at_first():
 
 
 def test_planes_number_as_published():
-    canonical = HierarchicalPlanes(STILL, [Level(128, 128, 32), Level(512, 128, 16)])
-    flow = HierarchicalPlanes(MOVING, [Level(128, 128, 32)])
+    canonical = HierarchicalPlanes(STATIC, [Level(128, 128, 32), Level(512, 128, 16)])
+    flow = HierarchicalPlanes(DYNAMIC, [Level(128, 128, 32)])
     field = Tensor4D(canonical, flow)
     assert sum(p.numel() for p in canonical.parameters()) == 3 * (128**2 * 32 + 512**2 * 16)
     assert sum(p.numel() for p in flow.parameters()) == 9 * 128**2 * 32
@@ -113,7 +113,7 @@ def test_planes_number_as_published():
     assert shapes == [(256, 64), (256, 256 + 96 + 64), (256, 256), (3, 256)]
     assert field.tint[0].weight.shape == (256, 3 + 21 + 3 + 256)
     assert float(field.sharpness.detach()) == pytest.approx(math.exp(3))
-    nine = Tensor4DDensity(HierarchicalPlanes(MOVING, [Level(128, 128, 32), Level(512, 128, 16)]))
+    nine = Tensor4DDensity(HierarchicalPlanes(DYNAMIC, [Level(128, 128, 32), Level(512, 128, 16)]))
     assert nine.compression(nine.field_planes(torch.zeros(1, 3), torch.zeros(1))).shape == (1, 144)
 
 
@@ -154,9 +154,9 @@ def test_nothing_flows_at_time_zero_and_something_later():
     points = 2 * torch.rand(5, 3) - 1
     assert torch.equal(field.canonical(points, torch.zeros(5)), points)
     assert not torch.equal(field.canonical(points, torch.full((5,), 0.4)), points)
-    still = surface(moves=False)
-    assert still.canonical(points, torch.full((5,), 0.4)) is points
-    assert (field.moves, still.moves) == (True, False)
+    static = surface(moves=False)
+    assert static.canonical(points, torch.full((5,), 0.4)) is points
+    assert (field.moves, static.moves) == (True, False)
 
 
 def test_every_parameter_of_the_surface_gets_a_gradient():
@@ -174,7 +174,7 @@ def test_every_parameter_of_the_surface_gets_a_gradient():
 
 
 def test_every_parameter_of_the_density_gets_a_gradient():
-    for groups in [STILL, MOVING]:
+    for groups in [STATIC, DYNAMIC]:
         case = f"{len(groups)} groups"
         field = Tensor4DDensity(planes(groups), 16, octaves=(4, 3, 2))
         directions = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
@@ -182,7 +182,7 @@ def test_every_parameter_of_the_density_gets_a_gradient():
         assert (colour.shape, density.shape) == ((200, 3), (200,)), case
         (colour.sum() + density.sum()).backward()
         assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in field.parameters()), case
-        assert field.moves == (groups is MOVING), case
+        assert field.moves == (groups is DYNAMIC), case
 
 
 def test_opacities_and_weights_equal_loops():

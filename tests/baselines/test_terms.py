@@ -100,10 +100,10 @@ def test_density_fields_learn_by_the_weighted_histogram_term(tmp_path):
     (total,) = module.model.losses(rendering, rays, FIRST).values()
     assert total.item() == pytest.approx(error_of(rendering, rays).item(), rel=1e-6)
     late = next(s for s in range(6000, 6006) if not module.sampler.schedule.learns(s))
-    still = module.sampler.render(
+    undisturbed = module.sampler.render(
         module.field, rays, TrainingState(seed=0, step=late, batch=0, rank=0)
     )
-    assert module.sampler.losses(still) == {}
+    assert module.sampler.losses(undisturbed) == {}
 
 
 def test_annealing_rises_as_published_and_stays_for_images(tmp_path):

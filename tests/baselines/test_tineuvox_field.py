@@ -34,11 +34,11 @@ def test_size_is_the_published_one():
         megabytes = 2 * sum(p.numel() for p in made.parameters()) / 1e6
         assert megabytes == pytest.approx({100: 8, 160: 48}[resolution], rel=0.05), case
         networks = sum(p.numel() for p in made.parameters()) - made.grid.numel()
-        moment, lookup = 5 * channels, 15 * channels
+        time_features, lookup = 5 * channels, 15 * channels
         expected = (
-            (17 * width + width + width * moment + moment)
-            + ((63 + moment) * width + width + width * width + width + 3 * width + 3)
-            + ((lookup + moment + 63) * width + width)
+            (17 * width + width + width * time_features + time_features)
+            + ((63 + time_features) * width + width + width * width + width + 3 * width + 3)
+            + ((lookup + time_features + 63) * width + width)
             + (width + 1)
             + (width * width + width)
             + ((width + 27) * (width // 2) + width // 2 + 3 * (width // 2) + 3)

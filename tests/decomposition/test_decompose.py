@@ -9,11 +9,11 @@ from xplanes.decomposition import ORIENTATIONS, decompose, robust_pca
 
 def sequence(frames=6, channels=4, height=8, width=10, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    still = torch.randn(1, 3, channels, height, width, generator=generator)
+    static = torch.randn(1, 3, channels, height, width, generator=generator)
     moving = torch.zeros(frames, 3, channels, height, width)
     for frame in range(frames):
         moving[frame, :, :, frame : frame + 2, 3:5] = 3.0
-    return still + moving
+    return static + moving
 
 
 def test_each_orientation_is_its_own_matrix():

@@ -153,7 +153,7 @@ def test_zeros():
     assert result.drift == result.sparsity == 0
 
 
-def test_a_constant_sequence_stands_still():
+def test_a_constant_sequence_has_no_drift():
     for columns in [1, 2, 40]:
         matrix = torch.randn(500, 1, generator=torch.Generator().manual_seed(0)).repeat(1, columns)
         result = robust_pca(matrix, sparsity_weight="auto", tolerance=1e-6)
@@ -180,11 +180,11 @@ def test_a_single_column_goes_where_it_costs_less():
 
 def test_a_single_moving_entry_is_sparse():
     matrix = torch.randn(600, 1, generator=torch.Generator().manual_seed(1)).repeat(1, 20)
-    still = matrix.clone()
+    original = matrix.clone()
     matrix[17, 5] += 4
     result = robust_pca(matrix, sparsity_weight="auto", tolerance=1e-6)
     assert result.rank == 1
-    assert relative(result.low_rank, still.numpy()) < 1e-4
+    assert relative(result.low_rank, original.numpy()) < 1e-4
     assert result.sparse.abs().argmax() == 17 * 20 + 5
     assert result.sparse.abs().max() == pytest.approx(4, rel=1e-3)
 

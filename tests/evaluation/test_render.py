@@ -1,4 +1,4 @@
-"""Films: the paths they follow and the files they end in."""
+"""Rendered videos: camera paths, times and output files."""
 
 import sys
 from dataclasses import replace
@@ -11,13 +11,13 @@ from PIL import Image
 
 from xplanes.errors import ConfigError
 from xplanes.evaluation.render import (
-    FilmOptions,
+    VideoOptions,
     check_out,
-    film,
     poses,
+    render_video,
     times,
     view_pose,
-    write_film,
+    write_video,
 )
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.optional import MissingExtraError
@@ -32,7 +32,7 @@ def trained(trained_run: Path) -> TrainedRun:
 
 def test_ways_through_time():
     assert times("sweep", 5).tolist() == [0, 0.25, 0.5, 0.75, 1]
-    assert times("forth-and-back", 4).tolist() == [0, 0.5, 1, 0.5]
+    assert times("back-and-forth", 4).tolist() == [0, 0.5, 1, 0.5]
     assert times("0.3", 2).tolist() == pytest.approx([0.3, 0.3])
 
 
@@ -44,12 +44,12 @@ def test_other_times_are_refused():
 
 def test_camera_paths(trained: TrainedRun):
     centre = trained.frame.centre
-    orbit = poses(trained, FilmOptions(frames=6, elevation=30))
+    orbit = poses(trained, VideoOptions(frames=6, elevation=30))
     reach = (orbit[:, :3, 3] - centre).norm(dim=-1)
     assert reach.tolist() == pytest.approx([float(reach[0])] * 6, rel=1e-5)
     height = (orbit[:, 2, 3] - centre[2]) / reach
     assert height.tolist() == pytest.approx([0.5] * 6, abs=1e-5)
-    fixed = poses(trained, FilmOptions(path="fixed", frames=3, elevation=30))
+    fixed = poses(trained, VideoOptions(path="fixed", frames=3, elevation=30))
     assert torch.equal(fixed, orbit[:1].expand(3, 4, 4))
 
 
@@ -64,9 +64,9 @@ def test_a_view_is_found_by_its_name(trained: TrainedRun):
 
 def test_the_camera_of_a_view_renders_that_view(trained: TrainedRun, tmp_path: Path):
     views = trained.views
-    options = FilmOptions(path="view:test/r_001", time=str(float(views.times[1])))
+    options = VideoOptions(path="view:test/r_001", time=str(float(views.times[1])))
     assert options.count == 1
-    path = film(trained, options, str(tmp_path / "view.png"))
+    path = render_video(trained, options, str(tmp_path / "view.png"))
     expected = render_view(
         trained.module.field, trained.module.renderer, trained.frame, views, 1, torch.ones(3)
     )
@@ -74,8 +74,8 @@ def test_the_camera_of_a_view_renders_that_view(trained: TrainedRun, tmp_path: P
 
 
 def test_a_webp_is_the_default(trained: TrainedRun):
-    options = FilmOptions(frames=3, size=20, fps=10, time="sweep", what="depth")
-    path = film(trained, options)
+    options = VideoOptions(frames=3, size=20, fps=10, time="sweep", what="depth")
+    path = render_video(trained, options)
     assert path == trained.path / "media" / "render_orbit_sweep_depth.webp"
     with Image.open(path) as picture:
         assert (picture.n_frames, picture.size) == (3, (20, 20))  # type: ignore[attr-defined]
@@ -83,30 +83,30 @@ def test_a_webp_is_the_default(trained: TrainedRun):
         assert picture.info["duration"] == 100
 
 
-def test_a_film_of_upright_pictures_shows_all_of_their_height(trained: TrainedRun, tmp_path: Path):
+def test_a_video_of_portrait_images_shows_their_full_height(trained: TrainedRun, tmp_path: Path):
     train = trained.scene.splits["train"]
     half, focal = train.images[:, :, : train.width // 2], float(train.intrinsics.focal[0, 0])
     upright = replace(train, images=half, intrinsics=focal)
     scene = replace(trained.scene, splits=trained.scene.splits | {"train": upright})
-    options = FilmOptions(frames=1, time="0.5")
-    narrow = film(replace(trained, scene=scene), options, str(tmp_path / "narrow.png"))
-    whole = film(trained, options, str(tmp_path / "whole.png"))
+    options = VideoOptions(frames=1, time="0.5")
+    narrow = render_video(replace(trained, scene=scene), options, str(tmp_path / "narrow.png"))
+    whole = render_video(trained, options, str(tmp_path / "whole.png"))
     assert narrow.read_bytes() == whole.read_bytes()
 
 
 def test_a_folder_takes_a_png_per_frame_and_no_others(trained: TrainedRun, tmp_path: Path):
-    options = FilmOptions(frames=2, size=16)
-    folder = film(trained, options, f"{tmp_path}/frames/")
+    options = VideoOptions(frames=2, size=16)
+    folder = render_video(trained, options, f"{tmp_path}/frames/")
     assert sorted(p.name for p in folder.iterdir()) == ["frame_0000.png", "frame_0001.png"]
     with pytest.raises(ConfigError, match="holds files already"):
-        film(trained, options, f"{tmp_path}/frames/")
+        render_video(trained, options, f"{tmp_path}/frames/")
 
 
 def test_an_mp4_keeps_its_frames(tmp_path: Path):
     imageio = pytest.importorskip("imageio.v2")
     pytest.importorskip("imageio_ffmpeg")
     frames = [torch.full((35, 50, 3), value, dtype=torch.uint8) for value in (20, 120, 220)]
-    path = write_film(tmp_path / "film.mp4", frames, fps=8)
+    path = write_video(tmp_path / "video.mp4", frames, fps=8)
     read = imageio.mimread(path)
     assert len(read) == 3
     assert read[0].shape == (34, 50, 3)
@@ -116,24 +116,24 @@ def test_an_mp4_keeps_its_frames(tmp_path: Path):
 def test_an_mp4_without_the_extra_names_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(MissingExtraError, match=r'-e "\.\[video\]"'):
-        check_out("film.mp4", FilmOptions())
+        check_out("video.mp4", VideoOptions())
 
 
 def test_other_files_are_refused():
-    for out, words in {"film.gif": "end in .webp", "film": "end in", "a.png": "not 48"}.items():
+    for out, words in {"video.gif": "end in .webp", "video": "end in", "a.png": "not 48"}.items():
         with pytest.raises(ConfigError, match=words):
-            check_out(out, FilmOptions())
+            check_out(out, VideoOptions())
 
 
 def test_options_out_of_range_are_refused():
     refused = {
-        FilmOptions(path="spiral"): "--path spiral",
-        FilmOptions(time="2"): "--time 2",
-        FilmOptions(frames=0): "--frames 0",
-        FilmOptions(fps=0): "--fps 0",
-        FilmOptions(size=-4): "--size -4",
-        FilmOptions(size=0): "--size 0",
-        FilmOptions(elevation=100): "--elevation 100",
+        VideoOptions(path="spiral"): "--path spiral",
+        VideoOptions(time="2"): "--time 2",
+        VideoOptions(frames=0): "--frames 0",
+        VideoOptions(fps=0): "--fps 0",
+        VideoOptions(size=-4): "--size -4",
+        VideoOptions(size=0): "--size 0",
+        VideoOptions(elevation=100): "--elevation 100",
     }
     for options, words in refused.items():
         with pytest.raises(ConfigError, match=words):

@@ -294,7 +294,7 @@ def test_means_stand_beside_what_was_published(tmp_path: Path) -> None:
     assert [line[:5] for line in lines[:1]] == [["kplanes", "none", "proposal", "2", "25.50"]]
     for line, entry in zip(lines, entries, strict=False):
         assert line[6:] == [entry[n] for n in ("psnr", "ssim", "minutes", "scenes", "source")]
-    # Six random planes were not published: their own figures stand alone.
+    # There are no published figures for six planes with random initialisation.
     assert lines[-1][:5] == ["six_planes", "none", "occupancy", "1", "25.00"]
     assert set(lines[-1][6:]) == {""}
 

@@ -1,4 +1,4 @@
-"""Pictures in, triplanes and a film out."""
+"""Images in, triplanes and a turntable video out."""
 
 from pathlib import Path
 
@@ -38,12 +38,12 @@ def pictures(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def few(monkeypatch):
-    """A short film of small pictures."""
+    """A short video of small images."""
     monkeypatch.setattr(module, "FRAMES", 6)
     monkeypatch.setattr(module, "SIDE", 24)
 
 
-def test_pictures_become_triplanes_and_a_film(tmp_path: Path, pictures, few, capsys):
+def test_images_become_triplanes_and_a_video(tmp_path: Path, pictures, few, capsys):
     weights, out = publish(tmp_path, "openlrm-1.1"), tmp_path / "made.safetensors"
     arguments = ["lrm=small", f"lrm.weights={weights}", f"preparation.cache={tmp_path}/cache"]
     assert main(["triplanes", str(pictures), *arguments, f"out={out}"]) == 0
@@ -56,11 +56,11 @@ def test_pictures_become_triplanes_and_a_film(tmp_path: Path, pictures, few, cap
     for name, tensor in model.decoder.state_dict().items():
         assert torch.equal(sequence.decoder[name], tensor)
     assert sequence.decoder_config == model.decoder.options
-    with Image.open(out.with_suffix(".webp")) as film:
-        assert film.size == (24, 24)
+    with Image.open(out.with_suffix(".webp")) as video:
+        assert video.size == (24, 24)
 
 
-def test_the_film_begins_at_the_models_camera_and_goes_round(few):
+def test_the_video_begins_at_the_models_camera_and_completes_one_orbit(few):
     model = model_of()
     with torch.no_grad():
         # Dense where the features of plane xz are positive: on the side x > 0.

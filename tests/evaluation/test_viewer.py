@@ -47,7 +47,7 @@ def test_a_picture_from_a_view_is_that_view(trained: TrainedRun):
     picture = draw(
         trained,
         views.camera_to_world[2],
-        moment=float(views.times[2]),
+        timestep=float(views.times[2]),
         fov=fov,
         height=views.height,
         aspect=1.0,

@@ -121,7 +121,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def config_of(root: Path, lrm: str, cache: Path | None, *overrides: str) -> dict[str, Any]:
-    """A run of 40 steps with random planes or from an LRM."""
+    """A run of 40 steps with random initialisation or from an LRM."""
     place = f"preparation.cache={'null' if cache is None else cache}"
     wide = ("model.channels=32", "model.decoder.width=64") if lrm == "tiny" else ()
     return small_config(root / "scenes", *SETTINGS, *wide, f"lrm={lrm}", place, *overrides)

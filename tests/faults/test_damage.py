@@ -143,7 +143,7 @@ def test_weights(tally, tmp_path: Path, share: float) -> None:
         with pytest.raises(LRMError) as caught:
             load(CONFIGS["triposr"], path)
         tally.said(str(caught.value), name)
-    for name in ("start.pt", "start.safetensors"):
+    for name in ("initial.pt", "initial.safetensors"):
         save_triplanes(tmp_path / name, TriplaneSequence(torch.rand(2, 3, 2, 4, 4)))
         cut(tmp_path / name, share)
         with pytest.raises(ConfigError) as error:

@@ -1,4 +1,4 @@
-"""Runs killed at any moment go on to the same end."""
+"""A run that is killed at any time resumes and reaches the same result."""
 
 import json
 import os
@@ -41,7 +41,7 @@ def go_on(nursery, config, folder: Path) -> None:
 
 @pytest.mark.parametrize("number", range(RANDOM_MOMENTS))
 def test_random_moments(tally, nursery, shared, whole, tmp_path: Path, number: int) -> None:
-    """kill -9 at random moments of a run, lrm=none and lrm=tiny"""
+    """kill -9 at random times of a run, lrm=none and lrm=tiny"""
     lrm = ("none", "tiny")[number % 2]
     config = config_of(shared, lrm, tmp_path / "cache")
     folder = tmp_path / "run"

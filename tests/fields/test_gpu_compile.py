@@ -38,7 +38,7 @@ triton.runtime.driver.set_active(Driver())
 
 from xplanes.fields import gpu, gpu_products
 from xplanes.fields.lookup import plane_features_gpu
-from xplanes.fields.products import STILL, plane_product_gpu
+from xplanes.fields.products import STATIC, plane_product_gpu
 from xplanes.fields.xplanes import PLANE_SETS
 
 for module in (gpu, gpu_products):
@@ -48,8 +48,8 @@ for module in (gpu, gpu_products):
 space, time = torch.zeros(3, 9, 9, 40).requires_grad_(), torch.zeros(3, 4, 7, 40).requires_grad_()
 found = plane_features_gpu(space, time, torch.zeros(5, 3), torch.zeros(5), PLANE_SETS["six"])
 found.sum().backward()
-planes = [torch.zeros(1, 8, 5, 5).requires_grad_() for _ in STILL]
-plane_product_gpu(planes, torch.zeros(5, 4), STILL).sum().backward()
+planes = [torch.zeros(1, 8, 5, 5).requires_grad_() for _ in STATIC]
+plane_product_gpu(planes, torch.zeros(5, 4), STATIC).sum().backward()
 """
 
 

@@ -37,8 +37,8 @@ def both(plane_set, space, time, points, times, exact=torch.float64):
         places = points.to(DEVICE), times.to(DEVICE)
         moving = leaves[1] if time is not None else None
         value = function(leaves[0], moving, *places, PLANE_SETS[plane_set])
-        pull = torch.linspace(-1, 1, value.numel(), device=DEVICE).to(precision).view_as(value)
-        gradients = torch.autograd.grad((value * pull).sum(), leaves)
+        upstream = torch.linspace(-1, 1, value.numel(), device=DEVICE).to(precision).view_as(value)
+        gradients = torch.autograd.grad((value * upstream).sum(), leaves)
         results.append([found.cpu() for found in (value.detach(), *gradients)])
     return results
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from xplanes.fields import products
-from xplanes.fields.products import MOVING, STILL, plane_product_gpu, plane_product_reference
+from xplanes.fields.products import DYNAMIC, STATIC, plane_product_gpu, plane_product_reference
 
 pytest.importorskip("triton", reason="triton is not installed")
 
@@ -28,19 +28,19 @@ def both(names, dtype, *, channels, count, sizes=(3, 4, 5), reach=1.3):
     ):
         planes = [p.to(DEVICE, dtype).to(precision).requires_grad_() for p in stacks]
         value = function(planes, places.to(DEVICE), names)
-        pull = torch.linspace(-1, 1, value.numel(), device=DEVICE).to(precision).view_as(value)
-        gradients = torch.autograd.grad((value * pull).sum(), planes)
+        upstream = torch.linspace(-1, 1, value.numel(), device=DEVICE).to(precision).view_as(value)
+        gradients = torch.autograd.grad((value * upstream).sum(), planes)
         results.append([found.detach().cpu() for found in (value, *gradients)])
     return results
 
 
 def test_values_and_gradients_are_the_twins():
     for names, channels, count in [
-        (MOVING, 1, 9),
-        (MOVING, 8, 70),
-        (MOVING, 40, 13),
-        (STILL, 3, 129),
-        (STILL, 32, 16),
+        (DYNAMIC, 1, 9),
+        (DYNAMIC, 8, 70),
+        (DYNAMIC, 40, 13),
+        (STATIC, 3, 129),
+        (STATIC, 32, 16),
     ]:
         case = f"{len(names)} planes, channels={channels}, count={count}"
         ours, theirs = both(names, torch.float32, channels=channels, count=count)
@@ -55,7 +55,7 @@ def test_values_and_gradients_are_the_twins():
 
 def test_in_float64_nothing_but_rounding_is_left():
     for sizes in [(3, 4, 5), (1, 1, 1)]:
-        ours, theirs = both(MOVING, torch.float64, channels=2, count=7, sizes=sizes)
+        ours, theirs = both(DYNAMIC, torch.float64, channels=2, count=7, sizes=sizes)
         for a, b in zip(ours, theirs, strict=True):
             torch.testing.assert_close(
                 a, b, atol=1e-12, rtol=1e-12, msg=lambda m, c=sizes: f"{c}: {m}"
@@ -63,17 +63,17 @@ def test_in_float64_nothing_but_rounding_is_left():
 
 
 def test_no_point():
-    ours, theirs = both(STILL, torch.float32, channels=4, count=0)
+    ours, theirs = both(STATIC, torch.float32, channels=4, count=0)
     assert ours[0].shape == theirs[0].shape == (0, 4)
     assert all((gradient == 0).all() for gradient in ours[1:])
 
 
 def test_points_that_fill_up_a_block_spread_no_nan():
-    planes = [torch.full((1, 4, 3, 3), torch.nan, device=DEVICE) for _ in STILL]
+    planes = [torch.full((1, 4, 3, 3), torch.nan, device=DEVICE) for _ in STATIC]
     for plane in planes:
         plane[..., 0, 0] = 1.0
         plane.requires_grad_()
-    value = plane_product_gpu(planes, torch.full((1, 4), -1.0, device=DEVICE), STILL)
+    value = plane_product_gpu(planes, torch.full((1, 4), -1.0, device=DEVICE), STATIC)
     value.sum().backward()
     assert (value == 1).all()
     for plane in planes:

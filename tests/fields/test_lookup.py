@@ -46,8 +46,8 @@ def both(plane_set, space, time, points, times):
         leaves = [p.clone().requires_grad_() for p in (space, time) if p is not None]
         moving = leaves[1] if time is not None else None
         value = function(leaves[0], moving, points, times, PLANE_SETS[plane_set])
-        pull = torch.linspace(-1, 1, value.numel(), dtype=value.dtype).view_as(value)
-        gradients = torch.autograd.grad((value * pull).sum(), leaves)
+        upstream = torch.linspace(-1, 1, value.numel(), dtype=value.dtype).view_as(value)
+        gradients = torch.autograd.grad((value * upstream).sum(), leaves)
         results.append((value.detach(), *gradients))
     return results
 
@@ -229,8 +229,8 @@ def test_nine_planes_with_equal_twins_are_six_planes():
 def test_a_still_scene_ignores_the_rows_of_its_set():
     space, _ = stacks("six")
     points, times = scattered(20)
-    still = plane_features(space, None, points, times, PLANE_SETS["three"])
-    assert torch.equal(still, plane_features(space, None, points, times, PLANE_SETS["six"]))
+    static = plane_features(space, None, points, times, PLANE_SETS["three"])
+    assert torch.equal(static, plane_features(space, None, points, times, PLANE_SETS["six"]))
 
 
 def strided(space, time, points, times):

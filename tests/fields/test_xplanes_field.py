@@ -1,4 +1,4 @@
-"""The field: names and shapes of planes, gradients to all parameters, start values."""
+"""The field: names and shapes of planes, gradients to all parameters, initial values."""
 
 import functools
 

@@ -10,7 +10,7 @@ AXES = ((0, 1), (0, 2), (1, 2))
 """Axes along columns and rows of the planes xy, xz, yz."""
 
 
-def still_features(channels: int = 8, size: int = 16, seed: int = 0) -> Tensor:
+def static_features(channels: int = 8, size: int = 16, seed: int = 0) -> Tensor:
     """Smooth random features. [3, C, H, H]"""
     generator = torch.Generator().manual_seed(seed)
     coarse = torch.randn(3, channels, 4, 4, generator=generator)
@@ -22,15 +22,15 @@ def blob(frames: int = 8, channels: int = 8, size: int = 16, seed: int = 1) -> T
     generator = torch.Generator().manual_seed(seed)
     features = torch.randn(3, channels, 1, 1, generator=generator)
     grid = (torch.arange(size) + 0.5) / size * 2 - 1
-    moments = []
+    timesteps = []
     for t in torch.linspace(0, 1, frames).tolist():
         centre = (1.2 * t - 0.6, 0.3 * math.sin(6 * t), 0.2 - 0.5 * t)
         bumps = [(-(((grid - place) / 0.25) ** 2)).exp() for place in centre]
         covers = [bumps[row][:, None] * bumps[column] for column, row in AXES]
-        moments.append(features * torch.stack(covers)[:, None])
-    return torch.stack(moments)
+        timesteps.append(features * torch.stack(covers)[:, None])
+    return torch.stack(timesteps)
 
 
 def moving_sequence(frames: int = 8, channels: int = 8, size: int = 16) -> Tensor:
-    """Still features plus the blob. [T, 3, C, H, H]"""
-    return still_features(channels, size) + blob(frames, channels, size)
+    """Static features plus the blob. [T, 3, C, H, H]"""
+    return static_features(channels, size) + blob(frames, channels, size)

@@ -53,7 +53,7 @@ def test_compiling_is_no_part_of_a_stages_time(folder: Path, monkeypatch):
 
     before, clock = warm_up.seconds, iter([0.0, 10.0, 40.0, 45.0])
     monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
-    assert StageCache(folder).stage("film", [1], make).seconds == pytest.approx(15)
+    assert StageCache(folder).stage("video", [1], make).seconds == pytest.approx(15)
     assert warm_up.seconds - before == pytest.approx(30)
 
 

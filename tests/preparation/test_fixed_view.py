@@ -34,7 +34,7 @@ SMALL_FIELD = (
     "model.sampler.coarse_steps=10",
     "model.sampler.sweep_at=[15]",
 )
-MOMENTS = torch.linspace(0, 1, 50)
+TIMES = torch.linspace(0, 1, 50)
 VIEWS = {"openlrm": OPENLRM_VIEW, "triposr": TRIPOSR_VIEW}
 
 
@@ -208,10 +208,10 @@ def test_frames_are_picked_evenly():
 
 
 def test_of_a_scene_of_one_moment_the_frame_of_that_moment_is_picked(tmp_path: Path):
-    still = ball_scene(moving=False)
-    views = still.splits["train"]
+    static = ball_scene(moving=False)
+    views = static.splits["train"]
     views = replace(views, times=torch.full_like(views.times, 0.5))
-    scene = replace(still, splits=still.splits | {"train": views}, video=ball_views(5, 0.5))
+    scene = replace(static, splits=static.splits | {"train": views}, video=ball_views(5, 0.5))
     made, _ = video_of(settings(tmp_path), scene, tmp_path / "cache")
     assert made.views.times.tolist() == [0.5]
 
@@ -220,7 +220,7 @@ def test_a_video_that_leaves_out_moments_is_refused():
     for times in ([0.0, 0.1, 0.2, 0.3], [0.6, 0.8, 1.0], [0, 0.05, 0.95, 1]):
         video = ball_views(len(times), 0.5, size=4, times=torch.tensor(times))
         words = r"no frame near time .*preparation\.fixed_view=train"
-        assert_refused(SceneError, words, partial(pick_frames, video, MOMENTS), times)
+        assert_refused(SceneError, words, partial(pick_frames, video, TIMES), times)
 
 
 def test_the_models_camera_sees_the_whole_scene_inside_its_box():

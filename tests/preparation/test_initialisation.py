@@ -9,7 +9,7 @@ from typing import get_args, get_type_hints
 import pytest
 import torch
 
-from tests.preparation.sequences import blob, moving_sequence, still_features
+from tests.preparation.sequences import blob, moving_sequence, static_features
 from tests.refusals import assert_refused
 from tests.synthetic import ball_scene
 from tests.training.runs import small_config
@@ -121,11 +121,11 @@ def test_left_open_rows_of_time_frame_and_decoder_are_those_of_a_random_initiali
     assert len(module.field.decoder.layers) == 4
 
 
-def test_the_field_shows_what_stands_still_where_nothing_moves(tmp_path: Path):
-    # With few frames the automatic weight takes peaks of what stands still for motion.
+def test_the_initial_field_shows_the_static_part_where_nothing_moves(tmp_path: Path):
+    # With few frames the automatic weight takes peaks of static content for motion.
     sequence = TriplaneSequence(moving_sequence(frames=40))
     found, module = initialised(tmp_path, sequence, "model.resolution=16")
-    truth, moved = still_features(), blob().abs().amax(dim=0)
+    truth, moved = static_features(), blob().abs().amax(dim=0)
     for index, name in enumerate(("xy", "xz", "yz")):
         untouched = moved[index] < 1e-3
         assert untouched.float().mean() > 0.1
@@ -231,11 +231,11 @@ def test_one_triplane_is_the_space_planes(tmp_path: Path, caplog):
             assert torch.equal(found.values.planes[name], sequence.triplanes[0, index]), name
 
 
-def test_a_sequence_that_stands_still_is_initialised_with_noise_in_time(tmp_path: Path):
-    still = still_features().expand(40, -1, -1, -1, -1).contiguous()
-    found, module = initialised(tmp_path, TriplaneSequence(still), "model.resolution=16")
+def test_a_constant_sequence_is_initialised_with_noise_in_time(tmp_path: Path):
+    static = static_features().expand(40, -1, -1, -1, -1).contiguous()
+    found, module = initialised(tmp_path, TriplaneSequence(static), "model.resolution=16")
     assert float(module.field.time.detach().std()) == pytest.approx(0.01, rel=0.1)
-    assert found.values.planes["xy"].sub(still[0, 0]).norm() < 0.1 * still[0, 0].norm()
+    assert found.values.planes["xy"].sub(static[0, 0]).norm() < 0.1 * static[0, 0].norm()
 
 
 def test_every_floating_type_gives_single_precision_planes(tmp_path: Path):
@@ -339,7 +339,7 @@ def test_the_video_of_a_run_shows_the_field_in_its_own_frame(tmp_path: Path, mon
         return original(field, renderer, frame, *others, **options)
 
     monkeypatch.setattr(pipeline, "render_path", render)
-    monkeypatch.setattr(pipeline, "FILM_FRAMES", 2)
+    monkeypatch.setattr(pipeline, "VIDEO_FRAMES", 2)
     plain = small_config(
         tmp_path,
         "lrm=file",

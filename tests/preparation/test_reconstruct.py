@@ -67,7 +67,7 @@ def silent(_: str) -> None:
     pass
 
 
-def filmed(size=24, count=6):
+def video_scene(size=24, count=6):
     """A scene with a video of a ball that hangs beside the middle."""
 
     def centre(time):
@@ -94,7 +94,7 @@ def made_of(method, scene, cache=None):
 def check_field_of_model(folder: Path, name: str, matching: str) -> None:
     """The field has the colours and densities of the model, at their place in the world."""
     method = settings(folder, name, f"lrm.matching={matching}", "lrm.crop=false")
-    scene = filmed()
+    scene = video_scene()
     made, lrm, frame = made_of(method, scene)
     sequence, model = made.sequence, lrm.model
     case = f"{name}, matching {matching}"
@@ -141,7 +141,7 @@ def test_the_field_is_the_models_at_its_place_in_the_world(tmp_path: Path):
 
 
 def test_the_cube_holds_all_that_the_views_show(tmp_path: Path):
-    scene = filmed()
+    scene = video_scene()
     for name in SIDES:
         made, _, frame = made_of(settings(tmp_path, name), scene)
         ball = inside_ball(3000, 1 / frame.scale) + frame.centre
@@ -149,7 +149,7 @@ def test_the_cube_holds_all_that_the_views_show(tmp_path: Path):
 
 
 def test_the_report_is_whole(tmp_path: Path):
-    made, lrm, _ = made_of(settings(tmp_path, "openlrm-1.1"), filmed())
+    made, lrm, _ = made_of(settings(tmp_path, "openlrm-1.1"), video_scene())
     assert made.report["frames"] == made.report["distinct"] == 3
     assert made.report["cached"] == 0
     apart = made.report["mismatch_pixels"]
@@ -163,7 +163,7 @@ def test_the_report_is_whole(tmp_path: Path):
 
 def test_equal_frames_count_as_skipped(tmp_path: Path):
     method = settings(tmp_path, "openlrm-1.1", "preparation.frames=4", "preparation.cache=null")
-    scene = filmed()
+    scene = video_scene()
     images = scene.video.images.clone()
     images[1:4] = images[0]
     scene = replace(scene, video=replace(scene.video, images=images))
@@ -173,15 +173,15 @@ def test_equal_frames_count_as_skipped(tmp_path: Path):
 
 
 def test_one_crop_holds_the_object_at_all_times(tmp_path: Path):
-    frames = filmed(size=48).video.images
+    frames = video_scene(size=48).video.images
     crop = picture_crop(frames, crop=True)
     tight = (frames[..., 3].amax(dim=0) > 0).nonzero()
     spans = tight.amax(dim=0) - tight.amin(dim=0)
     assert crop.side == int(int(spans.max()) / 0.85)
     assert picture_crop(frames, crop=False).side == 48
-    specks = frames.clone()
-    specks[:, 1, 1] = 20
-    assert picture_crop(specks, crop=True) == crop
+    floaters = frames.clone()
+    floaters[:, 1, 1] = 20
+    assert picture_crop(floaters, crop=True) == crop
     opaque = torch.full_like(frames, 255)
     assert picture_crop(opaque, crop=True).side == 48
     with pytest.raises(LRMError, match=r"empty.*lrm\.crop=false"):

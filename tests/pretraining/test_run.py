@@ -12,10 +12,10 @@ from tests.pretraining.small import OVERRIDES, same, small_config, small_pool, s
 from xplanes.cli import main
 from xplanes.lrm import load
 from xplanes.pretraining import pool as pool_module
+from xplanes.pretraining.initialisation import init_model
 from xplanes.pretraining.module import PATIENCE, PretrainingError, PretrainingModule, Upkeep
 from xplanes.pretraining.pool import PretrainingBatches
 from xplanes.pretraining.run import CHECKPOINT
-from xplanes.pretraining.start import start_model
 
 
 @pytest.fixture(autouse=True)
@@ -79,17 +79,17 @@ def test_another_model_does_not_go_on_in_the_same_folder(finished, pool_folder, 
     assert f"run={finished}" in capsys.readouterr().err
 
 
-def test_finer_planes_start_from_a_finished_run(finished, tmp_path, pool_folder, capsys):
-    start = f"start={finished}/tiny.safetensors"
-    finer = ("model.low_resolution=8", start, "schedule.max_steps=1")
+def test_finer_planes_are_initialised_from_a_finished_run(finished, tmp_path, pool_folder, capsys):
+    coarse = f"init_from={finished}/tiny.safetensors"
+    finer = ("model.low_resolution=8", coarse, "schedule.max_steps=1")
     assert command(tmp_path / "fine", pool_folder, *finer) == 0
     assert command(tmp_path / "wrong", pool_folder, *finer, "model.width=24") == 1
-    assert "start=" in capsys.readouterr().err
+    assert "init_from=" in capsys.readouterr().err
 
 
 def module(*overrides):
     config = small_config("schedule.max_steps=40", "schedule.render_from=0", *overrides)
-    model = start_model(small_sizes(), 0)
+    model = init_model(small_sizes(), 0)
     return config, PretrainingModule(model, config.batch, config.schedule, 0, bf16=False)
 
 

@@ -13,11 +13,11 @@ from xplanes.cli import main
 from xplanes.fields.decoder import Decoder
 from xplanes.lrm.canonical import OPENLRM_VIEW, CanonicalView
 from xplanes.pretraining import score as score_module
-from xplanes.pretraining.pool import FOCAL, camera, film_solids, inside
+from xplanes.pretraining.initialisation import init_model
+from xplanes.pretraining.pool import FOCAL, camera, inside, render_solids
 from xplanes.pretraining.quick import QuickLook, overlap, world_to_model
 from xplanes.pretraining.score import Subject, demo_subjects, held_out, score, score_all
 from xplanes.pretraining.solids import BOX
-from xplanes.pretraining.start import start_model
 
 SIDE, TEXELS = 40, 64
 
@@ -61,7 +61,7 @@ def test_a_model_that_knows_the_answer_scores_high():
     subject = Subject(
         "box",
         torch.from_numpy(np.stack(poses)),
-        lambda pose, side: torch.from_numpy(film_solids(solids, pose.numpy(), side)[0]),
+        lambda pose, side: torch.from_numpy(render_solids(solids, pose.numpy(), side)[0]),
         lambda points: torch.from_numpy(inside(solids, points.double().numpy())),
     )
     model = KnowingModel(solids, subject.cameras[0], colour)
@@ -97,7 +97,7 @@ def test_scores_and_sheets_are_written(tmp_path, monkeypatch):
     monkeypatch.setattr(score_module, "demo_subjects", lambda: held_out(1))
     lines = []
     table = score_all(
-        start_model(small_sizes(), 0).eval(), tmp_path, objects=2, announce=lines.append
+        init_model(small_sizes(), 0).eval(), tmp_path, objects=2, announce=lines.append
     )
     written = json.loads((tmp_path / "scores.json").read_text())
     assert written["mean"] == table
@@ -108,7 +108,7 @@ def test_scores_and_sheets_are_written(tmp_path, monkeypatch):
 
 
 def test_a_quick_look_needs_no_drawing():
-    values = QuickLook(small_pool(2), 2).scores(start_model(small_sizes(), 0))
+    values = QuickLook(small_pool(2), 2).scores(init_model(small_sizes(), 0))
     assert 0 <= values["iou"] <= 1
     assert 3 < values["psnr_novel"] < 30
 

@@ -14,7 +14,7 @@ from xplanes.pretraining.pool import FOCAL
 from xplanes.pretraining.run import compose_pretraining
 from xplanes.pretraining.score import held_out
 from xplanes.pretraining.settings import parse_pretraining, published_sizes
-from xplanes.scenes.demo.film import CAMERA_ANGLE_X, CAMERA_DISTANCE, camera_at
+from xplanes.scenes.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE, camera_at
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from xplanes.pretraining.objects import (
     TRAINING_SEEDS,
     procedural_object,
 )
-from xplanes.pretraining.pool import FOCAL, camera, cast, film_solids, inside
+from xplanes.pretraining.pool import FOCAL, camera, cast, inside, render_solids
 from xplanes.pretraining.solids import (
     BOX,
     BRICKS,
@@ -27,7 +27,7 @@ from xplanes.pretraining.solids import (
     Solids,
 )
 from xplanes.scenes.cameras import pixel_rays
-from xplanes.scenes.demo.film import CAMERA_ANGLE_X, CAMERA_DISTANCE, film
+from xplanes.scenes.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE, render_image
 from xplanes.scenes.demo.scenes import DEMO_SCENES, build_demo_scene
 
 LIGHT = [0.35, -0.5, 0.8, 0.5, 0.22, 0.38, 0.6]
@@ -108,11 +108,11 @@ def test_occupancy_agrees():
         assert (inside(solids, points) == truth).all(), seed
 
 
-def test_pictures_agree_with_the_demo_films():
+def test_images_agree_with_the_demo_renderer():
     solids = procedural_object(5)
     pose = camera(30, 25)
-    colour, alpha, depth = film_solids(solids, pose, 48)
-    truth = film(solids.posed(), torch.from_numpy(pose), 48).astype(np.float64) / 255
+    colour, alpha, depth = render_solids(solids, pose, 48)
+    truth = render_image(solids.posed(), torch.from_numpy(pose), 48).astype(np.float64) / 255
     on_white = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
     assert np.abs(alpha - truth[..., 3]).mean() < 1e-3
     assert np.abs(colour - on_white).mean() < 4e-3

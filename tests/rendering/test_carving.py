@@ -29,8 +29,8 @@ def allowed_at(grid, points, time):
 
 def test_a_still_ball_is_kept_and_the_corners_are_not():
     frame = cube_frame(1.4, ORIGIN)
-    films = {size: ball_views(24, 0.5, size=size, times=torch.zeros(24)) for size in (24, 64)}
-    for (size, views), resolution in itertools.product(films.items(), [6, 24]):
+    rendered = {size: ball_views(24, 0.5, size=size, times=torch.zeros(24)) for size in (24, 64)}
+    for (size, views), resolution in itertools.product(rendered.items(), [6, 24]):
         case = f"size={size}, resolution={resolution}"
         grid = carved(views, resolution=resolution, bins=1)
         assert allowed_at(grid, frame.points(inside_ball(4000, 0.5)), 0.0).all(), case
@@ -44,9 +44,9 @@ def test_a_still_ball_is_kept_and_the_corners_are_not():
 
 def test_content_close_to_wide_cameras_is_kept():
     centre = torch.tensor([0.6, 0.6, 0.6])
-    still = {"size": 160, "angle": 1.5, "centre": lambda _: centre, "times": torch.zeros(40)}
+    static = {"size": 160, "angle": 1.5, "centre": lambda _: centre, "times": torch.zeros(40)}
     for distance in [1.9, 2.2, 4.0]:
-        views = ball_views(40, 0.3, poses=surrounding(40, distance), **still)
+        views = ball_views(40, 0.3, poses=surrounding(40, distance), **static)
         for resolution in [8, 32]:
             case = f"distance={distance}, resolution={resolution}"
             grid = carved(views, resolution=resolution, bins=1, frame=cube_frame(1.0, ORIGIN))
@@ -56,7 +56,7 @@ def test_content_close_to_wide_cameras_is_kept():
 
 def test_a_still_ball_in_a_moving_scene_is_kept():
     for count in [12, 50, 200]:
-        # Times differ, so the grid does not know that the ball stands still.
+        # Times differ, so the grid does not know that the ball is static.
         grid = carved(ball_views(count, 0.5, size=24))
         points = cube_frame(1.4, ORIGIN).points(inside_ball(2000, 0.5))
         for time in torch.linspace(0, 1, 17).tolist():
@@ -65,7 +65,7 @@ def test_a_still_ball_in_a_moving_scene_is_kept():
 
 
 def test_a_moving_ball_is_never_ruled_out_and_most_else_is_empty():
-    # In the span over which content is taken to stand still, with 50 views, the slow ball moves by
+    # In the span over which content counts as static, with 50 views, the slow ball moves by
     # at most a fifth of its radius, the fast one by its whole radius. More views do not rule out
     # what moves: the small ball moves twice as fast.
     for count, radius, turns, share in [

@@ -65,10 +65,10 @@ def test_gradients_follow_the_product_rule():
         depth.requires_grad_()
         colour.requires_grad_()
         total, _ = merge(depth, colour, *rest)
-        pull = torch.randn(total.shape, generator=torch.Generator().manual_seed(2)).double()
-        ours = torch.autograd.grad((total * pull).sum(), (depth, colour))
+        upstream = torch.randn(total.shape, generator=torch.Generator().manual_seed(2)).double()
+        ours = torch.autograd.grad((total * upstream).sum(), (depth, colour))
         arrays = (t.detach().numpy() for t in (depth, colour, rest[0]))
-        theirs = composite_gradient(*arrays, rest[1].tolist(), len(rest[2]), pull.numpy())
+        theirs = composite_gradient(*arrays, rest[1].tolist(), len(rest[2]), upstream.numpy())
         for a, b in zip(ours, theirs, strict=True):
             np.testing.assert_allclose(a, b, atol=1e-10, err_msg=f"{merge.__name__}, {scale}")
 

@@ -39,13 +39,13 @@ def occupied_at(grid, points, time):
     return found
 
 
-def still(_):
+def static(_):
     return torch.zeros(3)
 
 
 def test_a_field_that_shows_all_leaves_its_own_cells_and_few_around():
     views = ball_views(12, 0.5, size=32)
-    grid = filled(views, ball_field(0.5, still))
+    grid = filled(views, ball_field(0.5, static))
     points = FRAME.points(inside_ball(500, 0.45))
     for time in (0.1, 0.4, 0.6, 0.9):
         assert occupied_at(grid, points, time).all()
@@ -54,9 +54,9 @@ def test_a_field_that_shows_all_leaves_its_own_cells_and_few_around():
 
 def test_rays_may_march_in_groups(monkeypatch):
     views = ball_views(6, 0.5, size=24)
-    whole = filled(views, ball_field(0.3, still))
+    whole = filled(views, ball_field(0.3, static))
     monkeypatch.setattr(filling, "RAYS", 50)
-    grouped = filled(views, ball_field(0.3, still))
+    grouped = filled(views, ball_field(0.3, static))
     assert torch.equal(grouped.occupied, whole.occupied)
     assert torch.equal(grouped.density, whole.density)
 
@@ -90,6 +90,6 @@ def test_cells_that_are_ruled_out_stay_so():
     allowed = torch.rand(4, 12, 12, 12, generator=torch.Generator().manual_seed(1)) < 0.5
     grid.allow(allowed)
     generator = torch.Generator().manual_seed(0)
-    fill(grid, ball_field(0.5, still), views, FRAME, step=STEP, generator=generator)
+    fill(grid, ball_field(0.5, static), views, FRAME, step=STEP, generator=generator)
     assert not (grid.occupied & ~allowed.flatten()).any()
     assert torch.equal(grid.occupied, grid.density > grid.empty_density)

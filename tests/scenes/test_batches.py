@@ -218,12 +218,12 @@ def test_jitter_is_even():
 
 
 def test_only_rays_far_from_silhouettes_move_in_time_and_not_far():
-    still = batches_of(per_batch=4000, background_share=0.3).draw(3)
+    static = batches_of(per_batch=4000, background_share=0.3).draw(3)
     moved = batches_of(per_batch=4000, background_share=0.3, background_jitter=0.2).draw(3)
     for name in ("origins", "directions", "target", "jitter"):
-        assert torch.equal(still[name], moved[name]), name
-    change = moved["times"] - still["times"]
-    shown = still["alpha"] > 0
+        assert torch.equal(static[name], moved[name]), name
+    change = moved["times"] - static["times"]
+    shown = static["alpha"] > 0
     assert shown.any()
     assert not change[shown].any()
     # Two of the five views stand at an end of time, where half of all moves lead nowhere.
@@ -235,5 +235,5 @@ def test_only_rays_far_from_silhouettes_move_in_time_and_not_far():
 
 
 def test_a_still_scene_has_no_other_times():
-    still = replace(VIEWS, times=torch.zeros(len(VIEWS)))
-    assert not batches_of(still, background_jitter=0.2).draw(0)["times"].any()
+    static = replace(VIEWS, times=torch.zeros(len(VIEWS)))
+    assert not batches_of(static, background_jitter=0.2).draw(0)["times"].any()

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from tests.refusals import assert_refused
 from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.demo import DEMO_SCENES, Assembly, Joint, Part, build_demo_scene
-from xplanes.scenes.demo.film import CAMERA_ANGLE_X, CAMERA_DISTANCE, camera_at, film
 from xplanes.scenes.demo.geometry import (
     Box,
     Bricks,
@@ -28,6 +27,7 @@ from xplanes.scenes.demo.geometry import (
     rgb,
 )
 from xplanes.scenes.demo.motions import Bounce, Keys, Steady, Swing
+from xplanes.scenes.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE, camera_at, render_image
 from xplanes.scenes.demo.shading import Light
 
 RED, BLUE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
@@ -105,12 +105,12 @@ def test_colour_without_light_is_the_paint_at_the_hit():
     time=st.floats(0, 1),
 )
 def test_moving_scene_and_rays_together_changes_nothing(angles, shift, time):
-    still = small_assembly()
-    moved = still.placed(shift, angles)
+    resting = small_assembly()
+    moved = resting.placed(shift, angles)
     frame = Assembly((Part(Box((1, 1, 1)), Plain(RED)),)).placed(shift, angles)
     pose = frame.pose(0, torch.float64).parts[0]
     origins, directions = (each.double() for each in rays(200, seed=3))
-    here = still.pose(time, torch.float64).cast(origins, directions)
+    here = resting.pose(time, torch.float64).cast(origins, directions)
     there = moved.pose(time, torch.float64).cast(
         origins @ pose.rotation.T + pose.translation, directions @ pose.rotation.T
     )
@@ -223,7 +223,7 @@ def test_a_point_lands_in_its_pixel():
         point = torch.tensor([0.4, -0.3, 0.5], dtype=torch.float64)
         dot = Part(Ellipsoid((0.03, 0.03, 0.03)), Plain(RED), position=tuple(point.tolist()))
         camera = camera_at(azimuth, elevation)
-        picture = film(Assembly((dot,)).pose(0), camera, 64)
+        picture = render_image(Assembly((dot,)).pose(0), camera, 64)
         x, y, z = (camera.inverse() @ torch.cat([point, point.new_ones(1)]))[:3].tolist()
         focal = focal_length(CAMERA_ANGLE_X, 64)
         column, row = 32 + focal * x / -z, 32 - focal * y / -z
@@ -242,7 +242,7 @@ def test_camera_stands_at_the_usual_distance():
 def test_edges_keep_the_colour_of_the_object():
     white = Light(sun=0.0, sky=0.0, ambient=1.0)
     ball = Assembly((Part(Ellipsoid((0.5, 0.5, 0.5)), Plain(RED)),), light=white)
-    picture = film(ball.pose(0), camera_at(0, 0), 48)
+    picture = render_image(ball.pose(0), camera_at(0, 0), 48)
     edge = (picture[..., 3] > 0) & (picture[..., 3] < 255)
     assert edge.sum() > 20
     assert (picture[edge][:, 0] >= 254).all()
@@ -267,12 +267,12 @@ def test_scenes_stay_in_their_box_and_ball():
             assert (points <= high + 1e-4).all(), case
 
 
-def test_only_the_still_scene_stands_still():
+def test_only_the_scene_still_life_is_static():
     camera = camera_at(-50, 25)
     for name in DEMO_SCENES:
         assembly = build_demo_scene(name)
-        first, later = (film(assembly.pose(time), camera, 32) for time in (0.0, 0.37))
-        assert (first == later).all() == (name == "still"), name
+        first, later = (render_image(assembly.pose(time), camera, 32) for time in (0.0, 0.37))
+        assert (first == later).all() == (name == "still_life"), name
 
 
 def test_most_of_a_scene_moves_smoothly_and_colours_follow_the_seed():

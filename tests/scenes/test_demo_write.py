@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from xplanes.scenes.demo import ensure_demo_scene, write
-from xplanes.scenes.demo.film import CAMERA_ANGLE_X, CAMERA_DISTANCE
+from xplanes.scenes.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE
 
 ASKED = {"resolution": 16, "train_views": 4, "val_views": 2, "test_views": 3}
 
@@ -139,7 +139,7 @@ def test_a_failed_rendering_leaves_nothing(tmp_path, monkeypatch):
     def fail(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("xplanes.scenes.demo.write.film", fail)
+    monkeypatch.setattr("xplanes.scenes.demo.write.render_image", fail)
     with pytest.raises(KeyboardInterrupt):
         make(tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -226,7 +226,7 @@ def test_frames_without_times_do_not_pass_for_those_of_time_zero(tmp_path):
         for frame in scene.contents["train"]["frames"]:
             del frame["time"]
         scene.write()
-        assert scene.read(splits=splits).splits["train"].is_still, split
+        assert scene.read(splits=splits).splits["train"].is_static, split
 
 
 def test_video_is_read_when_there_is_one(scene):
@@ -399,7 +399,7 @@ def test_images_of_different_sizes(scene):
     assert "r_3.png" in message
 
 
-def test_pictures_of_different_sizes_make_no_film(scene):
+def test_a_video_needs_frames_of_equal_size(scene):
     Image.fromarray(picture(0, 8)).save(scene.path / "train" / "r_3.png")
     paths = [scene.path / "train" / f"r_{i}.png" for i in (0, 3)]
     message = assert_refused(SceneError, "", partial(load_images, paths, None), None)

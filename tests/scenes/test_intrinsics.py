@@ -26,7 +26,7 @@ from xplanes.scenes.dnerf import read_scene
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import cube_frame, optical_centre, scene_frame
 from xplanes.scenes.silhouettes import foreground, may_hold
-from xplanes.scenes.source import stands_still
+from xplanes.scenes.source import frames_are_equal
 from xplanes.scenes.views import Intrinsics, Scene, Views, camera_rays, joined
 from xplanes.training.evaluation import score_view
 
@@ -67,7 +67,7 @@ def pixel_of(point, pose, focal_x, focal_y, centre_x, centre_y):
     return centre_y - focal_y * up / -back, centre_x + focal_x * right / -back
 
 
-def film(cameras, poses, times=None, centre=(0.0, 0.0, 0.0)):
+def rendered(cameras, poses, times=None, centre=(0.0, 0.0, 0.0)):
     """A ball before cameras of which each has its own size and intrinsics."""
     images = []
     for camera, pose in zip(cameras, poses, strict=True):
@@ -91,7 +91,9 @@ def film(cameras, poses, times=None, centre=(0.0, 0.0, 0.0)):
 
 def mixed(count=8, **options):
     """Views of two cameras in turn."""
-    return film([(WIDE, UPRIGHT)[i % 2] for i in range(count)], surrounding(count, 4.0), **options)
+    return rendered(
+        [(WIDE, UPRIGHT)[i % 2] for i in range(count)], surrounding(count, 4.0), **options
+    )
 
 
 def soiled(views, value):
@@ -224,9 +226,11 @@ def test_rays_of_the_pixels_that_show_the_ball_meet_it_and_no_others():
 
 
 def test_a_cropped_image_keeps_its_rays():
-    whole = film([WIDE], surrounding(1, 4.0))
+    whole = rendered([WIDE], surrounding(1, 4.0))
     height, width, *focal, centre_x, centre_y = WIDE
-    cut = film([(height - 9, width - 15, *focal, centre_x - 11, centre_y - 5)], surrounding(1, 4.0))
+    cut = rendered(
+        [(height - 9, width - 15, *focal, centre_x - 11, centre_y - 5)], surrounding(1, 4.0)
+    )
     left = torch.zeros(height, width, dtype=torch.bool)
     left[5 : height - 4, 11 : width - 4] = True
     torch.testing.assert_close(cut.image_rays(0)[1], whole.image_rays(0)[1][left.flatten()])
@@ -371,7 +375,7 @@ def test_carving_by_different_cameras_keeps_the_ball_and_empties_the_rest():
         )
         for cells in (grid.allowed, grid.occupied):
             assert cells.view(4, 24, 24, 24)[:, z, y, x].all()
-        assert grid.occupied.float().mean() < (0.2 if views.is_still else 0.35)
+        assert grid.occupied.float().mean() < (0.2 if views.is_static else 0.35)
 
 
 def test_images_without_alpha_carve_nothing_though_padding_has_none():
@@ -396,7 +400,7 @@ def test_the_cube_of_different_cameras_holds_the_ball_closely():
 def test_without_alpha_the_cube_is_what_the_widest_camera_sees():
     poses = surrounding(12, 3.0)
     cameras = [(10, 10, 12.0, 12.0, 5.0, 5.0), (20, 24, 24.0, 21.0, 12.0, 10.0)] * 6
-    half = 1 / scene_frame(opaque(film(cameras, poses))).scale
+    half = 1 / scene_frame(opaque(rendered(cameras, poses))).scale
     assert half == pytest.approx(1.5)  # half of 24 pixels at a focal length of 24, 3 away
 
 
@@ -408,7 +412,7 @@ def test_images_cropped_around_a_thing_look_at_it():
         row, column = pixel_of(place, pose, 90.0, 90.0, 50.0, 50.0)
         top, left = round(row) - 16, round(column) - 16
         cameras.append((32, 32, 90.0, 90.0, 50.0 - left, 50.0 - top))
-    views = film(cameras, poses, centre=tuple(place.tolist()))
+    views = rendered(cameras, poses, centre=tuple(place.tolist()))
     assert (optical_centre(views) - place).norm() < 0.03
     frame = scene_frame(views)
     assert frame.points(inside_ball(3000, RADIUS) + place).abs().max() <= 1
@@ -459,17 +463,17 @@ def test_the_data_module_serves_views_at_their_own_size():
 
 
 def test_frames_of_different_lenses_do_not_stand_still():
-    views = film([WIDE] * 3, surrounding(1, 4.0).repeat(3, 1, 1))
-    assert stands_still(views)
+    views = rendered([WIDE] * 3, surrounding(1, 4.0).repeat(3, 1, 1))
+    assert frames_are_equal(views)
     focal = views.intrinsics.focal.clone()
     focal[2] *= 1.02
-    assert not stands_still(replace(views, intrinsics=replace(views.intrinsics, focal=focal)))
+    assert not frames_are_equal(replace(views, intrinsics=replace(views.intrinsics, focal=focal)))
 
 
 # Pictures of them
 
 
-def test_a_film_shows_as_much_as_the_views():
+def test_a_video_has_the_field_of_view_of_the_training_views():
     square = ball_views(3, RADIUS, size=20, angle=0.7)
     assert square.intrinsics.focal_at(50) == pytest.approx(focal_length(0.7, 50))
     assert square.intrinsics.fov_y == pytest.approx(0.7)

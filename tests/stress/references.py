@@ -1,16 +1,16 @@
-"""Compositing in float64 NumPy, quick enough for a thousand samples; tied to tests.oracles."""
+"""Fast compositing in float64 NumPy, checked against tests.oracles."""
 
 import numpy as np
 
 
-def composite(optical_depth, colour, distances, pull):
-    """One ray by Beer and Lambert, and the gradient of ``sum(total * pull)``.
+def composite(optical_depth, colour, distances, upstream):
+    """One ray by Beer and Lambert, and the gradient of ``sum(total * upstream)``.
 
     Args:
         optical_depth: [N]
         colour: [N, 3]
         distances: [N]
-        pull: [5]
+        upstream: [5]
 
     Returns:
         total [5], weights [N], gradients of depth [N] and of colour [N, 3]
@@ -18,10 +18,10 @@ def composite(optical_depth, colour, distances, pull):
     before = np.cumsum(optical_depth) - optical_depth
     weights = np.exp(-before) * -np.expm1(-optical_depth)
     values = np.concatenate([colour, np.ones_like(distances)[:, None], distances[:, None]], axis=1)
-    value = values @ pull
+    value = values @ upstream
     behind = np.cumsum((weights * value)[::-1])[::-1] - weights * value
     d_depth = np.exp(-before - optical_depth) * value - behind
-    return weights @ values, weights, d_depth, weights[:, None] * pull[:3]
+    return weights @ values, weights, d_depth, weights[:, None] * upstream[:3]
 
 
 def worst(ours, theirs, least=1e-12):

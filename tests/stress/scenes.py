@@ -43,7 +43,7 @@ def write_scene(root: Path, kind: str, *, views: int = 6, times: int = 6, size: 
         root: Folder for scenes.
         kind: One of `SCENES`.
         views: Training views, from all sides.
-        times: Distinct moments among them.
+        times: Distinct timesteps among them.
         size: Pixels along each side.
 
     Returns:
@@ -56,8 +56,8 @@ def write_scene(root: Path, kind: str, *, views: int = 6, times: int = 6, size: 
         (folder / split).mkdir(parents=True)
         frames = []
         for number in range(count):
-            moment = number % times
-            time = moment / max(times - 1, 1)
+            timestep = number % times
+            time = timestep / max(times - 1, 1)
             angle = 0.3 + 2.4 * number + (split == "test")
             height = 0.4 + 0.5 * math.sin(number)
             pose = look_at(_place(angle, height)[None])[0]

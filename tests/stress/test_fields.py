@@ -1,4 +1,4 @@
-"""Fields of the X-Planes with planes of every size: forward, backward, and as starts of runs."""
+"""X-Planes fields with extreme values: forward, backward, and as initialisations."""
 
 from pathlib import Path
 
@@ -99,11 +99,11 @@ def test_drawn_fields(tally) -> None:
 
 @pytest.mark.parametrize("frames", [1, 6, 300])
 @pytest.mark.parametrize("value", VALUES)
-def test_starts_of_every_size(tally, tmp_path: Path, value, frames) -> None:
+def test_initial_values_of_every_size(tally, tmp_path: Path, value, frames) -> None:
     """Runs from triplanes of 0, 1e-30, 1, 1e4, 1e30 and mixed, 1 to 300 frames"""
     scene = write_scene(tmp_path / "scenes", "ball")
     planes = spread((frames, 3, 4, 8, 8), value, torch.Generator().manual_seed(0)).float()
-    save_triplanes(tmp_path / "start.pt", TriplaneSequence(planes))
-    plain = settings("six_planes", scene, "lrm=file", f"lrm.triplanes={tmp_path / 'start.pt'}")
+    save_triplanes(tmp_path / "initial.pt", TriplaneSequence(planes))
+    plain = settings("six_planes", scene, "lrm=file", f"lrm.triplanes={tmp_path / 'initial.pt'}")
     state = tally.trained(lambda: trained(plain, tmp_path / "run"))
     assert state is not None or value in (1e30, "mixed")

@@ -46,8 +46,8 @@ def values_and_gradients(function, space, time, points, times, rows):
     leaves = [plane.clone().requires_grad_() for plane in (space, time) if plane is not None]
     moving = None if time is None else leaves[1]
     value = function(leaves[0], moving, points, times, rows)
-    pull = torch.linspace(-1, 1, value.numel(), dtype=value.dtype).view_as(value)
-    return value.detach(), *torch.autograd.grad((value * pull).sum(), leaves)
+    upstream = torch.linspace(-1, 1, value.numel(), dtype=value.dtype).view_as(value)
+    return value.detach(), *torch.autograd.grad((value * upstream).sum(), leaves)
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE)

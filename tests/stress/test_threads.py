@@ -1,4 +1,4 @@
-"""The same numbers from any number of threads, and the same bits from the same seed."""
+"""Results do not depend on the number of threads and are deterministic given the seed."""
 
 from pathlib import Path
 
@@ -53,7 +53,7 @@ def test_training(tally, tmp_path: Path, model) -> None:
 @pytest.mark.parametrize("precision", ["32", "bf16"])
 @pytest.mark.parametrize("model", MODELS)
 def test_same_seed(tally, tmp_path: Path, model, precision) -> None:
-    """Same seed twice, trainer.deterministic=true: bit for bit, all models"""
+    """Same seed twice, trainer.deterministic=true: bit-identical, all models"""
     if precision == "bf16" and model in SLOW:
         pytest.skip("this model computes in float32 alone")
     scene = write_scene(tmp_path, "ball")

@@ -1,4 +1,4 @@
-"""Training at the edges: scenes without content, few rays, views and moments, high rates."""
+"""Training at the edges: scenes without content, few rays, views and timesteps, high rates."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def test_scenes_without_content(tally, root, tmp_path, model, kind) -> None:
 @pytest.mark.parametrize("precision", ["32", "bf16"])
 @pytest.mark.parametrize("kind", SCENES)
 def test_a_start_from_scenes_without_content(tally, root, tmp_path, kind, precision, crop) -> None:
-    """The same scenes filmed and started from lrm=tiny, decoder in float32 and bfloat16"""
+    """The same scenes initialised from lrm=tiny, decoder in float32 and bfloat16"""
     changed = (
         f"model.precision={precision}",
         f"lrm.crop={crop}",
@@ -58,14 +58,14 @@ FEW = {
     "one ray": ((6, 6), ("model.rays.per_batch=1",)),
     "one view of many": ((6, 6), ("data.views=1",)),
     "one view": ((1, 1), ()),
-    "one moment": ((6, 1), ()),
+    "one timestep": ((6, 1), ()),
 }
 
 
 @pytest.mark.parametrize("what", FEW)
 @pytest.mark.parametrize("model", MODELS)
 def test_as_little_as_there_can_be(tally, root, tmp_path, model, what) -> None:
-    """One ray a batch, one view, one moment, all models"""
+    """One ray a batch, one view, one timestep, all models"""
     (views, times), overrides = FEW[what]
     config = settings(model, write_scene(root, "ball", views=views, times=times), *overrides)
     assert tally.trained(lambda: trained(config, tmp_path / "run")) is not None
@@ -75,7 +75,7 @@ def test_as_little_as_there_can_be(tally, root, tmp_path, model, what) -> None:
 @pytest.mark.parametrize("rows", [1, 300])
 @pytest.mark.parametrize("model", ["six_planes", "nine_planes"])
 def test_rows_of_time(tally, root, tmp_path, model, rows, precision) -> None:
-    """1 and 300 rows of time, 300 moments, decoder in float32 and bfloat16"""
+    """1 and 300 rows of time, 300 timesteps, decoder in float32 and bfloat16"""
     scene = write_scene(root, "ball", views=300, times=300, size=12)
     changed = (f"model.time_resolution={rows}", f"model.precision={precision}")
     config = settings(model, scene, *changed)

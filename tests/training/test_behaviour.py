@@ -466,21 +466,21 @@ def test_scene_of_one_moment_trains_without_planes_of_time(scenes: Path, tmp_pat
             del frame["time"]
         path.write_text(json.dumps(content))
     dnerf = {"_target_": "xplanes.scenes.dnerf.BlenderSettings", "name": "dnerf"}
-    still = dict(config, data=config["data"] | dnerf)
+    static = dict(config, data=config["data"] | dnerf)
     for name in ("seed", "train_views", "test_views", "val_views"):
-        del still["data"][name]
-    still["data"].update(scene=folder.name)
-    run(still, tmp_path / "still", [], resume=False)
-    state = torch.load(tmp_path / "still" / "checkpoints" / "last.ckpt", weights_only=True)
+        del static["data"][name]
+    static["data"].update(scene=folder.name)
+    run(static, tmp_path / "static", [], resume=False)
+    state = torch.load(tmp_path / "static" / "checkpoints" / "last.ckpt", weights_only=True)
     assert "field.time" not in state["state_dict"]
 
 
 def test_a_scene_without_motion_has_no_planes_of_time(scenes: Path, tmp_path: Path) -> None:
     cases = {
-        ("data.scene=still",): "frames are equal",
-        ("data.scene=still", "data.still=false"): None,
+        ("data.scene=still_life",): "frames are equal",
+        ("data.scene=still_life", "data.static=false"): None,
         ("data.scene=excavator",): None,
-        ("data.scene=excavator", "data.still=true"): "data.still=true",
+        ("data.scene=excavator", "data.static=true"): "data.static=true",
     }
     for overrides, reason in cases.items():
         folder = tmp_path / "-".join(overrides)

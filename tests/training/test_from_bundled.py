@@ -25,7 +25,7 @@ SETTINGS = (
 @pytest.fixture(scope="module")
 def train(scenes: Path):
     def train(folder: Path, *overrides: str) -> list[float]:
-        """PSNR at the start and at the end of a run."""
+        """PSNR at step 0 and at the end of a run."""
         run(small_config(scenes, *SETTINGS, *overrides), folder, [], resume=False)
         return [float(row["psnr"]) for row in read_rows(folder / "curve.csv")]
 
@@ -34,7 +34,7 @@ def train(scenes: Path):
 
 @pytest.fixture(scope="module")
 def random(train, tmp_path_factory: pytest.TempPathFactory) -> list[float]:
-    """What random planes come to."""
+    """PSNR of random initialisation."""
     return train(tmp_path_factory.mktemp("random") / "run", "lrm=none")
 
 
@@ -64,10 +64,10 @@ def test_a_scene_of_one_moment_needs_one_triplane(train, tmp_path: Path):
 
 def test_a_scene_without_motion_trains_as_a_still_one(train, tmp_path: Path):
     folder = tmp_path / "run"
-    train(folder, "lrm=tiny", "data.scene=still", "trainer.max_steps=1")
+    train(folder, "lrm=tiny", "data.scene=still_life", "trainer.max_steps=1")
     assert (told(folder)["lrm"]["frames"], told(folder)["lrm"]["distinct"]) == (1, 1)
     assert told(folder)["decomposition"] == {}
     loaded = load_run(folder)
-    assert loaded.is_still
+    assert loaded.is_static
     assert loaded.module.renderer.grid.time_bins == 1
     assert "trains as a static one" in (folder / "train.log").read_text()

@@ -1,4 +1,4 @@
-"""Runs that start from a Large Reconstruction Model: stages, files, going on after a stop."""
+"""Runs initialised from a Large Reconstruction Model: stages, files, resuming."""
 
 import json
 from pathlib import Path
@@ -63,7 +63,7 @@ def test_a_run_from_the_scenes_video(settings, tmp_path: Path, name, model):
 
 @pytest.fixture(scope="module")
 def uninterrupted(settings, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run whose fixed view a field films."""
+    """A run whose fixed-view video is rendered by a field."""
     place = tmp_path_factory.mktemp("uninterrupted")
     config = settings(place, "openlrm-1.1", "preparation.fixed_view=train")
     run(config, place / "run", [], resume=False)

@@ -1,4 +1,4 @@
-"""Runs that start from a triplane file: what they write, how they go on, how they are loaded."""
+"""Runs initialised from a triplane file: outputs, resuming, loading."""
 
 import json
 from pathlib import Path
@@ -191,9 +191,9 @@ def test_a_start_holds_the_planes(place: Path, tmp_path: Path) -> None:
         kept = weights(tmp_path / name)
         return torch.cat([kept["field.space"].flatten(), kept["field.time"].flatten()])
 
-    start = planes("start", "trainer.max_steps=1")
+    initial = planes("initial", "trainer.max_steps=1")
     free, held = (planes(w, f"model.loss.initial_weight={w}") for w in ("0", "1000"))
-    assert float((held - start).norm()) < 0.5 * float((free - start).norm())
+    assert float((held - initial).norm()) < 0.5 * float((free - initial).norm())
 
 
 def built(config: dict) -> XPlanesModel:
@@ -266,9 +266,9 @@ def test_the_loss_pulls_random_planes_towards_the_sparse_part(
         run(settings(place, *overrides), folder, [], resume=False)
         rows = TIME_ROWS[model.removesuffix("_planes")]
         left[weight] = unexplained_energy(weights(folder)["field.time"], sparse, rows=rows)
-    start = metrics(tmp_path / "100")["decomposition"]["unexplained"]["after"]
-    assert start == pytest.approx(1, abs=0.1)
-    assert left[100] < 0.5 * start
+    initial = metrics(tmp_path / "100")["decomposition"]["unexplained"]["after"]
+    assert initial == pytest.approx(1, abs=0.1)
+    assert left[100] < 0.5 * initial
     assert left[100] < 0.5 * left[0]
 
 
@@ -304,7 +304,7 @@ def test_a_run_from_one_triplane_is_loaded_too(place: Path, tmp_path: Path) -> N
     run(config, tmp_path / "run", [], resume=False)
     assert metrics(tmp_path / "run")["decomposition"] == {}
     assert not (tmp_path / "run" / "media" / "decomposition.png").exists()
-    assert load_run(tmp_path / "run").is_still
+    assert load_run(tmp_path / "run").is_static
 
 
 def test_a_damaged_site_is_named(trained: Path, tmp_path: Path) -> None:
@@ -344,14 +344,14 @@ def test_a_random_start_says_so_and_leaves_no_trace(
     state = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
     assert not state["site"]["initialised"]
     assert metrics(tmp_path / "run")["decomposition"] == {}
-    assert "from     random planes" in capsys.readouterr().out
+    assert "from     random initialisation" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("model", ["six_planes", "nine_planes"])
 def test_a_trained_fields_own_triplanes_start_a_field_that_renders_as_it(
     place: Path, tmp_path: Path, model: str
 ) -> None:
-    """Ties orientation, time, decoder and frame of a file to the field's, end to end."""
+    """Checks end to end that orientation, time, decoder and frame of a file match the field's."""
     common = (f"model={model}", "model.precision=32", "model.sampler.coarse_steps=0")
     config = small_config(place / "scenes", *common, "trainer.max_steps=80", UNSCORED)
     run(config, tmp_path / "first", [], resume=False)
@@ -382,15 +382,15 @@ def test_a_trained_fields_own_triplanes_start_a_field_that_renders_as_it(
 
 
 def triplanes_of(field: XPlanes, frames: int) -> torch.Tensor:
-    """What the field's features are at each moment, as triplanes. [T, 3, C, H, H]"""
+    """What the field's features are at each timestep, as triplanes. [T, 3, C, H, H]"""
     size = field.space.shape[1]
     ticks = torch.arange(frames)
     profiles = frame_profiles(field.time, ticks, frames, size)
-    moments = []
+    timesteps = []
     for frame in range(frames):
         products = [
             torch.einsum("wc,hc->chw", profiles[first, frame], profiles[second, frame])
             for first, second in field.rows
         ]
-        moments.append(field.space.permute(0, 3, 1, 2) + torch.stack(products))
-    return torch.stack(moments)
+        timesteps.append(field.space.permute(0, 3, 1, 2) + torch.stack(products))
+    return torch.stack(timesteps)

@@ -1,4 +1,4 @@
-"""L_r in training: a gradient at random frames, unbiased, equal on all ranks."""
+"""L_r in training: an unbiased gradient from random frames, equal on all ranks."""
 
 import pytest
 import torch

@@ -73,13 +73,13 @@ def test_time_smoothness_gradient_is_autograd_s():
 
 def test_distance_gradient_is_autograd_s():
     for shape in SHAPES:
-        start = planes_of(shape, seed=2)
+        initial = planes_of(shape, seed=2)
         check_gradient(
             shape,
-            lambda gradient, planes, start=start: add_distance_gradient(
-                gradient, planes, start, 0.6
+            lambda gradient, planes, initial=initial: add_distance_gradient(
+                gradient, planes, initial, 0.6
             ),
-            lambda planes, start=start: 0.6 * (planes - start).square().mean(),
+            lambda planes, initial=initial: 0.6 * (planes - initial).square().mean(),
         )
 
 

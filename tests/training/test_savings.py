@@ -37,7 +37,7 @@ def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Watched:
         steps.append((rays, len(samples)))
         count(self, samples, rays)
 
-    # Where silhouettes forbid to look the field is what it was at the start.
+    # Outside the silhouettes the field keeps its initial values.
     config = small_config(
         scenes,
         "model.sampler.silhouettes=false",

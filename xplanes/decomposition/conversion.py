@@ -99,8 +99,8 @@ def shared_factors(sparse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Time planes xt, yt, zt of six planes, each shared by two orientations.
 
     Alternating least squares per frame and channel: with two factors fixed the third has a closed
-    form, so the product loss never rises. It starts from the rank-1 pairs of each orientation,
-    every factor as the mean of its two candidates with their signs made equal.
+    form, so the product loss never rises. Each factor is initialised with the mean of its two
+    candidates among the rank-1 pairs of each orientation, with their signs made equal.
 
     Args:
         sparse: The sparse part, square planes. [T, 3, C, N, N]
@@ -173,7 +173,7 @@ def space_planes(
     """Space planes from the low-rank part (X-Planes, Eq. 13; "middle" is the paper's choice).
 
     Args:
-        low_rank: What stands still. [T, 3, C, H, W]
+        low_rank: The static part. [T, 3, C, H, W]
         static: "middle" (the frame T/2), "median" or "mean" over time, entry by entry.
         resolution: R, in cells; None keeps the triplanes' own, which must then be square.
 
@@ -210,14 +210,14 @@ def time_planes(
     noise: float = 0.01,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """Space-time planes whose products start near the sparse part (X-Planes, Eq. 14-16).
+    """Space-time planes whose products approximate the sparse part (X-Planes, Eq. 14-16).
 
     "rank1" minimises the product loss frame by frame on the triplanes' own grid: in closed form for
-    nine planes, by alternating least squares for six. "random" is the paper's start near zero. Both
-    get noise, because a product of two zeros has a zero gradient.
+    nine planes, by alternating least squares for six. "random" is the paper's initialisation near
+    zero. Noise is added to both, because a product of two zeros has a zero gradient.
 
     Args:
-        sparse: What moves. [T, 3, C, H, W]
+        sparse: The dynamic part. [T, 3, C, H, W]
         plane_set: "six" (xt, yt, zt shared) or "nine" (xt, yt, xt, zt, yt, zt, a pair per row).
         dynamic: "rank1" or "random".
         resolution: R, in cells; None keeps the triplanes' own, which must then be square.

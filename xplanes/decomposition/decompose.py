@@ -16,8 +16,8 @@ class Decomposition:
     """Two triplane sequences that add up to the one given, and how each orientation came out.
 
     Attributes:
-        low_rank: What stands still. [T, 3, C, H, W]
-        sparse: What moves. [T, 3, C, H, W]
+        low_rank: The static part. [T, 3, C, H, W]
+        sparse: The dynamic part. [T, 3, C, H, W]
         reports: For "xy", "xz" and "yz" the builtins of ``RobustPCA.report``.
     """
 

@@ -1,6 +1,6 @@
 """Algorithm 1 of the paper as it is printed, with a full singular value decomposition.
 
-Slow and plain on purpose: the fused passes are tied to it by tests, and ``method="exact"`` runs it.
+Slow and simple on purpose: tests compare the fused passes with it; ``method="exact"`` runs it.
 """
 
 from collections.abc import Callable

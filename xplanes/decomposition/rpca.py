@@ -34,7 +34,7 @@ class RobustPCA:
         sparsity: Share of non-zero entries in S.
         low_rank_energy: ``|L|^2 / |Y|^2``.
         sparse_energy: ``|S|^2 / |Y|^2``.
-        drift: ``|L - L(T/2)| / |L|``: 0 if L stands still.
+        drift: ``|L - L(T/2)| / |L|``: 0 if L is constant over time.
         sparsity_weight: The weight used.
         penalty: The penalty at the end, in units of ``1 / unit``.
         unit: What Y is measured in: its root mean square, or 1 with ``scale="none"``.
@@ -83,7 +83,7 @@ def robust_pca(
 
     Both norms scale with Y, so the optimum does too: the weight suits every scale. The penalty does
     not; ``scale="rms"`` measures it against the root mean square of Y. Only the path of a fixed
-    penalty depends on it: "adaptive" starts from it and always measures it so.
+    penalty depends on it: "adaptive" uses it as the initial value in these units.
 
     Beside the results, which have the size of Y each, memory holds four cache-sized blocks; an
     input that is neither float32 nor float64, or has no contiguous rows or columns, is copied once.
@@ -92,7 +92,7 @@ def robust_pca(
         matrix: Y, any floating type; never changed. Half precision is computed and returned in
             float32. [M, T]
         sparsity_weight: Weight of S; "auto" is ``1 / sqrt(max(M, T))`` (Candes et al. 2011).
-        penalty: Penalty of ADMM; the start of it for "adaptive", unused by "growing".
+        penalty: Penalty of ADMM; the initial one for "adaptive", unused by "growing".
         tolerance: Bound on ``|L + S - Y| / |Y|``; "adaptive" also wants the relative step below
             ten times this. float32 cannot reach much below 1e-6.
         max_iterations: Limit; reaching it unconverged gives a warning.

@@ -1,4 +1,4 @@
-"""L_r: the loss that ties products of time planes to the sparse part (X-Planes, Eq. 17)."""
+"""L_r: keeps products of time planes near the sparse part (X-Planes, Eq. 17)."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Films along a path of cameras and times, as the command line names them."""
+"""Videos along a path of cameras and times: `xplanes render`."""
 
 import difflib
 import math
@@ -32,8 +32,8 @@ def orbit_poses(views: Views, frame: Frame, count: int, elevation: float = ELEVA
     return orbit(count, radius=float(distance), elevation=elevation, target=frame.centre)
 
 
-def film_times(frames: int) -> Tensor:
-    """Times that run forth and back once, so that a repeated film does not jump. [frames]"""
+def video_times(frames: int) -> Tensor:
+    """Times from 0 to 1 and back to 0, so that a looped video has no jump. [frames]"""
     phase = torch.arange(frames) / max(frames, 1)
     return 1 - (2 * phase - 1).abs()
 
@@ -82,23 +82,24 @@ def render_path(
 def _depth(image: dict[str, Tensor], distance: float) -> Tensor:
     """Depth as colours, near is light; white where there is nothing. [R, 3]
 
-    The scale is the field's cube as seen from ``distance``, not what a frame happens to show: a
-    film would flicker.
+    The scale is that of the field's cube seen from ``distance``. A scale of each frame's own would
+    make a video flicker.
     """
     colours = colour_map(0.5 + 0.5 * (distance - image["depth"]))
     return torch.lerp(torch.ones_like(colours), colours, image["opacity"][:, None])
 
 
-def check_film(path: Path, *, frames: int, folder: bool = False) -> None:
-    """Refuse what `write_film` could not write, before anything is rendered.
+def check_video(path: Path, *, frames: int, folder: bool = False) -> None:
+    """Refuse what `write_video` cannot write, before anything is rendered.
 
     Args:
-        path: Where the film is to go.
+        path: The video file, or the folder for its frames.
         frames: Number of frames.
         folder: Whether ``path`` is a folder for one PNG per frame.
 
     Raises:
-        ConfigError: If the ending stands for no format, or files would be mixed.
+        ConfigError: If the suffix is unknown, the folder is not empty, or a .png would get several
+            frames.
         ImportError: For .mp4 without the extra ``video``, naming it.
     """
     if folder:
@@ -109,28 +110,29 @@ def check_film(path: Path, *, frames: int, folder: bool = False) -> None:
         require("imageio.v2", extra="video")
     elif path.suffix == ".png" and frames > 1:
         raise ConfigError(
-            f"{path} holds one picture, not {frames}: a folder takes one PNG per frame if its name "
-            f"ends in / ({path.with_suffix('')}/)"
+            f"{path} is one image, not {frames}: to write one PNG per frame, name a folder "
+            f"with / at its end ({path.with_suffix('')}/)"
         )
     elif path.suffix not in (".webp", ".png"):
-        raise ConfigError(f"{path}: films end in .webp or .mp4, pictures in .png, folders in /")
+        raise ConfigError(
+            f"{path}: a video must end in .webp or .mp4, an image in .png, a folder in /"
+        )
 
 
-def write_film(path: Path, frames: Iterable[Tensor], *, fps: int, folder: bool = False) -> Path:
-    """Write frames as a film, whole or not at all.
+def write_video(path: Path, frames: Iterable[Tensor], *, fps: int, folder: bool = False) -> Path:
+    """Write frames as a video, atomically.
 
     Args:
-        path: Its ending decides: .webp needs nothing more, .mp4 the extra ``video``, .png takes one
-            frame.
+        path: Its suffix sets the format: .webp, .mp4 (extra ``video``), or .png (one frame).
         frames: uint8 [H, W, 3] each.
         fps: Frames per second.
         folder: Write one PNG per frame into the folder ``path`` instead.
 
     Raises:
-        ConfigError: For another ending.
+        ConfigError: For another suffix.
         ImportError: For .mp4 without the extra, naming it.
     """
-    check_film(path, frames=1, folder=folder)
+    check_video(path, frames=1, folder=folder)
     if folder:
         for number, frame in enumerate(frames):
             _write_png(path / f"frame_{number:04d}.png", frame)
@@ -179,12 +181,12 @@ LARGEST = 8192
 
 
 @dataclass(frozen=True)
-class FilmOptions:
-    """What to film.
+class VideoOptions:
+    """What to render.
 
     Attributes:
         path: Camera: ``orbit``, ``fixed`` (the first camera of the orbit), or ``view:FILE``.
-        time: ``sweep`` (from 0 to 1), ``forth-and-back``, or a number from 0 to 1.
+        time: ``sweep`` (from 0 to 1), ``back-and-forth``, or a number from 0 to 1.
         frames: Number of frames; None for 48, or 1 where neither camera nor time moves.
         fps: Frames per second.
         size: Pixels per side; None for those of the training views.
@@ -193,7 +195,7 @@ class FilmOptions:
     """
 
     path: str = "orbit"
-    time: str = "forth-and-back"
+    time: str = "back-and-forth"
     frames: int | None = None
     fps: int = 16
     size: int | None = None
@@ -205,11 +207,11 @@ class FilmOptions:
         """Number of frames."""
         if self.frames is not None:
             return self.frames
-        frozen = self.path != "orbit" and self.time not in ("sweep", "forth-and-back")
+        frozen = self.path != "orbit" and self.time not in ("sweep", "back-and-forth")
         return 1 if frozen else FRAMES
 
     def check(self) -> None:
-        """Refuse what cannot be filmed.
+        """Refuse options that cannot be rendered.
 
         Raises:
             ConfigError: With the option, its value and what is allowed.
@@ -230,17 +232,17 @@ class FilmOptions:
             )
 
 
-def film(trained: TrainedRun, options: FilmOptions, out: str | None = None) -> Path:
-    """Render and write a film.
+def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = None) -> Path:
+    """Render and write a video.
 
     Args:
         trained: The run.
-        options: What to film.
+        options: What to render.
         out: A file (.webp, .mp4, .png), or a folder if it ends in /; by default a file in the run's
             media/ that is named after the paths.
 
     Returns:
-        Where the film is.
+        The file or folder that was written.
 
     Raises:
         ConfigError: If options are out of range or contradict one another.
@@ -266,22 +268,22 @@ def film(trained: TrainedRun, options: FilmOptions, out: str | None = None) -> P
         what=options.what,
     )
     shown = progress(frames, options.count, "frames")
-    return write_film(target, shown, fps=options.fps, folder=folder)
+    return write_video(target, shown, fps=options.fps, folder=folder)
 
 
-def check_out(out: str | None, options: FilmOptions) -> None:
+def check_out(out: str | None, options: VideoOptions) -> None:
     """Refuse an ``--out`` that could not be written, before the run is loaded.
 
     Raises:
-        ConfigError: As `xplanes.evaluation.render.check_film`.
+        ConfigError: As `xplanes.evaluation.render.check_video`.
         ImportError: For .mp4 without the extra ``video``.
     """
     target, folder = destination(Path(), options, out, "last")
-    check_film(target, frames=options.count, folder=folder)
+    check_video(target, frames=options.count, folder=folder)
 
 
 def destination(
-    run: Path, options: FilmOptions, out: str | None, checkpoint: str
+    run: Path, options: VideoOptions, out: str | None, checkpoint: str
 ) -> tuple[Path, bool]:
     """The file or folder to write, and whether it is a folder."""
     if out is not None:
@@ -293,7 +295,7 @@ def destination(
     return run / "media" / ("_".join(parts) + ending), False
 
 
-def poses(trained: TrainedRun, options: FilmOptions) -> Tensor:
+def poses(trained: TrainedRun, options: VideoOptions) -> Tensor:
     """Camera of each frame. [F, 4, 4]"""
     views = trained.scene.splits["train"]
     if options.path == "orbit":
@@ -353,16 +355,16 @@ def times(name: str, count: int) -> Tensor:
     """Time of each frame, from 0 to 1. [F]
 
     Raises:
-        ConfigError: If ``name`` is neither a way through time nor a number from 0 to 1.
+        ConfigError: If ``name`` is neither sweep, back-and-forth nor a number from 0 to 1.
     """
     if name == "sweep":
         return torch.linspace(0, 1, count)
-    if name == "forth-and-back":
-        return film_times(count)
+    if name == "back-and-forth":
+        return video_times(count)
     try:
-        moment = float(name)
+        time = float(name)
     except ValueError:
-        moment = math.nan
-    if not 0 <= moment <= 1:
-        raise ConfigError(f"--time {name}: must be sweep, forth-and-back or a number from 0 to 1")
-    return torch.full((count,), moment)
+        time = math.nan
+    if not 0 <= time <= 1:
+        raise ConfigError(f"--time {name}: must be sweep, back-and-forth or a number from 0 to 1")
+    return torch.full((count,), time)

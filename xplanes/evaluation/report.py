@@ -49,7 +49,7 @@ def header(
     frozen = sum(p.numel() for p in module.parameters()) - trainable
     moving = ""
     if not module.field.moves:
-        reason = scene.still or "one timestep only"
+        reason = scene.static_reason or "one timestep only"
         moving = f" · trains as a static one, without time planes: {reason}"
     budget = f"{trainer.get('max_steps')} steps"
     if trainer.get("max_seconds") is not None:

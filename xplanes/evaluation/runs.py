@@ -56,7 +56,7 @@ class TrainedRun:
         return self.scene.splits[self.split]
 
     @property
-    def is_still(self) -> bool:
+    def is_static(self) -> bool:
         """Whether the field has no time."""
         return not self.module.field.moves
 

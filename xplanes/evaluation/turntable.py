@@ -1,4 +1,4 @@
-"""Triplanes of pictures, and a film that goes round them: `xplanes triplanes`."""
+"""Triplanes from images, and a turntable video of them: `xplanes triplanes`."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from xplanes.errors import ConfigError
-from xplanes.evaluation.render import render_path, write_film
+from xplanes.evaluation.render import render_path, write_video
 from xplanes.experiment import Experiment
 from xplanes.fields import XPlanes
 from xplanes.fields.xplanes import SPACE_PLANES
@@ -33,16 +33,16 @@ KINDS = (".png", ".jpg", ".jpeg")
 def write_triplanes(
     paths: Sequence[Path], out: Path, experiment: Experiment, *, say: Callable[[str], None]
 ) -> Path:
-    """Turn pictures into triplanes, and write them and a film that goes round them.
+    """Encode images into triplanes; write these and a turntable video.
 
     Args:
-        paths: Pictures, or folders of them.
-        out: File to write, .safetensors or .pt; the film lies beside it.
-        experiment: Settings, of which the model's, the cache and the device count.
-        say: Takes lines about what happens.
+        paths: Images, or folders of them.
+        out: File to write, .safetensors or .pt; the video gets the same name and .webp.
+        experiment: Settings; the LRM's, the cache and the device are used.
+        say: Receives progress messages.
 
     Returns:
-        The film.
+        The video file.
 
     Raises:
         ConfigError, LRMError, SceneError: If a setting, the weights or a picture cannot be used.
@@ -53,14 +53,14 @@ def write_triplanes(
     options = experiment.method.lrm
     if not isinstance(options, ImageLRMSettings):
         raise ConfigError(
-            f"lrm={options.name} makes no triplanes of pictures: choose a model, such as lrm=small"
+            f"lrm={options.name} does not encode images: choose a model, such as lrm=small"
         )
     lrm = options.load_model(say)
     frames = load_images(pictures, None)
     if bool((frames[..., 3] == 255).all()):
         say(
-            "the images have no transparency: the model takes the background for a part of the "
-            "object"
+            "the images have no transparency: the model will reconstruct the background as part of "
+            "the object"
         )
     folder = experiment.method.preparation.cache
     device = experiment.device
@@ -82,14 +82,14 @@ def write_triplanes(
         f"wrote {out}: {count} triplanes of {size} x {size} texels and {channels} channels, "
         f"{encoded.seconds / encoded.distinct:.2f} s each"
     )
-    film = out.with_suffix(".webp")
-    write_film(film, turntable(encoded.triplanes, lrm.model, device), fps=FPS)
-    say(f"wrote {film}")
-    return film
+    video = out.with_suffix(".webp")
+    write_video(video, turntable(encoded.triplanes, lrm.model, device), fps=FPS)
+    say(f"wrote {video}")
+    return video
 
 
 def find_pictures(paths: Sequence[Path]) -> list[Path]:
-    """Picture files; of a folder all that it holds, by name.
+    """Image files; a folder stands for all images in it, sorted by name.
 
     Raises:
         SceneError: If one is missing, or there are none.
@@ -111,15 +111,15 @@ def find_pictures(paths: Sequence[Path]) -> list[Path]:
 
 
 def turntable(triplanes: Tensor, model: LRM, device: torch.device) -> Iterator[Tensor]:
-    """Frames of a camera that goes once round, from where the model's own camera stands.
+    """Frames of one camera orbit that begins at the model's canonical camera.
 
     Args:
-        triplanes: One or several, shown one after the other. [T, 3, C, H, H]
-        model: The model that made them.
+        triplanes: One or more, shown one after another. [T, 3, C, H, H]
+        model: The model that produced them.
         device: Where to render.
 
     Yields:
-        Pictures on white. uint8 [SIDE, SIDE, 3]
+        Images on white. uint8 [SIDE, SIDE, 3]
     """
     view = model.view
     frame = cube_frame(view.half_side, torch.zeros(3))

@@ -1,4 +1,4 @@
-"""A trained scene in the browser: a camera to move and a time to set."""
+"""Interactive viewer in the browser: free camera and time slider."""
 
 import math
 import threading
@@ -17,7 +17,7 @@ from xplanes.scenes.views import camera_rays
 HOST = "127.0.0.1"
 SIZES = ("64", "96", "128", "200", "320", "480", "720")
 LOOP_SECONDS = 4.0
-"""How long the scene's time takes from 0 to 1 while it plays."""
+"""Duration of one playback from time 0 to 1."""
 TICK_SECONDS = 0.04
 SETTLE_SECONDS = 0.25
 """How long a camera must rest before the picture is drawn in full."""
@@ -45,7 +45,7 @@ def draw(
     trained: TrainedRun,
     pose: Tensor,
     *,
-    moment: float,
+    timestep: float,
     fov: float,
     height: int,
     aspect: float,
@@ -56,7 +56,7 @@ def draw(
     Args:
         trained: The run.
         pose: Camera-to-world matrix. [4, 4]
-        moment: Time, from 0 to 1.
+        timestep: Time, from 0 to 1.
         fov: Vertical field of view, in radians.
         height: Rows.
         aspect: Columns per row.
@@ -73,7 +73,7 @@ def draw(
         trained.module.field,
         origins.to(device),
         directions.to(device),
-        moment,
+        timestep,
         trained.scene.background.to(device),
     )
     if what == "depth":
@@ -102,9 +102,9 @@ class Viewer:
         self.server = viser.ViserServer(host=HOST, port=port, verbose=False)
         self._place_camera()
         gui = self.server.gui
-        still = trained.is_still
-        self.time = gui.add_slider("time", 0.0, 1.0, 0.005, 0.0, disabled=still)
-        self.play = gui.add_button("play", disabled=still)
+        static = trained.is_static
+        self.time = gui.add_slider("time", 0.0, 1.0, 0.005, 0.0, disabled=static)
+        self.play = gui.add_button("play", disabled=static)
         size = min(SIZES, key=lambda text: abs(int(text) - trained.views.height))
         self.size = gui.add_dropdown("resolution", SIZES, initial_value=size)
         self.what = gui.add_dropdown("show", ("colour", "depth"))
@@ -140,7 +140,7 @@ class Viewer:
             return draw(
                 self.trained,
                 pose,
-                moment=float(self.time.value),
+                timestep=float(self.time.value),
                 fov=camera.fov,
                 height=height,
                 aspect=camera.aspect,

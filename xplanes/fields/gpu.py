@@ -19,7 +19,7 @@ one. With more the backward runs out of registers."""
 WIDEST = 128
 """Channels of a program at most; the second axis of the grid takes the others."""
 
-SIZES = ["count", "size", "moments", "width"]
+SIZES = ["count", "size", "timesteps", "width"]
 """Numbers that make no variants of a kernel, so that one trial covers all resolutions."""
 
 OUTSIDE = tl.constexpr(3.0)
@@ -104,12 +104,12 @@ def coordinates(points, n, count):
 
 @triton.jit
 def read_factors(
-    time, moments, width, line, places, channel, AXES: tl.constexpr, CHANNELS: tl.constexpr
+    time, timesteps, width, line, places, channel, AXES: tl.constexpr, CHANNELS: tl.constexpr
 ):
     """What the time planes hold, one after the other."""
     found = ()
     for plane in tl.static_range(len(AXES)):
-        value = read(time, plane * moments, width, line, places[AXES[plane]], channel, CHANNELS)
+        value = read(time, plane * timesteps, width, line, places[AXES[plane]], channel, CHANNELS)
         found = found + (value,)  # noqa: RUF005 (triton unpacks nothing)
     return found
 
@@ -123,7 +123,7 @@ def forward(
     features,
     count,
     size,
-    moments,
+    timesteps,
     width,
     ROWS: tl.constexpr,
     AXES: tl.constexpr,
@@ -139,9 +139,9 @@ def forward(
     xz = read(space, size, size, depth, column, channel, CHANNELS)
     yz = read(space, 2 * size, size, depth, row, channel, CHANNELS)
     if len(AXES) > 0:
-        line = time_taps(tl.load(times + n, mask=n < count, other=0.0), moments)
+        line = time_taps(tl.load(times + n, mask=n < count, other=0.0), timesteps)
         places = space_taps(x, width), space_taps(y, width), space_taps(z, width)
-        factor = read_factors(time, moments, width, line, places, channel, AXES, CHANNELS)
+        factor = read_factors(time, timesteps, width, line, places, channel, AXES, CHANNELS)
         xy += factor[ROWS[0][0]] * factor[ROWS[0][1]]
         xz += factor[ROWS[1][0]] * factor[ROWS[1][1]]
         yz += factor[ROWS[2][0]] * factor[ROWS[2][1]]
@@ -162,7 +162,7 @@ def backward(
     time_gradient,
     count,
     size,
-    moments,
+    timesteps,
     width,
     ROWS: tl.constexpr,
     AXES: tl.constexpr,
@@ -179,26 +179,26 @@ def backward(
     xy = tl.load(gradient + offset, mask=mask, other=0.0)
     xz = tl.load(gradient + offset + CHANNELS, mask=mask, other=0.0)
     yz = tl.load(gradient + offset + 2 * CHANNELS, mask=mask, other=0.0)
-    pull = xy, xz, yz
+    upstream = xy, xz, yz
     if SPACE:
         column, row, depth = space_taps(x, size), space_taps(y, size), space_taps(z, size)
         spread(space_gradient, 0, size, row, column, xy, channel, CHANNELS)
         spread(space_gradient, size, size, depth, column, xz, channel, CHANNELS)
         spread(space_gradient, 2 * size, size, depth, row, yz, channel, CHANNELS)
     if len(AXES) > 0:
-        line = time_taps(tl.load(times + n, mask=n < count, other=0.0), moments)
+        line = time_taps(tl.load(times + n, mask=n < count, other=0.0), timesteps)
         places = space_taps(x, width), space_taps(y, width), space_taps(z, width)
-        factor = read_factors(time, moments, width, line, places, channel, AXES, CHANNELS)
+        factor = read_factors(time, timesteps, width, line, places, channel, AXES, CHANNELS)
         for plane in tl.static_range(len(AXES)):
             # A plane that two rows share is written once, with the sum of both.
             source = tl.zeros_like(xy)
             for r in tl.static_range(3):
                 if ROWS[r][0] == plane:
-                    source += pull[r] * factor[ROWS[r][1]]
+                    source += upstream[r] * factor[ROWS[r][1]]
                 if ROWS[r][1] == plane:
-                    source += pull[r] * factor[ROWS[r][0]]
+                    source += upstream[r] * factor[ROWS[r][0]]
             place = places[AXES[plane]]
-            first = plane * moments
+            first = plane * timesteps
             spread(time_gradient, first, width, line, place, source, channel, CHANNELS)
 
 

@@ -70,11 +70,11 @@ def backward(
     channel = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     live = n < count
     mask = live[:, None] & (channel < CHANNELS)[None, :]
-    pull = tl.load(gradient + n[:, None] * CHANNELS + channel[None, :], mask=mask, other=0.0)
+    upstream = tl.load(gradient + n[:, None] * CHANNELS + channel[None, :], mask=mask, other=0.0)
     values = read_all(planes, sizes, places, n, live, channel, AXES, CHANNELS)
     for p in tl.static_range(len(AXES)):
         # Each factor's gradient is the product of all others, which may hold zeros.
-        source = pull
+        source = upstream
         for q in tl.static_range(len(AXES)):
             if q != p:
                 source *= values[q]

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 Groups = tuple[tuple[str, ...], ...]
 """Planes that belong together; every group owns its planes."""
 
-STILL: Groups = (("yz",), ("xz",), ("xy",))
-MOVING: Groups = (("yz", "yt", "zt"), ("xz", "xt", "zt"), ("xy", "xt", "yt"))
+STATIC: Groups = (("yz",), ("xz",), ("xy",))
+DYNAMIC: Groups = (("yz", "yt", "zt"), ("xz", "xt", "zt"), ("xy", "xt", "yt"))
 
 AXES = "xyzt"
 
@@ -65,7 +65,7 @@ def bilinear(plane: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
 
 
 class HierarchicalPlanes(nn.Module):
-    """For each group its planes of all levels, side by side. They start at zero.
+    """For each group its planes of all levels, side by side. They are initialised to zero.
 
     Args:
         groups: Names of the planes, "ab" with axis a along its columns and b along its rows.
@@ -106,8 +106,8 @@ class HierarchicalPlanes(nn.Module):
 
     def forward(self, points: Tensor, times: Tensor) -> list[Tensor]:
         """Features of each group, for points in [-1, 1]^3. [N, 3], [N] -> [N, width] each"""
-        moment = EARLIEST + (LATEST - EARLIEST) * times
-        place = dict(zip(AXES, [*points.unbind(dim=1), moment], strict=True))
+        scaled = EARLIEST + (LATEST - EARLIEST) * times
+        place = dict(zip(AXES, [*points.unbind(dim=1), scaled], strict=True))
         blurred, fine = bool(self.blurred), bool(self.fine)
         found = []
         for group in self.groups:

@@ -45,7 +45,7 @@ def plane_features(
 
     Args:
         space: Planes xy, xz, yz. [3, H, H, C]
-        time: Space-time planes, rows are time; None for a scene that stands still. [P, T, H', C]
+        time: Space-time planes, rows are time; None for a static scene. [P, T, H', C]
         points: Positions in the field's frame. [N, 3]
         times: Times from 0 to 1. [N]
         rows: For each space plane, the two time planes multiplied.
@@ -182,8 +182,8 @@ def _kernels_hold(device: torch.device, dtype: torch.dtype, channels: int, rows:
         leaves = [stack.to(dtype).to(precision).requires_grad_() for stack in stacks]
         moving, points, times = leaves[1] if rows else None, waves(device, 50, 3), waves(device, 50)
         value = function(leaves[0], moving, 1.4 * points, 0.5 + 0.6 * times, rows)
-        pull = waves(device, 50, 3, channels).to(precision)
-        return [value, *torch.autograd.grad((value * pull).sum(), leaves)]
+        upstream = waves(device, 50, 3, channels).to(precision)
+        return [value, *torch.autograd.grad((value * upstream).sum(), leaves)]
 
     what = f"plane lookup ({channels} channels, {dtype})"
     return proven(what, attempt, plane_features_gpu, plane_features_reference, dtype)

@@ -92,7 +92,8 @@ class PaddedMLP(nn.Module):
     """Linear layers without biases; ones fill up the input to a multiple of 16 columns.
 
     The padding is trained like any weight: P columns of ones act as one bias whose learning rate is
-    P times as high. Weights start uniform after Glorot, for widths rounded up to multiples of 16.
+    P times as high. Weights are initialised with Glorot's uniform distribution, for widths rounded
+    up to multiples of 16.
 
     Args:
         widths: Columns of the input, neurons of each hidden layer, columns of the output.

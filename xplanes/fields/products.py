@@ -16,8 +16,8 @@ AXES = "xyzt"
 BLOCK = 2048
 """Points whose intermediate gradients lie in the cache together."""
 
-MOVING = ("xy", "xz", "xt", "yz", "yt", "zt")
-STILL = ("xy", "xz", "yz")
+DYNAMIC = ("xy", "xz", "xt", "yz", "yt", "zt")
+STATIC = ("xy", "xz", "yz")
 """Planes in the order of the product."""
 
 
@@ -32,9 +32,10 @@ class PlaneProducts(nn.Module):
         channels: Channels of each plane.
         resolution: Texels along each space axis at scale 1.
         scales: Factors on the resolution.
-        time_resolution: Rows of time, at every scale; None for a scene that stands still.
-        low: Space planes start uniform between this
-        high: and this; time planes start at 1.
+        time_resolution: Rows of time, at every scale; None for a static scene.
+        low: Lower bound of the uniform initialisation of space planes. Time planes are
+            initialised to 1.
+        high: Upper bound of that initialisation.
 
     Source: K-Planes, Section 3.
     """
@@ -50,7 +51,7 @@ class PlaneProducts(nn.Module):
         high: float,
     ) -> None:
         super().__init__()
-        self.names = STILL if time_resolution is None else MOVING
+        self.names = STATIC if time_resolution is None else DYNAMIC
         self.channels = channels
         self.scales = nn.ModuleList()
         for scale in scales:
@@ -218,8 +219,8 @@ def _kernels_hold(
         ]
         planes = [plane.requires_grad_() for plane in planes]
         value = function(planes, 1.2 * waves(device, 50, 4), names)
-        pull = waves(device, 50, channels).to(precision)
-        return [value, *torch.autograd.grad((value * pull).sum(), planes)]
+        upstream = waves(device, 50, channels).to(precision)
+        return [value, *torch.autograd.grad((value * upstream).sum(), planes)]
 
     what = f"products of planes ({channels} channels, {dtype})"
     return proven(what, attempt, plane_product_gpu, plane_product_reference, dtype)

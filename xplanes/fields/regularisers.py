@@ -59,9 +59,9 @@ def add_time_smoothness_gradient(gradient: Tensor, planes: Tensor, weight: float
 
 
 @torch.no_grad()
-def add_distance_gradient(gradient: Tensor, plane: Tensor, start: Tensor, weight: float) -> None:
-    """Add ``weight`` times the gradient of the mean squared distance from ``start``."""
-    gradient.add_(plane - start, alpha=2 * weight / plane.numel())
+def add_distance_gradient(gradient: Tensor, plane: Tensor, initial: Tensor, weight: float) -> None:
+    """Add ``weight`` times the gradient of the mean squared distance from ``initial``."""
+    gradient.add_(plane - initial, alpha=2 * weight / plane.numel())
 
 
 @dataclass(frozen=True)

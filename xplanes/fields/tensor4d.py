@@ -27,8 +27,8 @@ class SkipNetwork(nn.Module):
         features: Columns of the features.
         width: Neurons of the hidden layers.
         outputs: Columns of the output.
-        radius: The first output starts as the distance from a sphere of this radius around the
-            origin; None starts at random.
+        radius: The first output is initialised to the distance from a sphere of this radius
+            around the origin; None for a random initialisation.
 
     Source: Tensor4D, released code; NeuS; IGR (start).
     """
@@ -80,11 +80,11 @@ class Tensor4D(RadianceField):
 
     Args:
         planes: Planes of the canonical space.
-        flow_planes: Planes of the flow; None for a scene that stands still.
+        flow_planes: Planes of the flow; None for a static scene.
         width: Neurons of the hidden layers.
         octaves: Frequencies for positions, times and directions.
-        radius: Of the sphere at the start.
-        sharpness: The surface's width at the start is exp(-10 times this).
+        radius: Of the initial sphere.
+        sharpness: The surface's initial width is exp(-10 times this).
 
     Source: Tensor4D, released code.
     """
@@ -143,8 +143,8 @@ class Tensor4D(RadianceField):
         if self.flow is None or self.compression is None or self.flow_planes is None:
             return points
         features = self.compression(self.flow_planes(points, times))
-        moment = octaves(2 * times[:, None] - 1, self.octaves[1])
-        values = torch.cat([octaves(points, self.octaves[0]), moment], dim=1)
+        encoded_time = octaves(2 * times[:, None] - 1, self.octaves[1])
+        values = torch.cat([octaves(points, self.octaves[0]), encoded_time], dim=1)
         return points + self.flow(values, features) * (times > 0)[:, None]
 
     def features(self, places: Tensor) -> Tensor:
@@ -193,7 +193,7 @@ class Tensor4DDensity(ViewDependentField):
     This is not the published model: it has no surface, no normals and no flow.
 
     Args:
-        planes: Nine planes, or three for a scene that stands still.
+        planes: Nine planes, or three for a static scene.
         width: Neurons of the hidden layers.
         octaves: Frequencies for positions, times and directions.
 
@@ -239,8 +239,8 @@ class Tensor4DDensity(ViewDependentField):
     def geometry(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
         values = octaves(points, self.octaves[0])
         if self.moves:
-            moment = octaves(2 * times[:, None] - 1, self.octaves[1])
-            values = torch.cat([values, moment], dim=1)
+            encoded_time = octaves(2 * times[:, None] - 1, self.octaves[1])
+            values = torch.cat([values, encoded_time], dim=1)
         found = self.trunk(values, self.compression(self.field_planes(points, times)))
         return DENSITY_SCALE * F.softplus(found[:, 0] + DENSITY_START), found[:, 1:]
 

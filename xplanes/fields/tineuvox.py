@@ -27,9 +27,9 @@ class TiNeuVox(ViewDependentField):
         channels: Channels of a cell.
         width: Neurons of the hidden layers.
         octaves: Frequencies for positions, times, directions and features.
-        alpha: Opacity of one cell of the finished grid at the start.
-        halvings: How often the number of cells is halved at the start.
-        moves: Whether points are moved to canonical space; a still scene needs none of it.
+        alpha: Initial opacity of one cell of the final grid.
+        halvings: How often the number of cells is halved for the initial grid.
+        moves: Whether points are moved to canonical space; False for a static scene.
         unit: World units per unit of the field's frame.
         precision: Of the matrix products.
 
@@ -66,11 +66,11 @@ class TiNeuVox(ViewDependentField):
         self.register_buffer("voxels", torch.tensor(resolution**3 // 2**halvings))
         self.grid = nn.Parameter(torch.zeros(1, channels, *self._size(int(self.voxels))))
         points, times, directions, features = (1 + 2 * count for count in octaves)
-        moment = PER_CHANNEL * channels
-        self.time = layers([times, width, moment])
-        self.deformation = layers([3 * points + moment, width, width, 3]) if moves else None
+        time_features = PER_CHANNEL * channels
+        self.time = layers([times, width, time_features])
+        self.deformation = layers([3 * points + time_features, width, width, 3]) if moves else None
         read = len(STRIDES) * channels * features
-        self.trunk = layers([read + moment + 3 * points, width])
+        self.trunk = layers([read + time_features + 3 * points, width])
         self.density = nn.Linear(width, 1)
         self.tint = nn.Linear(width, width)
         self.colours = layers([width + 3 * directions, width // 2, 3])
@@ -136,12 +136,12 @@ class TiNeuVox(ViewDependentField):
         count = self.octaves
         with self._mixed(points):
             encoded = octaves(places, count[0])
-            moment = self.time(octaves(times[:, None], count[1]))
+            time_features = self.time(octaves(times[:, None], count[1]))
             moved = places
             if self.deformation is not None:
-                moved = places + self.deformation(torch.cat([encoded, moment], dim=1))
+                moved = places + self.deformation(torch.cat([encoded, time_features], dim=1))
             read = octaves(self.read(moved.to(self.grid.dtype)), count[3])
-            features = self.trunk(torch.cat([read, moment, encoded], dim=1)).relu()
+            features = self.trunk(torch.cat([read, time_features, encoded], dim=1)).relu()
             logit = self.density(features)[:, 0]
         per_cell = F.softplus(logit.to(points.dtype) + self.shift)
         # The published density counts per side of a cell of the finished grid.

@@ -36,7 +36,7 @@ class XPlanes(RadianceField):
     there.
 
     Args:
-        planes: Start values by name, axis "a" of plane "ab" along the columns: xy, xz, yz
+        planes: Initial values by name, axis "a" of plane "ab" along the columns: xy, xz, yz
             [C, H, H] and the plane set's time planes [C, T, H'], T rows of time.
         decoder: From features [N, 3 C] to colour [N, 3] and density [N].
         plane_set: "six" (K-Planes' set), "nine" (Tensor4D's) or "three" (no time).
@@ -135,9 +135,9 @@ def random_planes(
     time_scale: float,
     generator: torch.Generator,
 ) -> dict[str, Tensor]:
-    """Start values for a field without an LRM: small noise around zero.
+    """Random initialisation for a field without an LRM: small noise around zero.
 
-    Time planes must not start at zero: a product of two zeros has no gradient.
+    Time planes must not be initialised to zero: a product of two zeros has no gradient.
 
     Args:
         plane_set: A key of `PLANE_SETS`.

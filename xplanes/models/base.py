@@ -21,12 +21,12 @@ from xplanes.streams import TrainingState
 
 @dataclass(frozen=True)
 class InitialValues:
-    """What a field starts from, where that is not random.
+    """Initial values of a field that is not initialised randomly.
 
     Attributes:
         planes: Planes by name. [C, rows, columns] each
         decoder: Weights of the decoder; None for a fresh one.
-        sparse: The sparse part to which L_r ties the time planes; None leaves L_r out.
+        sparse: Target of the regulariser L_r for the time planes; None disables L_r.
             [T, 3, C, H, H]
     """
 

@@ -1,4 +1,4 @@
-"""What a field is initialised from: an LRM, a file of triplanes, or nothing."""
+"""Sources of a field's initialisation: an LRM, a triplane file, or random values."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -31,7 +31,7 @@ def nothing_skipped() -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Initialisation:
-    """What a field starts from, and how it was made.
+    """A field's initialisation and how it was made.
 
     Attributes:
         model: The model's settings as the field is to be built: the source decides about channels,
@@ -39,8 +39,8 @@ class Initialisation:
         frame: The field's frame: the source's own, or the scene's.
         values: Planes, decoder and sparse part; None for a random initialisation.
         report: The decomposition for metrics.json: per orientation, and as ``unexplained`` the
-            share of the sparse part's energy that the time planes leave, ``before`` (at random) and
-            ``after`` (as they are initialised).
+            share of the sparse part's energy that the time planes do not explain: ``before`` with
+            random planes, ``after`` with the initial ones.
         seconds: Seconds of each stage; of one from the cache those that it took to make.
         words: The initialisation in one line.
         pictures: By name, colours from 0 to 1: the two parts at a few timesteps, and what the model
@@ -55,7 +55,7 @@ class Initialisation:
     values: InitialValues | None = None
     report: dict[str, Any] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=no_time)
-    words: str = "random planes"
+    words: str = "random initialisation"
     pictures: dict[str, Tensor] = field(default_factory=dict)
     lrm: dict[str, Any] = field(default_factory=dict)
     skipped: dict[str, float] = field(default_factory=nothing_skipped)
@@ -114,7 +114,7 @@ class InitialiserSettings(Settings, ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class RandomSettings(InitialiserSettings):
-    """Planes are initialised at random."""
+    """Random initialisation of the planes."""
 
     def load(self, say: Callable[[str], None] = print) -> None:
         return None
@@ -148,7 +148,7 @@ class DecompositionSettings(Settings):
     name: str  # Name of the settings.
     method: Literal["adaptive", "growing", "admm", "exact"]  # admm: the paper's; exact: slow.
     sparsity_weight: Positive | Literal["auto"]  # Weight of the sparse part; auto fits the size.
-    penalty: Positive  # Penalty of ADMM; where adaptive starts.
+    penalty: Positive  # Penalty of ADMM; the initial one for adaptive.
     scale: Literal["rms", "none"]  # Unit of the penalty: rms of the features, or none.
     tolerance: Positive  # Relative residual at which it stops.
     max_iterations: Count  # Iterations at most.

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from xplanes.errors import ConfigError
-from xplanes.fields.hierarchy import MOVING, STILL, Groups, HierarchicalPlanes, Level
+from xplanes.fields.hierarchy import DYNAMIC, STATIC, Groups, HierarchicalPlanes, Level
 from xplanes.fields.tensor4d import Tensor4D, Tensor4DDensity
 from xplanes.models.base import InitialValues, Model, ModelSettings, warm_cosine
 from xplanes.rendering.neus import NeusSettings, SurfaceRendering
@@ -57,7 +57,7 @@ class Tensor4DDensitySettings(ModelSettings):
     def build(self, site: Site, initial: InitialValues | None = None) -> Model:
         with initial_values(site.seed, Stream.BASELINE_FIELD):
             field = Tensor4DDensity(
-                self.planes(MOVING if site.moves else STILL, fine=True),
+                self.planes(DYNAMIC if site.moves else STATIC, fine=True),
                 self.width,
                 octaves=self.octaves,
             )
@@ -96,8 +96,8 @@ class Tensor4DSettings(Tensor4DDensitySettings):
     def build(self, site: Site, initial: InitialValues | None = None) -> Model:
         with initial_values(site.seed, Stream.BASELINE_FIELD):
             field = Tensor4D(
-                self.planes(STILL, fine=True),
-                self.planes(MOVING, fine=False) if site.moves else None,
+                self.planes(STATIC, fine=True),
+                self.planes(DYNAMIC, fine=False) if site.moves else None,
                 self.width,
                 octaves=self.octaves,
                 radius=self.radius,

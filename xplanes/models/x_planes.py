@@ -132,7 +132,7 @@ class XPlanesModel(Model):
         settings: Weights and learning rates.
         field: The field.
         site: What it was built for.
-        initial: What it starts from; None for random planes.
+        initial: Initial values; None for a random initialisation.
     """
 
     def __init__(
@@ -241,5 +241,5 @@ class XPlanesModel(Model):
         )
 
     def _fading(self, step: int) -> float:
-        """Share of the weights that is left of what ties the field to its initialisation."""
+        """Factor on the regularisers that keep the field near its initialisation."""
         return 1.0 if self.fade is None else max(0.0, 1 - step / self.fade)

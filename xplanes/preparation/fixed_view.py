@@ -87,7 +87,7 @@ def fixed_view(
             "(transforms_video.json); set preparation.fixed_view=train"
         )
     times = scene.splits["train"].times
-    count = 1 if scene.splits["train"].is_still else options.frames
+    count = 1 if scene.splits["train"].is_static else options.frames
     if scene.video is not None and options.fixed_view != "train":
         check_camera(scene.video)
         views = pick_frames(scene.video, torch.linspace(0, 1, count) if count > 1 else times[:1])

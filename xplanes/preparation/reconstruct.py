@@ -1,4 +1,4 @@
-"""From a scene to a triplane sequence: film it, show each frame to the model, place the result."""
+"""From a scene to a triplane sequence: fixed-view video, LRM encoding, alignment."""
 
 import hashlib
 import logging
@@ -23,7 +23,7 @@ from xplanes.preparation.cache import StageCache, fingerprint
 from xplanes.preparation.encode import encode
 from xplanes.preparation.fixed_view import FixedView, fixed_view
 from xplanes.preparation.sequence import TriplaneSequence
-from xplanes.preparation.stages import film_sheet
+from xplanes.preparation.stages import contact_sheet
 from xplanes.settings import Count
 
 logger = logging.getLogger(__name__)
@@ -174,7 +174,7 @@ def reconstruct(
         seconds={"fixed_view": video.seconds, "lrm": lrm.seconds + encoded.seconds},
         report=report,
         words=words,
-        picture=film_sheet(frames, alignment.crop, model),
+        picture=contact_sheet(frames, alignment.crop, model),
     )
 
 
@@ -198,7 +198,7 @@ def align_to(video: FixedView, model: LRM, options: ImageLRMSettings) -> Alignme
 
 
 def picture_crop(frames: Tensor, *, crop: bool) -> Crop:
-    """One crop for all frames: around what is opaque in any, or around the whole pictures.
+    """One crop for all frames: around what is opaque in any of them, or the whole image.
 
     Args:
         frames: Premultiplied RGBA. uint8 [T, H, W, 4]
@@ -210,7 +210,7 @@ def picture_crop(frames: Tensor, *, crop: bool) -> Crop:
     alpha = frames[..., 3].amax(dim=0)
     if not crop or bool((alpha > 0).all()):
         return square_crop(*alpha.shape)
-    # What is hardly there, such as specks of a field that films, is not the object.
+    # Faint content, such as floaters of the field that renders the fixed-view video, is left out.
     solid = torch.where(alpha >= SOLID, alpha, 0)
     try:
         return foreground_crop(solid)

@@ -1,4 +1,4 @@
-"""Triplane sequences: what every source of a start supplies, and their files."""
+"""Triplane sequences, which every source of an initialisation supplies, and their files."""
 
 import json
 from collections.abc import Mapping
@@ -155,7 +155,7 @@ def load_triplanes(path: Path) -> TriplaneSequence:
 
 
 def check_sequence(sequence: TriplaneSequence, name: str) -> None:
-    """Refuse a sequence that no field can start from.
+    """Refuse a sequence that cannot initialise a field.
 
     Args:
         sequence: The sequence.

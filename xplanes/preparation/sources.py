@@ -182,7 +182,7 @@ def from_sequence(
     """
     views = place.scene.splits["train"]
     model = _settled(method, sequence, views, source=source)
-    if len(sequence.triplanes) == 1 and not views.is_still:
+    if len(sequence.triplanes) == 1 and not views.is_static:
         logger.warning(
             "nothing moves in the only triplane of %s: the field gets no time planes and trains as "
             "a static one",
@@ -192,8 +192,8 @@ def from_sequence(
     parts = decompose_stage(sequence.triplanes, method.decomposition, cache, device)
     _warn(parts, method)
     planes = convert_stage(parts, model, method.decomposition, method.seed, cache, device)
-    tied = model.plane_set != "three" and model.loss.sparse_weight > 0
-    values = InitialValues(planes.planes, sequence.decoder, parts.sparse if tied else None)
+    regularised = model.plane_set != "three" and model.loss.sparse_weight > 0
+    values = InitialValues(planes.planes, sequence.decoder, parts.sparse if regularised else None)
     return Initialisation(
         model=model,
         frame=sequence.frame or place.frame,
@@ -222,7 +222,7 @@ def _settled(
     """The model's settings with what the sequence decides."""
     frames, _, channels = sequence.triplanes.shape[:3]
     model = replace(cast(XPlanesSettings, method.model), channels=channels)
-    if views.is_still or frames == 1:
+    if views.is_static or frames == 1:
         model = replace(model, plane_set="three")
     if model.plane_set != "three":
         model = replace(model, time_resolution=model.time_resolution or time_rows(views.times))
@@ -273,7 +273,7 @@ def _words(
     if unexplained:
         words.append(
             f"time planes {method.decomposition.dynamic}, {100 * unexplained['after']:.0f}% of the "
-            f"sparse part unexplained ({100 * unexplained['before']:.0f}% with random planes)"
+            f"sparse part unexplained (random: {100 * unexplained['before']:.0f}%)"
         )
     else:
         words.append("no time planes")

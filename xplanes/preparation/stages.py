@@ -36,8 +36,8 @@ def parts_sheet(low_rank: Tensor, sparse: Tensor, timesteps: int = 4, side: int 
     timesteps compare.
 
     Args:
-        low_rank: What stands still. [T, 3, C, H, W]
-        sparse: What moves. [T, 3, C, H, W]
+        low_rank: The static part. [T, 3, C, H, W]
+        sparse: The dynamic part. [T, 3, C, H, W]
         timesteps: Columns, spread evenly over time.
         side: Pixels per plane.
 
@@ -45,11 +45,11 @@ def parts_sheet(low_rank: Tensor, sparse: Tensor, timesteps: int = 4, side: int 
         Colours from 0 to 1. [3 (side + 4), M 2 (side + 4), 3]
     """
     chosen = spread(timesteps, len(low_rank))
-    still, moving = (_colours(part[chosen]) for part in (low_rank, sparse))
-    still = still - still.mean(dim=(0, 3, 4), keepdim=True)
-    spread_of = 5 * still.std(dim=(0, 3, 4), correction=0, keepdim=True).clamp_min(1e-8)
+    static, moving = (_colours(part[chosen]) for part in (low_rank, sparse))
+    static = static - static.mean(dim=(0, 3, 4), keepdim=True)
+    spread_of = 5 * static.std(dim=(0, 3, 4), correction=0, keepdim=True).clamp_min(1e-8)
     peak = 2 * moving.abs().amax(dim=(0, 2, 3, 4), keepdim=True).clamp_min(1e-8)
-    both = torch.stack([still / spread_of, moving / peak], dim=1) + 0.5  # [M, 2, 3, 3, H, W]
+    both = torch.stack([static / spread_of, moving / peak], dim=1) + 0.5  # [M, 2, 3, 3, H, W]
     tiles = F.interpolate(both.clamp(0, 1).flatten(0, 2), size=(side, side), mode="nearest")
     tiles = F.pad(tiles, (2, 2, 2, 2), value=1.0)
     size = side + 4
@@ -65,7 +65,7 @@ def _colours(planes: Tensor) -> Tensor:
     return torch.cat([shown, shown[:, :, :1].expand(-1, -1, missing, -1, -1)], dim=2)
 
 
-def film_sheet(
+def contact_sheet(
     frames: Tensor, crop: Crop, model: LRM, timesteps: int = 6, side: int = 160
 ) -> Tensor:
     """A few frames as the model is shown them.
@@ -107,8 +107,8 @@ class Parts:
     """A sequence in two parts.
 
     Attributes:
-        low_rank: What stands still, on the CPU. [T, 3, C, H, H]
-        sparse: What moves, on the CPU. [T, 3, C, H, H]
+        low_rank: The static part, on the CPU. [T, 3, C, H, H]
+        sparse: The dynamic part, on the CPU. [T, 3, C, H, H]
         report: For "xy", "xz" and "yz" the entries of `REPORTED`; empty where there was nothing to
             take apart.
         picture: Both parts at a few timesteps; None where there was nothing to take apart.
@@ -128,7 +128,7 @@ class Parts:
 
 @dataclass(frozen=True)
 class Planes:
-    """The start of the planes.
+    """Initial planes.
 
     Attributes:
         planes: By name. [C, rows, columns] each

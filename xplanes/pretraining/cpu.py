@@ -275,7 +275,7 @@ def inside(parts, points, result):
 
 
 @njit(**COMPILE)
-def film(parts, rectangles, pose, focal, samples, colour, alpha, depth):
+def render(parts, rectangles, pose, focal, samples, colour, alpha, depth):
     """A picture on white, its opacity, and the depth of each pixel's first sample."""
     kinds, sizes, rotations, centres = parts[:4]
     side = len(colour) * samples

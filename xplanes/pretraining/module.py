@@ -43,7 +43,7 @@ class PretrainingModule(LightningModule):
     steps or in seconds of the training clock, whichever is used up first.
 
     Args:
-        model: The model, as `start_model` makes it.
+        model: The model, as `init_model` makes it.
         batch: What a step looks at.
         schedule: Budget, optimisers and weights.
         seed: The run's seed.

@@ -19,7 +19,7 @@ from xplanes.lrm.canonical import CanonicalView
 from xplanes.pretraining.objects import procedural_object
 from xplanes.pretraining.solids import Array, Solids
 from xplanes.scenes.cameras import look_at
-from xplanes.scenes.demo.film import CAMERA_ANGLE_X, CAMERA_DISTANCE
+from xplanes.scenes.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE
 
 FOCAL = 0.5 / math.tan(0.5 * CAMERA_ANGLE_X)
 """Focal length of D-NeRF's cameras as a share of the picture's side."""
@@ -33,7 +33,7 @@ def camera(azimuth: float, elevation: float) -> Array:
     return look_at(CAMERA_DISTANCE * torch.tensor([place], dtype=torch.float64))[0].numpy()
 
 
-def film_solids(
+def render_solids(
     solids: Solids, pose: Array, side: int, samples: int = 2
 ) -> tuple[Array, Array, Array]:
     """Render one picture.
@@ -51,7 +51,7 @@ def film_solids(
     colour, alpha, depth = np.empty((side, side, 3)), np.empty((side, side)), np.empty((side, side))
     cpu = compiled("xplanes.pretraining.cpu")
     seen = _rectangles(solids, pose, side * samples)
-    cpu.film(solids.arrays, seen, pose, FOCAL, samples, colour, alpha, depth)
+    cpu.render(solids.arrays, seen, pose, FOCAL, samples, colour, alpha, depth)
     return colour, alpha, depth
 
 
@@ -124,7 +124,7 @@ def draw_sample(seed: int, views: int, side: int) -> NDArray:
     record = np.zeros(1, sample_type(views, side))
     for view, (azimuth, elevation) in enumerate(_cameras(random, views)):
         pose = camera(azimuth, elevation)
-        colour, alpha, depth = film_solids(solids, pose, side)
+        colour, alpha, depth = render_solids(solids, pose, side)
         record["pictures"][0, view, ..., :3] = np.rint(255 * colour)
         record["pictures"][0, view, ..., 3] = np.rint(255 * alpha)
         record["depths"][0, view] = depth - CAMERA_DISTANCE

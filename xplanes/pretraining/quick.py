@@ -10,7 +10,7 @@ from xplanes.metrics import psnr
 from xplanes.pretraining.losses import triplane_logits
 from xplanes.pretraining.pool import FOCAL, Pool
 from xplanes.pretraining.render import render_view
-from xplanes.scenes.demo.film import CAMERA_DISTANCE
+from xplanes.scenes.demo.render import CAMERA_DISTANCE
 
 _USED = ("pictures", "poses", "points", "inside")
 

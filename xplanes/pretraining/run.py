@@ -23,12 +23,12 @@ from xplanes.lrm.bundled import CHECKSUM
 from xplanes.lrm.config import LRMConfig, parse_config
 from xplanes.lrm.keys import NAMES
 from xplanes.lrm.openlrm import OpenLRM
+from xplanes.pretraining.initialisation import grow_model, init_model
 from xplanes.pretraining.module import PretrainingModule, Upkeep
 from xplanes.pretraining.objects import HELD_OUT_SEEDS, TRAINING_SEEDS
 from xplanes.pretraining.pool import FOCAL, SHARD, PretrainingBatch, PretrainingBatches, ensure_pool
 from xplanes.pretraining.quick import QuickLook
 from xplanes.pretraining.settings import PretrainingSettings, parse_pretraining, published_sizes
-from xplanes.pretraining.start import grow_model, start_model
 from xplanes.training.fit import quiet_lightning
 from xplanes.training.interrupt import Interrupt
 
@@ -160,7 +160,11 @@ def assemble(
         announce=announce,
     )
     sizes = parse_config(published_sizes(config.model, FOCAL))
-    model = start_model(sizes, config.seed) if config.start is None else _grown(config.start, sizes)
+    model = (
+        init_model(sizes, config.seed)
+        if config.init_from is None
+        else _grown(config.init_from, sizes)
+    )
     module = PretrainingModule(
         model, batch, config.schedule, config.seed, bf16=fast_bf16(torch.device("cpu"))
     )
@@ -178,14 +182,16 @@ def assemble(
     return module, data, QuickLook(held_out, config.schedule.score_objects)
 
 
-def _grown(start: str, sizes: LRMConfig) -> OpenLRM:
-    weights = Path(start)
+def _grown(init_from: str, sizes: LRMConfig) -> OpenLRM:
+    weights = Path(init_from)
     try:
         earlier = load(read_json(weights.with_suffix(".json")), weights)
         assert isinstance(earlier, OpenLRM)
         return grow_model(earlier, sizes).requires_grad_(True)
     except (OSError, ValueError, RuntimeError) as problem:
-        raise ConfigError(f"start={start}: not the weights of such a model: {problem}") from problem
+        raise ConfigError(
+            f"init_from={init_from}: not the weights of such a model: {problem}"
+        ) from problem
 
 
 def _settle(run: Path, plain: dict) -> None:

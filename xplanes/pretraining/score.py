@@ -14,11 +14,11 @@ from xplanes.lrm import LRM
 from xplanes.metrics import psnr, ssim
 from xplanes.pretraining.losses import triplane_logits
 from xplanes.pretraining.objects import HELD_OUT_SEEDS, procedural_object
-from xplanes.pretraining.pool import FOCAL, camera, film_solids, inside, view_cameras
+from xplanes.pretraining.pool import FOCAL, camera, inside, render_solids, view_cameras
 from xplanes.pretraining.quick import model_pose, overlap, world_to_model
 from xplanes.pretraining.render import render_view
-from xplanes.scenes.demo.film import camera_at, film
 from xplanes.scenes.demo.posed import Posed
+from xplanes.scenes.demo.render import camera_at, render_image
 from xplanes.scenes.demo.scenes import DEMO_SCENES, build_demo_scene
 
 GRID = 48
@@ -56,7 +56,7 @@ def held_out(count: int) -> Iterator[Subject]:
         yield Subject(
             f"object {seed - HELD_OUT_SEEDS.start}",
             torch.from_numpy(np.stack([camera(*at) for at in view_cameras(seed, 4)])),
-            lambda pose, side, s=solids: torch.from_numpy(film_solids(s, pose.numpy(), side)[0]),
+            lambda pose, side, s=solids: torch.from_numpy(render_solids(s, pose.numpy(), side)[0]),
             lambda points, s=solids: torch.from_numpy(inside(s, points.double().numpy())),
         )
 
@@ -70,7 +70,7 @@ def demo_subjects(time: float = 0.4) -> Iterator[Subject]:
         posed = build_demo_scene(name).pose(time)
 
         def picture(pose: Tensor, side: int, posed: Posed = posed) -> Tensor:
-            rgba = torch.from_numpy(film(posed, pose, side)).float() / 255
+            rgba = torch.from_numpy(render_image(posed, pose, side)).float() / 255
             return rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
 
         for rise in (0.0, RISE):

@@ -88,7 +88,7 @@ class PretrainingSettings(Settings):
     """The whole configuration of a pretraining."""
 
     seed: Steps  # Source of all randomness.
-    start: str | None  # Weights with coarser planes to go on from; null: none.
+    init_from: str | None  # Weights of a model with coarser planes; null: random initialisation.
     run: str  # Folder of checkpoints and logs; an earlier run in it goes on.
     model: SizeSettings
     pool: PoolSettings

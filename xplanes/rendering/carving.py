@@ -39,7 +39,7 @@ def carve(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
         joined = join_in_time(alone, views.times)
         for index, cover in enumerate(covers):
             likely[index, part] = joined[cover].any(dim=0)
-            allowed[index, part] = (joined if views.is_still else alone)[cover].any(dim=0)
+            allowed[index, part] = (joined if views.is_static else alone)[cover].any(dim=0)
     grid.allow(allowed)
     grid.presume(likely)
 

@@ -126,7 +126,7 @@ class OccupancySettings(SamplerSettings):
     skip_empty: bool  # Skip samples in empty cells.
     skip_occluded: bool  # Skip samples behind opaque surfaces.
     occlusion: Annotated[float, Range(0, 1)]  # Transmittance below which a surface is opaque.
-    thinning: Weight  # Gradients below this times the mean are passed on at random; 0: all are.
+    thinning: Weight  # Gradients below this times the mean are subsampled; 0: none.
     silhouettes: bool  # Rule out cells that the images' alpha shows to be empty.
     fill: bool  # Empty cells in which an initialised field shows nothing.
     coarse_steps: Steps  # First steps, in which samples lie twice as far apart.

@@ -36,7 +36,7 @@ class Site:
         precision: Of matrix products: "32" or "bf16".
         bounds: Box in world units that some fields cover; None for those that need none. [2, 3]
         views: Training views; None where a checkpoint is loaded without its data.
-        initialised: Whether the field starts from something that it shows.
+        initialised: Whether the initial field already shows the scene.
         device: Where it is going to be trained; the CPU when None.
     """
 

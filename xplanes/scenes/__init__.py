@@ -1,1 +1,1 @@
-"""What is filmed: cameras, scene files, procedural scenes and the ray batches drawn from them."""
+"""Input data: cameras, scene files, procedural scenes and the ray batches drawn from them."""

@@ -37,7 +37,7 @@ class RayBatches:
 
     With ``skip_background`` rays far from the silhouettes are drawn at ``background_share`` instead
     of at their share of the pixels. They show nothing but background; a few keep the air clear of
-    floaters. What is far from a silhouette is taken to be empty a moment before and after, too.
+    floaters. Space far from a silhouette counts as empty shortly before and after, too.
 
     Args:
         views: Training views.
@@ -60,7 +60,7 @@ class RayBatches:
         natural = len(self.far) / views.pixels
         skip = settings.skip_background and 0 < natural < 1
         self.far_share = min(settings.background_share, natural) if skip else natural
-        jitter = skip and not views.is_still
+        jitter = skip and not views.is_static
         self.background_jitter = settings.background_jitter if jitter else 0.0
         self.skipped = max(0.0, 1 - self.far_share / natural) * natural if skip else 0.0
         """Share of all pixels that uniform drawing would have shown and this one leaves out."""

@@ -167,7 +167,7 @@ class SceneDataModule(LightningDataModule):
         """
         if name not in self.scene.splits:
             found = self.settings.read((name,)).splits[name]
-            if self.scene.still:
+            if self.scene.static_reason:
                 found = replace(found, times=torch.zeros_like(found.times))
             self._scene = replace(self.scene, splits=self.scene.splits | {name: found})
         return self.scene.splits[name]
@@ -280,7 +280,7 @@ class _GivenScene(SceneSettings):
             resolution=None,
             views=None,
             train_on_video=False,
-            still=None,
+            static=None,
             eval_split=None,
             eval_views=None,
             half_side=None,

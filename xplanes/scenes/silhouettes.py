@@ -9,7 +9,7 @@ from torch import Tensor
 from xplanes.scenes.views import Views
 
 WINDOW = 0.06
-"""Share of the time span over which content is taken to stand still when silhouettes are joined."""
+"""Share of the time span over which content counts as static when silhouettes are joined."""
 
 MOST_VIEWS = 5
 """Views of such a span at most: more rule out little empty space, but ever more of what moves."""

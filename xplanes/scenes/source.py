@@ -14,24 +14,24 @@ from xplanes.scenes.views import Scene, Views, joined
 from xplanes.settings import Count, Positive, Settings
 
 SAME = 2
-"""Steps of 1/255 by which a pixel that stands still may differ between frames."""
+"""Largest difference of a static pixel between frames, in steps of 1/255."""
 
 
-def stands_still(video: Views) -> bool:
+def frames_are_equal(video: Views) -> bool:
     """Whether all frames of a fixed camera, at two timesteps or more, show the same."""
     first = video.images[0].to(torch.int16)
-    fixed = video.intrinsics.is_shared and not video.is_still
+    fixed = video.intrinsics.is_shared and not video.is_static
     return fixed and all(
         int((frame.to(torch.int16) - first).abs().max()) <= SAME for frame in video.images[1:]
     )
 
 
-def at_one_moment(scene: Scene, reason: str) -> Scene:
+def as_static(scene: Scene, reason: str) -> Scene:
     """The scene with all views at time 0, and one frame of its video.
 
     Args:
         scene: The scene.
-        reason: How it is known that nothing moves, for the header of a run.
+        reason: Why the scene is known to be static, for the header of a run.
     """
     splits = {
         name: replace(views, times=torch.zeros_like(views.times))
@@ -41,7 +41,7 @@ def at_one_moment(scene: Scene, reason: str) -> Scene:
     if video is not None:
         video = video.subset(torch.zeros(1, dtype=torch.long))
         video = replace(video, times=torch.zeros(1))
-    return replace(scene, splits=splits, video=video, still=reason)
+    return replace(scene, splits=splits, video=video, static_reason=reason)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,7 @@ class SceneSettings(Settings, ABC):
     resolution: Count | None  # Pixels per side; null keeps the native size.
     views: Count | None  # Training views kept, spread over time; null keeps all.
     train_on_video: bool  # Train on the frames of the scene's fixed camera too.
-    still: bool | None  # Nothing moves; null: where the fixed camera's frames are equal.
+    static: bool | None  # Static scene; null: if all frames of the fixed camera are equal.
     eval_split: Literal["test", "val"] | None  # Scored split; null: val in training, test after it.
     eval_views: Count | None  # Views of a scored split at most, spread over time; null takes all.
     half_side: Positive | None  # Half the side of the scene's cube; null finds it.
@@ -99,10 +99,10 @@ class SceneSettings(Settings, ABC):
                 )
             parts["train"] = joined(parts["train"], scene.video)
         scene = replace(scene, name=self.scene, splits=parts)
-        if self.still:
-            return at_one_moment(scene, "data.still=true")
-        if self.still is None and scene.video is not None and stands_still(scene.video):
-            return at_one_moment(scene, f"the fixed camera's {len(scene.video)} frames are equal")
+        if self.static:
+            return as_static(scene, "data.static=true")
+        if self.static is None and scene.video is not None and frames_are_equal(scene.video):
+            return as_static(scene, f"the fixed camera's {len(scene.video)} frames are equal")
         return scene
 
     def _load_scored(self) -> Scene:

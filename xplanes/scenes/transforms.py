@@ -243,7 +243,7 @@ def _refuse_repeats(
     labels: list[str], paths: list[Path], poses: np.ndarray, times: list[float]
 ) -> None:
     files: dict[Path, str] = {}
-    moments: dict[tuple[bytes, float], str] = {}
+    seen: dict[tuple[bytes, float], str] = {}
     for index, label in enumerate(labels):
         other = files.setdefault(paths[index], label)
         if other is not label:
@@ -251,7 +251,7 @@ def _refuse_repeats(
         # Paths around a static object may pass the same place twice, so only times convict.
         if not times:
             continue
-        other = moments.setdefault((poses[index].tobytes(), times[index]), label)
+        other = seen.setdefault((poses[index].tobytes(), times[index]), label)
         if other is not label:
             raise SceneError(
                 f"{label} has the same camera and time as {other}. Remove one of the two, or "

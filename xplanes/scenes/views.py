@@ -151,7 +151,7 @@ class Views:
         return f"{'up to ' if self.is_padded else ''}{self.width}x{self.height} px"
 
     @property
-    def is_still(self) -> bool:
+    def is_static(self) -> bool:
         """Whether all views show one timestep, so that nothing can move."""
         return bool((self.times == self.times[0]).all())
 
@@ -224,21 +224,21 @@ def _padded(images: Tensor, height: int, width: int) -> Tensor:
 
 @dataclass(frozen=True)
 class Scene:
-    """A filmed scene.
+    """A scene: its views and what is known about it.
 
     Attributes:
         name: Name for titles and run directories.
         splits: Views by split name: train, val, test.
         video: Frames of a fixed camera, where the scene has one.
         background: What lies behind the scene in scores and pictures. [3]
-        still: How it is known that nothing moves; empty where something may.
+        static_reason: Why the scene is known to be static; empty if it may move.
     """
 
     name: str
     splits: dict[str, Views]
     video: Views | None = None
     background: Tensor = field(default_factory=lambda: torch.ones(3))
-    still: str = ""
+    static_reason: str = ""
 
 
 def camera_rays(

@@ -20,7 +20,7 @@ from xplanes.scenes.views import Views
 logger = logging.getLogger(__name__)
 
 KEPT = """model.name lrm.name model.sampler.name data.name data.scene data.seed data.resolution
-data.views data.train_views data.train_on_video data.still data.half_side""".split()
+data.views data.train_views data.train_on_video data.static data.half_side""".split()
 """Settings on which the planes, their frame and what they show depend. Files may have moved."""
 
 

@@ -27,7 +27,7 @@ _FLOOR = -0.55
 
 
 def balls(variation: Variation) -> Assembly:
-    """Five balls jump to their own beat and turn as they fly; plate and posts stand still."""
+    """Five balls jump to their own beat and turn as they fly; plate and posts are static."""
     joints: list[Joint] = []
     parts = _plate(variation)
     for number, (x, y, radius, height, count, phase, surface) in enumerate(_balls(variation)):
@@ -83,7 +83,7 @@ _STEPS = (0.0, 0.22, 0.42, 0.58, 0.8, 1.0)
 
 
 def excavator(variation: Variation) -> Assembly:
-    """Tracks, earth and cones stand still; house, boom, arm and bucket move."""
+    """Tracks, earth and cones are static; house, boom, arm and bucket move."""
     yellow = variation.paint("#f2b21b")
     dark, steel = variation.natural("#34363b"), variation.natural("#8d949c")
     joints = (
@@ -209,7 +209,7 @@ _STRIDES = 2
 
 
 def walker(variation: Variation) -> Assembly:
-    """Arms and legs swing, the body rises and falls a little; the ground stands still."""
+    """Arms and legs swing, the body rises and falls a little; the ground is static."""
     phase = variation.phase()
     joints = [
         Joint("body", "world", (0.0, 0.0, -0.06), (0, 0, 0), "slide", (0, 0, 1),
@@ -306,7 +306,7 @@ _GROUND = -0.72
 
 
 def windmill(variation: Variation) -> Assembly:
-    """The sails turn and the cap follows the wind a little; the island stands still."""
+    """The sails turn and the cap follows the wind a little; the island is static."""
     joints = (
         Joint("cap", "world", (0.0, 0.0, 0.28), (0, 0, 0), "hinge", (0, 0, 1),
               Swing(0.0, 12.0, 1.0, variation.phase())),
@@ -410,8 +410,8 @@ def _sails(variation: Variation) -> list[Part]:
 _TOP = -0.42
 
 
-def still(variation: Variation) -> Assembly:
-    """Nothing moves."""
+def still_life(variation: Variation) -> Assembly:
+    """A static table with a teapot, books, a cactus and fruit."""
     parts = [
         *_table(variation),
         *_books(variation, (-0.38, 0.4)),
@@ -549,7 +549,7 @@ DEMO_SCENES: dict[str, DemoScene] = {
     "walker": DemoScene(walker),
     "balls": DemoScene(balls),
     "windmill": DemoScene(windmill, azimuth=0.0),
-    "still": DemoScene(still),
+    "still_life": DemoScene(still_life),
 }
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from xplanes.backend import threads
 from xplanes.scenes.demo.assembly import Assembly
-from xplanes.scenes.demo.film import CAMERA_ANGLE_X, camera_at, film, hemisphere_cameras
+from xplanes.scenes.demo.render import CAMERA_ANGLE_X, camera_at, hemisphere_cameras, render_image
 from xplanes.scenes.demo.scenes import build_demo_scene, demo_scene
 from xplanes.scenes.dnerf import read_scene
 from xplanes.scenes.errors import SceneError
@@ -138,7 +138,7 @@ def _write_split(
     frames = []
     for number, (time, camera) in enumerate(shots):
         file = f"./{split}/r_{number:03d}"
-        picture = film(assembly.pose(time), camera, resolution)
+        picture = render_image(assembly.pose(time), camera, resolution)
         Image.fromarray(picture).save(folder / f"{file}.png", compress_level=6)
         frames.append({"file_path": file, "time": time, "transform_matrix": camera.tolist()})
     index = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}

@@ -17,7 +17,7 @@ SLOWEST, FASTEST = 0.8, 16.0
 """Range of the waves' frequencies, in radians per unit length."""
 
 
-def start_model(config: LRMConfig, seed: int) -> OpenLRM:
+def init_model(config: LRMConfig, seed: int) -> OpenLRM:
     """A model with random weights and places that match between picture and planes.
 
     A token is placed by waves along x, y and z, in channels of their own. A patch of the picture

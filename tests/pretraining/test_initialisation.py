@@ -12,23 +12,23 @@ from xplanes.lrm import LRMError, load
 from xplanes.lrm.bundled import bundled_models, load_bundled
 from xplanes.lrm.canonical import canonical_vector
 from xplanes.lrm.config import parse_config
+from xplanes.pretraining.initialisation import grow_model, init_model
 from xplanes.pretraining.pool import FOCAL
 from xplanes.pretraining.run import export, published_state
 from xplanes.pretraining.settings import parse_pretraining, published_sizes
-from xplanes.pretraining.start import grow_model, start_model
 
 SIZES = published_sizes(small_config().model, FOCAL)
 
 
 def test_seeds_make_models():
-    first, again, other = (start_model(small_sizes(), seed).state_dict() for seed in (0, 0, 1))
+    first, again, other = (init_model(small_sizes(), seed).state_dict() for seed in (0, 0, 1))
     assert same(first, again)
     assert not same(first, other)
 
 
 def test_planes_attend_to_the_picture_where_they_lie():
     config = small_sizes("model.image_size=96", "model.width=128", "model.low_resolution=12")
-    model = start_model(config, 0)
+    model = init_model(config, 0)
     with torch.no_grad():
         image = model.encoder(torch.ones(1, 3, 96, 96))
         camera = model.camera(canonical_vector(model.view)[None])
@@ -54,14 +54,14 @@ def test_planes_attend_to_the_picture_where_they_lie():
 
 def test_finer_planes_go_on_from_coarser_ones():
     torch.manual_seed(0)
-    earlier = start_model(small_sizes(), 0)
+    earlier = init_model(small_sizes(), 0)
     finer = small_sizes("model.low_resolution=8")
     untouched = grow_model(earlier, finer).state_dict()
     assert same(
         {k: v for k, v in untouched.items() if k != "position"},
         {k: v for k, v in earlier.state_dict().items() if k != "position"},
     )
-    torch.testing.assert_close(untouched["position"], start_model(finer, 0).position.data)
+    torch.testing.assert_close(untouched["position"], init_model(finer, 0).position.data)
     with torch.no_grad():
         earlier.position += 0.3
     torch.testing.assert_close(
@@ -70,7 +70,7 @@ def test_finer_planes_go_on_from_coarser_ones():
 
 
 def test_weights_keep_their_meaning_on_the_way_through_a_file(tmp_path):
-    model = start_model(small_sizes(), 2)
+    model = init_model(small_sizes(), 2)
     path = export(model, SIZES, tmp_path, "small")
     loaded, found = load_bundled("small", tmp_path)
     assert bundled_models(tmp_path) == ["small"]
@@ -91,7 +91,7 @@ def test_weights_keep_their_meaning_on_the_way_through_a_file(tmp_path):
 
 
 def test_published_names_of_equally_wide_queries_and_keys():
-    state = published_state(start_model(small_sizes(), 0))
+    state = published_state(init_model(small_sizes(), 0))
     assert "transformer.layers.0.cross_attn.in_proj_weight" in state
     assert not [name for name in state if "q_proj" in name]
 

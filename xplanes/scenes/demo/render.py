@@ -17,7 +17,9 @@ CAMERA_DISTANCE = 4.031128874149275
 """Distance of D-NeRF's cameras from the origin."""
 
 
-def film(posed: Posed, camera_to_world: Tensor, resolution: int, samples: int = 2) -> NDArray:
+def render_image(
+    posed: Posed, camera_to_world: Tensor, resolution: int, samples: int = 2
+) -> NDArray:
     """Render one picture.
 
     Args:

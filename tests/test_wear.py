@@ -57,7 +57,7 @@ def test_a_damaged_demo_scene_says_to_delete_it(trained_run: Path, tmp_path: Pat
     data.read()
     (picture,) = (tmp_path / "scenes").glob("excavator*/train/r_003.png")
     picture.write_bytes(picture.read_bytes()[:50])
-    with pytest.raises(SceneError, match=r"r_003\.png.*demo scene: delete .* rendered again"):
+    with pytest.raises(SceneError, match=r"r_003\.png.*demo scene: delete .* to render it again"):
         data.read()
 
 

@@ -1,6 +1,6 @@
 """The command line: `xplanes COMMAND ...`.
 
-Must stay quick: what is heavy is imported by the command that needs it.
+Heavy modules are imported by the commands that need them, so that the help is fast.
 """
 
 import argparse
@@ -24,14 +24,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: What follows ``xplanes``; taken from the command line when None.
 
     Returns:
-        The exit code: 0, 1 after an error that was explained in words, 130 if interrupted.
+        The exit code: 0, 1 after a reported error, 130 after Ctrl-C.
     """
     os.environ.update(waiting(os.environ))  # before torch is loaded
     words = sys.argv[1:] if arguments is None else list(arguments)
     if words[:1] == ["train"]:
         from xplanes.launch import train
 
-        # Hydra has a command line of its own, with options that argparse must not see.
+        # Hydra parses the command line of training itself.
         train(words[1:], words[:1] if sys.argv[1:] == words else ())
         return 0
     options = build_parser().parse_args(words)
@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("\nstopped", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        # The reader, such as head, has seen enough; closing keeps Python from complaining.
+        # The reader of the pipe (such as head) has exited; closing suppresses Python's warning.
         sys.stderr.close()
         return 0
     except Exception as error:
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _known_errors() -> tuple[type[Exception], ...]:
-    """Errors whose message says all."""
+    """Errors that are reported without a traceback."""
     from xplanes.errors import ConfigError
     from xplanes.files import StorageError
     from xplanes.lrm.errors import LRMError
@@ -80,7 +80,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _add_download(commands: "argparse._SubParsersAction") -> None:
-    parser = commands.add_parser("download", help="get public scenes")
+    parser = commands.add_parser("download", help="download public scenes")
     parser.add_argument("dataset", choices=["dnerf"], help="the eight D-NeRF scenes")
     parser.add_argument(
         "--root", type=Path, default=Path("data/dnerf"), help="default: %(default)s"
@@ -96,12 +96,12 @@ def _download(options: argparse.Namespace) -> None:
 
 
 def _add_triplanes(commands: "argparse._SubParsersAction") -> None:
-    parser = commands.add_parser("triplanes", help="turn pictures into triplanes with an LRM")
+    parser = commands.add_parser("triplanes", help="encode images into triplanes with an LRM")
     parser.add_argument(
         "arguments",
         nargs="+",
         metavar="IMAGES lrm=NAME lrm.weights=FILE out=FILE.safetensors",
-        help="pictures (with transparency) or folders of them, and settings of train.py",
+        help="RGBA images or folders of them, and settings of train.py",
     )
     parser.set_defaults(command=_triplanes)
 
@@ -131,7 +131,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="MODULE",
-        help="a module of your own whose classes the run's settings may name",
+        help="your module with classes that the run's settings name; repeatable",
     )
 
 
@@ -153,15 +153,17 @@ def _say(text: str) -> None:
 
 
 def _add_evaluate(commands: "argparse._SubParsersAction") -> None:
-    parser = commands.add_parser("evaluate", help="score every view of a split")
+    parser = commands.add_parser(
+        "evaluate", help="compute PSNR, SSIM and LPIPS of all views of a split"
+    )
     _add_run(parser)
     parser.add_argument(
-        "--split", choices=["test", "val", "train"], help="default: the split scored in training"
+        "--split", choices=["test", "val", "train"], help="default: the split evaluated in training"
     )
     parser.add_argument(
         "--lpips",
         choices=["vgg", "alex", "none"],
-        help="network of LPIPS, downloaded if need be; default: vgg if it is on this machine",
+        help="backbone of LPIPS, downloaded if necessary; default: vgg if already downloaded",
     )
     parser.set_defaults(command=_evaluate)
 
@@ -183,27 +185,38 @@ def _add_render(commands: "argparse._SubParsersAction") -> None:
     parser.add_argument(
         "--path",
         default="orbit",
-        help="camera: orbit, fixed, or view:FILE with the name of a view; default: %(default)s",
+        help="camera path: orbit, fixed, or view:FILE (camera of a view); default: %(default)s",
     )
     parser.add_argument(
         "--time",
         default="back-and-forth",
         help="sweep, back-and-forth, or a number from 0 to 1; default: %(default)s",
     )
-    parser.add_argument("--frames", type=int, help="default: 48, or 1 where nothing moves")
-    parser.add_argument("--fps", type=int, default=16, help="default: %(default)s")
-    parser.add_argument("--size", type=int, help="pixels per side; default: as the training views")
+    parser.add_argument(
+        "--frames",
+        type=int,
+        help="number of frames; default: 48, or 1 if neither camera nor time moves",
+    )
+    parser.add_argument(
+        "--fps", type=int, default=16, help="frames per second; default: %(default)s"
+    )
+    parser.add_argument(
+        "--size", type=int, help="pixels per side; default: that of the training views"
+    )
     parser.add_argument(
         "--elevation",
         type=float,
         default=20.0,
-        help="height angle of orbit and fixed in degrees; default: %(default)s",
+        help="elevation of orbit and fixed in degrees; default: %(default)s",
     )
     parser.add_argument(
-        "--what", choices=["colour", "depth"], default="colour", help="default: %(default)s"
+        "--what",
+        choices=["colour", "depth"],
+        default="colour",
+        help="rendered quantity; default: %(default)s",
     )
     parser.add_argument(
-        "--out", help="FILE.webp, FILE.mp4, FILE.png, or a folder with / at its end for PNGs"
+        "--out", help="FILE.webp, FILE.mp4, FILE.png, or FOLDER/ for one PNG per frame"
     )
     parser.set_defaults(command=_render)
 
@@ -231,9 +244,11 @@ def _render(options: argparse.Namespace) -> None:
 
 
 def _add_view(commands: "argparse._SubParsersAction") -> None:
-    parser = commands.add_parser("view", help="look around in the browser (extra: viewer)")
+    parser = commands.add_parser("view", help="interactive viewer in the browser (extra: viewer)")
     _add_run(parser)
-    parser.add_argument("--port", type=int, default=8080, help="default: %(default)s")
+    parser.add_argument(
+        "--port", type=int, default=8080, help="port of the viewer; default: %(default)s"
+    )
     parser.set_defaults(command=_view)
 
 
@@ -259,10 +274,13 @@ def _view(options: argparse.Namespace) -> None:
 
 
 def _add_table(commands: "argparse._SubParsersAction") -> None:
-    parser = commands.add_parser("table", help="put the runs of a sweep side by side")
+    parser = commands.add_parser("table", help="compare the runs of a sweep in a table")
     parser.add_argument("folder", type=Path, metavar="SWEEP_DIR", help="a sweep or folder of runs")
     parser.add_argument(
-        "--out", type=Path, metavar="FOLDER", help="of table.md and table.csv; default: SWEEP_DIR"
+        "--out",
+        type=Path,
+        metavar="FOLDER",
+        help="output folder of table.md and table.csv; default: SWEEP_DIR",
     )
     parser.set_defaults(command=_table)
 
@@ -288,11 +306,16 @@ def _pretrain(options: argparse.Namespace) -> None:
 
 
 def _add_score(commands: "argparse._SubParsersAction") -> None:
-    parser = commands.add_parser("score-lrm", help="judge a small LRM by held-out objects")
-    parser.add_argument("model", help="tiny, mini, or weights: FOLDER/NAME.safetensors")
-    parser.add_argument("--objects", type=int, default=64, help="default: %(default)s")
+    parser = commands.add_parser("score-lrm", help="evaluate a small LRM on held-out objects")
+    parser.add_argument("model", help="tiny, mini, or FOLDER/NAME.safetensors")
     parser.add_argument(
-        "--out", type=Path, default=Path("outputs/score-lrm"), help="default: %(default)s"
+        "--objects", type=int, default=64, help="number of objects; default: %(default)s"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("outputs/score-lrm"),
+        help="output folder; default: %(default)s",
     )
     parser.set_defaults(command=_score)
 

@@ -56,7 +56,7 @@ KNOWN_ERRORS = (
     StorageError,
     MisconfigurationException,
 )
-"""Errors whose message says all; their traceback goes to train.log alone."""
+"""Errors that are reported by their message; the traceback is written to train.log only."""
 
 VIDEO_FRAMES, VIDEO_FPS, VIDEO_SIZE = 48, 16, 200
 

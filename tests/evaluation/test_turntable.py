@@ -88,7 +88,7 @@ def test_settings_that_make_no_triplanes_are_refused(tmp_path: Path, pictures):
     def make(*arguments, out="made.pt"):
         write_triplanes([pictures], Path(out), settings(*arguments), say=lambda _: None)
 
-    with pytest.raises(ConfigError, match=r"lrm=none makes no triplanes.*lrm=small"):
+    with pytest.raises(ConfigError, match=r"lrm=none does not encode images.*lrm=small"):
         make("lrm=none")
     with pytest.raises(ConfigError, match=r"out=made\.zip: must end in"):
         make("lrm=small", out="made.zip")

@@ -132,7 +132,7 @@ def test_weights(tally, tmp_path: Path, share: float) -> None:
     cut(tmp_path / "tiny.safetensors", share)
     with pytest.raises(LRMError) as caught:
         load_bundled("tiny", tmp_path)
-    tally.said(str(caught.value), "tiny.safetensors is damaged", "install the package again")
+    tally.said(str(caught.value), "tiny.safetensors is damaged", "reinstall the package")
     for name in ("model.safetensors", "model.ckpt"):
         path = tmp_path / name
         if name.endswith("ckpt"):

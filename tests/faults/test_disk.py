@@ -93,7 +93,7 @@ def test_full_disk_elsewhere(tally, nursery, shared, whole, tmp_path: Path, what
             # Finished stages are merely not kept.
             lrm, config = "tiny", config_of(shared, "tiny", disk / "cache")
             child = nursery.run(config, folder, resume=False)
-            tally.said(child.output(), "cannot be written: stages are not kept")
+            tally.said(child.output(), "cannot be written: stages are not cached")
             assert not list(disk.iterdir())
         assert outcome(folder) == whole[lrm]
     tally.recovered()

@@ -118,7 +118,7 @@ def test_crop_moves_the_centre_to_its_middle():
 def test_wrong_cameras_are_refused():
     pose = random_pose(4)
     options = {"height": 400, "width": 400, "view": OPENLRM_VIEW}
-    with pytest.raises(LRMError, match="looks away"):
+    with pytest.raises(LRMError, match="behind the source camera"):
         align(pose, focal=500, target=2 * pose[:3, 3], **options)
     with pytest.raises(LRMError, match="too short"):
         align(pose, focal=100, target=torch.zeros(3), **options)

@@ -59,8 +59,8 @@ def test_swapped_weights_are_refused(tmp_path: Path):
 
 def test_a_model_that_is_not_there_is_named_with_those_that_are(tmp_path: Path):
     ship(tmp_path, "tiny")
-    with pytest.raises(LRMError, match=r"huge\.safetensors.*no such model.*there is tiny"):
+    with pytest.raises(LRMError, match=r"huge\.safetensors.*no such model.*contains tiny"):
         load_bundled("huge", tmp_path)
     (tmp_path / "tiny.json").unlink()
-    with pytest.raises(LRMError, match=r"tiny\.json: no such model.*there is none"):
+    with pytest.raises(LRMError, match=r"tiny\.json: no such model.*contains none"):
         load_bundled("tiny", tmp_path)

@@ -34,7 +34,7 @@ def test_published_sizes():
 def test_references_are_followed():
     assert parse_config(CONFIGS["triposr"]).width == 64
     for value, message in (
-        ("${tokenizer.absent}", "lacks"),
+        ("${tokenizer.absent}", "does not exist"),
         ("${backbone.in_channels}", "circle"),
         ("${oc.env:HOME}", "in_channels"),
     ):

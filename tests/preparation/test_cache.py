@@ -144,7 +144,7 @@ def test_a_folder_that_cannot_be_written_costs_the_cache_alone(tmp_path: Path, c
     with caplog.at_level(logging.WARNING):
         stage = StageCache(tmp_path / "file").stage("parts", INPUTS, Maker())
     assert stage.content["report"]["rank"] == 2
-    assert "cannot be written: stages are not kept" in caplog.text
+    assert "cannot be written: stages are not cached" in caplog.text
 
 
 def test_an_entry_that_cannot_be_written_is_not_kept(tmp_path: Path, caplog, monkeypatch):
@@ -191,7 +191,7 @@ def test_a_folder_that_takes_no_files_is_read_and_not_written(
     before = sorted(folder.iterdir())
     monkeypatch.setattr(cache_module, "require_writable", refuse)
     cache, make = StageCache(folder), Maker()
-    assert "cannot be written: stages are not kept" in caplog.text
+    assert "cannot be written: stages are not cached" in caplog.text
     assert cache.stage("parts", INPUTS, make, alone=True).cached
     assert not cache.stage("others", INPUTS, make, alone=True).cached
     cache.keep("more", INPUTS, make(), 1.0)

@@ -53,7 +53,7 @@ def test_a_stopped_training_goes_on_as_if_it_had_not(tmp_path, pool_folder, monk
     monkeypatch.setattr(Upkeep, "on_train_batch_end", real)
     assert state(tmp_path / "cut")["progress"]["steps"] == 4
     assert command(tmp_path / "cut", pool_folder, steps) == 0
-    assert "going on" in capsys.readouterr().out
+    assert "resuming" in capsys.readouterr().out
     whole, cut = state(tmp_path / "whole"), state(tmp_path / "cut")
     assert whole["progress"]["steps"] == cut["progress"]["steps"] == 6
     assert same(whole["state_dict"], cut["state_dict"])

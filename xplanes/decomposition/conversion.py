@@ -15,14 +15,14 @@ from xplanes.fields.xplanes import PLANE_SETS
 
 
 def space_weights(size_out: int, size_in: int, like: Tensor) -> Tensor:
-    """Weights that sample a spatial axis at the cell centres of another resolution.
+    """Interpolation weights from a spatial axis to the cell centres of another resolution.
 
     The convention is that of LRM planes: ``align_corners=False``, zero outside.
 
     Args:
         size_out: Cells to sample at.
         size_in: Cells of the plane.
-        like: A tensor whose type and device to use.
+        like: A tensor with the type and device of the result.
 
     Returns:
         One row per sampled cell. [size_out, size_in]
@@ -32,12 +32,12 @@ def space_weights(size_out: int, size_in: int, like: Tensor) -> Tensor:
 
 
 def time_weights(times: Tensor, size: int, like: Tensor) -> Tensor:
-    """Weights that sample the time axis: time t lies at row ``t * (size - 1)``.
+    """Interpolation weights along the time axis: time t lies at row ``t * (size - 1)``.
 
     Args:
-        times: Times in [0, 1]; clamped to it. [B]
+        times: Times, clamped to [0, 1]. [B]
         size: Rows of the plane along time.
-        like: A tensor whose type and device to use.
+        like: A tensor with the type and device of the result.
 
     Returns:
         One row per time. [B, size]
@@ -59,14 +59,14 @@ _SWEEPS = 15
 def rank1_factors(planes: Tensor) -> tuple[Tensor, Tensor]:
     """Best rank-1 product of every slice: the minimiser of the product loss for nine planes.
 
-    Power iteration from the longest row; slices that are zero are not touched. Each pair is signed
-    like the one of the frame before, so that interpolation in time does not pass through zero.
+    Power iteration, initialised with the longest row; slices of zeros stay zero. The signs of each
+    pair follow the previous frame, so that interpolation in time does not pass through zero.
 
     Args:
         planes: One orientation of the sparse part. [T, C, H, W]
 
     Returns:
-        Factors along the width and along the rows, each with half of the magnitude, so that
+        Factors along the width and along the rows, of equal norm; their outer product
         ``rows x width`` is the slice. [T, W, C], [T, H, C]
     """
     frames, channels, height, width = planes.shape
@@ -76,7 +76,7 @@ def rank1_factors(planes: Tensor) -> tuple[Tensor, Tensor]:
     second = torch.zeros(len(slices), height, dtype=kind, device=planes.device)
     active = slices.abs().amax(dim=(1, 2)).nonzero()[:, 0]
     for chosen in active.split(_SLICES):
-        # In units of the largest entry the squares stay in range for any scale.
+        # Normalised by the largest entry, so that squares neither overflow nor underflow.
         part = slices[chosen].to(kind)
         unit = part.abs().amax(dim=(1, 2), keepdim=True)
         part = part / unit
@@ -112,7 +112,7 @@ def shared_factors(sparse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     parts = [_shared_in_cache(frames) for frames in sparse.split(few)]
     x, y, z = (torch.cat(factors) for factors in zip(*parts, strict=True))
     signs = _running_signs(x, y, z)
-    # The product of any two keeps its value only if all three are flipped together.
+    # Products of pairs keep their sign only if all three factors are flipped together.
     return x * signs, y * signs, z * signs
 
 
@@ -141,7 +141,7 @@ def _sign(first: Tensor, second: Tensor) -> Tensor:
 
 
 def _running_signs(*factors: Tensor) -> Tensor:
-    """Signs that keep a frame's factors, taken together, from opposing the frame before.
+    """Signs that align the factors of each frame with those of the previous frame.
 
     Args:
         *factors: Factors of the same frames and channels. [T, N, C] each
@@ -164,7 +164,7 @@ TIME_PLANES = {
 """Time planes of each plane set, in storage order."""
 
 TIME_ROWS = {name: PLANE_SETS[name] for name in TIME_PLANES}
-"""For xy, xz and yz the time planes of its first and second axis, by position in storage."""
+"""For xy, xz and yz: indices of the time planes of the first and second axis."""
 
 
 def space_planes(
@@ -174,8 +174,8 @@ def space_planes(
 
     Args:
         low_rank: The static part. [T, 3, C, H, W]
-        static: "middle" (the frame T/2), "median" or "mean" over time, entry by entry.
-        resolution: R, in cells; None keeps the triplanes' own, which must then be square.
+        static: "middle" (frame T/2), or the elementwise "median" or "mean" over time.
+        resolution: R in cells; None keeps that of the triplanes, which must then be square.
 
     Returns:
         Planes xy, xz, yz. [3, R, R, C]
@@ -218,12 +218,12 @@ def time_planes(
 
     Args:
         sparse: The dynamic part. [T, 3, C, H, W]
-        plane_set: "six" (xt, yt, zt shared) or "nine" (xt, yt, xt, zt, yt, zt, a pair per row).
+        plane_set: "six" (xt, yt, zt shared) or "nine" (xt, yt, xt, zt, yt, zt: one pair per row).
         dynamic: "rank1" or "random".
-        resolution: R, in cells; None keeps the triplanes' own, which must then be square.
-        time_resolution: Rt; None takes T, one row per frame.
+        resolution: R in cells; None keeps that of the triplanes, which must then be square.
+        time_resolution: Rt; None for T, one row per frame.
         noise: Standard deviation of the noise.
-        generator: Source of the noise.
+        generator: Generator of the noise.
 
     Returns:
         Time planes in the order of ``TIME_PLANES``. [P, Rt, R, C]
@@ -265,7 +265,7 @@ def time_planes(
     ticks = torch.linspace(0, 1, count, dtype=torch.float64, device=sparse.device)
     for plane, factor in zip(planes, factors, strict=True):
         if len(factor) != count:
-            # A single row has to stand for all times: take the middle.
+            # A single row represents all times: take the middle frame.
             weights = time_weights(ticks if count > 1 else ticks + 0.5, frames, factor)
             factor = torch.einsum("st,tac->sac", weights, factor)
         if factor.shape[1] != size:
@@ -275,11 +275,11 @@ def time_planes(
 
 
 def frame_profiles(planes: Tensor, frames: Tensor, count: int, size: int) -> Tensor:
-    """Sample time planes at frames and at the cell centres of a grid, one axis after the other.
+    """Sample time planes separably at frames and at the cell centres of a grid.
 
     Args:
         planes: Time planes. [P, Rt, R, C]
-        frames: Numbers of the frames. [B]
+        frames: Indices of the frames. [B]
         count: Number of frames T that fill [0, 1].
         size: Cells of the grid along the spatial axis.
 
@@ -290,7 +290,7 @@ def frame_profiles(planes: Tensor, frames: Tensor, count: int, size: int) -> Ten
     position = frames.to(planes.device).double() / max(count - 1, 1) * last
     before = position.floor().long().clamp(0, last)
     share = (position - before).to(planes.dtype)[:, None, None]
-    # One gather for both neighbours: its gradient is written to the planes once.
+    # One gather for both neighbours, so that its gradient is accumulated in one pass.
     rows = planes[:, torch.cat([before, (before + 1).clamp_max(last)])]
     values = rows[:, : len(before)].lerp(rows[:, len(before) :], share)
     if planes.shape[2] == size:
@@ -299,7 +299,7 @@ def frame_profiles(planes: Tensor, frames: Tensor, count: int, size: int) -> Ten
 
 
 def _median(values: Tensor) -> Tensor:
-    """Median over the first axis, the mean of the middle two where their number is even."""
+    """Median over the first axis; for an even number, the mean of the two middle values."""
     lower = values.median(dim=0).values
     if len(values) % 2:
         return lower

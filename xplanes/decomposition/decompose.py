@@ -1,4 +1,4 @@
-"""A triplane sequence as the sum of a standing and a moving one."""
+"""A triplane sequence as the sum of a static (low-rank) and a dynamic (sparse) part."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,12 +13,12 @@ ORIENTATIONS = ("xy", "xz", "yz")
 
 @dataclass(frozen=True)
 class Decomposition:
-    """Two triplane sequences that add up to the one given, and how each orientation came out.
+    """Low-rank and sparse part of a triplane sequence, and reports of robust PCA.
 
     Attributes:
         low_rank: The static part. [T, 3, C, H, W]
         sparse: The dynamic part. [T, 3, C, H, W]
-        reports: For "xy", "xz" and "yz" the builtins of ``RobustPCA.report``.
+        reports: For each of "xy", "xz" and "yz": ``RobustPCA.report``.
     """
 
     low_rank: Tensor
@@ -54,11 +54,11 @@ def decompose(triplanes: Tensor, **options: Any) -> Decomposition:
 
 
 def check_triplanes(triplanes: Tensor, name: str) -> None:
-    """Refuse what is not a non-empty triplane sequence.
+    """Check that a tensor is a non-empty triplane sequence.
 
     Args:
         triplanes: The tensor. [T, 3, C, H, W]
-        name: What the message calls it.
+        name: Its name in error messages.
 
     Raises:
         ValueError: For a wrong shape.

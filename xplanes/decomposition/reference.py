@@ -27,16 +27,16 @@ def plain_admm(
 
     Args:
         matrix: Y, float32 or float64, not zero. [M, T]
-        low_rank: Where L goes. [M, T]
-        sparse: Where S goes. [M, T]
+        low_rank: Output L. [M, T]
+        sparse: Output S. [M, T]
         sparsity_weight: Weight of the sparse part.
         penalty: The penalty, absolute.
         tolerance: Stop when ``|L + S - Y| / |Y|`` is below this.
-        max_iterations: Limit on the iterations.
+        max_iterations: Maximum number of iterations.
         on_iteration: Called after each iteration.
 
     Returns:
-        The state at the end.
+        The final state.
     """
     norm = torch.linalg.vector_norm(matrix).item()
     progress = Progress(penalty=penalty)

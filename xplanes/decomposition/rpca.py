@@ -1,4 +1,4 @@
-"""Robust PCA: a matrix as the sum of a low-rank and a sparse one."""
+"""Robust PCA: a matrix as the sum of a low-rank and a sparse matrix."""
 
 import math
 import warnings
@@ -20,7 +20,7 @@ SCALES = ("rms", "none")
 
 @dataclass(frozen=True)
 class RobustPCA:
-    """The two parts of a matrix, and how they came out.
+    """Result of robust PCA.
 
     Attributes:
         low_rank: L. [M, T]
@@ -28,15 +28,15 @@ class RobustPCA:
         rank: Rank of L.
         iterations: Iterations made.
         residual: ``|L + S - Y| / |Y|``, Frobenius norms, measured on the result.
-        converged: Whether the tolerance was met within the limit.
-        change: Size of the last measured step (see ``solver.Progress``); a small residual
-            beside a large change means feasible but not yet the optimal split.
+        converged: Whether the tolerance was reached within the maximum number of iterations.
+        change: Size of the last measured step (see ``solver.Progress``). A small residual with a
+            large change means that the split is feasible but not yet optimal.
         sparsity: Share of non-zero entries in S.
         low_rank_energy: ``|L|^2 / |Y|^2``.
         sparse_energy: ``|S|^2 / |Y|^2``.
         drift: ``|L - L(T/2)| / |L|``: 0 if L is constant over time.
         sparsity_weight: The weight used.
-        penalty: The penalty at the end, in units of ``1 / unit``.
+        penalty: The final penalty, in units of ``1 / unit``.
         unit: What Y is measured in: its root mean square, or 1 with ``scale="none"``.
         method: The method used.
     """
@@ -58,7 +58,7 @@ class RobustPCA:
     method: str
 
     def report(self) -> dict[str, int | float | bool | str]:
-        """Everything but the two matrices, as builtins."""
+        """All attributes except the two matrices, as builtins."""
         names = [field.name for field in fields(self)]
         return {name: getattr(self, name) for name in names if name not in ("low_rank", "sparse")}
 
@@ -76,33 +76,34 @@ def robust_pca(
     progress: bool = True,
     out: tuple[Tensor, Tensor] | None = None,
 ) -> RobustPCA:
-    """Split Y into L + S with the least ``|L|_* + sparsity_weight |S|_1`` (X-Planes, Eq. 10-12).
+    """Split Y into L + S, minimising ``|L|_* + sparsity_weight |S|_1`` (X-Planes, Eq. 10-12).
 
     The paper prints a Frobenius norm for L, but its update (Eq. 24-25) is singular value
-    thresholding, the proximal step of the NUCLEAR norm, which is what is minimised here.
+    thresholding, the proximal operator of the nuclear norm. The nuclear norm is minimised here.
 
-    Both norms scale with Y, so the optimum does too: the weight suits every scale. The penalty does
-    not; ``scale="rms"`` measures it against the root mean square of Y. Only the path of a fixed
-    penalty depends on it: "adaptive" uses it as the initial value in these units.
+    Both norms scale with Y, so the optimal weight does not depend on the scale of Y. The penalty
+    does; ``scale="rms"`` measures it in units of the root mean square of Y. "adaptive" uses it as
+    the initial value only, always in these units.
 
-    Beside the results, which have the size of Y each, memory holds four cache-sized blocks; an
-    input that is neither float32 nor float64, or has no contiguous rows or columns, is copied once.
+    Besides the two results, which have the size of Y, memory use is four cache-sized blocks. A
+    matrix that is neither float32 nor float64, or not contiguous in rows or columns, is copied.
 
     Args:
         matrix: Y, any floating type; never changed. Half precision is computed and returned in
             float32. [M, T]
         sparsity_weight: Weight of S; "auto" is ``1 / sqrt(max(M, T))`` (Candes et al. 2011).
         penalty: Penalty of ADMM; the initial one for "adaptive", unused by "growing".
-        tolerance: Bound on ``|L + S - Y| / |Y|``; "adaptive" also wants the relative step below
-            ten times this. float32 cannot reach much below 1e-6.
-        max_iterations: Limit; reaching it unconverged gives a warning.
-        method: "adaptive" (over-relaxed ADMM, penalty balanced, then grown no faster than the
-            split converges), "growing" (inexact ALM, Lin et al. 2010, growth 1.2: the smallest
-            residual soonest, a slightly wrong split), "admm" (the paper's Algorithm 1), "exact"
-            (the same with a full singular value decomposition, slow: the reference).
+        tolerance: Bound on ``|L + S - Y| / |Y|``; "adaptive" also requires a relative step
+            below ten times this. float32 cannot reach much below 1e-6.
+        max_iterations: Maximum number of iterations; a warning is given if it is reached.
+        method: "adaptive" (over-relaxed ADMM with a balanced penalty that then grows no faster
+            than the split converges), "growing" (inexact ALM, Lin et al. 2010, growth 1.2: fastest
+            to a small residual, but the split is slightly off), "admm" (the paper's Algorithm 1),
+            "exact" (the same with a full singular value decomposition: the slow reference).
         scale: "rms" or "none": the unit of the penalty.
         progress: Show a progress bar after two seconds.
-        out: Where L and S go, in the computing type and layout of the matrix. [M, T], [M, T]
+        out: Output tensors for L and S, with the computation type and layout of the matrix.
+            [M, T], [M, T]
 
     Raises:
         ValueError: For a wrong number of dimensions, an empty matrix, NaN or infinity, or an option
@@ -123,7 +124,7 @@ def robust_pca(
         end = Progress(0, 0, penalty, 0.0, 0.0)
         return _result(work, low_rank, sparse, end, weight, 1.0, method, tolerance, 1.0)
 
-    # Squares of extreme numbers leave the range of the type: compute on a copy near 1, exactly.
+    # Squares of extreme values overflow or underflow: compute on a copy scaled by a power of two.
     factor = 1.0 if 1e-12 < peak < 1e12 else 2.0 ** -math.frexp(peak)[1]
     if factor != 1:
         work = work * factor
@@ -139,7 +140,7 @@ def robust_pca(
             if method == "adaptive":
                 begin = penalty * math.sqrt(work.numel()) / _norm(work)
             elif method == "growing":
-                # Lin et al. start from 1.25 over the spectral norm; the Frobenius norm is at hand.
+                # Lin et al. initialise with 1.25 / spectral norm; the Frobenius norm is cheaper.
                 begin = 1.25 / _norm(work)
             end = minimise(
                 work, low_rank, sparse, sparsity_weight=weight, penalty=begin,
@@ -189,17 +190,17 @@ def _check_matrix(matrix: Tensor) -> float:
         raise ValueError(f"robust_pca needs a non-empty matrix [M, T], not {tuple(matrix.shape)}")
     low, high = torch.aminmax(matrix)
     peak = max(abs(low.item()), abs(high.item()))
-    # NaN compares as false, whichever of the two it is in.
+    # Comparisons with NaN are false.
     if not (math.isfinite(low.item()) and math.isfinite(high.item())):
         raise ValueError(
-            "robust_pca got NaN or infinity: the triplanes or features it was given are broken "
+            "the input of robust_pca contains NaN or infinity: check the triplanes or features "
             f"(smallest value {low.item()}, largest {high.item()})"
         )
     return peak
 
 
 def _computable(matrix: Tensor) -> Tensor:
-    """The matrix itself if a pass can read it in place, else a copy that can be."""
+    """The matrix itself if it can be read in place, else a copy."""
     rows, columns = matrix.shape
     if matrix.dtype not in (torch.float32, torch.float64):
         matrix = matrix.float()
@@ -232,7 +233,7 @@ def _result(
     tolerance: float,
     factor: float,
 ) -> RobustPCA:
-    """Measure the parts in one pass, undo the scale ``factor`` and judge convergence."""
+    """Measure the parts in one pass, undo the scale ``factor`` and check convergence."""
     middle = matrix.shape[1] // 2
     sums = torch.zeros(6, dtype=torch.float64, device=matrix.device)
     rows = block_rows(matrix)
@@ -271,7 +272,7 @@ def _result(
 
 @contextmanager
 def _full_precision(device: torch.device) -> Iterator[None]:
-    """Keep reduced-precision matrix products (TF32, bfloat16, autocast) out of the loop."""
+    """Disable reduced-precision matrix products (TF32, bfloat16, autocast)."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("highest")
     try:

@@ -11,15 +11,15 @@ _SPARSE_FLOOR = 0.05
 
 @dataclass(frozen=True)
 class Schedule:
-    """How the penalty moves and how far each step is stretched.
+    """Schedule of the penalty, and over-relaxation.
 
-    The adaptive values were chosen by iterations to a given error on feature-like matrices.
+    The adaptive values minimise the iterations to a given error on feature-like matrices.
 
     Attributes:
         relaxation: Over-relaxation of the low-rank part; 1 is plain ADMM.
-        growth: Factor on the penalty per iteration where it grows; 1 keeps it fixed.
+        growth: Factor on the penalty per iteration when it grows; 1 keeps it fixed.
         adaptive: Set the penalty from the iterates for ten iterations, then balance it.
-        ratio: What ``penalty * |S| / |multiplier|`` is brought to at first.
+        ratio: Initial target of ``penalty * |S| / |multiplier|``.
         grow_above: Grow while relative residual over relative change is above this.
         shrink_below: Shrink while it is below this.
     """
@@ -59,7 +59,7 @@ class Norms:
 class Penalty:
     """The penalty of this iteration, the one before and the one after.
 
-    A pass already prepares the next one, so what it measures can only move the penalty after that.
+    A pass prepares the next one, so its measurements change the penalty of the pass after that.
     """
 
     def __init__(self, schedule: Schedule, start: float, norm: float) -> None:
@@ -71,13 +71,13 @@ class Penalty:
         self._direction = 0
 
     def warm(self, iteration: int) -> bool:
-        """Whether the penalty still follows the norms of the iterates."""
+        """Whether the penalty is still set from the norms of the iterates."""
         return self._schedule.adaptive and iteration <= _WARM_UP
 
     def relative(self, norms: Norms) -> tuple[float, float]:
-        """Residual over the sparse part, and change over the multiplier.
+        """Residual relative to the sparse part, and change relative to the multiplier.
 
-        The floor keeps rounding from counting as a residual where the sparse part is nearly zero.
+        A lower bound excludes rounding errors if the sparse part is nearly zero.
         """
         primal = norms.residual / max(norms.sparse, _SPARSE_FLOOR * self._norm)
         return primal, norms.change / max(norms.multiplier, 1e-30 * self._norm)
@@ -85,12 +85,12 @@ class Penalty:
     def balance(self, iteration: int, norms: Norms, *, feasible: bool) -> None:
         """Choose whether to grow, keep or shrink until the next check.
 
-        Every turn halves the rate on a logarithmic scale, so that the penalty comes to rest.
+        Each change of direction halves the logarithmic rate, so that the penalty settles.
 
         Args:
             iteration: Number of this iteration.
-            norms: What the last iteration measured.
-            feasible: The residual is far below the tolerance: growing would help nothing.
+            norms: Norms of the last iteration.
+            feasible: Whether the residual is far below the tolerance (growth has no benefit).
         """
         if not self._schedule.adaptive or self.warm(iteration):
             return

@@ -24,15 +24,15 @@ CHANGE_OVER_TOLERANCE = 10.0
 
 @dataclass
 class Progress:
-    """Where the loop stands.
+    """State of the loop.
 
     Attributes:
         iterations: Passes made.
         rank: Rank of the low-rank part.
         penalty: Penalty of the last pass, absolute.
         residual: ``|L + S - Y| / |Y|`` at the last check, Frobenius norms.
-        change: At the last check the larger of ``|L + S - Y| / |S|`` and the change of S over the
-            scaled multiplier: the relative size of the step still being taken.
+        change: Relative step size at the last check: the larger of ``|L + S - Y| / |S|`` and the
+            change of S relative to the scaled multiplier.
     """
 
     iterations: int = 0
@@ -58,18 +58,18 @@ def minimise(
 
     Args:
         matrix: Y, float32 or float64, rows or columns contiguous, not zero. [M, T]
-        low_rank: Where L goes. [M, T]
-        sparse: Where S goes; holds the state of the iteration meanwhile. [M, T]
+        low_rank: Output L. [M, T]
+        sparse: Output S; stores the state during the iterations. [M, T]
         sparsity_weight: Weight of the sparse part.
         penalty: Penalty of the first pass, absolute.
-        schedule: How the penalty moves.
+        schedule: Schedule of the penalty.
         tolerance: Stop when the residual is below this and, for an adaptive schedule, the change
             below ten times this.
-        max_iterations: Limit on the passes, at least 1.
+        max_iterations: Maximum number of passes, at least 1.
         on_iteration: Called after each pass.
 
     Returns:
-        The state at the end; the last pass is plain ADMM and is not measured here.
+        The final state; the last pass is plain ADMM and is not included in its measurements.
     """
     work = Workspace(matrix, sparse)
     gram = start(work)

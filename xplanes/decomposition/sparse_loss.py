@@ -13,17 +13,17 @@ Rows = Sequence[tuple[int, int]]
 def sparse_product_loss(
     time_planes: Tensor, sparse: Tensor, frames: Tensor, *, rows: Rows
 ) -> Tensor:
-    """Mean squared difference of the sparse part and the planes' products at some frames.
+    """Mean squared error of the products of time planes against the sparse part at some frames.
 
-    Frames drawn uniformly make it an unbiased estimate of the mean over all frames. The planes are
-    sampled along time and space one after the other, on 1D profiles; only the outer product has the
-    size of a triplane.
+    For uniformly drawn frames it is an unbiased estimate of the mean over all frames. Planes are
+    sampled separably, first in time, then in space; only the outer product has the size of a
+    triplane.
 
     Args:
         time_planes: Time planes of any resolution. [P, Rt, R, C]
         sparse: The sparse part of all frames, held fixed. [T, 3, C, H, W]
-        frames: Numbers of the frames to use, repeats allowed. [B]
-        rows: For xy, xz and yz the positions of the time planes of its first and second axis:
+        frames: Indices of the frames; may repeat. [B]
+        rows: For xy, xz and yz: indices of the time planes of the first and second axis,
             ``TIME_ROWS[plane_set]``.
 
     Returns:
@@ -43,7 +43,7 @@ def sparse_product_loss(
 
 @torch.no_grad()
 def unexplained_energy(time_planes: Tensor, sparse: Tensor, *, rows: Rows) -> float:
-    """Share of the energy of the sparse part that the planes' products leave, over all frames.
+    """Fraction of the sparse part's energy that products of time planes do not explain.
 
     Args:
         time_planes: Time planes. [P, Rt, R, C]
@@ -51,7 +51,7 @@ def unexplained_energy(time_planes: Tensor, sparse: Tensor, *, rows: Rows) -> fl
         rows: As for ``sparse_product_loss``.
 
     Returns:
-        0 for a perfect start, 1 for planes of zeros; 0 also where nothing moves.
+        0 for an exact fit, 1 for planes of zeros; 0 if the sparse part is zero.
     """
     left = energy = 0.0
     for frame in range(len(sparse)):
@@ -62,15 +62,15 @@ def unexplained_energy(time_planes: Tensor, sparse: Tensor, *, rows: Rows) -> fl
 
 
 class SparseProduct:
-    """Holds the sparse part, and adds the gradient of L_r at a few random frames.
+    """The regulariser L_r, evaluated at a few random frames per step.
 
-    It is no module: the sparse part is large, can be had again from its source, and belongs in no
-    checkpoint.
+    It is not a module: the sparse part is large, can be recomputed, and must not be written to
+    checkpoints.
 
     Args:
         sparse: The sparse part of all frames. [T, 3, C, H, W]
-        rows: For xy, xz and yz the positions of their two time planes.
-        count: Frames per application.
+        rows: For xy, xz and yz: indices of their two time planes.
+        count: Frames per step.
     """
 
     def __init__(self, sparse: Tensor, rows: Rows, count: int) -> None:
@@ -79,13 +79,13 @@ class SparseProduct:
     def add_gradient(
         self, gradient: Tensor, planes: Tensor, weight: float, generator: torch.Generator
     ) -> None:
-        """Add ``weight`` times the gradient at random frames, an unbiased estimate of the whole.
+        """Add ``weight`` times an unbiased estimate of the gradient, from random frames.
 
         Args:
             gradient: Changed in place. [P, Rt, R, C]
             planes: Time planes. [P, Rt, R, C]
-            weight: Factor.
-            generator: Source of the frames, on the CPU.
+            weight: Weight of the regulariser.
+            generator: Generator that draws the frames, on the CPU.
         """
         frames = torch.randint(len(self.sparse), (self.count,), generator=generator)
         with torch.enable_grad():
@@ -95,7 +95,7 @@ class SparseProduct:
 
     @torch.no_grad()
     def value(self, planes: Tensor) -> float:
-        """The loss at frames spread evenly, the same at each call."""
+        """The loss at evenly spaced frames; deterministic."""
         return float(self._loss(planes, _spread(self.count, len(self.sparse))))
 
     def _loss(self, planes: Tensor, frames: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ _SINGLE_PRECISION_ERROR = 3e-9
 
 
 def block_rows(matrix: Tensor) -> int:
-    """Rows per block, so that a block and its temporaries stay in the processor's cache."""
+    """Rows per block, so that a block and its temporaries fit in the cache."""
     elements = _BLOCK_ELEMENTS.get(matrix.device.type, _BLOCK_ELEMENTS["cuda"])
     return max(64, elements // max(1, matrix.shape[1]))
 
@@ -38,7 +38,7 @@ def needs_double(largest: float, threshold: float, tolerance: float) -> bool:
     Args:
         largest: Largest singular value.
         threshold: Threshold of the singular values, in the same unit.
-        tolerance: Relative accuracy that is wanted.
+        tolerance: Required relative accuracy.
     """
     return _SINGLE_PRECISION_ERROR * largest > 0.1 * tolerance * threshold
 
@@ -48,7 +48,7 @@ def shrinkage_from_gram(gram: Tensor, threshold: float) -> tuple[Tensor, Tensor,
 
     Args:
         gram: Gram matrix of the columns, float64. [T, T]
-        threshold: What is taken off every singular value.
+        threshold: Value subtracted from every singular value.
 
     Returns:
         Right singular vectors above the threshold, their factors ``1 - threshold / s`` (all in
@@ -64,11 +64,11 @@ def shrinkage_from_gram(gram: Tensor, threshold: float) -> tuple[Tensor, Tensor,
 def singular_value_threshold(
     matrix: Tensor, threshold: float, *, exact: bool = False
 ) -> tuple[Tensor, int]:
-    """Shrink the singular values: the proximal step of the nuclear norm (X-Planes, Eq. 24-25).
+    """Shrink the singular values: the proximal operator of the nuclear norm (X-Planes, Eq. 24-25).
 
     Args:
         matrix: A matrix with many more rows than columns, float32 or float64. [M, T]
-        threshold: What is taken off every singular value; below zero they stay at zero.
+        threshold: Value subtracted from every singular value; negative results become zero.
         exact: Use a full singular value decomposition instead of the Gram matrix.
 
     Returns:
@@ -91,15 +91,15 @@ _NARROW_FROM_COLUMNS = 96
 
 @dataclass(frozen=True)
 class Step:
-    """What one iteration needs to know besides the arrays.
+    """Parameters of one iteration.
 
     Attributes:
         basis: Right singular vectors kept, float64. [T, K]
         factors: Their shrinkage factors, float64. [K]
-        old_limit: Clip limit under which the stored Z was made.
+        old_limit: Clip limit with which the stored Z was computed.
         limit: Clip limit of this iteration.
-        rescale: Last penalty over this one.
-        next_rescale: This penalty over the next one.
+        rescale: Ratio of the previous penalty to this one.
+        next_rescale: Ratio of this penalty to the next one.
         relaxation: Over-relaxation of the low-rank part.
         double: Multiply the Gram matrix in float64.
     """
@@ -115,7 +115,7 @@ class Step:
 
 
 class Workspace:
-    """The matrix and its state cut into row blocks, with four block-sized buffers."""
+    """The matrix and its state as row blocks, with four block-sized buffers."""
 
     def __init__(self, matrix: Tensor, state: Tensor) -> None:
         self.rows = min(block_rows(matrix), len(matrix))
@@ -150,11 +150,11 @@ def iterate(
         work: The blocks; their state is overwritten.
         step: Parameters of the iteration.
         norms: Measure the norms of the sparse part and of the multiplier over the penalty.
-        changes: Measure these, the change of the sparse part and ``|L + S - Y|`` too.
+        changes: Also measure the change of the sparse part and ``|L + S - Y|``.
 
     Returns:
-        The Gram matrix of the next X, in float64 on the CPU, and the four norms (zero where
-        not measured). One transfer from the device serves both. [T, T]
+        The Gram matrix of the next X, in float64 on the CPU, and the four norms (zero if not
+        measured). Both need a single transfer from the device. [T, T]
     """
     matrix, alpha = work.matrix, step.relaxation
     columns, kept = step.basis.shape
@@ -162,7 +162,7 @@ def iterate(
     gram = totals[4:].view(columns, columns)
     forward = (step.basis * (alpha * step.factors)).to(matrix)
     backward = step.basis.mT.to(matrix)
-    # Two thin products beat one square product only where few of many directions are kept.
+    # Two thin products are faster than one square product only if few directions are kept.
     narrow = columns >= _NARROW_FROM_COLUMNS and 4 * kept <= columns
     weights = (
         forward if narrow else ((step.basis * (alpha * step.factors)) @ step.basis.mT).to(matrix)
@@ -204,11 +204,11 @@ def iterate(
 
 
 def finish(work: Workspace, low_rank: Tensor, step: Step) -> None:
-    """Make one plain iteration that leaves L in ``low_rank`` and S in place of the state.
+    """Make one plain iteration; write L to ``low_rank`` and overwrite the state with S.
 
     Args:
         work: The blocks; their state becomes the sparse part.
-        low_rank: Where the low-rank part goes. [M, T]
+        low_rank: Output L. [M, T]
         step: Parameters of the iteration.
     """
     weights = ((step.basis * step.factors) @ step.basis.mT).to(work.matrix)

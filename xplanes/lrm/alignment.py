@@ -1,8 +1,8 @@
 """From the world of a scene to the frame of a Large Reconstruction Model.
 
-A model predicts in its own frame, as if its image came from its own camera. A similarity takes the
-real source camera there. Where the focal lengths differ no similarity is exact, because perspective
-is stronger for the shorter one; what remains is reported in pixels.
+A model predicts in its own frame and assumes that the image was taken by its canonical camera. A
+similarity transform maps the real source camera to that camera. If the focal lengths differ, no
+similarity is exact; the remaining error is reported in pixels.
 """
 
 import math
@@ -19,18 +19,18 @@ from xplanes.lrm.images import Crop, square_crop
 from xplanes.scenes.frame import Frame
 
 MOST = 2.0
-"""A cube grows by this factor at most: what lies beyond is not the model's to say."""
+"""Largest factor by which a cube grows: the model predicts nothing far outside its own cube."""
 
 
 def fit_cube(triplanes: Tensor, half_side: float, wanted: float) -> tuple[Tensor, float]:
-    """Add or take texels on all sides until the planes span another cube.
+    """Pad or crop the planes on all sides to another cube.
 
-    Inside both cubes the field stays the same function. What is added continues the border texels.
+    The field does not change inside both cubes. Padding repeats the border texels.
 
     Args:
         triplanes: Planes xy, xz, yz. [T, 3, C, H, H]
-        half_side: Half the side of the cube that they span.
-        wanted: Half the side of the cube that they are to hold.
+        half_side: Half the side of their cube.
+        wanted: Half the side of the cube that they must contain.
 
     Returns:
         The planes, and half the side of their cube: ``wanted``, rounded up to whole texels.
@@ -39,7 +39,7 @@ def fit_cube(triplanes: Tensor, half_side: float, wanted: float) -> tuple[Tensor
     size = triplanes.shape[-1]
     texel = 2 * half_side / size
     span = min(wanted, MOST * half_side)
-    # A hair more than a whole number of texels is that number.
+    # A tolerance, so that rounding errors do not add a texel.
     texels = math.ceil((span - half_side) / texel - 1e-6)
     if not texels:
         return triplanes, half_side
@@ -56,13 +56,13 @@ Matching = Literal["scale", "pad"]
 
 @dataclass(frozen=True)
 class Mismatch:
-    """How far the source picture and the model's own picture of one scene lie apart.
+    """Distance between the projections of points into the source and the canonical camera.
 
     Attributes:
         largest: Largest distance in pixels.
         mean: Mean distance in pixels.
-        radius: Points considered: those within this distance of the centre, in the model's frame,
-            that the source camera sees.
+        radius: Largest distance from the centre of the points considered, in the model's frame;
+            points outside the source image are left out.
     """
 
     largest: float
@@ -72,13 +72,13 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class Alignment:
-    """Where the model's field lies in the world.
+    """Alignment of the model's frame with the world.
 
     Attributes:
         frame: From the world to the model's frame.
-        half_side: Half the side of the model's cube, in its frame; there is nothing outside.
-        crop: The square of the source picture that the model is shown.
-        mismatch: What the similarity cannot make good.
+        half_side: Half the side of the model's cube, in its frame; the field is empty outside.
+        crop: Square of the source image that is the model's input.
+        mismatch: Remaining error of the similarity.
     """
 
     frame: Frame
@@ -88,17 +88,17 @@ class Alignment:
 
     @property
     def density_factor(self) -> float:
-        """Density per unit of the world for one per unit of the model's frame."""
+        """Factor from density in the model's frame to density in world units."""
         return self.frame.scale
 
     @property
     def field_frame(self) -> Frame:
-        """From the world to the field's cube [-1, 1]^3, which is the model's cube."""
+        """Frame that maps the model's cube in the world to the field's cube [-1, 1]^3."""
         return Frame(self.frame.scale / self.half_side, self.frame.rotation, self.frame.centre)
 
     @property
     def field_density_factor(self) -> float:
-        """Density per unit of the field's cube for one per unit of the model's frame."""
+        """Factor from density in the model's frame to density in the field's cube."""
         return self.half_side
 
 
@@ -113,34 +113,34 @@ def align(
     matching: Matching = "scale",
     crop: Crop | None = None,
 ) -> Alignment:
-    """Place a model's frame in the world so that its picture is the source camera's.
+    """Align a model's frame with the world so that its camera matches the source camera.
 
     Args:
         camera_to_world: Pose of the source camera. [4, 4]
         focal: Its focal length in pixels.
-        height: Height of its pictures in pixels.
-        width: Width of its pictures in pixels.
-        target: World point in the middle of the scene; only its depth counts, as the model expects
-            the object in the middle of its picture. [3]
+        height: Height of its images in pixels.
+        width: Width of its images in pixels.
+        target: Centre of the scene in world coordinates. Only its depth is used, because the model
+            expects the object at the centre of the image. [3]
         view: The model's own camera and box.
-        matching: How to meet a focal length that is not the model's. "scale" shows the model the
-            picture as it is and makes sizes agree at the target's depth. "pad" first adds a margin
-            until the focal length, as a share of the picture's side, is the model's: exact
-            geometry, fewer pixels on the object.
-        crop: Square of the picture that the model is shown; the smallest square around the picture
+        matching: How to treat a focal length other than the model's. "scale" uses the image as it
+            is; sizes agree at the depth of the target. "pad" first adds a margin, so that the focal
+            length relative to the image side equals the model's: exact geometry, but fewer pixels
+            on the object.
+        crop: Square of the image that is the model's input; the smallest square around the image
             when None.
 
     Returns:
-        The alignment; apply its ``crop`` to the pictures before preparing them for the model.
+        The alignment; apply its ``crop`` to the images before preparing them for the model.
 
     Raises:
-        LRMError: If the target is behind the camera, the camera would stand inside the model's box,
-            or both "pad" and a crop are asked for.
+        LRMError: If the target is behind the camera, the camera would be inside the model's box, or
+            both "pad" and a crop are given.
     """
     pose, middle = camera_to_world.double(), target.double()
     depth = float((middle - pose[:3, 3]) @ -pose[:3, 2])
     if depth <= 0:
-        raise LRMError(f"the source camera looks away from the target {target.tolist()}")
+        raise LRMError(f"the target is behind the source camera: {target.tolist()}")
     if crop is not None and matching == "pad":
         raise LRMError('matching="pad" makes its own crop: give crop=None, or matching="scale"')
     if crop is None:
@@ -152,10 +152,10 @@ def align(
     if scale * depth <= view.half_side:
         raise LRMError(
             f"a focal length of {focal:g} pixels is too short for this model: the camera would "
-            f'stand inside its box; use matching="pad" or a source camera with a focal length of '
-            f"{view.focal:g} of the picture's side"
+            f'be inside its box; use matching="pad" or a source camera with a focal length of '
+            f"{view.focal:g} of the image side"
         )
-    # The ray through the middle of what the model sees, followed to the target's depth.
+    # The point at the target's depth on the ray through the centre of the crop.
     right = (crop.left + 0.5 * crop.side - 0.5 * width) / focal
     down = (crop.top + 0.5 * crop.side - 0.5 * height) / focal
     ray = pose.new_tensor([right, -down, -1.0])
@@ -168,14 +168,14 @@ def align(
 def focal_mismatch(
     view: CanonicalView, share: float, side: int, *, radius: float | None = None
 ) -> Mismatch:
-    """Distance between where source camera and model see the same point, after "scale" matching.
+    """Distance between projections into source and canonical camera, after "scale" matching.
 
     Args:
         view: The model's own camera and box.
-        share: Focal length of the source camera, as a share of the side of what the model sees.
-        side: That side in pixels.
-        radius: Points within this distance of the centre are considered, in the model's frame; half
-            the side of the box when None.
+        share: Focal length of the source camera as a share of the crop's side.
+        side: The crop's side in pixels.
+        radius: Largest distance of the points from the centre, in the model's frame; half the side
+            of the box when None.
 
     Returns:
         The largest and the mean distance over these points.

@@ -1,4 +1,4 @@
-"""Models that come with the package."""
+"""The bundled models."""
 
 import hashlib
 from pathlib import Path
@@ -9,7 +9,7 @@ from xplanes.lrm.model import LRM
 from xplanes.lrm.weights import read_config
 
 FOLDER = Path(__file__).parent / "shipped"
-"""NAME.safetensors beside NAME.json, its config.json with the checksum of the weights."""
+"""Folder of NAME.safetensors and NAME.json, the model configuration with the weights' checksum."""
 
 CHECKSUM = "weights_sha256"
 
@@ -20,28 +20,28 @@ def bundled_models(folder: Path = FOLDER) -> list[str]:
 
 
 def load_bundled(name: str, folder: Path = FOLDER) -> tuple[LRM, Path]:
-    """Load a model that comes with the package, or was exported into a folder in the same form.
+    """Load a bundled model, or one exported to a folder in the same format.
 
     Args:
         name: Name of the model.
-        folder: Where it lies.
+        folder: Its folder.
 
     Returns:
-        The model and the file of its weights.
+        The model and the path of its weights.
 
     Raises:
-        LRMError: If there is none of that name, or its files are damaged or do not belong together.
+        LRMError: If it does not exist, or its files are damaged or do not match.
     """
     path, described = folder / f"{name}.safetensors", folder / f"{name}.json"
     if not path.is_file() or not described.is_file():
         known = ", ".join(bundled_models(folder)) or "none"
-        raise LRMError(f"{path} and {described.name}: no such model; in {folder} there is {known}")
+        raise LRMError(f"{path} and {described.name}: no such model; {folder} contains {known}")
     config = read_config(described)
     expected = config.pop(CHECKSUM, None)
     found = hashlib.sha256(path.read_bytes()).hexdigest()
     if found != expected:
         raise LRMError(
             f"{path} is damaged or belongs to another model: its SHA-256 begins with {found[:12]}, "
-            f"{described.name} says {str(expected)[:12]}; install the package again"
+            f"{described.name} says {str(expected)[:12]}; reinstall the package"
         )
     return load(config, path), path

@@ -1,4 +1,4 @@
-"""The camera from which a Large Reconstruction Model believes that its image was taken."""
+"""The canonical camera of a Large Reconstruction Model: the one that it assumes for its input."""
 
 import math
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ Rows = tuple[tuple[float, float, float], ...]
 
 @dataclass(frozen=True)
 class CanonicalView:
-    """A model's own camera and box. Camera axes are OpenGL's: x right, y up, looking along -z.
+    """A model's canonical camera and box. Camera axes are OpenGL's: x right, y up, view along -z.
 
     Attributes:
-        rotation: Turns camera axes into the model's frame. 3 rows of 3
+        rotation: From camera axes to the model's frame. 3 rows of 3
         distance: From the camera to the centre of the box, in units of the model's frame.
         focal: Focal length as a share of the image's width.
-        half_side: Half the side of the cube in which the model's field lives.
+        half_side: Half the side of the cube of the model's field.
         background: Grey value, from 0 to 1, behind the object in the model's input.
     """
 
@@ -46,7 +46,7 @@ OPENLRM_VIEW = CanonicalView(
     half_side=1.0,
     background=1.0,
 )
-"""On the -y side, z up. Trained with distances from 1.9 to 2.6 and this focal length only."""
+"""At -y, z up. The training data has distances from 1.9 to 2.6 and this focal length only."""
 
 TRIPOSR_VIEW = CanonicalView(
     rotation=((0, 0, 1), (1, 0, 0), (0, 1, 0)),
@@ -55,13 +55,13 @@ TRIPOSR_VIEW = CanonicalView(
     half_side=0.87,
     background=0.5,
 )
-"""On the +x side, z up. Nominal: the model is not told its camera."""
+"""At +x, z up. Nominal: the model has no camera input."""
 
 
 def camera_vector(
     camera_to_world: Tensor, focal: tuple[float, float], centre: tuple[float, float] = (0.5, 0.5)
 ) -> Tensor:
-    """Cameras as OpenLRM reads them: the pose's three rows, then focal lengths and centre.
+    """OpenLRM's camera vector: three rows of the pose, focal lengths, principal point.
 
     Args:
         camera_to_world: Poses in the model's frame, OpenGL camera axes. [N, 4, 4] or [N, 3, 4]
@@ -79,5 +79,5 @@ def camera_vector(
 
 
 def canonical_vector(view: CanonicalView = OPENLRM_VIEW) -> Tensor:
-    """The canonical camera as OpenLRM reads it. [16]"""
+    """OpenLRM's camera vector of the canonical camera. [16]"""
     return camera_vector(view.camera_to_world()[None], (view.focal, view.focal))[0].float()

@@ -17,15 +17,15 @@ from xplanes.lrm.openlrm import OpenLRM
 from xplanes.lrm.triposr import TripoSR
 
 NAMED = 4
-"""Tensors named in a message at most."""
+"""Maximum number of tensors listed in a message."""
 
 
 class MismatchError(LRMError):
-    """Weights do not fit the sizes that they were loaded for.
+    """Weights do not match the model's sizes.
 
     Args:
         message: What does not fit.
-        fits: Names of the published models that they do fit.
+        fits: Names of the published models that they match.
     """
 
     def __init__(self, message: str, fits: list[str]) -> None:
@@ -69,21 +69,21 @@ def load(config: Mapping[str, Any] | LRMConfig, weights: Path) -> LRM:
 
 
 def build(config: LRMConfig) -> LRM:
-    """A model of the given sizes whose tensors have shapes and no memory yet."""
+    """A model on the meta device: shapes without memory."""
     with torch.device("meta"):
         model = TripoSR(config) if config.architecture == "triposr" else OpenLRM(config)
     return model.eval().requires_grad_(False)
 
 
 def fill(model: LRM, state: Mapping[str, Tensor]) -> None:
-    """Give a model its tensors.
+    """Load published tensors into a model.
 
     Args:
-        model: As `build` makes it.
+        model: A model from `build`.
         state: Published tensors by their published names.
 
     Raises:
-        MismatchError: If any is missing, superfluous or of another shape.
+        MismatchError: If a tensor is missing, unexpected or of another shape.
     """
     problems = mismatches(model, state)
     if problems:
@@ -96,7 +96,7 @@ def fill(model: LRM, state: Mapping[str, Tensor]) -> None:
 
 
 def mismatches(model: LRM, state: Mapping[str, Tensor]) -> list[str]:
-    """What keeps published tensors from fitting a model, in words; nothing if they fit."""
+    """Differences between published tensors and a model, for messages; empty if they match."""
     translate = translator(model.config.architecture)
     expected = {name: list(tensor.shape) for name, tensor in model.state_dict().items()}
     unknown, shapes, found = [], [], set()
@@ -124,7 +124,7 @@ def mismatches(model: LRM, state: Mapping[str, Tensor]) -> list[str]:
 
 
 def fitting(state: Mapping[str, Tensor]) -> list[str]:
-    """Names of the published models whose tensors have the names and shapes of these."""
+    """Names of the published models with the same tensor names and shapes."""
     return [name for name in PUBLISHED if not mismatches(_published_model(name), state)]
 
 
@@ -134,9 +134,9 @@ def _published_model(name: str) -> LRM:
 
 
 def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors of a file by name, and the configuration that OpenLRM 1.0 stores beside them.
+    """Tensors of a file by name, and the configuration that OpenLRM 1.0 files contain.
 
-    Files with pickles are read without running what they contain.
+    Pickles are loaded with ``weights_only``: code in them is never run.
 
     Raises:
         LRMError: If the file is missing, damaged, or holds more than tensors and numbers.
@@ -153,7 +153,7 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         or not all(isinstance(value, Tensor) for value in content.values())
         or not isinstance(carried, dict)
     ):
-        raise LRMError(f"{path} holds no weights by name: is it the file published for inference?")
+        raise LRMError(f"{path} contains no named weights: give the file published for inference")
     return {str(name): tensor for name, tensor in content.items()}, carried
 
 
@@ -177,8 +177,8 @@ def _read_pickle(path: Path) -> Any:
             return torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as problem:
         raise LRMError(
-            f"{path} is no file of weights, or holds code, which is never run: use the "
-            f".safetensors file where there is one"
+            f"{path} is not a file of weights, or contains code, which is never run: use the "
+            f".safetensors file if there is one"
         ) from problem
     except (RuntimeError, OSError, EOFError, ValueError, KeyError) as problem:
         raise LRMError(f"{path} is damaged or incomplete: {problem}") from problem
@@ -195,7 +195,7 @@ def _translated(model: LRM, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _same_size(config: Mapping[str, Any], carried: Mapping[str, Any]) -> bool:
-    """Whether a file's own configuration has the sizes of the published model asked for."""
+    """Whether the configuration in a file has the sizes of the requested published model."""
     model = carried.get("model", {})
     sizes = ("transformer_dim", "transformer_layers", "triplane_dim")
     return all(model.get(key) == config.get(key) for key in sizes)

@@ -88,7 +88,7 @@ PUBLISHED: dict[str, Published] = {
     "openlrm-small-1.1": Published(_openlrm_1_1("s", 384, 512, 12, 32), "lrm=small"),
     "openlrm-base-1.1": Published(_openlrm_1_1("b", 768, 768, 12, 48), "lrm=base"),
     "openlrm-large-1.1": Published(_openlrm_1_1("b", 768, 1024, 16, 80), "lrm=xlarge"),
-    # Version 1.0 carries its own configuration in model.pth, which wins; camera_embed_dim and
+    # Version 1.0 has its configuration in model.pth, which takes precedence; camera_embed_dim and
     # transformer_heads are assumed here.
     "openlrm-small-1.0": Published(_openlrm_1_0(768, 12, 32), _old("small", "small")),
     "openlrm-base-1.0": Published(_openlrm_1_0(1024, 12, 40), _old("base", "base")),
@@ -102,7 +102,7 @@ def published_config(name: str) -> dict[str, Any]:
     """The configuration of a published model.
 
     Raises:
-        LRMError: If there is none of that name.
+        LRMError: If no published model has that name.
     """
     if name not in PUBLISHED:
         raise LRMError(f"architecture={name!r}: must be one of {', '.join(PUBLISHED)}")
@@ -125,13 +125,13 @@ class EncoderConfig:
         heads: Attention heads.
         hidden: Channels inside the feed-forward layers.
         patch: Side of a patch in pixels.
-        grid: Patches along each side of the images that the position embedding was learned for.
-        norm_epsilon: Added to variances.
-        registers: Extra tokens that are dropped at the end.
+        grid: Patches along each side of the training images (size of the position embedding).
+        norm_epsilon: Epsilon of the layer norms.
+        registers: Number of register tokens, which are dropped at the end.
         layer_scale: Whether each branch is scaled per channel before it is added.
         antialias_positions: How the position embedding is resized (`interpolate_positions`).
-        mean: Subtracted from RGB; None for raw RGB.
-        std: RGB is divided by it.
+        mean: Mean of the RGB normalisation; None for no normalisation.
+        std: Standard deviation of the RGB normalisation.
     """
 
     width: int
@@ -153,7 +153,7 @@ class LRMConfig:
     """Sizes of a Large Reconstruction Model.
 
     Attributes:
-        architecture: Family, which settles all that is not a number.
+        architecture: Model family.
         image_size: Side of the input image in pixels.
         encoder: The image encoder.
         width: Channels of the triplane's tokens.
@@ -162,10 +162,10 @@ class LRMConfig:
         head_width: Channels of each head.
         channels: Channels C of each plane.
         low_resolution: Tokens along each side of a plane; planes have twice as many texels.
-        camera_width: Channels of the camera embedding; 0 where there is none.
+        camera_width: Channels of the camera embedding; 0 if there is none.
         decoder_width: Neurons of the decoder's hidden layers.
         decoder_hidden: Number of these layers.
-        source_distance: From the model's own camera to the centre of its box.
+        source_distance: Distance from the canonical camera to the centre of the box.
         source_focal: That camera's focal length as a share of the image's side.
         density_scale: Factor on the density.
     """
@@ -199,13 +199,13 @@ def parse_config(config: Mapping[str, Any]) -> LRMConfig:
         config: The content of the published config.json or config.yaml (OpenLRM 1.1, TripoSR) or
             of ``kwargs`` in model.pth (OpenLRM 1.0). The key ``architecture`` may name the family:
             openlrm-1.0, openlrm-1.1 or triposr. ``image_size``, ``image_mean`` and ``image_std``
-            may override what the published file does not say. OpenLRM models of other sizes and
-            another camera say so in ``encoder_sizes`` (img_size, patch_size, embed_dim, depth,
+            may add what the published file lacks. OpenLRM models of other sizes or with another
+            camera use the keys ``encoder_sizes`` (img_size, patch_size, embed_dim, depth,
             num_heads, num_register_tokens), ``source_distance``, ``source_focal`` and
             ``density_scale``.
 
     Raises:
-        LRMError: If a key is missing, out of range, or asks for what is not supported.
+        LRMError: If a key is missing, out of range or not supported.
     """
     architecture = guess_architecture(config)
     if architecture == "triposr":
@@ -217,7 +217,7 @@ def guess_architecture(config: Mapping[str, Any]) -> Architecture:
     """The family that a configuration belongs to.
 
     Raises:
-        LRMError: If it names an unknown one, or names none and its keys fit none.
+        LRMError: If the family is unknown or cannot be inferred.
     """
     named = str(config.get("architecture", "openlrm")).lower().replace("_", "-")
     for known in ("openlrm-1.0", "openlrm-1.1", "triposr"):
@@ -243,7 +243,7 @@ DINOV2 = {"dinov2_vits14_reg": (384, 6), "dinov2_vitb14_reg": (768, 12)}
 """Width and heads of DINOv2 by name."""
 
 SOURCE_SIZES = {512: 224, 768: 336, 1024: 448}
-"""Image side by transformer width, which OpenLRM 1.1's config.json does not hold."""
+"""Image size by transformer width; OpenLRM 1.1's config.json does not contain it."""
 
 
 def _openlrm(config: Mapping[str, Any], architecture: Architecture) -> LRMConfig:
@@ -289,7 +289,7 @@ def _openlrm(config: Mapping[str, Any], architecture: Architecture) -> LRMConfig
 
 
 def _encoder_sizes(config: Mapping[str, Any]) -> Any:
-    """Sizes of an encoder that is not the published one, under either of their names."""
+    """Sizes of a non-standard encoder, under either key."""
     return config.get("encoder_sizes") or config.get("_reduced_encoder")
 
 

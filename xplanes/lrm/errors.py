@@ -1,4 +1,4 @@
-"""The error that every problem with a Large Reconstruction Model is reported as."""
+"""The error class of Large Reconstruction Models."""
 
 
 class LRMError(ValueError):

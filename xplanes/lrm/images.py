@@ -1,4 +1,4 @@
-"""From pictures with transparency to what each model expects to see."""
+"""Preprocessing: from RGBA images to the input of each model."""
 
 from dataclasses import dataclass
 
@@ -11,17 +11,17 @@ from xplanes.lrm.config import Architecture
 from xplanes.lrm.errors import LRMError
 
 FOREGROUND_RATIO = 0.85
-"""Share of the picture's side that TripoSR wants the object to fill."""
+"""Share of the image side that the object fills in TripoSR's preprocessing."""
 
 
 @dataclass(frozen=True)
 class Crop:
-    """A square window on a picture; what lies beyond the picture is transparent.
+    """A square crop of an image; pixels outside the image are transparent.
 
     Attributes:
-        top: Row of the window's first pixel; negative above the picture.
-        left: Column of the window's first pixel; negative left of the picture.
-        side: Side of the window in pixels.
+        top: Row of the crop's first pixel; negative above the image.
+        left: Column of the crop's first pixel; negative left of the image.
+        side: Side of the crop in pixels.
         kept: Top, left, bottom and right (exclusive) of the part that is copied; all when None.
     """
 
@@ -31,13 +31,13 @@ class Crop:
     kept: tuple[int, int, int, int] | None = None
 
     def apply(self, rgba: Tensor) -> Tensor:
-        """The window's content, transparent black beyond the picture.
+        """Apply the crop; pixels outside the image are transparent black.
 
         Args:
-            rgba: Pictures, alpha last. [N, 4, H, W]
+            rgba: Images, alpha last. [N, 4, H, W]
 
         Returns:
-            The window. [N, 4, side, side]
+            Cropped images. [N, 4, side, side]
         """
         check_rgba(rgba)
         height, width = rgba.shape[-2:]
@@ -53,9 +53,9 @@ class Crop:
 
 
 def square_crop(height: int, width: int, zoom: float = 1.0) -> Crop:
-    """The smallest centred square around a picture, its side divided by ``zoom``.
+    """The smallest centred square around an image, its side divided by ``zoom``.
 
-    The margin is a whole number of pixels on every side, so that the middle stays the middle.
+    Margins are whole numbers of pixels and equal on opposite sides, so that the centre stays.
     """
     side = max(height, width)
     side += 2 * round(0.5 * side * (1 / zoom - 1))
@@ -65,8 +65,8 @@ def square_crop(height: int, width: int, zoom: float = 1.0) -> Crop:
 def foreground_crop(alpha: Tensor, ratio: float = FOREGROUND_RATIO) -> Crop:
     """The square in which the opaque part fills ``ratio`` of the side.
 
-    TripoSR's own rule, which loses the last row and column of the opaque part. For a video give the
-    largest alpha over time, so that all frames get one crop.
+    As in TripoSR, the last row and column of the opaque part are lost. For a video, pass the
+    maximum of alpha over time, so that all frames share one crop.
 
     Args:
         alpha: Opacity. [H, W]
@@ -79,7 +79,7 @@ def foreground_crop(alpha: Tensor, ratio: float = FOREGROUND_RATIO) -> Crop:
     """
     rows, columns = (alpha > 0).nonzero().unbind(1)
     if not len(rows) or rows.min() == rows.max() or columns.min() == columns.max():
-        raise LRMError("the picture is empty: no object can be cropped from its alpha channel")
+        raise LRMError("the image is empty: its alpha channel has no object to crop to")
     top, bottom = int(rows.min()), int(rows.max())
     left, right = int(columns.min()), int(columns.max())
     tight = max(bottom - top, right - left)
@@ -94,7 +94,7 @@ def foreground_crop(alpha: Tensor, ratio: float = FOREGROUND_RATIO) -> Crop:
 
 
 def composite_on(rgba: Tensor, background: float) -> Tensor:
-    """Put a grey value behind pictures. uint8 or 0 to 1, [N, 4, H, W] -> 0 to 1, [N, 3, H, W]"""
+    """Composite images (uint8 or in [0, 1]) on grey. [N, 4, H, W] -> [N, 3, H, W]"""
     check_rgba(rgba)
     rgba = rgba.float() / 255 if rgba.dtype == torch.uint8 else rgba
     colour, alpha = rgba[:, :3], rgba[:, 3:]
@@ -102,10 +102,10 @@ def composite_on(rgba: Tensor, background: float) -> Tensor:
 
 
 def prepare(rgba: Tensor, architecture: Architecture, size: int) -> Tensor:
-    """Pictures as a model's own code prepares them, without cropping.
+    """Preprocess images as in a model's published code, without cropping.
 
     Args:
-        rgba: Pictures, alpha last; uint8, or from 0 to 1. [N, 4, H, W]
+        rgba: Images, alpha last; uint8, or in [0, 1]. [N, 4, H, W]
         architecture: Family of the model.
         size: Side of the result in pixels.
 
@@ -116,7 +116,7 @@ def prepare(rgba: Tensor, architecture: Architecture, size: int) -> Tensor:
     """
     if architecture == "triposr":
         colour = composite_on(rgba, TRIPOSR_VIEW.background)
-        # TripoSR keeps 8 bits of the composite, cut off rather than rounded.
+        # TripoSR truncates the composite to 8 bits.
         return resize_triposr((colour * 255).floor() / 255, size)
     return resize_openlrm(composite_on(rgba, OPENLRM_VIEW.background), size)
 
@@ -135,10 +135,10 @@ def resize_triposr(images: Tensor, size: int) -> Tensor:
 
 
 def check_rgba(rgba: Tensor) -> None:
-    """Refuse what is no batch of pictures with alpha.
+    """Check that a tensor is a batch of RGBA images.
 
     Raises:
         LRMError: Naming the shape.
     """
     if rgba.ndim != 4 or rgba.shape[1] != 4:
-        raise LRMError(f"pictures have the shape {list(rgba.shape)}: must be [N, 4, H, W]")
+        raise LRMError(f"images have the shape {list(rgba.shape)}: must be [N, 4, H, W]")

@@ -1,9 +1,9 @@
-"""Names of tensors in published checkpoints, and what they are called here.
+"""Names of tensors in published checkpoints, and their names in this package.
 
 In a name, ``{i}`` stands for the number of a layer, ``{p}`` for weight or bias, and ``{e}`` for the
 even number of a linear layer with activations between: its half (``{h}``) counts the layers.
-A tensor with several names here holds them stacked along its first axis; None names what a
-checkpoint may hold and nothing here needs.
+A tensor with several names here contains them stacked along its first axis. None marks tensors that
+a checkpoint may contain and that are not needed.
 """
 
 import re
@@ -66,7 +66,7 @@ _OPENLRM: Names = {
     f"{_LAYER}.norm2.mlp.1.{{p}}": "blocks.{i}.norm2.modulation.1.{p}",
     f"{_LAYER}.norm3.norm.{{p}}": "blocks.{i}.norm3.norm.{p}",
     f"{_LAYER}.norm3.mlp.1.{{p}}": "blocks.{i}.norm3.modulation.1.{p}",
-    # Packed where image and triplane tokens are equally wide, separate where they are not.
+    # Packed if image and triplane tokens have the same width, else separate.
     f"{_LAYER}.cross_attn.in_proj_weight": _packed("blocks.{i}.image_attention", "weight"),
     f"{_LAYER}.cross_attn.q_proj_weight": "blocks.{i}.image_attention.query.weight",
     f"{_LAYER}.cross_attn.k_proj_weight": "blocks.{i}.image_attention.key.weight",
@@ -126,12 +126,12 @@ _PLACEHOLDERS = {"i": r"\d+", "e": r"\d*[02468]", "p": r"weight|bias"}
 
 
 def translator(architecture: Architecture) -> "Translator":
-    """What turns published names of a family into ours."""
+    """The name translation of a family."""
     return Translator(NAMES[architecture])
 
 
 class Translator:
-    """Turns published names into ours.
+    """Translates published names to the names in this package.
 
     Args:
         names: Published name to ours, with placeholders.
@@ -141,7 +141,7 @@ class Translator:
         self.patterns = [(_pattern(name), ours) for name, ours in names.items()]
 
     def __call__(self, name: str) -> tuple[str, ...] | None:
-        """Our names for a published tensor, none where it is not needed; None if unknown."""
+        """Names of a published tensor in this package; empty if not needed, None if unknown."""
         for pattern, ours in self.patterns:
             match = pattern.fullmatch(name)
             if match is None:

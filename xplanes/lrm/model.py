@@ -1,4 +1,4 @@
-"""What all Large Reconstruction Models here have in common."""
+"""Base class of the Large Reconstruction Models."""
 
 import copy
 
@@ -17,8 +17,8 @@ class LRM(nn.Module):
 
     Args:
         config: Sizes of the model.
-        view: The model's own camera and box.
-        decoder: From features [N, 3 C] to colour [N, 3] and density [N], the latter per unit
+        view: The model's canonical camera and box.
+        decoder: Maps features [N, 3 C] to colour [N, 3] and density [N], the latter per unit
             length of the model's frame.
 
     Attributes:
@@ -38,17 +38,17 @@ class LRM(nn.Module):
 
     @property
     def image_size(self) -> int:
-        """Side in pixels of the images that the model was trained on."""
+        """Side of the training images in pixels."""
         return self.config.image_size
 
     @property
     def half_side(self) -> float:
-        """Half the side of the cube in which the field lives, in the model's frame."""
+        """Half the side of the field's cube, in the model's frame."""
         return self.view.half_side
 
     @property
     def background(self) -> float:
-        """Grey value from 0 to 1 that must lie behind the object in input images."""
+        """Grey value of the background of input images, in [0, 1]."""
         return self.view.background
 
     def encode(self, images: Tensor, camera: Tensor | None = None) -> Tensor:
@@ -56,7 +56,7 @@ class LRM(nn.Module):
 
         Args:
             images: RGB from 0 to 1, composited on `background`. [N, 3, S, S]
-            camera: Cameras as OpenLRM reads them; the canonical one when None. [N, 16]
+            camera: OpenLRM's camera vectors; the canonical camera when None. [N, 16]
 
         Returns:
             Planes xy, xz, yz, first axis along the columns. [N, 3, C, H, H]
@@ -67,13 +67,13 @@ class LRM(nn.Module):
         raise NotImplementedError
 
     def prepare(self, rgba: Tensor) -> Tensor:
-        """Pictures with alpha as the model wants to see them. [N, 4, H, W] -> [N, 3, S, S]"""
+        """Preprocess RGBA images for the model. [N, 4, H, W] -> [N, 3, S, S]"""
         return prepare(rgba, self.config.architecture, self.image_size)
 
     def field_decoder(self, half_side: float | None = None) -> Decoder:
-        """A trainable copy of the decoder for a field in a cube [-1, 1]^3 of its own.
+        """A trainable copy of the decoder for a field in the cube [-1, 1]^3.
 
-        It differs in the unit of length that densities refer to.
+        Its densities refer to the unit of length of that cube.
 
         Args:
             half_side: Half the side of that cube in the model's frame; the model's own when None.
@@ -89,17 +89,17 @@ class LRM(nn.Module):
             tokens: Tokens of side R. [N, 3 R R, D]
 
         Returns:
-            Planes in the model's own layout. [N, 3, C, 2 R, 2 R]
+            Planes in the model's layout. [N, 3, C, 2 R, 2 R]
         """
         side = self.config.low_resolution
         grid = tokens.transpose(1, 2).unflatten(2, (3, side, side)).transpose(1, 2)
         return self.upsample(grid.flatten(0, 1)).unflatten(0, (len(tokens), 3))
 
     def check_images(self, images: Tensor) -> None:
-        """Refuse what is no batch of square images.
+        """Check that a tensor is a batch of square images.
 
         Raises:
-            LRMError: Naming the shape or type.
+            LRMError: If not; the message names the shape or type.
         """
         if images.ndim != 4 or images.shape[1] != 3 or images.shape[2] != images.shape[3]:
             raise LRMError(f"images have the shape {list(images.shape)}: must be [N, 3, S, S]")

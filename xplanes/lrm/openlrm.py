@@ -16,7 +16,7 @@ EPSILON = 1e-6
 
 
 class ModulatedNorm(nn.Module):
-    """A layer norm shifted and scaled by the camera.
+    """A layer norm whose shift and scale depend on the camera.
 
     Args:
         width: Channels D of the tokens.
@@ -88,7 +88,7 @@ class OpenLRM(LRM):
 
     @torch.no_grad()
     def encode(self, images: Tensor, camera: Tensor | None = None) -> Tensor:
-        """Predict triplanes; images may have any side that is a multiple of the patch."""
+        """Predict triplanes; the image side may be any multiple of the patch size."""
         self.check_images(images)
         patch = self.config.encoder.patch
         if images.shape[-1] % patch:
@@ -118,13 +118,13 @@ class OpenLRM(LRM):
 
 
 def turn_third_plane(planes: Tensor) -> Tensor:
-    """Swap rows and columns of the last plane: OpenLRM keeps "zy" where X-Planes has "yz".
+    """Swap rows and columns of the last plane: OpenLRM has "zy", X-Planes "yz".
 
     Args:
         planes: Planes xy, xz, zy or xy, xz, yz. [..., 3, C, H, H]
 
     Returns:
-        The same with the third plane turned. [..., 3, C, H, H]
+        The same with the third plane transposed. [..., 3, C, H, H]
     """
     xy, xz, third = planes.unbind(-4)
     return torch.stack([xy, xz, third.transpose(-2, -1)], dim=-4)

@@ -1,4 +1,4 @@
-"""Reading settings from a configuration that somebody else has published."""
+"""Reading settings from a published configuration."""
 
 import math
 import re
@@ -11,12 +11,12 @@ from xplanes.lrm.errors import LRMError
 
 @dataclass(frozen=True)
 class Reader:
-    """Takes settings out of a nested configuration and names what is missing or wrong.
+    """Reads settings from a nested configuration; errors name missing or invalid keys.
 
     Attributes:
         values: The section read from.
-        place: Keys that lead to it, for messages.
-        root: The whole configuration, for references; ``values`` where empty.
+        place: Key path of the section, for messages.
+        root: The whole configuration, for references; ``values`` if empty.
     """
 
     values: Mapping[str, Any]
@@ -24,14 +24,14 @@ class Reader:
     root: Mapping[str, Any] = field(default_factory=dict)
 
     def inner(self, key: str) -> "Reader":
-        """A section of this section."""
+        """A subsection."""
         value = self.values.get(key)
         if not isinstance(value, Mapping):
             raise LRMError(f"the model's configuration has no section {self.place}{key}")
         return Reader(value, f"{self.place}{key}.", self.root or self.values)
 
     def integer(self, key: str, default: int | None = None) -> int:
-        """A whole number above zero."""
+        """A positive integer."""
         value = self._resolve(self.values.get(key, default))
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             raise LRMError(
@@ -41,7 +41,7 @@ class Reader:
         return value
 
     def number(self, key: str, default: float) -> float:
-        """Any number."""
+        """A number."""
         value = self._resolve(self.values.get(key, default))
         try:
             return float(value)  # YAML 1.1 reads 1e-12 as text
@@ -51,7 +51,7 @@ class Reader:
             ) from None
 
     def positive(self, key: str, default: float) -> float:
-        """A finite number above zero."""
+        """A finite positive number."""
         value = self.number(key, default)
         if not 0 < value < math.inf:
             raise LRMError(
@@ -60,7 +60,7 @@ class Reader:
         return value
 
     def require(self, key: str, value: Any) -> None:
-        """Refuse a setting that differs from the only one that is supported."""
+        """Refuse any value other than the supported one."""
         found = self._resolve(self.values.get(key, value))
         if found != value:
             raise LRMError(
@@ -86,7 +86,9 @@ class Reader:
             found: Any = self.root or self.values
             for key in match[1].split("."):
                 if not isinstance(found, Mapping) or key not in found:
-                    raise LRMError(f"the model's configuration refers to {value}, which it lacks")
+                    raise LRMError(
+                        f"the model's configuration refers to {value}, which does not exist"
+                    )
                 found = found[key]
             value = found
         raise LRMError(f"the model's configuration refers to {value} in a circle")

@@ -12,10 +12,10 @@ from xplanes.lrm.model import LRM
 from xplanes.lrm.vit import Attention, GatedFeedForward
 
 CHORD = 2 * 0.999 * TRIPOSR_VIEW.half_side
-"""Length of the axis-aligned way through TripoSR's box, in its frame.
+"""Length of an axis-aligned ray through TripoSR's box, in its frame.
 
-TripoSR takes density per share of each ray's own way through the box. Divided by this length it
-becomes a density per unit length: exact for the central ray, nearly so for the others.
+TripoSR's density is relative to the length of each ray inside the box. Divided by this length, it
+is a density per unit length: exact for the central ray, approximate for the others.
 """
 
 
@@ -73,16 +73,16 @@ class TripoSR(LRM):
 
     @torch.no_grad()
     def encode(self, images: Tensor, camera: Tensor | None = None) -> Tensor:
-        """Predict triplanes; images are resized to the side that the model was trained on."""
+        """Predict triplanes; images are resized to the size of the training images."""
         self.check_images(images)
         if camera is not None:
-            raise LRMError("TripoSR takes no camera: leave camera=None")
+            raise LRMError("TripoSR has no camera input: camera must be None")
         return self.planes(self.transform(self.encoder(resize_triposr(images, self.image_size))))
 
     def transform(self, image: Tensor) -> Tensor:
         """Tokens of the triplane from those of the image. [N, K, E] -> [N, 3 R R, D]"""
         start = self.tokens.permute(0, 2, 3, 1).flatten(0, 2).expand(len(image), -1, -1)
-        # The statistics of a group run over all tokens.
+        # Group statistics are computed over all tokens.
         normalised = self.norm(start.transpose(1, 2)).transpose(1, 2)
         tokens = self.project_in(normalised)
         for block in self.blocks:

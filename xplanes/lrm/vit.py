@@ -10,7 +10,7 @@ from xplanes.lrm.config import EncoderConfig
 def attend(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
     """Scaled dot-product attention. [N, H, T, E], [N, H, K, E], [N, H, K, E] -> [N, H, T, E]
 
-    In bfloat16 on the CPU plain products, one sequence at a time so that its scores stay in the
+    In bfloat16 on the CPU, plain products, one sequence at a time so that its scores stay in the
     cache, take a third of the fused kernel's time (768 tokens, 2 heads of 64 channels).
     """
     if query.device.type != "cpu" or query.dtype != torch.bfloat16:
@@ -24,13 +24,13 @@ def attend(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
 
 
 class Attention(nn.Module):
-    """Multi-head attention over a token sequence, or from it to another one.
+    """Multi-head self-attention or cross-attention.
 
     Args:
         width: Channels D of the tokens, in and out.
         heads: Number of heads.
         head_width: Channels of each head; width / heads when None.
-        context_width: Channels E of the tokens attended to; the same as ``width`` when None.
+        context_width: Channels E of the context tokens; ``width`` when None.
         bias: Whether query, key and value have biases.
         out_bias: Whether the output has one.
     """
@@ -71,7 +71,7 @@ def feed_forward(width: int, hidden: int) -> nn.Sequential:
 
 
 class GatedFeedForward(nn.Module):
-    """A feed-forward layer in which half of the hidden values gate the other half (GEGLU).
+    """A gated feed-forward layer (GEGLU).
 
     Args:
         width: Channels D in and out.
@@ -84,7 +84,7 @@ class GatedFeedForward(nn.Module):
         self.contract = nn.Linear(hidden, width)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """Process each token alone. [N, T, D] -> [N, T, D]"""
+        """Process each token separately. [N, T, D] -> [N, T, D]"""
         value, gate = self.expand(tokens).chunk(2, dim=-1)
         return self.contract(value * F.gelu(gate))
 
@@ -97,7 +97,7 @@ def interpolate_positions(position: Tensor, side: int, *, antialias: bool) -> Te
             [1, 1 + G G, D]
         side: Patches along each side of the image.
         antialias: DINOv2's rule: antialiased, to the exact size. Otherwise DINO's, which maps
-            coordinates by the factor (side + 0.1) / G; the 0.1 changes the result by percents.
+            coordinates by the factor (side + 0.1) / G; the 0.1 changes the result by some percent.
 
     Returns:
         The embedding for side x side patches. [1, 1 + side side, D]
@@ -116,7 +116,7 @@ def interpolate_positions(position: Tensor, side: int, *, antialias: bool) -> Te
 
 
 class Block(nn.Module):
-    """Self-attention and a feed-forward layer, each after a norm and added to its input.
+    """A pre-norm transformer block: self-attention and a feed-forward layer, both residual.
 
     Args:
         config: Sizes of the encoder.
@@ -145,7 +145,7 @@ class VisionTransformer(nn.Module):
     """An image encoder: DINO ViT (OpenLRM 1.0, TripoSR) or DINOv2 with registers (OpenLRM 1.1).
 
     Args:
-        config: Sizes and the points in which the two differ.
+        config: Sizes, and the options in which the two differ.
     """
 
     def __init__(self, config: EncoderConfig) -> None:

@@ -22,12 +22,12 @@ PATIENCE_SECONDS = 0.8
 
 
 class Probe:
-    """An attempt to connect, made in the background.
+    """A connection attempt in the background.
 
-    The hub's own client tries again for half a minute before it gives up.
+    The hub's own client retries for half a minute.
 
     Args:
-        url: Address of the server, http or https. Through a proxy where the environment names one.
+        url: Address of the server, http or https. A proxy from the environment is used.
     """
 
     def __init__(self, url: str) -> None:
@@ -36,7 +36,7 @@ class Probe:
         self._thread.start()
 
     def answers(self) -> bool:
-        """Whether the server, or the proxy, took the connection in time."""
+        """Whether the server, or the proxy, accepted the connection in time."""
         self._thread.join(PATIENCE_SECONDS)
         return self._answered
 
@@ -47,7 +47,7 @@ class Probe:
             parts = urlsplit(proxy if "//" in proxy else f"//{proxy}")
         port = parts.port or (443 if parts.scheme == "https" else 80)
         try:
-            # The name is looked up first, for which no time limit can be set: hence the thread.
+            # The name lookup has no time limit, hence the thread.
             with socket.create_connection((parts.hostname or "", port), PATIENCE_SECONDS):
                 self._answered = True
         except OSError:
@@ -59,15 +59,15 @@ CONFIG_FILES = ("config.json", "config.yaml")
 
 @dataclass(frozen=True)
 class WeightSource:
-    """Where the weights of a model come from.
+    """Source of the weights of a model.
 
     Attributes:
         architecture: A name of `xplanes.lrm.config.PUBLISHED`.
         repository: On the Hugging Face hub, owner/name.
-        file: Name of the file there.
-        revision: Branch, tag or commit there.
-        licence: Of the weights.
-        megabytes: Size of the file.
+        file: Name of the file in the repository.
+        revision: Branch, tag or commit of the repository.
+        licence: Licence of the weights.
+        megabytes: Size of the file in MB.
         weights: A local file to use instead; None for the hub.
         config: A local config.json or config.yaml for weights of other sizes; None for the
             published sizes.
@@ -93,8 +93,8 @@ def load_weights(
 ) -> LRM:
     """Load the weights of a model from a file that `find_weights` found.
 
-    Weights of other than the published sizes need their configuration: the file that
-    ``source.config`` names, or one named config.json or config.yaml beside the weights.
+    Weights of other than the published sizes need a configuration: ``source.config``, or a
+    config.json or config.yaml in the folder of the weights.
 
     Raises:
         LRMError: If they do not fit the architecture.
@@ -105,10 +105,10 @@ def load_weights(
         return load({"architecture": source.architecture}, path)
     except MismatchError as problem:
         beside = [path.parent / name for name in CONFIG_FILES if (path.parent / name).is_file()]
-        # A published model of another size is a mistake, whatever lies beside it.
+        # A published model of another size is an error, even if a configuration exists.
         if problem.fits or not beside or source.weights is None:
             raise
-        announce(f"{path} has sizes of its own: using {beside[0]}")
+        announce(f"{path} has other sizes than published: using {beside[0]}")
         return load(read_config(beside[0]), path)
 
 
@@ -119,19 +119,19 @@ def find_weights(
     endpoint: str | None = None,
     cache: Path | None = None,
 ) -> Path:
-    """The file with the weights of a model, downloaded if need be.
+    """Find the weights of a model; download them if necessary.
 
     Args:
-        source: Where the weights come from.
-        announce: Takes a line before anything is downloaded.
-        endpoint: Address of the hub; the usual one when None.
-        cache: The hub's cache; the usual one when None.
+        source: Source of the weights.
+        announce: Receives a message before a download.
+        endpoint: Address of the hub; the default when None.
+        cache: The hub's cache; the default when None.
 
     Returns:
         A local file, or one in the hub's cache.
 
     Raises:
-        LRMError: If the local file is missing, or the hub cannot be reached or does not have it.
+        LRMError: If the local file is missing, the hub cannot be reached, or the hub lacks it.
     """
     if source.weights is not None:
         if not source.weights.is_file():
@@ -153,7 +153,7 @@ def find_weights(
     )
     try:
         return Path(hub.hf_hub_download(**place, cache_dir=cache, endpoint=endpoint))
-    except Exception as problem:  # the hub's errors have no class in common
+    except Exception as problem:  # the hub's errors have no common class
         reason = " ".join(str(problem).split())[:300]
         raise LRMError(
             f"{source.url} cannot be downloaded ({type(problem).__name__}: {reason}). "
@@ -176,13 +176,13 @@ def read_config(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, yaml.YAMLError) as problem:
         raise LRMError(f"{path} cannot be read: {problem}") from problem
     if not isinstance(content, dict):
-        raise LRMError(f"{path} is no configuration: it holds no keys")
+        raise LRMError(f"{path} is not a configuration: it has no keys")
     return content
 
 
 def _advice(source: WeightSource) -> str:
     return (
         f"{source.architecture} needs weights of {source.megabytes} MB (licence {source.licence}): "
-        f"fetch {source.url} where there is a network and set lrm.weights=FILE, or start without "
-        f"them with lrm=none"
+        f"download {source.url} on a machine with a network and set lrm.weights=FILE, or train "
+        f"without them: lrm=none"
     )

@@ -124,14 +124,14 @@ class RandomSettings(InitialiserSettings):
 class PreparationSettings(Settings):
     """What happens before training, for an initialisation that is not random."""
 
-    cache: str | None  # Folder for finished stages; null computes them anew.
+    cache: str | None  # Folder of cached stages; null disables the cache.
     frames: Count  # Timesteps of the fixed-view video.
-    fixed_view: Literal["auto", "video", "train"]  # The scene's video, or one that a field renders.
-    fixed_view_model: str  # The model that renders it: a file of conf/model.
-    fixed_view_seconds: Positive  # Training clock of the field that renders it.
-    fixed_view_steps: Count  # Its steps at most.
-    azimuth: float | None  # The camera that renders it, degrees from x to y; null: an axis.
-    elevation: Annotated[float, Range(-90, 90)]  # Its height angle in degrees.
+    fixed_view: Literal["auto", "video", "train"]  # The scene's video, or one rendered by a field.
+    fixed_view_model: str  # Model of that field: a file of conf/model.
+    fixed_view_seconds: Positive  # Training time of that field in seconds.
+    fixed_view_steps: Count  # Maximum number of training steps of that field.
+    azimuth: float | None  # Azimuth of the fixed view in degrees; null: a world axis.
+    elevation: Annotated[float, Range(-90, 90)]  # Elevation of the fixed view in degrees.
 
     def check(self) -> None:
         models = sorted(path.stem for path in (CONF / "model").glob("*.yaml"))
@@ -146,16 +146,16 @@ class DecompositionSettings(Settings):
     """From a triplane sequence to low-rank and sparse parts, and from these to planes."""
 
     name: str  # Name of the settings.
-    method: Literal["adaptive", "growing", "admm", "exact"]  # admm: the paper's; exact: slow.
-    sparsity_weight: Positive | Literal["auto"]  # Weight of the sparse part; auto fits the size.
+    method: Literal["adaptive", "growing", "admm", "exact"]  # admm: the paper's; exact: reference.
+    sparsity_weight: Positive | Literal["auto"]  # Weight of the sparse part; auto: from the size.
     penalty: Positive  # Penalty of ADMM; the initial one for adaptive.
-    scale: Literal["rms", "none"]  # Unit of the penalty: rms of the features, or none.
-    tolerance: Positive  # Relative residual at which it stops.
-    max_iterations: Count  # Iterations at most.
-    static: Literal["middle", "median", "mean"]  # Space planes from the low-rank part.
+    scale: Literal["rms", "none"]  # Unit of the penalty: rms of the features, or 1.
+    tolerance: Positive  # Relative residual of convergence.
+    max_iterations: Count  # Maximum number of iterations.
+    static: Literal["middle", "median", "mean"]  # Space planes: frame T/2, median or mean.
     dynamic: Literal["random", "rank1"]  # Time planes: rank1 fits the sparse part.
-    noise: Annotated[float, Range(0)]  # Standard deviation of the time planes' noise.
-    cache: bool  # Keep the parts in preparation.cache (twice the triplanes' size).
+    noise: Annotated[float, Range(0)]  # Standard deviation of the noise on time planes.
+    cache: bool  # Cache both parts (twice the size of the triplanes).
 
     def check(self) -> None:
         if self.dynamic == "random" and self.noise == 0:

@@ -21,10 +21,10 @@ from xplanes.streams import Stream, TrainingState, initial_values
 class KPlanesLoss(Settings):
     """Weights of the terms of the loss beyond the colour's mean squared error."""
 
-    variation: Variation  # Form of the total variation: coded, or corrected (as in the paper).
-    total_variation: Weight  # Of squared differences between texels.
-    time_smoothness: Weight  # Of squared second differences along time.
-    time_identity: Weight  # Of the time planes' distance from 1.
+    variation: Variation  # Total variation as in the released code, or corrected (as in the paper).
+    total_variation: Weight  # Weight of total variation.
+    time_smoothness: Weight  # Weight of time smoothness (squared second differences).
+    time_identity: Weight  # Weight of the distance of time planes from 1.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,17 +33,17 @@ class KPlanesSettings(ModelSettings):
 
     field_class: ClassVar = KPlanes
 
-    variant: Literal["hybrid", "explicit"]  # MLPs; or linear, colour bases by direction.
-    half_side: Positive | None  # Half its cube's side, about the origin; null: the scene's.
-    resolution: Count  # Texels along each space axis, at the first scale.
-    scales: list[Count]  # Factors on the resolution; the time axis keeps its rows.
+    variant: Literal["hybrid", "explicit"]  # MLP decoder, or linear decoder with learned bases.
+    half_side: Positive | None  # Half the side of a cube at the origin; null: the scene's cube.
+    resolution: Count  # Texels along each space axis at the first scale.
+    scales: list[Count]  # Factors on the space resolution.
     time_resolution: Count | None  # Rows of time; null: half the training views.
     channels: Count  # Channels of each plane and scale.
-    space_low: float  # Least initial value of the space planes.
-    space_high: float  # Largest one; time planes are initialised to 1.
+    space_low: float  # Lower bound of the uniform initialisation of space planes.
+    space_high: float  # Upper bound. Time planes are initialised to 1.
     width: Count  # Neurons of the hidden layers.
-    learning_rate: Positive  # Of all parameters.
-    warmup_steps: Steps  # Steps until the full learning rate; then half a cosine to 0.
+    learning_rate: Positive  # Learning rate of all parameters.
+    warmup_steps: Steps  # Warm-up steps, followed by cosine decay to 0.
     loss: KPlanesLoss
 
     def check(self) -> None:

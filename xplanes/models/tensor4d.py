@@ -24,22 +24,22 @@ class Tensor4DDensitySettings(ModelSettings):
 
     field_class: ClassVar = Tensor4DDensity
 
-    resolution: Count  # Texels along each space axis, coarse level.
-    fine_resolution: Count  # The same, fine level.
+    resolution: Count  # Texels along each space axis of the coarse planes.
+    fine_resolution: Count  # Texels along each space axis of the fine planes.
     time_resolution: Count  # Rows of time.
     channels: Count  # Channels of the coarse planes.
     fine_channels: Count  # Channels of the fine planes.
     width: Count  # Neurons of the hidden layers.
-    point_octaves: Steps  # Frequencies of the positions' encoding.
-    time_octaves: Steps  # Frequencies of the time's encoding.
-    direction_octaves: Steps  # Frequencies of the directions' encoding.
-    fine_from: Steps  # Step at which the fine level joins.
-    blur_until: Steps  # Steps in which planes are averaged down before they are read
-    blur_resolution: Count  # to this many texels.
-    learning_rate: Positive  # Of the networks.
-    plane_learning_rate: Positive  # Of the planes.
-    warmup_steps: Steps  # Steps until the full learning rate; then a cosine
-    final_rate: Share  # to this share of it.
+    point_octaves: Steps  # Frequencies of the position encoding.
+    time_octaves: Steps  # Frequencies of the time encoding.
+    direction_octaves: Steps  # Frequencies of the direction encoding.
+    fine_from: Steps  # Step from which the fine planes are used.
+    blur_until: Steps  # Step until which planes are downsampled before the lookup.
+    blur_resolution: Count  # Texels along each axis of downsampled planes.
+    learning_rate: Positive  # Learning rate of the networks.
+    plane_learning_rate: Positive  # Learning rate of the planes.
+    warmup_steps: Steps  # Warm-up steps, followed by cosine decay.
+    final_rate: Share  # Final learning rate relative to the peak.
 
     def planes(self, groups: Groups, *, fine: bool) -> HierarchicalPlanes:
         """Planes of the coarse level, and of the fine one."""
@@ -68,11 +68,11 @@ class Tensor4DDensitySettings(ModelSettings):
 class Tensor4DLoss(Settings):
     """Weights of the terms of the loss beyond the colour's error."""
 
-    masked: bool  # Compare colours in the silhouettes alone.
-    eikonal: Weight  # Of the gradient's distance from length 1.
-    opacity: Weight  # Of the cross entropy between opacity and silhouette.
-    smoothness: Weight  # Of the change of features over a small distance.
-    smoothness_distance: Positive  # That distance, the cube being 2 wide.
+    masked: bool  # Restrict the colour loss to the silhouettes.
+    eikonal: Weight  # Weight of the eikonal loss.
+    opacity: Weight  # Weight of the cross-entropy of opacity and silhouette.
+    smoothness: Weight  # Weight of the change of features over a small distance.
+    smoothness_distance: Positive  # That distance; the cube is 2 wide.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,8 +81,8 @@ class Tensor4DSettings(Tensor4DDensitySettings):
 
     field_class: ClassVar = Tensor4D
 
-    flow_planes: bool  # Train the flow's planes, which the released code forgets.
-    radius: Positive  # Of the initial sphere, the cube being 2 wide.
+    flow_planes: bool  # Train the flow planes; the released code does not.
+    radius: Positive  # Radius of the initial sphere; the cube is 2 wide.
     sharpness: Positive  # The surface's initial width is exp(-10 times this).
     loss: Tensor4DLoss
 

@@ -27,8 +27,8 @@ LEAST_LIGHT = 1e-6
 class TiNeuVoxLoss(Settings):
     """Weights of the terms of the loss beyond the colour's mean squared error."""
 
-    entropy: Weight  # Of the entropy of the light that passes each ray.
-    sample_colour: Weight  # Of the squared errors of single samples' colours.
+    entropy: Weight  # Weight of the entropy of rays' opacity.
+    sample_colour: Weight  # Weight of the squared colour errors of single samples.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,23 +37,23 @@ class TiNeuVoxSettings(ModelSettings):
 
     field_class: ClassVar = TiNeuVox
 
-    near: Weight  # The grid's box holds what the cameras see from here, in world units,
-    far: Positive  # to here,
-    margin: Positive  # and this many times as much.
-    half_side: Positive | None  # Half the side of a cube about the origin instead of that.
-    resolution: Count  # Cube root of the number of cells in the end.
-    channels: Count  # Channels of a cell.
+    near: Weight  # Near bound of the camera frusta that define the grid's bounding box.
+    far: Positive  # Far bound of these frusta, in world units.
+    margin: Positive  # Factor on the size of the bounding box.
+    half_side: Positive | None  # Half the side of a cube at the origin; null: the bounding box.
+    resolution: Count  # Cube root of the final number of cells.
+    channels: Count  # Channels of each cell.
     width: Count  # Neurons of the hidden layers.
     alpha_start: Annotated[float, Range(0, 1, open=True)]  # Initial opacity of one cell.
-    point_octaves: Steps  # Frequencies of the positions' encoding.
-    time_octaves: Steps  # Frequencies of the time's encoding.
-    direction_octaves: Steps  # Frequencies of the directions' encoding.
-    feature_octaves: Steps  # Frequencies of the features' encoding.
+    point_octaves: Steps  # Frequencies of the position encoding.
+    time_octaves: Steps  # Frequencies of the time encoding.
+    direction_octaves: Steps  # Frequencies of the direction encoding.
+    feature_octaves: Steps  # Frequencies of the feature encoding.
     grow_at: list[int]  # Steps at which the number of cells doubles.
-    grid_learning_rate: Positive  # Of the grid.
-    deformation_learning_rate: Positive  # Of the deformation.
-    network_learning_rate: Positive  # Of the other networks.
-    decay_steps: Count  # Steps in which learning rates fall to a tenth.
+    grid_learning_rate: Positive  # Learning rate of the grid.
+    deformation_learning_rate: Positive  # Learning rate of the deformation network.
+    network_learning_rate: Positive  # Learning rate of the other networks.
+    decay_steps: Count  # Steps over which learning rates decay to a tenth.
     loss: TiNeuVoxLoss
 
     def check(self) -> None:

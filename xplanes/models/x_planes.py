@@ -34,27 +34,27 @@ class DecoderSettings(Settings):
     """The MLP from features to colour and density."""
 
     width: Count  # Neurons of each hidden layer.
-    hidden: Steps  # Hidden layers.
-    activation: Literal["relu", "silu"]  # Between layers.
+    hidden: Steps  # Number of hidden layers.
+    activation: Literal["relu", "silu"]  # Activation between layers.
     density: Literal["softplus", "exp"]  # Activation of the density.
     density_scale: Positive  # Factor on the density.
     density_bias: float  # Initial bias of the density logit; lower is emptier.
-    colour_margin: Weight  # How far colours may pass 0 and 1.
-    freeze: bool  # Keep the decoder as it is initialised.
+    colour_margin: Weight  # Margin by which colours may exceed [0, 1].
+    freeze: bool  # Do not train the decoder.
 
 
 @dataclass(frozen=True, kw_only=True)
 class XPlanesLoss(Settings):
     """Weights of the terms of the loss beyond the colour's mean squared error."""
 
-    total_variation: Weight  # Of squared differences between texels.
-    time_smoothness: Weight  # Of squared second differences along time.
-    time_magnitude: Weight  # Of squared values of the time planes.
-    sparse_weight: Weight  # Of L_r: time planes' products near the sparse part (Eq. 17).
-    sparse_frames: Count  # Random timesteps per application of L_r.
-    initial_weight: Weight  # Of the distance from initialised planes, over the views squared.
-    initial_steps: Count | None  # Steps times views until L_r and that fade out; null: never.
-    every: Count  # Steps between applications of these, at as many times the weight.
+    total_variation: Weight  # Weight of total variation.
+    time_smoothness: Weight  # Weight of time smoothness (squared second differences).
+    time_magnitude: Weight  # Weight of the squared values of time planes.
+    sparse_weight: Weight  # Weight of L_r (X-Planes, Eq. 17).
+    sparse_frames: Count  # Random timesteps per evaluation of L_r.
+    initial_weight: Weight  # Weight of the distance to the initial planes; divided by views^2.
+    initial_steps: Count | None  # Steps times views over which both fade out; null: never.
+    every: Count  # Steps between evaluations of these terms; weights are scaled to match.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,17 +67,17 @@ class XPlanesSettings(ModelSettings):
 
     plane_set: Literal["six", "nine", "three"]
     resolution: Count  # Texels along each space axis.
-    time_resolution: Count | None  # Rows of time; null: half as many as distinct times.
+    time_resolution: Count | None  # Rows of time; null: half the number of distinct times.
     channels: Count  # Channels of each plane.
-    space_scale: Weight  # Standard deviation of the space planes at a random initialisation.
-    time_scale: Weight  # Standard deviation of the time planes at a random initialisation.
+    space_scale: Weight  # Standard deviation of randomly initialised space planes.
+    time_scale: Weight  # Standard deviation of randomly initialised time planes.
     decoder: DecoderSettings
     loss: XPlanesLoss
     plane_lr: Positive  # Learning rate of the space planes.
     time_lr: Positive  # Learning rate of the time planes.
     decoder_lr: Positive  # Learning rate of the decoder.
-    warmup_steps: Steps  # Steps until the full learning rate.
-    final_lr: Share  # Share of the learning rate left at the end.
+    warmup_steps: Steps  # Warm-up steps of the learning rates.
+    final_lr: Share  # Final learning rate relative to the initial one.
 
     @property
     def is_static(self) -> bool:

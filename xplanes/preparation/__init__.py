@@ -1,4 +1,4 @@
-"""From a scene or a file to what a field is initialised with, in stages that are kept."""
+"""From a scene or a file to the initialisation of a field, in cached stages."""
 
 from xplanes.preparation.sequence import TriplaneSequence, load_triplanes, save_triplanes
 

@@ -1,7 +1,7 @@
-"""Finished stages on disk, found by what went into them and never trusted unseen.
+"""A content-addressed cache of preparation stages on disk.
 
 An entry is one file of tensors and builtins. Its name is a hash of the stage's inputs, and it
-carries a checksum of its content: what is truncated, changed or of another version is made anew.
+contains a checksum: entries that are truncated, altered or of another version are recomputed.
 """
 
 import hashlib
@@ -26,21 +26,21 @@ from xplanes.locks import in_turn
 logger = logging.getLogger(__name__)
 
 DAY = 86_400.0
-"""Seconds after which an unfinished entry is nobody's any more."""
+"""Age in seconds from which an unfinished entry counts as abandoned."""
 
 VERSION = 3
-"""Raised when a stage would come out differently from the same inputs."""
+"""Version of the stages; increase it whenever a stage gives a different result."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """The outcome of a stage.
+    """Result of a stage.
 
     Attributes:
         content: Tensors and builtins.
-        seconds: How long it took to make, also where it came from the cache; without warming up.
+        seconds: Time to compute it, also if it came from the cache; warm-up excluded.
         cached: Whether it came from the cache.
-        key: Hash of what went into it; empty where nothing is kept.
+        key: Hash of its inputs; empty if nothing is cached.
     """
 
     content: dict[str, Any]
@@ -50,17 +50,17 @@ class Stage:
 
 
 class StageCache:
-    """A folder of finished stages.
+    """A folder of cached stages.
 
     Args:
-        folder: Where they are kept; None keeps nothing and finds nothing.
+        folder: The folder; None disables the cache.
     """
 
     def __init__(self, folder: Path | None) -> None:
         self.folder = folder
         self.writable = folder is not None and _takes_files(folder)
         if folder is not None and not self.writable:
-            logger.warning("preparation.cache=%s cannot be written: stages are not kept", folder)
+            logger.warning("preparation.cache=%s cannot be written: stages are not cached", folder)
 
     def stage(
         self,
@@ -71,14 +71,14 @@ class StageCache:
         keep: bool = True,
         alone: bool = False,
     ) -> Stage:
-        """Fetch a stage, or make and keep it.
+        """Load a stage from the cache, or compute and store it.
 
         Args:
-            name: Name of the stage, part of the file's name.
-            inputs: All that the outcome depends on: tensors, numbers, strings, lists, dicts.
-            make: Makes it: tensors and builtins in a dict.
-            keep: Whether this stage may be fetched and kept.
-            alone: Whether a second process that wants the same stage waits for the first one.
+            name: Name of the stage, part of the file name.
+            inputs: Everything that the result depends on: tensors, numbers, strings, lists, dicts.
+            make: Computes it: a dict of tensors and builtins.
+            keep: Whether to use the cache for this stage.
+            alone: Whether a second process waits for the first one that computes the same stage.
         """
         path, key = self._path(name, inputs)
         path = path if keep else None
@@ -95,11 +95,11 @@ class StageCache:
         return Stage(content, seconds, False, key)
 
     def find(self, name: str, inputs: Any) -> Stage | None:
-        """A stage that was kept, or None where it is not there or cannot be used."""
+        """A cached stage, or None if it does not exist or cannot be used."""
         return _find(*self._path(name, inputs))
 
     def keep(self, name: str, inputs: Any, content: dict[str, Any], seconds: float) -> None:
-        """Keep a stage that was just made."""
+        """Store a stage that was just computed."""
         path, key = self._path(name, inputs)
         self._put(path, key, content, seconds)
 
@@ -109,9 +109,9 @@ class StageCache:
 
     @contextmanager
     def workshop(self, name: str, inputs: Any) -> Iterator[Path]:
-        """A folder for the unfinished work of a stage, found again after an interruption.
+        """A folder for intermediate results of a stage, found again after an interruption.
 
-        It is removed when the block ends well.
+        It is removed when the block ends without an error.
         """
         path, _ = self._path(name, inputs)
         if path is None or not self.writable:
@@ -154,7 +154,7 @@ class _UnusableError(Exception):
 def _read(path: Path, key: str) -> tuple[dict[str, Any], float]:
     try:
         payload = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # A damaged file fails in any of a dozen ways.
+    except Exception as error:  # A damaged file raises many kinds of errors.
         raise _UnusableError(f"damaged ({type(error).__name__})") from error
     if not isinstance(payload, dict):
         raise _UnusableError("no entry of this cache")
@@ -173,7 +173,7 @@ def _read(path: Path, key: str) -> tuple[dict[str, Any], float]:
 
 
 def _write(path: Path, key: str, content: dict[str, Any], seconds: float) -> None:
-    """Keep an entry; failing to is no reason to stop a run."""
+    """Store an entry; a failure does not stop the run."""
     payload = {
         "version": VERSION,
         "key": key,
@@ -186,11 +186,11 @@ def _write(path: Path, key: str, content: dict[str, Any], seconds: float) -> Non
         with replacing(path) as temporary:
             torch.save(payload, temporary)
     except (OSError, RuntimeError) as error:
-        logger.warning("%s could not be written (%s): it is not kept", path, error)
+        logger.warning("%s could not be written (%s): it is not cached", path, error)
 
 
 def fingerprint(value: Any) -> str:
-    """A hash of tensors (type, shape and bytes) and builtins, in any nesting.
+    """Hash of nested tensors (type, shape and bytes) and builtins.
 
     Raises:
         TypeError: For a value of any other kind.
@@ -201,7 +201,7 @@ def fingerprint(value: Any) -> str:
 
 
 def _feed(digest: Any, value: Any) -> None:
-    # Lengths and kinds come first, so that no two values give the same bytes.
+    # Lengths and types come first, so that different values give different bytes.
     if isinstance(value, Tensor):
         digest.update(f"tensor {value.dtype} {tuple(value.shape)}:".encode())
         for part in value.detach().reshape(-1).split(1 << 24):

@@ -1,4 +1,4 @@
-"""Frames of the fixed view to triplanes, each distinct frame once."""
+"""LRM encoding of the fixed-view video: one forward pass per distinct frame."""
 
 import sys
 import time
@@ -20,8 +20,8 @@ class Encoded:
     Attributes:
         triplanes: One per frame, on the CPU. [T, 3, C, H, H]
         distinct: Number of frames that differ.
-        cached: How many of these came from the cache.
-        seconds: Time that the distinct frames took to encode, now or when they were kept.
+        cached: Number of these that came from the cache.
+        seconds: Time to encode the distinct frames, now or when they were cached.
     """
 
     triplanes: Tensor
@@ -41,20 +41,20 @@ def encode(
     batch: int,
     bf16: bool = False,
 ) -> Encoded:
-    """Run the model on every distinct frame.
+    """Encode every distinct frame.
 
-    A frame's triplane is kept as soon as it is there, so that an interrupted video goes on where it
-    stopped. Beyond the result, memory holds one batch.
+    Each triplane is cached as soon as it is computed, so that an interrupted run resumes where it
+    stopped. Besides the result, memory use is one batch.
 
     Args:
         model: The model.
         key: Hash of its weights and sizes.
         frames: Premultiplied RGBA. uint8 [T, H, W, 4]
-        crop: What the model is shown of them.
-        cache: Where triplanes are kept.
-        device: Where they are computed.
-        batch: Frames at a time.
-        bf16: Multiply in bfloat16.
+        crop: Crop that the model is given.
+        cache: Cache of the triplanes.
+        device: Device of the model.
+        batch: Frames per batch.
+        bf16: Use bfloat16 products.
     """
     places: dict[str, list[int]] = {}
     for number, frame in enumerate(frames):
@@ -96,7 +96,7 @@ def _inputs(
 
 
 def straight_alpha(frames: Tensor) -> Tensor:
-    """Premultiplied bytes as colours that are not multiplied by alpha, from 0 to 1.
+    """Premultiplied bytes to straight alpha, in [0, 1].
 
     Args:
         frames: Premultiplied RGBA. uint8 [T, H, W, 4]
@@ -114,6 +114,6 @@ def _progress(missing: list[str], batch: int) -> Any:
     from tqdm import tqdm
 
     chunks = [missing[start : start + batch] for start in range(0, len(missing), batch)]
-    # A bar needs a terminal: piped, it would fill the log.
+    # Show the progress bar on a terminal only; in a pipe it would fill the log.
     wanted = sys.stderr.isatty()
     return tqdm(chunks, desc="triplanes", unit="batch", leave=False, disable=not wanted)

@@ -1,7 +1,7 @@
 """The fixed-view video: one camera, all timesteps.
 
-A scene may bring it. Otherwise a field is trained on the scene for a short time and rendered from
-where the Large Reconstruction Model expects its camera to stand.
+A scene may provide it. Otherwise a field is trained on the scene for a short time and rendered from
+the canonical camera of the Large Reconstruction Model.
 """
 
 import math
@@ -24,20 +24,20 @@ from xplanes.training.fit import fit_quietly
 from xplanes.training.module import RadianceModule
 
 OBLONG = 0.01
-"""Share by which the two focal lengths of a video may differ: LRMs expect square pixels."""
+"""Largest relative difference of the two focal lengths: LRMs expect square pixels."""
 
 OFF_CENTRE = 0.02
-"""Share of a video's width by which its principal point may be off its middle, likewise."""
+"""Largest offset of the principal point from the image centre, as a share of the width."""
 
 CHECKPOINT_EVERY = 250
-"""Steps between checkpoints of that field."""
+"""Steps between checkpoints of the field that renders the fixed-view video."""
 
 
 def rendering_method(method: Method) -> Method:
-    """How the field that renders the video is trained: by its model's defaults.
+    """Settings of the field that renders the fixed-view video: the defaults of its model.
 
-    The run's own model would make ablations of it differ in their video too. Where training and
-    images may be sampled at different densities, training's does: a model looks at few pixels.
+    The run's own model is not used, because ablations of it would also change the video. Images are
+    rendered with the number of samples of training steps: the LRM sees images of few pixels.
     """
     name = method.preparation.fixed_view_model
     found = Method.read(compose_plain("train", [f"model={name}", "lrm=none"]))
@@ -49,13 +49,13 @@ def rendering_method(method: Method) -> Method:
 
 @dataclass(frozen=True)
 class FixedView:
-    """The video.
+    """The fixed-view video.
 
     Attributes:
-        views: Frames of one camera at timesteps that fill [0, 1] evenly; one where nothing moves.
-        target: World point in the middle of the scene. [3]
-        seconds: Time that it took to make.
-        words: Where it comes from, in a few words.
+        views: Frames of one camera, evenly spaced over [0, 1]; one frame for a static scene.
+        target: Centre of the scene in world coordinates. [3]
+        seconds: Time to produce it.
+        words: Its source, for messages.
     """
 
     views: Views
@@ -67,18 +67,18 @@ class FixedView:
 def fixed_view(
     method: Method, place: Place, view: CanonicalView, size: int, cache: StageCache
 ) -> FixedView:
-    """The scene's own video, or one that a field renders.
+    """The scene's own video, or one rendered by a field.
 
     Args:
         method: The run's settings.
         place: The scene and its frame.
-        view: The camera that the model believes in; a rendered video is taken by it.
-        size: Pixels per side that the model looks at; more are not rendered.
-        cache: Where a rendered video is kept.
+        view: Canonical camera of the LRM; a rendered video uses it.
+        size: Image size of the LRM in pixels, the largest size that is rendered.
+        cache: Cache of rendered videos.
 
     Raises:
-        SceneError: If the scene's video is asked for and there is none, it leaves out timesteps, or
-            its camera is none that models know.
+        SceneError: If the scene's video is requested and missing, lacks timesteps, or has a camera
+            that LRMs do not support.
     """
     options, scene, frame = method.preparation, place.scene, place.frame
     if options.fixed_view == "video" and scene.video is None:
@@ -96,50 +96,50 @@ def fixed_view(
 
 
 def check_camera(video: Views) -> None:
-    """Refuse a video that is not of one camera with square pixels and centred images.
+    """Check that a video has one camera, square pixels and a centred principal point.
 
     Raises:
-        SceneError: With what the camera is like.
+        SceneError: If not; the message describes the camera.
     """
     intrinsics = video.intrinsics
-    way_out = "set preparation.fixed_view=train to do without it, or lrm=none"
+    way_out = "set preparation.fixed_view=train to render another video, or lrm=none"
     if not intrinsics.is_shared:
         raise SceneError(
             "the frames of the fixed camera's video differ in focal length, principal point or "
-            f"size, but models take them for those of one camera: {way_out}"
+            f"size, but LRMs expect one camera: {way_out}"
         )
     (height, width), middle = video.size(0), 0.5 * intrinsics.size[0].flip(0)
     focal_x, focal_y = intrinsics.focal[0].tolist()
     if abs(focal_x / focal_y - 1) > OBLONG:
         raise SceneError(
             f"the fixed camera's focal lengths are {focal_x:.6g} and {focal_y:.6g} pixels along x "
-            f"and y, but models expect square pixels: resize its frames, or {way_out}"
+            f"and y, but LRMs expect square pixels: resize its frames, or {way_out}"
         )
     centre_x, centre_y = intrinsics.centre[0].tolist()
     if float((intrinsics.centre[0] - middle).abs().max()) > OFF_CENTRE * width:
         raise SceneError(
             f"the fixed camera's principal point is at {centre_x:.6g}, {centre_y:.6g} of "
-            f"{width}x{height} pixels, but models expect it in the middle: crop its frames, or "
+            f"{width}x{height} pixels, but LRMs expect it at the centre: crop its frames, or "
             f"{way_out}"
         )
 
 
 def pick_frames(video: Views, timesteps: Tensor) -> Views:
-    """The frames nearest to timesteps that are spread evenly, or to the only one. [T]
+    """The frames nearest to evenly spaced timesteps, or to a single timestep. [T]
 
     Raises:
-        SceneError: If the video leaves out so much that a timestep has no frame near it.
+        SceneError: If a timestep has no frame near it.
     """
     count = len(timesteps)
     gaps = (video.times[None] - timesteps[:, None]).abs()
     nearest, chosen = gaps.min(dim=1)
-    # A video of few frames may stand for each of them for a while.
+    # A video with few frames may use each of them for several timesteps.
     allowed = max(0.75 / max(count - 1, 1), 0.75 / max(len(video) - 1, 1))
     if float(nearest.max()) > allowed:
         timestep = float(timesteps[nearest.argmax()])
         raise SceneError(
             f"the video of the fixed camera has no frame near time {timestep:.2f}: its frames must "
-            "spread over all times from 0 to 1; set preparation.fixed_view=train to do without it"
+            "cover all times from 0 to 1; set preparation.fixed_view=train to render another video"
         )
     return video.subset(chosen)
 
@@ -152,17 +152,16 @@ def canonical_pose(
     azimuth: float | None,
     elevation: float,
 ) -> Tensor:
-    """Where the model's camera stands if its box is to hold the scene, and its picture too.
+    """Camera pose for which both the LRM's box and its image contain the scene.
 
     Args:
         views: Training views.
-        frame: The scene's frame, whose cube holds a ball around all that the views show.
+        frame: The scene's frame; its cube contains a bounding sphere of the content.
         view: The model's camera and box.
-        azimuth: Direction in degrees from the world's x axis towards y; None takes the axis of the
-            world that points most towards the training camera whose height angle is nearest to
-            ``elevation``. Things are often built along the world's axes, and planes hold best what
-            lies along theirs.
-        elevation: Height angle in degrees.
+        azimuth: Azimuth in degrees, from the world's x axis towards y. None selects the world axis
+            nearest to the training camera whose elevation is nearest to ``elevation``: objects are
+            often aligned with the world axes, and planes represent axis-aligned content best.
+        elevation: Elevation in degrees.
 
     Returns:
         Camera-to-world matrix. [4, 4]
@@ -193,8 +192,8 @@ def _rendered(
     focal = view.focal * side
     rendering = rendering_method(method)
     own_frame = rendering.model.frame(train, None)
-    # Samplers may begin at a fixed distance. The model's camera stands nearer than those that the
-    # field was trained with, so its rays begin behind it.
+    # Samplers may have a fixed near bound. The LRM's camera is closer than the training cameras, so
+    # its ray origins are moved back.
     away = (train.camera_to_world[:, :3, 3] - frame.centre).norm(dim=-1).mean()
     back = float(away - (pose[:3, 3] - frame.centre).norm())
     inputs = [
@@ -236,7 +235,7 @@ def _rendered(
 def _train(
     rendering: Method, method: Method, place: Place, frame: Frame, folder: Path
 ) -> RadianceModule:
-    """Train the field, going on from where an interrupted attempt stopped."""
+    """Train the field; an interrupted training is resumed."""
     module = RadianceModule.of(rendering)
     module.build(place.scene, frame, device=place.device)
     options = method.preparation
@@ -262,14 +261,14 @@ def _render(
     count: int,
     back: float,
 ) -> Tensor:
-    """Frames at evenly spread timesteps, premultiplied. uint8 [T, side, side, 4]"""
+    """Frames at evenly spaced timesteps, premultiplied. uint8 [T, side, side, 4]"""
     device = module.renderer.device
     origins, directions = camera_rays(pose, focal, side, side)
     origins, directions = frame.rays(origins - back * directions, directions)
     rays = origins.to(device), directions.to(device)
     frames = []
     for time in torch.linspace(0, 1, count).tolist():
-        # Black behind the scene leaves colours multiplied by opacity.
+        # Rendering on black gives premultiplied colours.
         image = module.renderer.image(module.field, *rays, time, torch.zeros(3, device=device))
         whole = torch.cat([image["colour"], image["opacity"][:, None]], dim=-1).clamp(0, 1)
         frames.append((whole * 255).round().to(torch.uint8).view(side, side, 4).cpu())

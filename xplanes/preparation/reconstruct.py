@@ -29,17 +29,17 @@ from xplanes.settings import Count
 logger = logging.getLogger(__name__)
 
 SOLID = 128
-"""Alpha from which a pixel belongs to the object that is cropped."""
+"""Alpha from which a pixel belongs to the cropped object."""
 
 
 @dataclass(frozen=True)
 class LoadedLRM:
-    """A model that is ready.
+    """A loaded LRM.
 
     Attributes:
         model: The model.
         key: Hash of its weights and sizes.
-        seconds: Time that it took to load.
+        seconds: Time to load it.
     """
 
     model: LRM
@@ -49,14 +49,14 @@ class LoadedLRM:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What a model made of a scene.
+    """Triplanes of a scene, predicted by an LRM.
 
     Attributes:
         sequence: Triplanes, decoder and frame.
         seconds: Seconds of ``fixed_view`` and ``lrm``.
         report: For metrics.json.
-        words: Where the triplanes come from, in a few words.
-        picture: Some frames as the model was shown them, colours from 0 to 1. [H, W, 3]
+        words: The source of the triplanes, for messages.
+        picture: Contact sheet of input frames, colours in [0, 1]. [H, W, 3]
     """
 
     sequence: TriplaneSequence
@@ -68,36 +68,36 @@ class Reconstruction:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageLRMSettings(InitialiserSettings, ABC):
-    """A model, and how it meets the scene's images."""
+    """Settings of an LRM and of its input images."""
 
-    weights: str | None  # A local file instead.
-    matching: Literal["scale", "pad"]  # Where focal lengths differ: scale, or pad (exact).
-    crop: bool  # Show the model the object at the size that it was trained with.
-    batch: Count  # Images at a time.
-    precision: Literal["auto", "32", "bf16"]  # auto: bf16 where the hardware has it.
+    weights: str | None  # A local file of weights; null: downloaded or bundled.
+    matching: Literal["scale", "pad"]  # If focal lengths differ: scale, or pad (exact).
+    crop: bool  # Crop images to the object size of the training data.
+    batch: Count  # Images per batch.
+    precision: Literal["auto", "32", "bf16"]  # auto: bf16 if the hardware supports it.
 
     def check(self) -> None:
         if self.crop and self.matching == "pad":
             raise ConfigError(
-                "crop=true with lrm.matching=pad: a crop settles the size already; set one of "
-                "lrm.crop=false and lrm.matching=scale"
+                "crop=true with lrm.matching=pad: both change the image size; set either "
+                "lrm.crop=false or lrm.matching=scale"
             )
 
     @abstractmethod
     def load_model(self, say: Callable[[str], None]) -> LoadedLRM:
-        """Find the weights, downloading them if need be, and load them.
+        """Find the weights, download them if necessary, and load them.
 
         Raises:
-            LRMError: If no weights can be had, or they do not fit.
+            LRMError: If the weights are not available or do not fit.
         """
 
     def bf16_on(self, device: torch.device) -> bool:
-        """Whether the model multiplies in bfloat16."""
+        """Whether the model uses bfloat16 products."""
         return self.precision == "bf16" or (self.precision == "auto" and fast_bf16(device))
 
 
 def loaded(model: LRM, path: Path, began: float) -> LoadedLRM:
-    """A model that was loaded from a file since ``began``."""
+    """A model loaded from a file, with the time since ``began``."""
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     key = fingerprint([digest, repr(model.config), repr(model.view)])
@@ -111,14 +111,14 @@ def reconstruct(
     lrm: LoadedLRM,
     cache: StageCache,
 ) -> Reconstruction:
-    """Make the triplane sequence of a scene.
+    """Predict the triplane sequence of a scene.
 
     Args:
         method: The run's settings.
-        options: Those of the model.
-        place: The scene and its frame, whose cube holds a ball around all that the views show.
+        options: Settings of the LRM.
+        place: The scene and its frame; its cube contains a bounding sphere of the content.
         lrm: The model.
-        cache: Where finished work is kept.
+        cache: Cache of the stages.
 
     Raises:
         LRMError, SceneError: If the scene's video or camera cannot be used.
@@ -129,8 +129,8 @@ def reconstruct(
     frames = video.views.images
     if bool((frames[..., 3] == 255).all()):
         logger.warning(
-            "the frames of the fixed view have no transparency: %s takes the background for a "
-            "part of the object; cut it out (RGBA), or set lrm=none",
+            "the frames of the fixed-view video have no transparency: %s will reconstruct the "
+            "background as part of the object; remove it (RGBA), or set lrm=none",
             options.name,
         )
     place.say(f"lrm: {len(frames)} frames to triplanes")
@@ -144,7 +144,7 @@ def reconstruct(
         batch=options.batch,
         bf16=options.bf16_on(device),
     )
-    # The cube is to hold the ball around all that the views show.
+    # The cube must contain the bounding sphere of the content.
     offset = float((alignment.frame.centre - frame.centre).norm())
     wanted = alignment.frame.scale * (1 / frame.scale + offset)
     triplanes, half_side = fit_cube(encoded.triplanes, alignment.half_side, wanted)
@@ -161,7 +161,7 @@ def reconstruct(
         "mismatch_pixels": {"largest": apart.largest, "mean": apart.mean},
     }
     words = (
-        f"{options.name} ({model.config.architecture}) on {video.words}, pictures and field up to "
+        f"{options.name} ({model.config.architecture}) on {video.words}, image and field up to "
         f"{apart.largest:.1f} px apart"
     )
     return Reconstruction(
@@ -179,10 +179,10 @@ def reconstruct(
 
 
 def align_to(video: FixedView, model: LRM, options: ImageLRMSettings) -> Alignment:
-    """Where the model's field lies in the world.
+    """Alignment of the model's frame with the world.
 
     Raises:
-        LRMError: If the video's camera cannot be the model's.
+        LRMError: If the camera of the video cannot be aligned with the model's.
     """
     views = video.views
     return align(
@@ -202,7 +202,7 @@ def picture_crop(frames: Tensor, *, crop: bool) -> Crop:
 
     Args:
         frames: Premultiplied RGBA. uint8 [T, H, W, 4]
-        crop: Whether the model wants to see the object at a size of its own.
+        crop: Whether to crop to the object.
 
     Raises:
         LRMError: If nothing is opaque.

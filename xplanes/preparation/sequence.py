@@ -15,15 +15,15 @@ from xplanes.files import replacing
 from xplanes.scenes.frame import Frame, check_frame, frame_content, read_frame
 
 MARK = "xplanes"
-"""Key of what is not a tensor in the metadata of a safetensors file."""
+"""Metadata key of a safetensors file for values that are not tensors."""
 
 
 def write_content(path: Path, content: dict[str, Any]) -> None:
-    """Write a dict of tensors and builtins, dicts of such among them, whole or not at all.
+    """Write a nested dict of tensors and builtins atomically.
 
     Args:
-        path: Where to; ``.safetensors`` is written as such.
-        content: Names without dots.
+        path: Output file; the suffix ``.safetensors`` selects that format.
+        content: The dict; keys have no dots.
     """
     with replacing(path) as temporary:
         if path.suffix != ".safetensors":
@@ -37,14 +37,14 @@ def write_content(path: Path, content: dict[str, Any]) -> None:
 
 
 def read_content(path: Path) -> Any:
-    """Read what `write_content` wrote; whatever goes wrong is raised as it comes."""
+    """Read a file of `write_content`; errors are not converted."""
     if path.suffix != ".safetensors":
         return torch.load(path, map_location="cpu", weights_only=True)
     from safetensors import safe_open
 
     with safe_open(path, "pt") as file:
         content = json.loads((file.metadata() or {}).get(MARK, "{}"))
-        for name in file.keys():  # noqa: SIM118, the file is no dict
+        for name in file.keys():  # noqa: SIM118, the file is not a dict
             node = content
             *groups, last = name.split(".", 1)
             for group in groups:
@@ -54,7 +54,7 @@ def read_content(path: Path) -> Any:
 
 
 def _apart(content: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors by dotted name, and all else in its place."""
+    """Tensors by dotted name, and the remaining nested dict."""
     tensors: dict[str, Tensor] = {}
     rest: dict[str, Any] = {}
     for name, value in content.items():
@@ -77,20 +77,20 @@ DECODER_OPTIONS: dict[str, tuple[type, ...]] = {
     "density_scale": (int, float),
     "colour_margin": (int, float),
 }
-"""Options that a decoder's weights need to mean anything, as in the group ``model.decoder``."""
+"""Options of a decoder that its weights require, as in the group ``model.decoder``."""
 
 _KEYS = {"triplanes", "decoder", "decoder_config", "frame"}
 
 
 @dataclass(frozen=True)
 class TriplaneSequence:
-    """One triplane per timestep of a scene, and what is needed to read it.
+    """One triplane per timestep of a scene, with decoder and frame.
 
     Attributes:
-        triplanes: Planes xy, xz, yz of timesteps that fill [0, 1] evenly; plane "ab" has axis a
-            along the columns, b along the rows, texels as in the field. Any floating type.
+        triplanes: Planes xy, xz, yz of timesteps evenly spaced over [0, 1]; plane "ab" has axis a
+            along the columns and b along the rows, texels as in the field. Any floating type.
             [T, 3, C, H, H]
-        decoder: Weights of the decoder that reads them, ``Decoder.state_dict()``; None for none.
+        decoder: Weights of their decoder, ``Decoder.state_dict()``; None if there is none.
         decoder_config: Its options, the keys of ``DECODER_OPTIONS``; given with ``decoder``.
         frame: How the world maps into the triplanes' cube; None for the scene's own frame.
     """
@@ -102,14 +102,14 @@ class TriplaneSequence:
 
 
 def save_triplanes(path: Path, sequence: TriplaneSequence) -> None:
-    """Write a sequence for ``lrm=file lrm.triplanes=PATH``, whole or not at all.
+    """Write a sequence for ``lrm=file lrm.triplanes=PATH`` atomically.
 
-    The file is safetensors where its name ends so, else torch.save's, of tensors and builtins:
-    ``triplanes``, and where they are given ``decoder``, ``decoder_config`` and ``frame`` {scale,
-    rotation [3, 3], centre [3]}.
+    The suffix .safetensors selects that format; any other suffix selects torch.save. Keys:
+    ``triplanes``, and optionally ``decoder``, ``decoder_config`` and ``frame`` {scale, rotation
+    [3, 3], centre [3]}.
 
     Raises:
-        ConfigError, SceneError: If the sequence could not be loaded again.
+        ConfigError, SceneError: If the sequence is invalid.
     """
     check_sequence(sequence, str(path))
     content: dict[str, Any] = {"triplanes": sequence.triplanes.detach().cpu().clone()}
@@ -125,14 +125,14 @@ def load_triplanes(path: Path) -> TriplaneSequence:
     """Read a file of `save_triplanes`.
 
     Raises:
-        ConfigError, SceneError: If it is missing or damaged, or holds what cannot be used.
+        ConfigError, SceneError: If it is missing, damaged or invalid.
     """
     if not path.is_file():
         raise ConfigError(f"{path}: there is no such file; save_triplanes writes one")
     try:
         content = read_content(path)
-    except Exception as error:  # A damaged file fails in any of a dozen ways.
-        # Its text advises to load the file as code.
+    except Exception as error:  # A damaged file raises many kinds of errors.
+        # The original message advises loading the file as code.
         raise ConfigError(
             f"{path} cannot be read ({type(error).__name__}): it is damaged, or no file of "
             "save_triplanes"
@@ -159,11 +159,11 @@ def check_sequence(sequence: TriplaneSequence, name: str) -> None:
 
     Args:
         sequence: The sequence.
-        name: What messages call it.
+        name: Its name in messages.
 
     Raises:
-        ConfigError, SceneError: For wrong types or shapes, numbers that are not finite, a decoder
-            that does not fit, or a frame that is none.
+        ConfigError, SceneError: For wrong types or shapes, values that are not finite, a decoder
+            that does not fit, or an invalid frame.
     """
     planes = sequence.triplanes
     if not isinstance(planes, Tensor) or not planes.is_floating_point():
@@ -176,7 +176,7 @@ def check_sequence(sequence: TriplaneSequence, name: str) -> None:
             "and yz, channels, rows and as many columns"
         )
     for number, frame in enumerate(planes):
-        if not frame.float().isfinite().all():  # In the type that it is computed in.
+        if not frame.float().isfinite().all():  # Checked in the computation type.
             raise ConfigError(f"{name}: triplane {number} of {len(planes)} holds NaN or infinity")
     if sequence.frame is not None:
         check_frame(sequence.frame, name)
@@ -198,7 +198,7 @@ def _check_decoder(sequence: TriplaneSequence, name: str) -> None:
         value = options[key]
         if isinstance(value, bool) or not isinstance(value, kinds):
             raise ConfigError(f"{name}: decoder_config.{key} is {value!r}: wrong type")
-    # What else the options must be is checked with the settings they replace.
+    # Further constraints are checked with the settings that they replace.
     if not (1 <= options["width"] <= 65536 and 0 <= options["hidden"] <= 256):
         raise ConfigError(
             f"{name}: decoder_config.width={options['width']}, hidden={options['hidden']}: out of "

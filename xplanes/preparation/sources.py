@@ -1,4 +1,4 @@
-"""Sources of an initialisation: published LRMs, those in the package, and files of triplanes."""
+"""Sources of an initialisation: published LRMs, bundled LRMs, and triplane files."""
 
 import logging
 import time
@@ -34,7 +34,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class BundledLRMSettings(ImageLRMSettings):
-    """A model of the package, or with ``weights`` one of the same form."""
+    """A bundled model, or with ``weights`` another model in the same format."""
 
     bundled: str  # Name of its files in the package.
 
@@ -55,12 +55,12 @@ class PublishedLRMSettings(ImageLRMSettings):
     """A published model."""
 
     architecture: str  # One of openlrm-{small,base,large}-{1.0,1.1} and triposr.
-    repository: str  # On the Hugging Face hub.
-    file: str  # Name of the weights there.
-    revision: str  # Branch, tag or commit there.
-    licence: str  # Of the weights.
-    megabytes: Count  # Size of the file.
-    config: str | None  # A config.json or config.yaml for weights of other sizes.
+    repository: str  # Repository on the Hugging Face hub.
+    file: str  # File name of the weights in the repository.
+    revision: str  # Branch, tag or commit of the repository.
+    licence: str  # Licence of the weights.
+    megabytes: Count  # Size of the file in MB.
+    config: str | None  # A config.json or config.yaml for weights of another model size.
 
     @property
     def source(self) -> WeightSource:
@@ -86,10 +86,10 @@ class PublishedLRMSettings(ImageLRMSettings):
 
 
 class LRMInitialiser(Initialiser):
-    """Triplanes of a fixed-view video, by an LRM.
+    """Triplanes that an LRM predicts from a fixed-view video.
 
     Args:
-        settings: How the model meets the scene's images.
+        settings: Settings of the LRM and of its input images.
         lrm: The model.
     """
 
@@ -114,7 +114,7 @@ class LRMInitialiser(Initialiser):
 
 @dataclass(frozen=True, kw_only=True)
 class TriplaneFileSettings(InitialiserSettings):
-    """A triplane sequence that was computed before, from a file."""
+    """A precomputed triplane sequence from a file."""
 
     triplanes: str | None  # File written by save_triplanes.
 
@@ -170,22 +170,21 @@ def from_sequence(
     source: str,
     seconds: Mapping[str, float],
 ) -> Initialisation:
-    """From a triplane sequence of any source to an initialisation.
+    """Convert a triplane sequence from any source to an initialisation.
 
     Args:
         sequence: The sequence, checked.
         method: The run's settings.
-        place: The scene, and its frame for a sequence that brings none.
-        cache: Where finished stages are kept.
-        source: What messages call the sequence.
-        seconds: Seconds of the stages that made it.
+        place: The scene and its frame; the frame is used if the sequence has none.
+        cache: Cache of the stages.
+        source: Name of the sequence in messages.
+        seconds: Seconds of the preceding stages.
     """
     views = place.scene.splits["train"]
     model = _settled(method, sequence, views, source=source)
     if len(sequence.triplanes) == 1 and not views.is_static:
         logger.warning(
-            "nothing moves in the only triplane of %s: the field gets no time planes and trains as "
-            "a static one",
+            "%s has a single triplane: the field has no time planes and is trained as static",
             source,
         )
     device = place.device
@@ -209,7 +208,7 @@ def from_sequence(
 
 
 def _left_out(parts: Parts) -> float:
-    """Share of the singular directions below the threshold, over all orientations."""
+    """Fraction of singular vectors below the threshold, over all orientations."""
     if not parts.report:
         return 0.0
     kept = sum(report["rank"] for report in parts.report.values())
@@ -219,7 +218,7 @@ def _left_out(parts: Parts) -> float:
 def _settled(
     method: Method, sequence: TriplaneSequence, views: Views, *, source: str
 ) -> XPlanesSettings:
-    """The model's settings with what the sequence decides."""
+    """The model's settings, with those that the sequence determines."""
     frames, _, channels = sequence.triplanes.shape[:3]
     model = replace(cast(XPlanesSettings, method.model), channels=channels)
     if views.is_static or frames == 1:
@@ -236,7 +235,7 @@ def _settled(
 
 
 def _warn(parts: Parts, method: Method) -> None:
-    """Say once which orientations did not converge."""
+    """Warn once about all orientations that did not converge."""
     open_ones = [
         f"{name} (residual {report['residual']:.1e}, last step {report['change']:.1e})"
         for name, report in parts.report.items()

@@ -1,4 +1,4 @@
-"""The stages from a triplane sequence to planes, each kept in the cache."""
+"""The cached stages from a triplane sequence to planes, and their images."""
 
 import sys
 import warnings
@@ -31,14 +31,13 @@ from xplanes.training.evaluation import spread
 def parts_sheet(low_rank: Tensor, sparse: Tensor, timesteps: int = 4, side: int = 128) -> Tensor:
     """Low-rank and sparse part side by side at a few timesteps, three channels as colours.
 
-    Rows are xy, xz, yz; a column is a timestep, its left half the low-rank part, its right half the
-    sparse one, in which grey is zero. Colours have one scale per orientation and part, so that
-    timesteps compare.
+    Rows are xy, xz, yz. Each column is a timestep: low-rank part on the left, sparse part on the
+    right (grey is zero). Each orientation and part has one colour scale for all timesteps.
 
     Args:
         low_rank: The static part. [T, 3, C, H, W]
         sparse: The dynamic part. [T, 3, C, H, W]
-        timesteps: Columns, spread evenly over time.
+        timesteps: Number of columns, evenly spaced in time.
         side: Pixels per plane.
 
     Returns:
@@ -59,7 +58,7 @@ def parts_sheet(low_rank: Tensor, sparse: Tensor, timesteps: int = 4, side: int 
 
 
 def _colours(planes: Tensor) -> Tensor:
-    """The first three channels, the first again where there are fewer. [M, 3, 3, H, W]"""
+    """The first three channels; the first one is repeated if there are fewer. [M, 3, 3, H, W]"""
     shown = planes[:, :, :3].detach().float().cpu()
     missing = 3 - shown.shape[2]
     return torch.cat([shown, shown[:, :, :1].expand(-1, -1, missing, -1, -1)], dim=2)
@@ -68,13 +67,13 @@ def _colours(planes: Tensor) -> Tensor:
 def contact_sheet(
     frames: Tensor, crop: Crop, model: LRM, timesteps: int = 6, side: int = 160
 ) -> Tensor:
-    """A few frames as the model is shown them.
+    """Contact sheet of a few frames, as the LRM sees them.
 
     Args:
         frames: Premultiplied RGBA. uint8 [T, H, W, 4]
-        crop: What the model is shown of them.
+        crop: Crop that the model is given.
         model: The model.
-        timesteps: Frames shown, spread evenly.
+        timesteps: Number of frames, evenly spaced in time.
         side: Pixels per frame.
 
     Returns:
@@ -99,22 +98,22 @@ REPORTED = (
     "sparsity_weight",
     "unit",
 )
-"""What metrics.json tells of each orientation."""
+"""Entries of metrics.json for each orientation."""
 
 
 @dataclass(frozen=True)
 class Parts:
-    """A sequence in two parts.
+    """Low-rank and sparse part of a sequence.
 
     Attributes:
         low_rank: The static part, on the CPU. [T, 3, C, H, H]
         sparse: The dynamic part, on the CPU. [T, 3, C, H, H]
-        report: For "xy", "xz" and "yz" the entries of `REPORTED`; empty where there was nothing to
-            take apart.
-        picture: Both parts at a few timesteps; None where there was nothing to take apart.
-        seconds: Time that it took.
+        report: For each of "xy", "xz" and "yz" the entries of `REPORTED`; empty for a single
+            triplane.
+        picture: Both parts at a few timesteps; None for a single triplane.
+        seconds: Time to compute it.
         cached: Whether they came from the cache.
-        key: Hash of what they depend on.
+        key: Hash of the inputs.
     """
 
     low_rank: Tensor
@@ -132,9 +131,9 @@ class Planes:
 
     Attributes:
         planes: By name. [C, rows, columns] each
-        unexplained: Share of the sparse part's energy that their products leave, ``before`` with
-            random planes and ``after`` with these; empty without planes of time.
-        seconds: Time that it took.
+        unexplained: Fraction of the sparse part's energy that products of time planes do not
+            explain: ``before`` for random planes, ``after`` for these; empty without time planes.
+        seconds: Time to compute it.
     """
 
     planes: Mapping[str, Tensor]
@@ -145,13 +144,13 @@ class Planes:
 def decompose_stage(
     triplanes: Tensor, config: DecompositionSettings, cache: StageCache, device: torch.device
 ) -> Parts:
-    """Robust PCA of a sequence; a single triplane is all low rank.
+    """Robust PCA of a sequence; a single triplane has no sparse part.
 
     Args:
         triplanes: The sequence. [T, 3, C, H, H]
         config: Its settings.
-        cache: Where the parts are kept.
-        device: Where they are computed.
+        cache: Cache of the stage.
+        device: Device of the computation.
     """
     triplanes = triplanes.float()
     options = {
@@ -170,9 +169,9 @@ def decompose_stage(
         if len(triplanes) == 1:
             return {"low_rank": triplanes, "sparse": None, "report": {}}
         with warnings.catch_warnings():
-            # Said once for all orientations by the caller, also when the parts are cached.
+            # The caller warns once for all orientations, also when the parts are cached.
             warnings.filterwarnings("ignore", message="robust PCA stopped")
-            # A bar needs a terminal: piped, it would fill the log.
+            # Show the progress bar on a terminal only; in a pipe it would fill the log.
             shown = sys.stderr.isatty()
             parts = decompose(triplanes.to(device), progress=shown, **options)
         report = {
@@ -208,15 +207,15 @@ def convert_stage(
     cache: StageCache,
     device: torch.device,
 ) -> Planes:
-    """Space planes from the low-rank part, time planes from the sparse one.
+    """Space planes from the low-rank part, time planes from the sparse part.
 
     Args:
         parts: The two parts.
         model: The model's settings, as the field is to be built.
-        config: Which planes to choose.
+        config: Settings of the conversion.
         seed: The run's seed, for the noise.
-        cache: Where the planes are kept.
-        device: Where they are computed.
+        cache: Cache of the stage.
+        device: Device of the computation.
     """
     moving = model.plane_set != "three"
     sparse = parts.sparse if moving else None

@@ -1,1 +1,1 @@
-"""Small Large Reconstruction Models of our own: procedural objects, training, scores."""
+"""Pretraining of small Large Reconstruction Models on procedural objects."""

@@ -1,4 +1,4 @@
-"""Compiled loops that render solids and look them up; `Solids.posed` is the readable twin.
+"""Compiled loops that render solids and test points; `Solids.posed` is the readable twin.
 
 Imported only when needed, since numba takes a second to load.
 """
@@ -186,7 +186,7 @@ def paint(pattern, paints, n, x, y, z):
 
 @njit(**COMPILE)
 def first(parts, ox, oy, oz, dx, dy, dz, any_hit):
-    """Distance to the first part on a ray and its number; any part's where that suffices."""
+    """Distance to the first part on a ray and its index; any hit part if ``any_hit``."""
     kinds, sizes, rotations, centres, reach = parts[:5]
     best, found = INF, -1
     for p in range(len(kinds)):
@@ -276,7 +276,7 @@ def inside(parts, points, result):
 
 @njit(**COMPILE)
 def render(parts, rectangles, pose, focal, samples, colour, alpha, depth):
-    """A picture on white, its opacity, and the depth of each pixel's first sample."""
+    """An image on white, its opacity, and the depth of each pixel's first sample."""
     kinds, sizes, rotations, centres = parts[:4]
     side = len(colour) * samples
     nearest, owner = np.full((side, side), INF), np.full((side, side), -1)

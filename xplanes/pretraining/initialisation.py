@@ -1,4 +1,4 @@
-"""A model before its first step: places of picture and planes speak one language."""
+"""Initialisation of a model: position embeddings of image and planes that match each other."""
 
 import torch
 import torch.nn.functional as F
@@ -8,25 +8,26 @@ from xplanes.lrm.config import LRMConfig
 from xplanes.lrm.openlrm import OpenLRM
 
 SHARPNESS = 1.2
-"""Factor on queries and keys that are compared as they are, for attention to the picture."""
+"""Scale of the identity that initialises queries and keys of attention to the image."""
 
 SELF_SHARPNESS = 0.8
-"""The same for attention among the planes."""
+"""The same for attention among the planes' tokens."""
 
 SLOWEST, FASTEST = 0.8, 16.0
-"""Range of the waves' frequencies, in radians per unit length."""
+"""Range of the frequencies of the position embedding, in radians per unit length."""
 
 
 def init_model(config: LRMConfig, seed: int) -> OpenLRM:
-    """A model with random weights and places that match between picture and planes.
+    """A model with random weights and matching position embeddings of image and planes.
 
-    A token is placed by waves along x, y and z, in channels of their own. A patch of the picture
-    has an x and a z, a token of plane "xz" too, and one of "xy" has an x: with equal query and key
-    weights each attends to what lies in its line of sight from the first step on.
+    The embedding of a token consists of sines and cosines of its x, y and z, each in its own
+    channels. An image patch has x and z, a token of plane "xz" has the same, a token of "xy" has x.
+    Because query and key weights are initialised equal, each token attends to the patches in its
+    line of sight from the first step.
 
     Args:
         config: Sizes of the model.
-        seed: Source of the random weights.
+        seed: Seed of the random weights.
     """
     generator = torch.Generator().manual_seed(seed)
     model = OpenLRM(config)
@@ -43,12 +44,12 @@ def init_model(config: LRMConfig, seed: int) -> OpenLRM:
     places = _places(config)
     with torch.no_grad():
         for block in [*model.encoder.blocks, *model.blocks]:
-            for name, child in block.named_modules():  # branches start small
+            for name, child in block.named_modules():  # residual branches are initialised small
                 if name.endswith(("attention.out", "mlp.2")) and "image" not in name:
                     child.weight.mul_(0.2)  # type: ignore[operator]
         patch = model.encoder.patch
         assert patch.bias is not None
-        patch.bias.copy_(-patch.weight.sum(dim=(1, 2, 3)))  # nothing to say of white
+        patch.bias.copy_(-patch.weight.sum(dim=(1, 2, 3)))  # a white patch has a zero token
         for block in model.blocks:
             _compare(block.image_attention, SHARPNESS)  # type: ignore[arg-type]
             _compare(block.self_attention, SELF_SHARPNESS)  # type: ignore[arg-type]
@@ -56,26 +57,26 @@ def init_model(config: LRMConfig, seed: int) -> OpenLRM:
                 nn.init.zeros_(norm.modulation[1].weight)  # type: ignore[index]
         model.encoder.position[0, 1:] = _patch_places(config, places)
         model.position[0] = 0.5 * _plane_places(config, places)
-        for layer in model.decoder.layers[:-1]:  # half of what rectifiers get is lost
+        for layer in model.decoder.layers[:-1]:  # ReLU drops half of the variance
             layer.weight.mul_(2**0.5)  # type: ignore[operator]
     return model
 
 
 def _compare(attention: nn.Module, sharpness: float) -> None:
-    """Let queries and keys be the tokens themselves."""
+    """Initialise query and key weights to a scaled identity."""
     for linear in (attention.query, attention.key):
         linear.weight.copy_(sharpness * torch.eye(*linear.weight.shape))  # type: ignore[union-attr]
 
 
 def _places(config: LRMConfig) -> tuple[range, int]:
-    """Channels of a head, by axis, and the number of waves along each."""
+    """First channel of each axis within a head, and the number of frequencies per axis."""
     width = config.head_width
     waves = width // 12
     return range(0, 6 * waves, 2 * waves), waves
 
 
 def _wave(values: Tensor, axis: int, config: LRMConfig, places: tuple[range, int]) -> Tensor:
-    """Waves along an axis in the channels of that axis, of every head. [T] -> [T, D]"""
+    """Sines and cosines of a coordinate, in its axis's channels of every head. [T] -> [T, D]"""
     starts, waves = places
     frequencies = SLOWEST * (FASTEST / SLOWEST) ** torch.linspace(0, 1, waves)
     phases = values[:, None] * frequencies
@@ -86,7 +87,7 @@ def _wave(values: Tensor, axis: int, config: LRMConfig, places: tuple[range, int
 
 
 def _patch_places(config: LRMConfig, places: tuple[range, int]) -> Tensor:
-    """Places of the picture's patches where the centre plane is seen. [G G, D]"""
+    """Position embedding of the image patches, at the plane through the centre. [G G, D]"""
     side = config.encoder.grid
     reach = 0.5 * config.source_distance / config.source_focal
     line = reach * (2 * (torch.arange(side) + 0.5) / side - 1)
@@ -95,7 +96,7 @@ def _patch_places(config: LRMConfig, places: tuple[range, int]) -> Tensor:
 
 
 def _plane_places(config: LRMConfig, places: tuple[range, int]) -> Tensor:
-    """Places of the tokens of the planes xy, xz and zy, rows first. [3 R R, D]"""
+    """Position embedding of the tokens of planes xy, xz and zy, row by row. [3 R R, D]"""
     side = config.low_resolution
     line = 2 * (torch.arange(side) + 0.5) / side - 1
     rows, columns = (part.flatten() for part in torch.meshgrid(line, line, indexing="ij"))
@@ -108,13 +109,14 @@ def _plane_places(config: LRMConfig, places: tuple[range, int]) -> Tensor:
 
 
 def grow_model(earlier: OpenLRM, config: LRMConfig) -> OpenLRM:
-    """A model with planes of another resolution that goes on from one that was trained.
+    """A model with another plane resolution, initialised from a trained one.
 
-    Everything is taken over; what places have learned is interpolated, their waves are drawn anew.
+    All weights are copied. The learned part of the position embedding is interpolated; sines and
+    cosines are computed for the new resolution.
 
     Args:
-        earlier: A model that differs in its low resolution at most.
-        config: Sizes of the new one.
+        earlier: The trained model; it may differ in ``low_resolution`` only.
+        config: Sizes of the new model.
     """
     model, places = OpenLRM(config), _places(config)
     old = earlier.config.low_resolution

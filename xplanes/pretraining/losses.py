@@ -1,4 +1,4 @@
-"""What a triplane is asked: is it solid here, of what colour, and what does a ray see."""
+"""Losses of pretraining: occupancy and colour at points, and rendered rays."""
 
 import torch
 import torch.nn.functional as F
@@ -9,12 +9,12 @@ from xplanes.rendering.box import ray_box
 
 
 def triplane_logits(planes: Tensor, decoder: Decoder, points: Tensor) -> Tensor:
-    """The decoder's logits at points.
+    """Decoder logits at points.
 
     Args:
         planes: Planes xy, xz, yz. [B, 3, C, H, H]
-        decoder: From features to logits.
-        points: Positions. [B, N, 3]
+        decoder: Maps features to logits.
+        points: Positions in the model's frame. [B, N, 3]
 
     Returns:
         Density and colour logits. [B, N, 4]
@@ -30,8 +30,8 @@ def triplane_logits(planes: Tensor, decoder: Decoder, points: Tensor) -> Tensor:
 def occupancy_loss(logits: Tensor, inside: Tensor) -> Tensor:
     """Binary cross-entropy of opacity over one step of length 1 / density_scale.
 
-    Over such a step the opacity 1 - exp(-softplus(logit - 1)) is the logistic function of
-    logit - 1, so the loss needs no exponentials of densities. [B, N, 4], [B, N] -> []
+    The opacity 1 - exp(-softplus(logit - 1)) of such a step is the sigmoid of logit - 1. The loss
+    is computed from the logits. [B, N, 4], [B, N] -> []
     """
     return F.binary_cross_entropy_with_logits(logits[..., 0].float() - 1, inside)
 
@@ -45,17 +45,17 @@ def colour_loss(logits: Tensor, colours: Tensor, margin: float) -> Tensor:
 def ray_samples(
     origins: Tensor, directions: Tensor, hits: Tensor, *, half_side: float, jitter: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Where rays are looked at: half evenly through the box, half around what they hit.
+    """Stratified samples on rays: half along the whole ray in the box, half around the surface.
 
     Args:
-        origins: Where rays start. [B, R, 3]
-        directions: Unit directions. [B, R, 3]
-        hits: Distance to the surface, inf where missed. [B, R]
+        origins: Ray origins. [B, R, 3]
+        directions: Unit ray directions. [B, R, 3]
+        hits: Distance to the surface, inf for rays that miss. [B, R]
         half_side: Half the side of the box.
-        jitter: From 0 to 1, place of each sample within its share. [B, R, S]
+        jitter: Position of each sample within its bin, in [0, 1]. [B, R, S]
 
     Returns:
-        Rising distances and the length that each stands for, 0 on rays that miss the box.
+        Ascending distances and the length of each sample, 0 on rays that miss the box.
         [B, R, S], [B, R, S]
     """
     near, far = ray_box(origins, directions, half_side)

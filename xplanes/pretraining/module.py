@@ -1,4 +1,4 @@
-"""The LightningModule: one model, taught by points and rays of procedural objects."""
+"""The LightningModule that trains a small LRM on points and rays of procedural objects."""
 
 import copy
 import math
@@ -29,23 +29,23 @@ from xplanes.pretraining.settings import BatchSettings, ScheduleSettings
 from xplanes.streams import Stream, step_generator
 
 PATIENCE = 20
-"""Steps in a row with a loss that is not finite after which training gives up."""
+"""Consecutive steps with a non-finite loss after which training stops."""
 
 
 class PretrainingError(ConfigError):
-    """Pretraining cannot go on; the message says what was seen and what to change."""
+    """Pretraining cannot continue; the message names the problem and the settings to change."""
 
 
 class PretrainingModule(LightningModule):
-    """Trains a model on objects whose every point is known.
+    """Trains a model on procedural objects with known occupancy and colour.
 
-    Optimisation is manual: Muon for the blocks' matrices, AdamW for all else. The budget is in
-    steps or in seconds of the training clock, whichever is used up first.
+    Optimisation is manual: Muon for the blocks' matrices, AdamW for all other parameters. The
+    budget is a number of steps or seconds of training, whichever is reached first.
 
     Args:
-        model: The model, as `init_model` makes it.
-        batch: What a step looks at.
-        schedule: Budget, optimisers and weights.
+        model: The model, initialised by `init_model`.
+        batch: Numbers of objects, points and rays per step.
+        schedule: Budget, optimisers and loss weights.
         seed: The run's seed.
         bf16: Whether blocks and decoder compute in bfloat16.
     """
@@ -69,7 +69,7 @@ class PretrainingModule(LightningModule):
 
     @property
     def progress(self) -> float:
-        """Share of the budget that is spent, of steps or of seconds, the larger."""
+        """Share of the budget that is used, in [0, 1]: of steps or seconds, whichever is larger."""
         share = self.steps / self.schedule.max_steps
         if self.schedule.max_seconds is not None:
             share = max(share, self.clock / self.schedule.max_seconds)
@@ -119,7 +119,7 @@ class PretrainingModule(LightningModule):
         self.last = {**parts, "gradient": float(norm), "rate": self.rate}
 
     def losses(self, batch: PretrainingBatch) -> tuple[Tensor, dict[str, float]]:
-        """The loss of a batch, and its terms by name."""
+        """Loss of a batch, and its terms by name."""
         options, decoder = self.schedule, self.model.decoder
         with torch.autocast(batch.images.device.type, torch.bfloat16, enabled=self.bf16):
             camera = self.camera.to(batch.images).expand(len(batch.images), -1)
@@ -159,7 +159,7 @@ class PretrainingModule(LightningModule):
 
     @property
     def rate(self) -> float:
-        """Factor on the learning rates: a warm-up, a plateau, and a fall to zero."""
+        """Learning rate schedule in [0, 1]: linear warm-up, constant, linear decay to zero."""
         warm = min(1.0, (self.steps + 1) / max(1, self.schedule.warmup_steps))
         left = (1 - self.progress) / max(self.schedule.decay_share, 1e-9)
         return warm * min(1.0, left)
@@ -179,7 +179,7 @@ class PretrainingModule(LightningModule):
             raise PretrainingError(
                 f"the loss was {value} for {PATIENCE} steps in a row, at step {self.steps}: lower "
                 f"schedule.muon_lr={self.schedule.muon_lr} and schedule.adam_lr="
-                f"{self.schedule.adam_lr}, then go on from an earlier checkpoint"
+                f"{self.schedule.adam_lr}, then resume from an earlier checkpoint"
             )
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -191,17 +191,17 @@ class PretrainingModule(LightningModule):
 
 
 LONGEST = 10.0
-"""Seconds that a step counts at most: a process that was stopped for a while did not train."""
+"""Upper bound in seconds on the time counted for one step, in case the process was suspended."""
 
 
 class Upkeep(Callback):
-    """All that a step needs besides the step.
+    """Training clock, logging, scores and checkpoints.
 
     Args:
-        path: The checkpoint, written whole or not at all.
-        schedule: How often.
-        look: Scores held-out objects.
-        announce: Takes a line now and then.
+        path: The checkpoint, written atomically.
+        schedule: Intervals of logging, scores and checkpoints.
+        look: Computes scores on held-out objects.
+        announce: Receives progress messages.
     """
 
     def __init__(
@@ -246,7 +246,7 @@ class Upkeep(Callback):
     ) -> None:
         if isinstance(exception, KeyboardInterrupt):
             self.save(trainer)
-            self.announce(f"stopped; the same command goes on from {self.path}")
+            self.announce(f"stopped; run the same command to resume from {self.path}")
 
     def save(self, trainer: Trainer) -> None:
         """Write the checkpoint."""

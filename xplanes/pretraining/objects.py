@@ -1,4 +1,4 @@
-"""Endless objects, one for each seed."""
+"""Procedural objects, one for each seed."""
 
 import colorsys
 import math
@@ -23,13 +23,13 @@ from xplanes.pretraining.solids import (
 
 Vector = tuple[float, float, float]
 Pattern = tuple[int, tuple[Vector, Vector, Vector], tuple[float, ...]]
-"""Kind, three paints, and numbers as `solids` lists them."""
+"""Kind, three colours, and parameters as listed in `solids`."""
 
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 
 
 def place(position: Vector = ORIGIN, turn: Vector = ORIGIN, scale: float = 1.0) -> Array:
-    """A similarity: scale, then turns about x, y and z in degrees, then a shift. [4, 4]"""
+    """A similarity: scale, rotations about x, y and z in degrees, translation. [4, 4]"""
     (a, b, c), frame = (math.radians(angle) for angle in turn), np.eye(4)
     sa, ca, sb, cb, sc, cc = (f(v) for v in (a, b, c) for f in (math.sin, math.cos))
     frame[:3, :3] = [
@@ -45,7 +45,7 @@ class Builder:
     """Collects the parts of one object.
 
     Args:
-        random: Where all choices come from.
+        random: Source of all random choices.
     """
 
     def __init__(self, random: np.random.Generator) -> None:
@@ -56,7 +56,7 @@ class Builder:
         self._patterns: list[Pattern] = []
 
     def add(self, frame: Array, kind: int, size: tuple[float, ...], pattern: Pattern) -> None:
-        """One part, in the frame's units."""
+        """Add a part; its size is in units of the frame."""
         self._kinds.append(kind)
         self._sizes.append((*size, *(1.0,) * (3 - len(size))))  # type: ignore[arg-type]
         self._frames.append(frame)
@@ -79,15 +79,15 @@ class Builder:
         )
 
     def uniform(self, low: float, high: float) -> float:
-        """A number between two."""
+        """A uniform random number in [low, high)."""
         return float(self.random.uniform(low, high))
 
     def count(self, low: int, high: int) -> int:
-        """A whole number from ``low`` to ``high``, both included."""
+        """A random integer in [low, high]."""
         return int(self.random.integers(low, high + 1))
 
     def chance(self, share: float) -> bool:
-        """True this often."""
+        """True with this probability."""
         return bool(self.random.random() < share)
 
     def paint(self) -> Vector:
@@ -102,7 +102,7 @@ class Builder:
         return colorsys.hsv_to_rgb(hue, saturation, value)
 
     def pattern(self, size: float, plain: float = 0.6) -> Pattern:
-        """A pattern for a part of about this size; plain this often."""
+        """A pattern for a part of this size; plain with the probability ``plain``."""
         paints = (self.paint(), self.paint(), self.paint())
         if self.chance(plain):
             mottle = self.uniform(0.02, 0.15) if self.chance(0.3) else 0.0
@@ -122,7 +122,7 @@ class Builder:
 
 
 def lump(b: Builder, frame: Array, size: float, turned: bool = True) -> None:
-    """Any solid around the origin of the frame."""
+    """A random solid at the origin of the frame."""
     angles = (b.uniform(0, 360), b.uniform(0, 360), b.uniform(0, 360))
     frame = frame @ place(turn=angles if turned else (0.0, 0.0, angles[2]))
     kind = b.count(BOX, TORUS)
@@ -139,7 +139,7 @@ def lump(b: Builder, frame: Array, size: float, turned: bool = True) -> None:
 
 
 def limb(b: Builder, frame: Array, links: int, length: float, thick: float, bend: float) -> Array:
-    """A chain along -z whose joints are bent at random; returns the frame at its end."""
+    """Add a chain along -z with randomly bent joints; returns the frame at its end."""
     pattern, same, box = b.pattern(length), b.chance(0.6), b.chance(0.3)
     for _ in range(links):
         frame = frame @ place(turn=(b.uniform(-bend, bend), b.uniform(-bend, bend), 0))
@@ -195,7 +195,7 @@ def machine(b: Builder, frame: Array) -> None:
 
 
 def figure(b: Builder, frame: Array) -> None:
-    """Somebody with a trunk, a head, arms and legs in any pose."""
+    """A person with trunk, head, arms and legs in a random pose."""
     leg, trunk, wide = b.uniform(0.25, 0.45), b.uniform(0.25, 0.4), b.uniform(0.1, 0.2)
     thick = b.uniform(0.05, 0.09)
     hip = frame @ place((0, 0, 2 * leg), (b.uniform(-8, 8), b.uniform(-15, 15), 0))
@@ -231,7 +231,7 @@ def figure(b: Builder, frame: Array) -> None:
 
 
 def beast(b: Builder, frame: Array) -> None:
-    """Something on four or six legs with neck, head and tail."""
+    """An animal with four or six legs, neck, head and tail."""
     long, fat, leg = b.uniform(0.35, 0.65), b.uniform(0.15, 0.3), b.uniform(0.15, 0.35)
     body, skin = frame @ place((0, 0, 2 * leg), (0, b.uniform(-15, 15), 0)), b.pattern(0.3)
     b.add(body, ELLIPSOID, (long, fat, fat * b.uniform(0.7, 1.2)), skin)
@@ -248,7 +248,7 @@ def beast(b: Builder, frame: Array) -> None:
 
 
 def tower(b: Builder, frame: Array) -> None:
-    """Storeys on one another, a roof, and perhaps sails, windows or a mast."""
+    """A tower with storeys and a roof, and optionally sails, windows or a mast."""
     radius, taper, level = b.uniform(0.2, 0.45), b.uniform(0.75, 1.0), 0.0
     wall, round_, turn = b.pattern(0.3, 0.3), b.chance(0.5), b.uniform(0, 90)
     for _ in range(b.count(1, 5)):
@@ -300,7 +300,7 @@ def craft(b: Builder, frame: Array) -> None:
 
 
 def furniture(b: Builder, frame: Array) -> None:
-    """A table, stool or chair, perhaps with things on it."""
+    """A table, stool or chair, optionally with objects on it."""
     wide, deep, high = b.uniform(0.3, 0.7), b.uniform(0.3, 0.7), b.uniform(0.2, 0.7)
     thick, wood = b.uniform(0.03, 0.07), b.pattern(0.3)
     for x in (-0.85 * wide, 0.85 * wide):
@@ -342,7 +342,7 @@ def plant(b: Builder, frame: Array) -> None:
 
 
 def heap(b: Builder, frame: Array) -> None:
-    """Any solids lying or floating anywhere."""
+    """Random solids at random positions."""
     for _ in range(b.count(2, 9)):
         size = b.uniform(0.1, 0.4)
         angle, far = b.uniform(0, 2 * math.pi), 0.8 * math.sqrt(b.random.random())
@@ -354,30 +354,30 @@ def heap(b: Builder, frame: Array) -> None:
 
 FAMILIES = (machine, figure, beast, tower, craft, furniture, plant, heap)
 SHARES = (0.24, 0.2, 0.08, 0.14, 0.06, 0.08, 0.06, 0.14)
-"""How often each is the main thing."""
+"""Probability of each kind of main object."""
 
 
 TRAINING_SEEDS = range(2**30)
-"""Seeds of objects to learn from."""
+"""Seeds of training objects."""
 
 HELD_OUT_SEEDS = range(2**30, 2**31)
-"""Seeds of objects to be judged by."""
+"""Seeds of held-out objects."""
 
 STREAM = 70_203
-"""Keeps these objects apart from all else that is drawn from small seeds."""
+"""Random stream of the objects, independent of all other streams."""
 
 
 def procedural_object(seed: int) -> Solids:
-    """The object of a seed: near the origin, within about 1.2 of it along each axis, z up.
+    """The object of a seed, within about 1.2 of the origin along each axis, z up.
 
     Args:
         seed: One of `TRAINING_SEEDS` or `HELD_OUT_SEEDS`.
 
     Raises:
-        ValueError: If it is neither.
+        ValueError: If the seed is in neither range.
     """
     if seed not in TRAINING_SEEDS and seed not in HELD_OUT_SEEDS:
-        raise ValueError(f"seed={seed}: objects have seeds from 0 to {HELD_OUT_SEEDS.stop - 1}")
+        raise ValueError(f"seed={seed}: must be from 0 to {HELD_OUT_SEEDS.stop - 1}")
     b = Builder(np.random.default_rng([STREAM, seed]))
     ground = _ground(b) if b.chance(0.75) else 0.0
     main = FAMILIES[int(b.random.choice(len(FAMILIES), p=SHARES))]
@@ -389,7 +389,7 @@ def procedural_object(seed: int) -> Solids:
 
 
 def _ground(b: Builder) -> float:
-    """A plate under everything; returns how far it reaches."""
+    """Add a ground plate below the object; returns its extent."""
     reach, thick = b.uniform(0.5, 1.0), b.uniform(0.015, 0.08)
     at = place((0, 0, -thick), (0, 0, b.uniform(0, 90)))
     if b.chance(0.5):
@@ -405,7 +405,7 @@ def _ground(b: Builder) -> float:
 
 
 def _prop(b: Builder, reach: float) -> None:
-    """Something small beside the main thing."""
+    """Add a small object beside the main one."""
     angle, far = b.uniform(0, 2 * math.pi), reach * b.uniform(0.5, 0.9)
     spot = (far * math.cos(angle), far * math.sin(angle), 0.0)
     kind = b.count(0, 4)
@@ -424,7 +424,7 @@ def _prop(b: Builder, reach: float) -> None:
 
 
 def _light(b: Builder) -> Array:
-    """A sun from above and light of about the strength of the demo scenes'."""
+    """A random sun from above and ambient light, about as strong as in the demo scenes."""
     turn, rise = b.uniform(0, 2 * math.pi), math.radians(b.uniform(35, 75))
     towards = (math.cos(turn) * math.cos(rise), math.sin(turn) * math.cos(rise), math.sin(rise))
     sun, sky, ambient = b.uniform(0.4, 0.6), b.uniform(0.15, 0.28), b.uniform(0.32, 0.45)
@@ -432,7 +432,7 @@ def _light(b: Builder) -> Array:
 
 
 def _framed(b: Builder, solids: Solids) -> Solids:
-    """Brought to the middle, and to a size that such cameras see whole."""
+    """Centre the object and scale it to fit into the view of the cameras."""
     low, high = solids.bounds()
     half = 0.5 * (high - low)
     scale = min(b.uniform(1.1, 1.7) / float(np.linalg.norm(half)), 1.1 / float(half.max()))

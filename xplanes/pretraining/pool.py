@@ -1,4 +1,4 @@
-"""Objects on disk, drawn once: shards that are checked, and go on where they stopped."""
+"""Training objects on disk: generated once, in checksummed shards; generation is resumable."""
 
 import hashlib
 import math
@@ -22,11 +22,11 @@ from xplanes.scenes.cameras import look_at
 from xplanes.scenes.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE
 
 FOCAL = 0.5 / math.tan(0.5 * CAMERA_ANGLE_X)
-"""Focal length of D-NeRF's cameras as a share of the picture's side."""
+"""Focal length of D-NeRF's cameras as a share of the image side."""
 
 
 def camera(azimuth: float, elevation: float) -> Array:
-    """Pose of a D-NeRF camera that looks at the origin from a direction in degrees. [4, 4]"""
+    """Pose of a camera that looks at the origin, at D-NeRF's distance; degrees. [4, 4]"""
     turn, rise = math.radians(azimuth), math.radians(elevation)
     flat = math.cos(rise)
     place = [flat * math.cos(turn), flat * math.sin(turn), math.sin(rise)]
@@ -36,17 +36,17 @@ def camera(azimuth: float, elevation: float) -> Array:
 def render_solids(
     solids: Solids, pose: Array, side: int, samples: int = 2
 ) -> tuple[Array, Array, Array]:
-    """Render one picture.
+    """Render one image.
 
     Args:
-        solids: What stands before the camera.
-        pose: Camera to world. [4, 4]
-        side: Pixels along each side.
+        solids: The object.
+        pose: Camera-to-world matrix. [4, 4]
+        side: Height and width in pixels.
         samples: Rays per pixel and axis.
 
     Returns:
-        Colour on white, opacity, and the distance along each pixel's first ray (inf where it
-        misses), which passes through the middle of its first sample. [S, S, 3], [S, S], [S, S]
+        Colour on white, opacity, and the depth along each pixel's first ray (inf if it misses),
+        which passes through the centre of the pixel's first sample. [S, S, 3], [S, S], [S, S]
     """
     colour, alpha, depth = np.empty((side, side, 3)), np.empty((side, side)), np.empty((side, side))
     cpu = compiled("xplanes.pretraining.cpu")
@@ -58,7 +58,7 @@ def render_solids(
 def cast(
     solids: Solids, origins: Array, directions: Array
 ) -> tuple[Array, NDArray[np.int64], Array, Array]:
-    """First surface on each ray [N, 3]: distance, part, normal, colour. [N], [N], [N, 3], [N, 3]"""
+    """First hit of each ray [N, 3]: distance, part, normal, colour. [N], [N], [N, 3], [N, 3]"""
     distances, owners = np.empty(len(origins)), np.empty(len(origins), dtype=np.int64)
     seen = np.zeros((len(origins), 6))
     cpu = compiled("xplanes.pretraining.cpu")
@@ -67,7 +67,7 @@ def cast(
 
 
 def inside(solids: Solids, points: Array) -> NDArray[np.bool_]:
-    """Which positions [N, 3] lie inside any part. [N]"""
+    """Whether points [N, 3] lie inside any part. [N]"""
     result = np.zeros(len(points), dtype=np.bool_)
     compiled("xplanes.pretraining.cpu").inside(solids.arrays, points, result)
     return result
@@ -77,7 +77,7 @@ _CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).res
 
 
 def _rectangles(solids: Solids, pose: Array, side: int) -> NDArray[np.int64]:
-    """Rows and columns (from, to) that each part can be seen in. [P, 4]"""
+    """Bounding rectangle of each part in the image: rows and columns (from, to). [P, 4]"""
     local = solids.extents[:, None] * _CORNERS
     corners = np.einsum("pij,pcj->pci", solids.rotations, local) + solids.centres[:, None]
     x, y, z = np.moveaxis((corners - pose[:3, 3]) @ pose[:3, :3], -1, 0)
@@ -89,21 +89,21 @@ def _rectangles(solids: Solids, pose: Array, side: int) -> NDArray[np.int64]:
 
 
 SURFACE, VOLUME = 2048, 1024
-"""Points kept near the surface, and anywhere around the object."""
+"""Points stored per object: near the surface, and in the volume around the object."""
 
 SPREADS = (0.01, 0.03, 0.09)
-"""Standard deviations of the distances at which points near the surface lie."""
+"""Standard deviations of the distance between the surface and points near it."""
 
 STREAM = 41_011
-"""Keeps cameras and points apart from the objects' own choices."""
+"""Random stream of cameras and points, independent of the objects' own stream."""
 
 
 def sample_type(views: int, side: int) -> np.dtype:
-    """One object as a record.
+    """Record type of one object.
 
-    Its fields are RGB on white and opacity of each view, the distance along each pixel's first ray
-    less the cameras' (inf where it misses), camera poses, points and whether they are inside, and
-    points on the surface with their colours.
+    Fields: RGB on white and opacity of each view; depth along each pixel's first ray minus the
+    camera distance (inf if it misses); camera poses; points and their occupancy; surface points and
+    their colours.
     """
     return np.dtype(
         [
@@ -119,7 +119,7 @@ def sample_type(views: int, side: int) -> np.dtype:
 
 
 def draw_sample(seed: int, views: int, side: int) -> NDArray:
-    """The record of an object, the same for the same seed. [1]"""
+    """Generate the record of an object, deterministically from its seed. [1]"""
     solids, random = procedural_object(seed), np.random.default_rng([STREAM, seed])
     record = np.zeros(1, sample_type(views, side))
     for view, (azimuth, elevation) in enumerate(_cameras(random, views)):
@@ -136,18 +136,18 @@ def draw_sample(seed: int, views: int, side: int) -> NDArray:
     near = found + spread * random.normal(size=found.shape)
     around = random.uniform(low - 0.15, high + 0.15, (VOLUME, 3))
     record["points"][0] = np.concatenate([near, around])
-    # Occupancy is that of the rounded points.
+    # Occupancy is evaluated at the rounded points.
     record["inside"][0] = inside(solids, record["points"][0].astype(np.float64))
     return record
 
 
 def view_cameras(seed: int, views: int) -> list[tuple[float, float]]:
-    """Azimuth and elevation of the cameras that see an object, in degrees."""
+    """Azimuth and elevation of an object's cameras, in degrees."""
     return _cameras(np.random.default_rng([STREAM, seed]), views)
 
 
 def _cameras(random: np.random.Generator, views: int) -> list[tuple[float, float]]:
-    """Mostly from the side, at times from above."""
+    """Elevation is mostly low; 15% of the views are from above."""
     found = []
     for _ in range(views):
         elevation = random.uniform(3, 50) if random.random() < 0.85 else random.uniform(50, 85)
@@ -156,7 +156,7 @@ def _cameras(random: np.random.Generator, views: int) -> list[tuple[float, float
 
 
 def surface_points(solids: Solids, random: np.random.Generator, count: int) -> tuple[Array, Array]:
-    """Points on the surface, as random lines from above and the sides first meet it.
+    """Sample the surface by casting random rays from above and from the sides.
 
     Returns:
         Positions and shaded colours. [N, 3], [N, 3]
@@ -183,20 +183,20 @@ def surface_points(solids: Solids, random: np.random.Generator, count: int) -> t
 
 
 VERSION = 1
-"""Raised when the same seed would come out as another record."""
+"""Version of the records; increase it whenever a seed gives a different record."""
 
 SHARD = 256
-"""Objects in a file."""
+"""Objects per file."""
 
 RECORD = "pool.json"
 
 
 @dataclass(frozen=True)
 class Pool:
-    """Records of objects, read from disk as they are needed.
+    """Records of objects, read from disk on demand.
 
     Attributes:
-        shards: Records of `sample_type`, mapped into memory. [SHARD] each
+        shards: Memory-mapped records of `sample_type`. [SHARD] each
     """
 
     shards: tuple[NDArray, ...]
@@ -205,7 +205,7 @@ class Pool:
         return sum(len(shard) for shard in self.shards)
 
     def __getitem__(self, number: int) -> Any:
-        """The record of an object by its place in the pool."""
+        """The record of an object by its index in the pool."""
         shard, index = divmod(number, SHARD)
         return self.shards[shard][index]
 
@@ -218,17 +218,17 @@ def ensure_pool(
     side: int,
     announce: Callable[[str], None] = print,
 ) -> Pool:
-    """The records of all objects with these seeds; what is missing on disk is drawn.
+    """Records of all objects with these seeds; missing shards are generated.
 
     Args:
-        folder: Where the shards lie; made if missing.
+        folder: Folder of the shards; created if missing.
         seeds: Seeds of the objects, a whole number of shards.
-        views: Pictures of each object.
-        side: Their pixels along each side.
-        announce: Takes a line now and then while objects are drawn.
+        views: Images per object.
+        side: Height and width of an image in pixels.
+        announce: Receives progress messages.
 
     Raises:
-        ConfigError: If the folder holds a pool of another kind, or its record is damaged.
+        ConfigError: If the folder holds a pool with other settings, or its index is damaged.
     """
     if len(seeds) % SHARD:
         raise ConfigError(f"pool.objects={len(seeds)}: must be a multiple of {SHARD}")
@@ -245,7 +245,7 @@ def ensure_pool(
             record["sha256"][path.name] = _digest(path)
             write_json(folder / RECORD, record)
             if number % 8 == 7 or (number + 1) * SHARD == len(seeds):
-                announce(f"drawn {(number + 1) * SHARD} of {len(seeds)} objects")
+                announce(f"generated {(number + 1) * SHARD} of {len(seeds)} objects")
         shards.append(np.load(path, mmap_mode="r"))
     return Pool(tuple(shards))
 
@@ -258,18 +258,18 @@ def _read(folder: Path, kind: dict[str, int]) -> dict[str, Any]:
         record = read_json(path)
     except ValueError as problem:
         raise ConfigError(
-            f"pool.root={folder}: {problem}; delete it, and the objects are drawn again"
+            f"pool.root={folder}: {problem}; delete it to generate the objects again"
         ) from problem
     found = {key: record.get(key) for key in kind}
     if found != kind:
         raise ConfigError(
-            f"pool.root={folder} holds a pool of {found}, wanted is {kind}: name another folder"
+            f"pool.root={folder} holds a pool with {found}, not {kind}: name another folder"
         )
     return record
 
 
 def _digest(path: Path) -> str | None:
-    """SHA-256 of a file; None where there is none."""
+    """SHA-256 of a file; None if it does not exist."""
     if not path.is_file():
         return None
     with path.open("rb") as file:
@@ -277,27 +277,27 @@ def _digest(path: Path) -> str | None:
 
 
 DITHER = 0.01
-"""Standard deviation of the distance to the surface at which its colour is asked for."""
+"""Standard deviation of the offset from the surface at which colours are supervised."""
 
 
 TRIES = 3
-"""Points near the surface of which one is kept."""
+"""Candidates per point near the surface; the farthest from the surface is used."""
 
 
 class PretrainingBatch(NamedTuple):
-    """Input pictures and what is known of the objects, all in the model's frame.
+    """Input images and supervision, in the model's frame.
 
     Attributes:
-        images: RGB on white. [B, 3, S, S]
+        images: RGB on white, in [0, 1]. [B, 3, S, S]
         points: Positions. [B, N, 3]
-        inside: Whether they are inside, 0 or 1. [B, N]
-        surface: Positions at the surface. [B, M, 3]
-        colours: Their colours. [B, M, 3]
-        origins: Where rays start. [B, R, 3]
-        directions: Their unit directions. [B, R, 3]
+        inside: Their occupancy, 0 or 1. [B, N]
+        surface: Positions near the surface. [B, M, 3]
+        colours: Their colours, in [0, 1]. [B, M, 3]
+        origins: Ray origins. [B, R, 3]
+        directions: Unit ray directions. [B, R, 3]
         ray_colours: Colours of their pixels, on white. [B, R, 3]
         ray_alpha: Opacity of their pixels. [B, R]
-        ray_hits: Distance to the surface, inf where missed. [B, R]
+        ray_hits: Distance to the surface, inf for rays that miss. [B, R]
     """
 
     images: Tensor
@@ -318,13 +318,13 @@ class PretrainingBatches:
     Args:
         pool: The objects.
         view: The model's camera.
-        seed: Source of all choices.
-        objects: Objects in a batch.
+        seed: Seed of all random choices.
+        objects: Objects per batch.
         near: Points near the surface, per object.
-        volume: Points around the object.
-        free: Points in front of what some view sees.
-        colour: Points at the surface.
-        rays: Rays, half of them of the input view; 0 for none.
+        volume: Points in the volume around the object, per object.
+        free: Points in the free space in front of the visible surface, per object.
+        colour: Surface points with colour supervision, per object.
+        rays: Rays per object, half of them from the input view; 0 for none.
     """
 
     def __init__(
@@ -346,7 +346,7 @@ class PretrainingBatches:
         self.scale = view.distance / CAMERA_DISTANCE
 
     def draw(self, step: int) -> PretrainingBatch:
-        """The batch of a step; an object shows once in as many steps as it takes to show all."""
+        """The batch of a step; each epoch uses every object at most once."""
         turns = len(self.pool) // self.objects
         order = np.random.default_rng([self.seed, step // turns]).permutation(len(self.pool))
         random = np.random.default_rng([self.seed, step, 1])
@@ -371,7 +371,7 @@ class PretrainingBatches:
         surface = record["surface"][at] + DITHER * random.normal(size=(self.colour, 3))
         origins, directions, pixels, hits = self._rays(record, source, turn, random, self.rays)
         image = record["pictures"][source, ..., :3]
-        # Mirrored and with its colours exchanged an object is another object.
+        # Augmentation: mirroring and permuting the colour channels.
         mirror, channels = random.random() < 0.5, random.permutation(3)
         if mirror:
             image = image[:, ::-1]
@@ -390,9 +390,9 @@ class PretrainingBatches:
         )
 
     def _near(self, record: NDArray, random: np.random.Generator) -> NDArray:
-        """Numbers of points near the surface: of `TRIES` each, the one farthest from it. [N]
+        """Indices of points near the surface: of `TRIES` candidates, the farthest from it. [N]
 
-        Those that lie closer than the planes' texels can tell teach little.
+        Points much closer to the surface than one texel carry little information.
         """
         tries = random.integers(SURFACE, size=(TRIES, self.near))
         apart = record["points"][tries].astype(np.float32) - record["surface"][tries]
@@ -400,7 +400,7 @@ class PretrainingBatches:
         return tries[best, np.arange(self.near)]
 
     def _turn(self, pose: NDArray) -> NDArray:
-        """From the object's world to the model's frame, about the origin. [3, 3]"""
+        """Rotation and scale from the object's world to the model's frame. [3, 3]"""
         return self.scale * self.view.rotation_matrix().numpy() @ pose[:3, :3].T.astype(float)
 
     def _rays(
@@ -416,11 +416,11 @@ class PretrainingBatches:
         pictures = record["pictures"]
         views, side = pictures.shape[:2]
         view = np.where(random.random(count) < 0.5, source, random.integers(views, size=count))
-        # Of two pixels take the second where the first shows nothing: half as much background.
+        # Of two candidates, take the second if the first is background: fewer background rays.
         pixel = random.integers(side, size=(2, count, 2))
         empty = pictures[view, pixel[0, :, 0], pixel[0, :, 1], 3] == 0
         row, column = np.where(empty[:, None], pixel[1], pixel[0]).T
-        # The first of two by two samples is where depth was taken.
+        # Depth belongs to the first of the 2 x 2 samples of a pixel.
         shift = 0.5 if middle else 0.25
         up = (0.5 - (row + shift) / side) / FOCAL
         right = ((column + shift) / side - 0.5) / FOCAL
@@ -435,7 +435,7 @@ class PretrainingBatches:
     def _free_points(
         self, record: NDArray, source: int, turn: NDArray, random: np.random.Generator
     ) -> NDArray:
-        """Points between where rays enter the box and where they hit something. [F, 3]"""
+        """Points between the near bound of the box and the first hit of a ray. [F, 3]"""
         origins, directions, _, hits = self._rays(
             record, source, turn, random, self.free, middle=False
         )

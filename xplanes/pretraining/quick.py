@@ -1,4 +1,4 @@
-"""A look at a few held-out objects while training goes on."""
+"""Scores on a few held-out objects during training."""
 
 import torch
 from torch import Tensor
@@ -16,11 +16,11 @@ _USED = ("pictures", "poses", "points", "inside")
 
 
 class QuickLook:
-    """Scores of the first objects of a held-out pool, seen from their first view.
+    """Scores of the first objects of a held-out pool, reconstructed from their first view.
 
     Args:
         pool: The objects.
-        count: How many are looked at.
+        count: Number of objects.
     """
 
     def __init__(self, pool: Pool, count: int) -> None:
@@ -28,7 +28,7 @@ class QuickLook:
 
     @torch.no_grad()
     def scores(self, model: OpenLRM) -> dict[str, float]:
-        """Overlap at the kept points, and PSNR of the input's view and of the second view."""
+        """IoU at the stored points, and PSNR (dB) of the input view and of the second view."""
         found: dict[str, list[float]] = {"iou": [], "psnr_input": [], "psnr_novel": []}
         camera = canonical_vector(model.view)[None]
         for number in range(self.count):
@@ -49,13 +49,13 @@ class QuickLook:
 
 
 def world_to_model(source: Tensor, model: LRM) -> Tensor:
-    """Scale and turn that take the source camera to the model's own. [4, 4] -> [3, 3]"""
+    """Scale and rotation from world to model frame, for a source camera. [4, 4] -> [3, 3]"""
     scale = model.view.distance / CAMERA_DISTANCE
     return (scale * model.view.rotation_matrix() @ source[:3, :3].T.double()).float()
 
 
 def model_pose(pose: Tensor, turn: Tensor) -> Tensor:
-    """A camera of the world in the model's frame. [4, 4], [3, 3] -> [4, 4]"""
+    """Camera pose in the model's frame. [4, 4], [3, 3] -> [4, 4]"""
     scale = turn.norm(dim=0).mean()
     moved = pose.clone().float()
     moved[:3, :3] = turn / scale @ moved[:3, :3]
@@ -64,6 +64,6 @@ def model_pose(pose: Tensor, turn: Tensor) -> Tensor:
 
 
 def overlap(found: Tensor, truth: Tensor) -> float:
-    """Intersection over union; 1 where both are empty. bool [N], bool [N]"""
+    """Intersection over union; 1 if both are empty. bool [N], bool [N]"""
     union = int((found | truth).sum())
     return int((found & truth).sum()) / union if union else 1.0

@@ -1,4 +1,4 @@
-"""Pictures of a triplane, by evenly spaced samples: short and plain."""
+"""Plain volume rendering of one triplane with evenly spaced samples."""
 
 import torch
 from torch import Tensor
@@ -8,7 +8,7 @@ from xplanes.pretraining.losses import composite, triplane_logits
 from xplanes.scenes.cameras import pixel_rays
 
 CHUNK = 2**14
-"""Samples decoded at a time, so that temporaries stay in the cache."""
+"""Samples decoded at once, so that temporaries fit in the cache."""
 
 
 def render_view(
@@ -21,16 +21,16 @@ def render_view(
     half_side: float = 1.0,
     samples: int = 96,
 ) -> Tensor:
-    """Render one triplane on white.
+    """Render one triplane on a white background.
 
     Args:
         planes: Planes xy, xz, yz. [1, 3, C, H, H]
-        decoder: From features to logits.
-        pose: Camera in the model's frame. [4, 4]
-        side: Pixels along each side.
-        focal: Focal length as a share of the side.
+        decoder: Maps features to logits.
+        pose: Camera-to-world matrix in the model's frame. [4, 4]
+        side: Height and width in pixels.
+        focal: Focal length as a share of the image side.
         half_side: Half the side of the box.
-        samples: Samples of each ray.
+        samples: Samples per ray.
 
     Returns:
         RGB from 0 to 1. [S, S, 3]

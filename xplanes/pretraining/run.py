@@ -1,4 +1,4 @@
-"""The whole job of `xplanes pretrain-lrm`: pool, training, weights."""
+"""`xplanes pretrain-lrm`: generates the objects, trains the model and exports its weights."""
 
 import hashlib
 import itertools
@@ -39,11 +39,11 @@ def export(model: OpenLRM, config: dict[str, Any], folder: Path, name: str) -> P
     Args:
         model: The model.
         config: The content of its config.json.
-        folder: Where to.
-        name: Name of the files.
+        folder: Output folder.
+        name: File name without suffix.
 
     Returns:
-        The weights. Their SHA-256 stands in the configuration as ``weights_sha256``.
+        The file of the weights. Its SHA-256 is written to the configuration as ``weights_sha256``.
     """
     path = folder / f"{name}.safetensors"
     state = {key: value.half().contiguous() for key, value in published_state(model).items()}
@@ -63,9 +63,9 @@ def published_state(model: OpenLRM) -> dict[str, Tensor]:
     result: dict[str, Tensor] = {}
     for published, names in NAMES[config.architecture].items():
         templates = () if names is None else (names,) if isinstance(names, str) else names
-        # Query, key and value of attention to the picture are stacked where widths are equal.
-        of_picture = ".cross_attn." in published and "out_proj" not in published
-        if of_picture and packed != ("in_proj" in published):
+        # Query, key and value of attention to the image are stacked if the widths are equal.
+        to_image = ".cross_attn." in published and "out_proj" not in published
+        if to_image and packed != ("in_proj" in published):
             continue
         for layer in range(layers):
             for part in ("weight", "bias"):
@@ -87,7 +87,7 @@ class Steps(IterableDataset):
 
     Args:
         batches: Draws the batch of a step.
-        step: Tells the step.
+        step: Returns the current step.
     """
 
     def __init__(self, batches: PretrainingBatches, step: Callable[[], int]) -> None:
@@ -99,18 +99,18 @@ class Steps(IterableDataset):
 
 
 def pretrain(plain: dict, config: PretrainingSettings, announce: Callable[[str], None]) -> Path:
-    """Train a model to the end of its budget, from its last checkpoint on where there is one.
+    """Train a model until its budget is used, resuming from its last checkpoint if there is one.
 
     Args:
-        plain: The configuration as builtins, kept beside the checkpoints.
-        config: The same, typed.
-        announce: Takes lines about what happens.
+        plain: The configuration as builtins, written to the run folder.
+        config: The same configuration as typed settings.
+        announce: Receives progress messages.
 
     Returns:
-        The weights; their configuration lies beside them.
+        The file of the weights; the configuration is in the same folder.
 
     Raises:
-        ConfigError: If the run's folder holds a run of another model or seed.
+        ConfigError: If the run folder holds a run with another model, pool or seed.
     """
     quiet_lightning()
     run = Path(config.run)
@@ -118,7 +118,7 @@ def pretrain(plain: dict, config: PretrainingSettings, announce: Callable[[str],
     _settle(run, plain)
     module, data, look = assemble(config, announce)
     if last.is_file():
-        announce(f"going on from {last}")
+        announce(f"resuming from {last}")
     interrupt = Interrupt()
     trainer = Trainer(
         accelerator="cpu",
@@ -142,7 +142,7 @@ def pretrain(plain: dict, config: PretrainingSettings, announce: Callable[[str],
 def assemble(
     config: PretrainingSettings, announce: Callable[[str], None]
 ) -> tuple[PretrainingModule, PretrainingBatches, QuickLook]:
-    """The module at its start, its batches, and what looks at held-out objects."""
+    """The initialised module, its training batches, and the scores on held-out objects."""
     pool, batch, side = config.pool, config.batch, config.model.image_size
     drawn = ensure_pool(
         Path(pool.root),
@@ -190,26 +190,26 @@ def _grown(init_from: str, sizes: LRMConfig) -> OpenLRM:
         return grow_model(earlier, sizes).requires_grad_(True)
     except (OSError, ValueError, RuntimeError) as problem:
         raise ConfigError(
-            f"init_from={init_from}: not the weights of such a model: {problem}"
+            f"init_from={init_from}: the weights do not fit this model: {problem}"
         ) from problem
 
 
 def _settle(run: Path, plain: dict) -> None:
-    """Keep the configuration in the run's folder, and refuse one that does not go on with it."""
+    """Write the configuration to the run folder; refuse one that contradicts the earlier one."""
     path = run / "config.json"
     if path.is_file():
         before = read_json(path)
         for key in ("seed", "model", "pool"):
             if before.get(key) != plain[key]:
                 raise ConfigError(
-                    f"run={run} holds a run with {key}={before.get(key)}, asked for is "
-                    f"{plain[key]}: name another folder, or leave {key} as it was"
+                    f"run={run} holds a run with {key}={before.get(key)}, not {key}={plain[key]}: "
+                    f"name another folder, or keep {key} as it was"
                 )
     write_json(path, plain)
 
 
 def compose_pretraining(overrides: Sequence[str]) -> dict:
-    """The configuration as builtins.
+    """The resolved configuration as builtins.
 
     Raises:
         ConfigError: For a key or option that does not exist.
@@ -218,10 +218,10 @@ def compose_pretraining(overrides: Sequence[str]) -> dict:
 
 
 def run_pretraining(overrides: Sequence[str], announce: Callable[[str], None]) -> Path:
-    """Train a small model of our own; returns its weights.
+    """Train a small LRM; returns the file of its weights.
 
     Raises:
-        ConfigError: If settings cannot work.
+        ConfigError: If a setting is invalid.
     """
     plain = compose_pretraining(overrides)
     config = parse_pretraining(plain)

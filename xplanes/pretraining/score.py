@@ -1,4 +1,4 @@
-"""How well a model reconstructs: held-out procedural objects, and the demo scenes."""
+"""Reconstruction quality on held-out procedural objects and on the demo scenes."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -22,25 +22,25 @@ from xplanes.scenes.demo.render import camera_at, render_image
 from xplanes.scenes.demo.scenes import DEMO_SCENES, build_demo_scene
 
 GRID = 48
-"""Points along each side of the box at which solid and empty are compared."""
+"""Points along each side of the box on which IoU is computed."""
 
 TURNS = (40.0, 180.0, -90.0)
-"""Degrees by which novel cameras of the demo scenes stand beside the fixed one."""
+"""Azimuths of the novel cameras of the demo scenes relative to the fixed camera, in degrees."""
 
 
 RISE = 20.0
-"""Height angle of these cameras in degrees."""
+"""Elevation of these cameras in degrees."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """Something to reconstruct.
+    """An object or scene to reconstruct.
 
     Attributes:
-        name: For tables and pictures.
-        cameras: The input's camera, then novel ones. [V, 4, 4]
-        picture: RGB on white from a camera, given the side in pixels. [S, S, 3]
-        inside: Which world points [N, 3] are solid. [N]
+        name: Name in tables.
+        cameras: Pose of the input camera, then of novel cameras. [V, 4, 4]
+        picture: Renders RGB on white for a pose and a side in pixels. [S, S, 3]
+        inside: Whether world points [N, 3] are occupied. [N]
     """
 
     name: str
@@ -50,7 +50,7 @@ class Subject:
 
 
 def held_out(count: int) -> Iterator[Subject]:
-    """The first held-out objects, each from the cameras that its seed gives it."""
+    """The first held-out objects, each with the cameras of its seed."""
     for seed in HELD_OUT_SEEDS[:count]:
         solids = procedural_object(seed)
         yield Subject(
@@ -62,9 +62,9 @@ def held_out(count: int) -> Iterator[Subject]:
 
 
 def demo_subjects(time: float = 0.4) -> Iterator[Subject]:
-    """The demo scenes at one timestep: from their fixed, level cameras, and from above these.
+    """The demo scenes at one timestep, from their fixed camera and from one above it.
 
-    Novel cameras stand beside them, above the horizon.
+    Novel cameras have an elevation of `RISE` degrees.
     """
     for name, scene in DEMO_SCENES.items():
         posed = build_demo_scene(name).pose(time)
@@ -86,11 +86,11 @@ def demo_subjects(time: float = 0.4) -> Iterator[Subject]:
 
 @dataclass(frozen=True)
 class Score:
-    """Scores of one subject, and a strip of pictures.
+    """Scores of one subject, and a strip of images.
 
     Attributes:
         name: The subject.
-        values: IoU, and PSNR and SSIM of the input's view and of novel views (their mean).
+        values: IoU, PSNR (dB) and SSIM of the input view, and their means over novel views.
         strip: Input, its reconstruction, a novel view, its reconstruction. [S, 4 S, 3]
     """
 
@@ -101,7 +101,7 @@ class Score:
 
 @torch.no_grad()
 def score(model: LRM, subject: Subject) -> Score:
-    """Reconstruct a subject from its first view."""
+    """Reconstruct a subject from its first view and score it."""
     side = model.image_size
     pictures = [subject.picture(pose, side).float() for pose in subject.cameras]
     planes = model.encode(pictures[0].permute(2, 0, 1)[None])
@@ -135,13 +135,13 @@ def score(model: LRM, subject: Subject) -> Score:
 def score_all(
     model: LRM, folder: Path, *, objects: int, announce: Callable[[str], None]
 ) -> dict[str, dict[str, float]]:
-    """Score held-out objects and demo scenes; write scores.json, objects.png and demo.png.
+    """Score held-out objects and demo scenes; write scores.json and PNG sheets.
 
     Args:
         model: The model.
-        folder: Where to write.
-        objects: Held-out objects.
-        announce: Takes lines of the table.
+        folder: Output folder.
+        objects: Number of held-out objects.
+        announce: Receives the lines of the table.
 
     Returns:
         Mean scores of the objects, and those of each demo scene, by name.
@@ -164,7 +164,7 @@ def score_all(
 
 
 def write_sheet(path: Path, strips: list[Tensor], columns: int) -> None:
-    """Strips of pictures side by side and below one another, as a PNG."""
+    """Write strips of images as a PNG sheet."""
     rows = [torch.cat(strips[i : i + columns], dim=1) for i in range(0, len(strips), columns)]
     width = max(row.shape[1] for row in rows)
     filled = [torch.nn.functional.pad(r, (0, 0, 0, width - r.shape[1]), value=1.0) for r in rows]

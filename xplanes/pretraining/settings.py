@@ -1,4 +1,4 @@
-"""Every setting of `xplanes pretrain-lrm`, typed. The values live in conf/."""
+"""Typed settings of `xplanes pretrain-lrm`. Their values are in conf/."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,21 +10,21 @@ from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
 
 @dataclass(frozen=True, kw_only=True)
 class SizeSettings(Settings):
-    """Sizes of a small OpenLRM 1.1, and the camera that it believes in."""
+    """Sizes of a small OpenLRM 1.1, and its canonical camera."""
 
-    name: str  # Name of the model, and of its files.
-    image_size: Count  # Pixels along each side of the input.
-    patch: Count  # Pixels along each side of a patch.
+    name: str  # Name of the model and its files.
+    image_size: Count  # Height and width of the input image in pixels.
+    patch: Count  # Side of a patch in pixels.
     encoder_depth: Count  # Blocks of the image encoder.
     registers: Count  # Register tokens of the image encoder.
     width: Count  # Channels of all tokens.
     heads: Count  # Attention heads.
     layers: Count  # Blocks of the triplane transformer.
-    low_resolution: Count  # Tokens along each side of a plane; it has twice the texels.
+    low_resolution: Count  # Tokens along each side of a plane; a plane has twice as many texels.
     channels: Count  # Channels of each plane.
     camera_width: Count  # Channels of the camera embedding.
     distance: Positive  # From the camera to the centre of the box [-1, 1]^3.
-    density_scale: Positive  # Factor on the density: one over the length of a step.
+    density_scale: Positive  # Factor on the density: 1 / (length of a step).
 
     def check(self) -> None:
         if self.image_size % self.patch:
@@ -37,24 +37,24 @@ class SizeSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class PoolSettings(Settings):
-    """Objects drawn once and kept on disk."""
+    """Objects that are generated once and stored on disk."""
 
     root: str  # Folder of the pool.
-    objects: Count  # Objects to learn from, a multiple of 256.
-    views: Count  # Pictures of each.
+    objects: Count  # Training objects, a multiple of 256.
+    views: Count  # Images per object.
 
 
 @dataclass(frozen=True, kw_only=True)
 class BatchSettings(Settings):
-    """What a step looks at."""
+    """Objects, points and rays of a training step."""
 
-    objects: Count  # Objects of a step, one input picture each.
+    objects: Count  # Objects per step, one input image each.
     near: Steps  # Points near the surface, per object.
-    volume: Steps  # Points around the object.
-    free: Steps  # Points in front of what a view sees.
-    colour: Steps  # Points at the surface, asked for their colour.
-    rays: Steps  # Rays rendered once rendering has begun.
-    samples: Count  # Samples of a ray.
+    volume: Steps  # Points in the volume around the object, per object.
+    free: Steps  # Points in the free space in front of the surface, per object.
+    colour: Steps  # Surface points with colour supervision, per object.
+    rays: Steps  # Rays rendered per object, from schedule.render_from on.
+    samples: Count  # Samples per ray.
 
     def check(self) -> None:
         if self.rays and self.samples < 4:
@@ -63,33 +63,33 @@ class BatchSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class ScheduleSettings(Settings):
-    """Budget, optimisers and weights of the losses."""
+    """Budget, optimisers and loss weights."""
 
-    max_steps: Count  # Steps at most.
-    max_seconds: Positive | None  # Training clock at most; null for no limit.
+    max_steps: Count  # Maximum number of steps.
+    max_seconds: Positive | None  # Maximum training time in seconds; null for no limit.
     muon_lr: Positive  # Peak learning rate of the blocks' matrices (Muon).
-    adam_lr: Positive  # Peak learning rate of all else (AdamW).
-    weight_decay: Weight  # Of both.
-    warmup_steps: Steps  # Steps until the peak.
-    decay_share: Share  # Share of the budget in which the rates fall to zero.
-    clip: Positive  # Norm that gradients are scaled down to.
-    average: Share  # Decay of the moving average of weights that is shipped.
-    colour_weight: Weight  # Of the colour at the surface.
-    render_weight: Weight  # Of rendered rays, colour and opacity.
+    adam_lr: Positive  # Peak learning rate of all other parameters (AdamW).
+    weight_decay: Weight  # Weight decay of both optimisers.
+    warmup_steps: Steps  # Warm-up steps of the learning rates.
+    decay_share: Share  # Share of the budget over which the learning rates decay to zero.
+    clip: Positive  # Maximum norm of the gradient.
+    average: Share  # Decay of the exponential moving average of the exported weights.
+    colour_weight: Weight  # Weight of the colour loss at surface points.
+    render_weight: Weight  # Weight of the loss on rendered rays (colour and opacity).
     render_from: Share  # Share of the budget from which rays are rendered.
-    checkpoint_seconds: Positive  # Between checkpoints.
-    score_seconds: Positive  # Between looks at held-out objects.
-    score_objects: Count  # Held-out objects looked at.
-    log_every: Count  # Steps between lines and TensorBoard scalars.
+    checkpoint_seconds: Positive  # Seconds between checkpoints.
+    score_seconds: Positive  # Seconds between scores on held-out objects.
+    score_objects: Count  # Held-out objects that are scored.
+    log_every: Count  # Steps between log lines and TensorBoard scalars.
 
 
 @dataclass(frozen=True, kw_only=True)
 class PretrainingSettings(Settings):
     """The whole configuration of a pretraining."""
 
-    seed: Steps  # Source of all randomness.
+    seed: Steps  # Seed of all random numbers.
     init_from: str | None  # Weights of a model with coarser planes; null: random initialisation.
-    run: str  # Folder of checkpoints and logs; an earlier run in it goes on.
+    run: str  # Folder of checkpoints and logs; a run in it is resumed.
     model: SizeSettings
     pool: PoolSettings
     batch: BatchSettings
@@ -107,7 +107,7 @@ def parse_pretraining(plain: Mapping[str, Any]) -> PretrainingSettings:
 
 
 def published_sizes(model: SizeSettings, focal: float) -> dict[str, Any]:
-    """The config.json of a model: OpenLRM 1.1's keys, and those of its own camera and sizes."""
+    """The config.json of a model: OpenLRM 1.1's keys, plus the keys for its camera and sizes."""
     return {
         "architecture": "openlrm-1.1",
         "camera_embed_dim": model.camera_width,

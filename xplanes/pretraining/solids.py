@@ -1,4 +1,4 @@
-"""A lit pile of solids as arrays, which compiled loops read, and the same as the demo's classes."""
+"""Lit solids as arrays for the compiled loops, and their conversion to the demo's classes."""
 
 from dataclasses import dataclass
 
@@ -24,13 +24,13 @@ from xplanes.scenes.demo.posed import Posed, PosedPart
 from xplanes.scenes.demo.shading import Light
 
 BOX, ELLIPSOID, CYLINDER, CAPSULE, TORUS = range(5)
-"""Kinds of solids. Their sizes are the arguments of the demo's class of that name."""
+"""Kinds of solids. Their sizes are the arguments of the demo class of the same name."""
 
 PLAIN, STRIPES, CHECKER, BRICKS, SECTORS = range(5)
 """Kinds of patterns.
 
-Their numbers are: mottle and wave; axis, width and colours; three cells and colours; length,
-height and joint; count and colours.
+Their parameters, in this order: mottle and wave length; axis, width and number of colours; three
+cell sizes and number of colours; length, height and joint; count and number of colours.
 """
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Solids:
-    """Solids at their places, painted and lit.
+    """Solids with positions, patterns and light.
 
     Attributes:
         kinds: BOX, ELLIPSOID, CYLINDER, CAPSULE or TORUS. int64 [P]
@@ -46,8 +46,8 @@ class Solids:
         rotations: From each part's coordinates to the world's. [P, 3, 3]
         centres: Each part's centre in the world. [P, 3]
         patterns: PLAIN, STRIPES, CHECKER, BRICKS or SECTORS. int64 [P]
-        paints: Colours of each pattern, in [0, 1]. [P, 3, 3]
-        numbers: Numbers of each pattern. [P, 4]
+        paints: Three colours of each pattern, in [0, 1]. [P, 3, 3]
+        numbers: Parameters of each pattern. [P, 4]
         light: Direction to the sun, strength of sun, sky and ambient light, and shadow. [7]
     """
 
@@ -62,7 +62,7 @@ class Solids:
 
     @property
     def arrays(self) -> tuple[NDArray, ...]:
-        """What the compiled loops take."""
+        """Arguments of the compiled loops."""
         return (
             self.kinds, self.sizes, self.rotations, self.centres, self.reach,
             self.patterns, self.paints, self.numbers, self.light,
@@ -70,7 +70,7 @@ class Solids:
 
     @property
     def extents(self) -> Array:
-        """Half sides of each part's box along its own axes. [P, 3]"""
+        """Half sides of each part's bounding box in its own axes. [P, 3]"""
         size, extent = self.sizes, self.sizes.copy()
         for kind, columns in (
             (CYLINDER, (size[:, 0], size[:, 0], size[:, 1])),
@@ -83,16 +83,16 @@ class Solids:
 
     @property
     def reach(self) -> Array:
-        """Radius of a ball around each part's centre that holds it. [P]"""
+        """Radius of each part's bounding sphere around its centre. [P]"""
         return np.linalg.norm(self.extents, axis=-1)
 
     def bounds(self) -> tuple[Array, Array]:
-        """Corners of an upright box that holds every part. [3], [3]"""
+        """Corners of the axis-aligned bounding box of all parts. [3], [3]"""
         reach = np.einsum("pij,pj->pi", np.abs(self.rotations), self.extents)
         return (self.centres - reach).min(axis=0), (self.centres + reach).max(axis=0)
 
     def moved(self, scale: float, shift: Array) -> "Solids":
-        """The whole scaled about the origin, patterns too, and then shifted."""
+        """All solids and patterns scaled about the origin, then translated."""
         numbers = self.numbers.copy()
         for kind, columns in ((PLAIN, slice(1, 2)), (STRIPES, slice(1, 2)), (CHECKER, slice(3))):
             numbers[self.patterns == kind, columns] *= scale
@@ -103,7 +103,7 @@ class Solids:
         )  # fmt: skip
 
     def posed(self) -> Posed:
-        """The same as the demo's classes, in double precision: the reference."""
+        """The same solids as the demo's classes, in double precision: the reference."""
         towards, (sun, sky, ambient, shadow) = tuple(self.light[:3]), self.light[3:]
         light = Light(towards, float(sun), float(sky), float(ambient), float(shadow))
         parts = [

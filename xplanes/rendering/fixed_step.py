@@ -133,9 +133,9 @@ class FixedStepRenderer(RayRenderer):
 class FixedStepSettings(SamplerSettings):
     """Equal steps through a field's box; samples that add nothing get no colour."""
 
-    near: Weight  # First sample's distance in world units.
-    far: Positive  # Last sample's distance in world units.
-    step: Positive  # Distance between samples, in cells of the field.
+    near: Weight  # Near bound in world units.
+    far: Positive  # Far bound in world units.
+    step: Positive  # Distance between samples, in cells.
     # Opacity, and weight, at which samples are dropped.
     threshold: Annotated[float, Range(0, 1, open=True)]
 

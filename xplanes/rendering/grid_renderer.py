@@ -117,23 +117,23 @@ Fraction = Annotated[float, Range(0, 1, open=True)]
 class OccupancySettings(SamplerSettings):
     """Where rays are sampled, and which samples are never computed."""
 
-    samples: Count  # Steps along the diagonal of the cube in training.
-    render_samples: Count  # The same in images, for scores and videos.
+    samples: Count  # Samples along the diagonal of the cube in training.
+    render_samples: Count  # Samples along the diagonal in evaluation and videos.
     grid_resolution: Count  # Cells of the occupancy grid along each side.
     time_bins: Count  # Bins of the occupancy grid along time.
     threshold: Fraction  # Opacity of one step below which a cell is empty.
-    decay: Share  # Factor on a cell's density at each update.
+    decay: Share  # Decay of the density of a cell at each update.
     skip_empty: bool  # Skip samples in empty cells.
     skip_occluded: bool  # Skip samples behind opaque surfaces.
     occlusion: Annotated[float, Range(0, 1)]  # Transmittance below which a surface is opaque.
     thinning: Weight  # Gradients below this times the mean are subsampled; 0: none.
-    silhouettes: bool  # Rule out cells that the images' alpha shows to be empty.
-    fill: bool  # Empty cells in which an initialised field shows nothing.
-    coarse_steps: Steps  # First steps, in which samples lie twice as far apart.
+    silhouettes: bool  # Prune cells outside the silhouettes (alpha).
+    fill: bool  # Prune empty cells of an initialised field.
+    coarse_steps: Steps  # Initial steps with half the number of samples.
     sweep_at: list[int]  # Steps at which all occupied cells are updated.
-    sweep_every: Count  # Steps between such sweeps later on.
-    update_every: Count  # Steps between updates of cells that no sample may reach.
-    update_cells: Count  # Cells per update at most.
+    sweep_every: Count  # Steps between such updates afterwards.
+    update_every: Count  # Steps between updates of random cells.
+    update_cells: Count  # Maximum number of cells per update.
 
     def check(self) -> None:
         if self.occlusion >= 1:

@@ -172,9 +172,9 @@ def _points(origins: Tensor, directions: Tensor, distances: Tensor) -> Tensor:
 class NeusSettings(SamplerSettings):
     """Samples near a surface, which a coarse round finds."""
 
-    samples: Count  # Equal steps of the coarse round.
-    more_samples: Count  # Samples that it adds near the surface.
-    coarse_sharpness: Positive  # Sharpness at which it looks for the surface.
+    samples: Count  # Uniform coarse samples per ray.
+    more_samples: Count  # Importance samples near the surface.
+    coarse_sharpness: Positive  # Sharpness of the importance sampling.
 
     def require(self, field: RadianceField | type[RadianceField]) -> None:
         if not hasattr(field, "distance_and_slope"):

@@ -207,28 +207,28 @@ class ProposalSettings(SamplerSettings):
 
     devices: ClassVar[int | None] = 1
 
-    near: Weight | None  # First sample's distance in world units; null: the cube's.
-    far: Positive | None  # Last sample's distance in world units; null: the cube's.
-    samples: Count  # Samples of a ray that reach the field.
-    proposal_samples: list[Count]  # Samples in each density field, in order.
+    near: Weight | None  # Near bound in world units; null: the cube.
+    far: Positive | None  # Far bound in world units; null: the cube.
+    samples: Count  # Samples per ray in the field.
+    proposal_samples: list[Count]  # Samples per ray in each density field.
     resolutions: list[Count]  # Texels along each space axis of each density field.
     time_resolution: Count  # Rows of time of the density fields.
     channels: Count  # Channels of their planes.
     width: Count  # Neurons of their hidden layer.
-    linear: bool  # Leave out their activation, as the explicit K-Planes does.
-    space_low: float  # Least initial value of their space planes.
-    space_high: float  # Largest one; time planes are initialised to 1.
-    padding: Positive  # Added to each weight before samples are drawn.
-    anneal_steps: Count  # Steps over which the weights' exponent rises to 1.
-    anneal_slope: Positive  # How fast it rises at first.
-    update_every: Count  # Steps between the density fields' updates, later on.
-    update_warmup: Count  # Steps over which they grow this rare.
-    histogram: Weight  # Weight of the bound on the field's weights.
+    linear: bool  # No activation, as in the explicit K-Planes.
+    space_low: float  # Lower bound of their uniform initialisation.
+    space_high: float  # Upper bound. Time planes are initialised to 1.
+    padding: Positive  # Padding of the histogram of weights.
+    anneal_steps: Count  # Steps over which the exponent of the weights anneals to 1.
+    anneal_slope: Positive  # Initial slope of the annealing.
+    update_every: Count  # Final number of steps between updates of the density fields.
+    update_warmup: Count  # Steps over which that interval grows.
+    histogram: Weight  # Weight of the proposal loss.
     variation: Literal["coded", "corrected"]  # Form of the total variation.
-    total_variation: Weight  # Weight of squared differences between texels.
-    time_smoothness: Weight  # Weight of squared second differences along time.
-    time_identity: Weight  # Weight of the time planes' distance from 1.
-    learning_rate: Positive  # Of the density fields.
+    total_variation: Weight  # Weight of total variation.
+    time_smoothness: Weight  # Weight of time smoothness.
+    time_identity: Weight  # Weight of the distance of time planes from 1.
+    learning_rate: Positive  # Learning rate of the density fields.
 
     def check(self) -> None:
         for name in ("proposal_samples", "resolutions"):

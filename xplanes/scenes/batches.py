@@ -23,13 +23,13 @@ NEAR_SILHOUETTE = 0.02
 class RaySettings(Settings):
     """Which rays a training step gets."""
 
-    per_batch: Count  # Rays of a step at most.
-    samples_per_batch: Count  # Samples of a step at most, on average.
+    per_batch: Count  # Maximum number of rays per batch.
+    samples_per_batch: Count  # Maximum number of samples per batch, on average.
     accumulate: Count  # Batches per optimiser step.
-    background: Literal["white", "random", "one"]  # Random for each ray, or one for the batch.
-    skip_background: bool  # Draw rays near the silhouettes more often than elsewhere.
-    background_share: Share  # Share of the rays drawn far from the silhouettes.
-    background_jitter: Share  # Share of all time by which their times are moved at most.
+    background: Literal["white", "random", "one"]  # random: per ray; one: random per batch.
+    skip_background: bool  # Sample rays near the silhouettes more often.
+    background_share: Share  # Share of rays far from the silhouettes.
+    background_jitter: Share  # Maximum random offset of the times of these rays.
 
 
 class RayBatches:

@@ -1,4 +1,4 @@
-"""What all sources of scenes share: their settings, and what is done with what they read."""
+"""Base class of the data formats: their common settings and the handling of static scenes."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ SAME = 2
 
 
 def frames_are_equal(video: Views) -> bool:
-    """Whether all frames of a fixed camera, at two timesteps or more, show the same."""
+    """Whether all frames of a fixed-camera video (two timesteps or more) are equal."""
     first = video.images[0].to(torch.int16)
     fixed = video.intrinsics.is_shared and not video.is_static
     return fixed and all(
@@ -27,7 +27,7 @@ def frames_are_equal(video: Views) -> bool:
 
 
 def as_static(scene: Scene, reason: str) -> Scene:
-    """The scene with all views at time 0, and one frame of its video.
+    """The scene as a static one: all views at time 0, and one frame of its video.
 
     Args:
         scene: The scene.
@@ -52,12 +52,12 @@ class SceneSettings(Settings, ABC):
     root: str  # Folder that holds the scenes.
     scene: str  # Folder of the scene, or name of the demo scene.
     resolution: Count | None  # Pixels per side; null keeps the native size.
-    views: Count | None  # Training views kept, spread over time; null keeps all.
-    train_on_video: bool  # Train on the frames of the scene's fixed camera too.
+    views: Count | None  # Training views, spread over time; null for all.
+    train_on_video: bool  # Also train on the frames of the fixed camera.
     static: bool | None  # Static scene; null: if all frames of the fixed camera are equal.
     eval_split: Literal["test", "val"] | None  # Scored split; null: val in training, test after it.
-    eval_views: Count | None  # Views of a scored split at most, spread over time; null takes all.
-    half_side: Positive | None  # Half the side of the scene's cube; null finds it.
+    eval_views: Count | None  # Views of a scored split at most, spread over time; null for all.
+    half_side: Positive | None  # Half the side of the scene's bounding cube; null estimates it.
 
     @property
     def folder(self) -> Path:
@@ -65,22 +65,22 @@ class SceneSettings(Settings, ABC):
         return Path(self.root) / self.scene
 
     def prepare(self) -> None:
-        """Fetch or make what is not on disk yet; one process of each machine does it.
+        """Download or render missing data; called in one process per machine.
 
         Raises:
-            SceneError: If it cannot be had.
+            SceneError: If the data cannot be obtained.
         """
 
     @abstractmethod
     def load(self, splits: Sequence[str]) -> Scene:
-        """Read some splits, and the video of a fixed camera where there is one.
+        """Read some splits, and the video of the fixed camera if there is one.
 
         Raises:
-            SceneError: Anything is missing, damaged or inconsistent; the message says what to do.
+            SceneError: If anything is missing, damaged or inconsistent.
         """
 
     def read(self, splits: Sequence[str] | None = None) -> Scene:
-        """The scene as these settings want it.
+        """The scene according to these settings.
 
         Args:
             splits: Splits to read; the training views and what is scored when None: `eval_split`,

@@ -1,4 +1,4 @@
-"""Parts on a tree of joints that move with time."""
+"""Articulated assemblies: parts on a tree of moving joints."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -21,16 +21,16 @@ WORLD = "world"
 
 @dataclass(frozen=True)
 class Joint:
-    """A frame that moves against its parent frame.
+    """A frame that moves relative to its parent frame.
 
     Attributes:
         name: Name by which parts and other joints refer to it.
         parent: Joint that carries it; must come earlier in the assembly.
         position: Its origin in the parent's frame.
         rotation: Angles about the parent's x, y and z, applied in this order, in degrees.
-        kind: A hinge turns about ``axis`` by degrees, a slide moves along it by lengths.
+        kind: A hinge rotates about ``axis`` (degrees); a slide translates along it (world units).
         axis: Axis in the joint's own frame; any length.
-        motion: State of the joint over time; needed unless it is fixed.
+        motion: State of the joint over time; required unless it is fixed.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class Part:
-    """A shape with a surface, fixed to a joint's frame (position and angles as of a joint)."""
+    """A shape with a surface, attached to a joint (position and angles as for a joint)."""
 
     shape: Primitive
     surface: Surface
@@ -60,7 +60,7 @@ class Assembly:
     Attributes:
         parts: The parts; each names the joint that carries it.
         joints: The joints, parents before children.
-        light: Light of the scene; None leaves the colours as painted.
+        light: Light of the scene; None for unlit colours.
     """
 
     parts: tuple[Part, ...]
@@ -72,24 +72,24 @@ class Assembly:
         for joint in self.joints:
             _require(joint.parent, known, f"parent of joint {joint.name!r}")
             if joint.name in known:
-                raise ValueError(f"two joints are called {joint.name!r}; names must differ")
+                raise ValueError(f"two joints are named {joint.name!r}; names must be unique")
             if (joint.motion is None) != (joint.kind == "fixed"):
                 raise ValueError(
-                    f"joint {joint.name!r}: hinges and slides need a motion, fixed joints none"
+                    f"joint {joint.name!r}: hinges and slides need a motion, fixed joints have none"
                 )
             known.add(joint.name)
         for part in self.parts:
             _require(part.joint, known, f"joint of a part ({part.shape})")
 
     def placed(self, position: Vector, rotation: Vector = (0.0, 0.0, 0.0)) -> "Assembly":
-        """The whole assembly moved as one (position and angles as of a joint)."""
+        """The whole assembly, rigidly moved (position and angles as for a joint)."""
         site = Joint("site", WORLD, position, rotation)
         joints = [replace(j, parent="site") if j.parent == WORLD else j for j in self.joints]
         parts = [replace(p, joint="site") if p.joint == WORLD else p for p in self.parts]
         return Assembly(tuple(parts), (site, *joints), self.light)
 
     def pose(self, time: float, dtype: torch.dtype = torch.float32) -> Posed:
-        """The assembly at ``time``, from 0 to 1, its poses kept in ``dtype``."""
+        """The assembly at ``time`` in [0, 1], with poses in ``dtype``."""
         frames = {WORLD: torch.eye(4, dtype=torch.float64)}
         for joint in self.joints:
             frame = frames[joint.parent] @ _frame(joint.position, joint.rotation)
@@ -103,15 +103,15 @@ class Assembly:
         return Posed(tuple(posed), self.light)
 
     def cast(self, origins: Tensor, directions: Tensor, time: float) -> Hits:
-        """First surface that each ray [N, 3] with unit direction [N, 3] meets at ``time``."""
+        """First hit of each ray (origins and unit directions [N, 3]) at ``time``."""
         return self.pose(time).cast(origins, directions)
 
     def inside(self, points: Tensor, time: float) -> Tensor:
-        """Which positions [N, 3] lie inside any part at ``time``. bool [N]"""
+        """Whether points [N, 3] lie inside any part at ``time``. bool [N]"""
         return self.pose(time).inside(points)
 
     def colour(self, points: Tensor, time: float) -> Tensor:
-        """Painted colours of the nearest part at positions [N, 3] at ``time``. [N, 3]"""
+        """Unlit colours of the nearest part at points [N, 3] at ``time``. [N, 3]"""
         return self.pose(time).colour(points)
 
 

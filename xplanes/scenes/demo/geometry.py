@@ -17,19 +17,19 @@ class Primitive(ABC):
     @property
     @abstractmethod
     def extent(self) -> tuple[float, float, float]:
-        """Half sides of the tightest box around the shape, along its own axes."""
+        """Half sides of the shape's bounding box, in its own axes. [3]"""
 
     @property
     @abstractmethod
     def radius_around(self) -> float:
-        """Radius of the smallest ball around the shape's centre that holds it."""
+        """Radius of the shape's bounding sphere around its centre."""
 
     @abstractmethod
     def hit(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """Distance along each ray to the surface, inf where the ray misses.
+        """Distance along each ray to the surface, inf for rays that miss.
 
         Args:
-            origins: Where the rays start; from inside, the ray hits where it leaves. [N, 3]
+            origins: Ray origins; a ray from inside hits where it leaves. [N, 3]
             directions: Unit directions. [N, 3]
 
         Returns:
@@ -45,14 +45,14 @@ class Primitive(ABC):
         """Distance to the surface, negative inside. [N]"""
 
     def inside(self, points: Tensor) -> Tensor:
-        """Whether points lie inside. bool [N]"""
+        """Whether points lie inside the shape. bool [N]"""
         return self.signed_distance(points) < 0
 
     def intersect(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """First hit of each ray: distance (inf where missed) and normal (0 where missed).
+        """First hit of each ray: distance (inf for a miss) and normal (0 for a miss).
 
         Args:
-            origins: Where the rays start. [N, 3]
+            origins: Ray origins. [N, 3]
             directions: Unit directions. [N, 3]
 
         Returns:
@@ -103,7 +103,7 @@ class Box(Primitive):
 
 @dataclass(frozen=True)
 class Ellipsoid(Primitive):
-    """An ellipsoid with the given radii; equal radii make a ball."""
+    """An ellipsoid with the given radii."""
 
     radii: tuple[float, float, float]
 
@@ -126,7 +126,7 @@ class Ellipsoid(Primitive):
         return normalize(points / points.new_tensor(self.radii).square(), dim=-1)
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Sign and zero are exact, elsewhere a first-order estimate of the distance. [N]"""
+        """First-order estimate of the signed distance; exact in sign and on the surface. [N]"""
         radii = points.new_tensor(self.radii)
         scaled = (points / radii).norm(dim=-1).clamp_min(1e-6)
         slope = (points / radii.square()).norm(dim=-1).clamp_min(1e-6 / min(self.radii))
@@ -165,7 +165,7 @@ class Cylinder(Primitive):
 
 @dataclass(frozen=True)
 class Capsule(Primitive):
-    """A cylinder of the given half height with half balls on both ends."""
+    """A cylinder of the given half height with hemispheres at both ends."""
 
     radius: float
     half_height: float
@@ -198,13 +198,13 @@ class Capsule(Primitive):
 
 
 def _first(near: Tensor, far: Tensor) -> Tensor:
-    """The first crossing ahead of a ray that is inside a convex shape from near to far. [N]"""
+    """First crossing in front of a ray that is inside a convex shape from near to far. [N]"""
     ahead = torch.where(near > 0, near, far)
     return torch.where((near <= far) & (ahead > 0), ahead, MISS)
 
 
 def _slab(origins: Tensor, directions: Tensor, half: float) -> tuple[Tensor, Tensor]:
-    """Where rays enter and leave the layer between -half and half of one axis. [N], [N]"""
+    """Near and far of rays in the slab from -half to half of one axis. [N], [N]"""
     tiny = directions.abs() < 1e-12
     inverse = 1 / directions.masked_fill(tiny, 1e-12)
     middle, reach = -origins * inverse, half * inverse.abs()
@@ -212,9 +212,9 @@ def _slab(origins: Tensor, directions: Tensor, half: float) -> tuple[Tensor, Ten
 
 
 def _ball(origins: Tensor, directions: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-    """Where rays enter and leave a ball; inf and -inf where they miss it. [N], [N]"""
+    """Near and far of rays in a sphere; inf and -inf for a miss. [N], [N]"""
     along = (origins * directions).sum(dim=-1)
-    # The foot of the perpendicular keeps the digits that |o|^2 - r^2 would lose far away.
+    # Measured from the foot of the perpendicular: |o|^2 - r^2 would lose precision far away.
     foot = origins - along[:, None] * directions
     spare = radius * radius - foot.square().sum(dim=-1)
     reach = spare.clamp_min(0).sqrt()
@@ -225,7 +225,7 @@ def _ball(origins: Tensor, directions: Tensor, radius: float) -> tuple[Tensor, T
 def cylinder_span(
     origins: Tensor, directions: Tensor, radius: float, half_height: float
 ) -> tuple[Tensor, Tensor]:
-    """Where rays enter and leave a capped cylinder; inf and -inf where they miss it. [N], [N]"""
+    """Near and far of rays in a capped cylinder; inf and -inf for a miss. [N], [N]"""
     flat, flat_origins = directions[:, :2], origins[:, :2]
     square = flat.square().sum(dim=-1)
     upright = square < 1e-12
@@ -241,7 +241,7 @@ def cylinder_span(
 
 
 def _corner_distance(out: Tensor) -> Tensor:
-    """Signed distance from how far a point sticks out along orthogonal directions. [N]"""
+    """Signed distance from the signed excess along orthogonal directions. [N]"""
     return out.clamp_min(0).norm(dim=-1) + out.amax(dim=-1).clamp_max(0)
 
 
@@ -264,7 +264,7 @@ class Surface(ABC):
 
 @dataclass(frozen=True)
 class Plain(Surface):
-    """One colour, mottled by soft waves of the given strength and wave length."""
+    """One colour, modulated by smooth waves of the given strength and wave length."""
 
     paint: Colour
     mottle: float = 0.0
@@ -282,7 +282,7 @@ class Plain(Surface):
 
 @dataclass(frozen=True)
 class Stripes(Surface):
-    """Bands of equal width across one axis (0, 1, 2), the colours taken in turn."""
+    """Bands of equal width along one axis (0, 1, 2), with alternating colours."""
 
     paints: tuple[Colour, ...]
     axis: int
@@ -295,7 +295,7 @@ class Stripes(Surface):
 
 @dataclass(frozen=True)
 class Checker(Surface):
-    """Cubes of two or more colours."""
+    """A checkerboard of cubes, with alternating colours."""
 
     paints: tuple[Colour, ...]
     cell: tuple[float, float, float]
@@ -307,7 +307,7 @@ class Checker(Surface):
 
 @dataclass(frozen=True)
 class Sectors(Surface):
-    """Slices of an orange around z, the colours taken in turn."""
+    """Sectors around the z axis, with alternating colours."""
 
     paints: tuple[Colour, ...]
     count: int
@@ -319,7 +319,7 @@ class Sectors(Surface):
 
 @dataclass(frozen=True)
 class Bricks(Surface):
-    """Rows of bricks with joints between them, every brick in its own tone.
+    """Rows of bricks with joints between them and a random tone for each brick.
 
     Attributes:
         paint: Colour of the bricks.
@@ -327,8 +327,8 @@ class Bricks(Surface):
         length: Length of a brick.
         height: Height of a row, along z.
         joint: Width of the joints.
-        around: Radius of a round wall whose bricks run around z; 0 for straight walls.
-        tone: How much the tones of the bricks differ.
+        around: Radius of a round wall around z; 0 for straight walls.
+        tone: Amplitude of the variation between bricks.
     """
 
     paint: Colour
@@ -345,7 +345,7 @@ class Bricks(Surface):
             along, length = torch.atan2(y, x) * self.around, self.length
             length = 2 * math.pi * self.around / max(round(2 * math.pi * self.around / length), 1)
         else:
-            # On a face of constant x or y the sum runs along the wall.
+            # On a face of constant x or y, the sum varies along the wall.
             along, length = x + y, self.length
         row = (z / self.height).floor()
         along = along / length + 0.5 * row.remainder(2)
@@ -361,8 +361,8 @@ class Bricks(Surface):
         return torch.where(in_joint[:, None], joints, bricks.clamp(0, 1))
 
 
-# Patterns are read a little below the surface: a face that lies exactly on the border between
-# two cells would otherwise take the colour of either at random.
+# Patterns are evaluated slightly below the surface: rounding would otherwise choose the colour of a
+# face that lies exactly on the border between two cells.
 _INWARD = 0.998
 
 
@@ -371,17 +371,17 @@ def _cell(values: Tensor, width: float) -> Tensor:
 
 
 def _pick(paints: tuple[Colour, ...], cells: Tensor) -> Tensor:
-    """The colour of each numbered cell, taken in turn. [N, 3]"""
+    """Colour of each cell by its index, modulo the number of colours. [N, 3]"""
     return cells.new_tensor(paints)[cells.remainder(len(paints)).long()]
 
 
 _HALVINGS = 44
-"""Halvings of a bracket no wider than the torus, down to the precision of float64."""
+"""Bisection steps from a bracket no wider than the torus to the precision of float64."""
 
 
 @dataclass(frozen=True)
 class Torus(Primitive):
-    """A ring around z: the circle of radius ``ring`` in the xy plane, made ``tube`` thick."""
+    """A torus around z: a circle of radius ``ring`` in the xy plane, with tube radius ``tube``."""
 
     ring: float
     tube: float
@@ -398,12 +398,12 @@ class Torus(Primitive):
         start, stop = cylinder_span(origins, directions, self.radius_around, self.tube)
         distance = torch.full_like(start, MISS)
         rays = ((start <= stop) & (stop > 0)).nonzero()[:, 0]
-        # Seen from the foot of the perpendicular the quartic has no cubic term and no digits are
-        # lost to the distance of the camera.
+        # With the origin at the foot of the perpendicular, the quartic has no cubic term, and the
+        # camera distance costs no precision.
         origin, direction = origins[rays].double(), directions[rays].double()
         foot = (origin * direction).sum(dim=-1)
         origin = origin - foot[:, None] * direction
-        # From a little before the cylinder around the torus, which touches it.
+        # Begin slightly before the enclosing cylinder, because it touches the torus.
         start = (start[rays].double() - 1e-6).clamp_min(0) + foot
         stop = stop[rays].double() + 1e-6 + foot
         root = _first_change(self._quartic(origin, direction), start, stop) - foot
@@ -418,7 +418,7 @@ class Torus(Primitive):
         return torch.hypot(points[:, :2].norm(dim=-1) - self.ring, points[:, 2]) - self.tube
 
     def _quartic(self, foot: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Factors (a, b, c) of t^4 + a t^2 + b t + c, negative inside the torus. [N] each"""
+        """Coefficients (a, b, c) of t^4 + a t^2 + b t + c, negative inside the torus. [N] each"""
         flat, across = foot[:, :2], direction[:, :2]
         bulk = foot.square().sum(dim=-1) + self.ring**2 - self.tube**2
         four = 4 * self.ring**2
@@ -430,13 +430,13 @@ class Torus(Primitive):
 
 
 def _first_change(factors: tuple[Tensor, Tensor, Tensor], start: Tensor, stop: Tensor) -> Tensor:
-    """First root of t^4 + a t^2 + b t + c from start to stop that it passes through, or inf. [N]"""
+    """First root with a sign change of t^4 + a t^2 + b t + c in [start, stop], or inf. [N]"""
     a, b, c = factors
 
     def value(t: Tensor) -> Tensor:
         return ((t * t + a) * t + b) * t + c
 
-    # Between its extrema the quartic is monotone: at most one change of sign in each piece.
+    # The quartic is monotone between its extrema: at most one sign change in each interval.
     extrema = torch.minimum(torch.maximum(_cubic_roots(a / 2, b / 4), start), stop)
     ends = torch.cat([start[None], extrema, stop[None]])
     outside = value(ends) >= 0
@@ -454,9 +454,9 @@ def _first_change(factors: tuple[Tensor, Tensor, Tensor], start: Tensor, stop: T
 
 
 def _cubic_roots(p: Tensor, q: Tensor) -> Tensor:
-    """Rising real roots of t^3 + p t + q, a single one repeated. [3, N]"""
+    """Real roots of t^3 + p t + q in ascending order; a single root is repeated. [3, N]"""
     spare = (q / 2).square() + (p / 3) ** 3
-    # One root: Cardano's formula, by the sum that does not cancel.
+    # One root: Cardano's formula, in the form without cancellation.
     cube = -torch.copysign(q.abs() / 2 + spare.clamp_min(0).sqrt(), q)
     large = torch.copysign(cube.abs() ** (1 / 3), cube)
     single = large - torch.where(large == 0, 0.0, p / (3 * large))

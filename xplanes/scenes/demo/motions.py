@@ -1,4 +1,4 @@
-"""How far a joint has moved at each time: degrees of a hinge, length of a slide."""
+"""Motions of joints over time: degrees for a hinge, world units for a slide."""
 
 import colorsys
 import math
@@ -15,12 +15,12 @@ class Motion(ABC):
 
     @abstractmethod
     def at(self, time: float) -> float:
-        """The state of the joint at ``time``, from 0 to 1."""
+        """State of the joint at ``time`` in [0, 1]."""
 
 
 @dataclass(frozen=True)
 class Swing(Motion):
-    """To and fro around ``centre``: ``centre + reach sin(2 pi (cycles time + phase))``."""
+    """Oscillation around ``centre``: ``centre + reach sin(2 pi (cycles time + phase))``."""
 
     centre: float
     reach: float
@@ -33,7 +33,7 @@ class Swing(Motion):
 
 @dataclass(frozen=True)
 class Steady(Motion):
-    """At constant speed: ``start + speed time``."""
+    """Constant speed: ``start + speed time``."""
 
     start: float
     speed: float
@@ -44,11 +44,11 @@ class Steady(Motion):
 
 @dataclass(frozen=True)
 class Keys(Motion):
-    """Through given values at given times, coming to rest at each.
+    """Smooth interpolation of keyframes, with zero speed at each of them.
 
     Attributes:
-        times: Rising times.
-        values: State at each of them; before the first and after the last nothing moves.
+        times: Times in ascending order.
+        values: State at each time; constant before the first and after the last.
     """
 
     times: tuple[float, ...]
@@ -66,7 +66,7 @@ class Keys(Motion):
 
 @dataclass(frozen=True)
 class Bounce(Motion):
-    """A ball that jumps to ``height`` ``count`` times; the turn at the ground is rounded off."""
+    """A ball that bounces ``count`` times to ``height``, with a smooth reversal at the ground."""
 
     height: float
     count: float
@@ -74,7 +74,7 @@ class Bounce(Motion):
     rounding: float = 0.08
 
     def at(self, time: float) -> float:
-        # A parabola of the triangle wave, whose tip is softened.
+        # A parabola of a triangle wave with a smoothed tip.
         wave = math.cos(math.pi * (self.count * time + self.phase))
         soft = math.sqrt(1 - wave * wave + self.rounding**2) - self.rounding
         full = math.sqrt(1 + self.rounding**2) - self.rounding
@@ -82,13 +82,13 @@ class Bounce(Motion):
 
 
 class Variation:
-    """Draws that depend on nothing but a scene's name and seed; seed 0 is the designed look.
+    """Random variation of a scene, determined by its name and seed; seed 0 keeps the designed look.
 
-    The same colour code becomes the same colour wherever a scene uses it.
+    Within a scene, a colour code always gives the same colour.
 
     Args:
         name: Name of the scene.
-        seed: Any whole number.
+        seed: Any integer.
     """
 
     def __init__(self, name: str, seed: int) -> None:
@@ -97,15 +97,15 @@ class Variation:
         self._phases = random.Random(f"{self._key} phase")
 
     def paint(self, code: str) -> Colour:
-        """A colour that may become any other hue, from its HTML code."""
+        """A colour whose hue may change freely, from its HTML code."""
         return self._recolour(code, 0.5)
 
     def natural(self, code: str) -> Colour:
-        """A colour of wood, stone or grass, which stays what it is."""
+        """A colour whose hue changes only slightly (wood, stone, grass), from its HTML code."""
         return self._recolour(code, 0.02)
 
     def phase(self, usual: float = 0.0) -> float:
-        """Part of a cycle, from 0 to 1, at which a motion starts."""
+        """Initial phase of a motion, in [0, 1]."""
         return usual if self._designed else self._phases.random()
 
     def _recolour(self, code: str, spread: float) -> Colour:

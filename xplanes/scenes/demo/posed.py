@@ -1,4 +1,4 @@
-"""Solids at their places in the world, and what rays and points find there."""
+"""Posed solids: ray casting and point queries in world coordinates."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,17 +11,17 @@ from xplanes.scenes.demo.geometry import MISS, Box, Primitive, Surface
 from xplanes.scenes.demo.shading import Light
 
 CHUNK = 16384
-"""Rays handled at a time, so that temporaries stay in the cache."""
+"""Rays per chunk, so that temporaries fit in the cache."""
 
 
 @dataclass(frozen=True)
 class PosedPart:
-    """A shape at its place in the world.
+    """A shape with its pose in the world.
 
     Attributes:
         shape: The solid.
         surface: Its colours.
-        rotation: From the part's coordinates to the world's. [3, 3]
+        rotation: From part to world coordinates. [3, 3]
         translation: The part's centre in the world. [3]
     """
 
@@ -31,30 +31,30 @@ class PosedPart:
     translation: Tensor
 
     def to_own(self, points: Tensor) -> Tensor:
-        """World positions in the part's coordinates. [N, 3]"""
+        """World points in the part's coordinates. [N, 3]"""
         return (points - self.translation.to(points)) @ self.rotation.to(points)
 
     def hit(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """Distance along each ray to the part, inf where missed. [N]"""
+        """Distance along each ray to the part, inf for a miss. [N]"""
         return self.shape.hit(self.to_own(origins), directions @ self.rotation.to(directions))
 
     def inside(self, points: Tensor) -> Tensor:
-        """Which world positions lie inside. bool [N]"""
+        """Whether world points lie inside the part. bool [N]"""
         return self.shape.inside(self.to_own(points))
 
     def colour(self, points: Tensor) -> Tensor:
-        """Colours of the part at world positions, without light. [N, 3]"""
+        """Unlit colours of the part at world points. [N, 3]"""
         return self.surface.colour(self.to_own(points))
 
 
 class Hits(NamedTuple):
-    """What rays see.
+    """First hits of rays.
 
     Attributes:
-        distance: Distance to the first surface, inf where a ray misses. [N]
-        normal: Outward unit normal there, 0 where missed. [N, 3]
-        colour: Colour, shaded if there is a light, 0 where missed. [N, 3]
-        part: Number of the part, -1 where missed. [N]
+        distance: Distance to the first surface, inf for a miss. [N]
+        normal: Outward unit normal at the hit, 0 for a miss. [N, 3]
+        colour: Colour, shaded if there is a light, 0 for a miss. [N, 3]
+        part: Index of the part, -1 for a miss. [N]
     """
 
     distance: Tensor
@@ -68,8 +68,8 @@ class Posed:
     """An assembly at one timestep.
 
     Attributes:
-        parts: The parts at their places.
-        light: Light of the scene; None leaves the colours as painted.
+        parts: The posed parts.
+        light: Light of the scene; None for unlit colours.
     """
 
     parts: tuple[PosedPart, ...]
@@ -85,10 +85,10 @@ class Posed:
         object.__setattr__(self, "_radii", radii)
 
     def cast(self, origins: Tensor, directions: Tensor) -> Hits:
-        """First surface that each ray meets.
+        """First hit of each ray.
 
         Args:
-            origins: Where the rays start. [N, 3]
+            origins: Ray origins. [N, 3]
             directions: Unit directions. [N, 3]
         """
         hits = Hits(
@@ -106,7 +106,7 @@ class Posed:
         return hits
 
     def nearest(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Distance to the first part on each ray, and its number (inf, -1 for none). [N], [N]"""
+        """Distance to the first part on each ray, and its index (inf, -1 for a miss). [N], [N]"""
         best = torch.full_like(directions[:, 0], MISS)
         part = torch.full_like(best, -1, dtype=torch.long)
         for number, rays in self._candidates(origins, directions):
@@ -117,24 +117,24 @@ class Posed:
         return best, part
 
     def inside(self, points: Tensor) -> Tensor:
-        """Which positions lie inside any part. bool [N]"""
+        """Whether points lie inside any part. bool [N]"""
         result = torch.zeros(len(points), dtype=torch.bool, device=points.device)
         for part in self.parts:
             result |= part.inside(points)
         return result
 
     def signed_distance(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Distance to the nearest part, negative inside, and that part's number. [N], [N]"""
+        """Signed distance to the nearest part, and that part's index. [N], [N]"""
         gaps = torch.stack([p.shape.signed_distance(p.to_own(points)) for p in self.parts])
         distance, part = gaps.min(dim=0)
         return distance, part
 
     def colour(self, points: Tensor, part: Tensor | None = None) -> Tensor:
-        """Painted colours, without light.
+        """Unlit colours.
 
         Args:
             points: Positions. [N, 3]
-            part: Whose colour to take, by number; the nearest part's when None. [N]
+            part: Index of the part at each point; the nearest part when None. [N]
 
         Returns:
             Colours in [0, 1]. [N, 3]
@@ -148,16 +148,16 @@ class Posed:
         return result
 
     def bounds(self) -> tuple[Tensor, Tensor]:
-        """Corners of an upright box that holds every part. [3], [3]"""
+        """Corners of the axis-aligned bounding box of all parts. [3], [3]"""
         reach = torch.stack(
             [p.rotation.abs() @ p.rotation.new_tensor(p.shape.extent) for p in self.parts]
         )
         return (self._centres - reach).amin(dim=0), (self._centres + reach).amax(dim=0)
 
     def _candidates(self, origins: Tensor, directions: Tensor) -> Iterator[tuple[int, Tensor]]:
-        """Parts with the rays that pass through the ball around them."""
+        """Each part with the rays that hit its bounding sphere."""
         centres = self._centres.to(origins)
-        # Widened by more than float32 loses in the squares below.
+        # Enlarged by more than the float32 rounding error of the squares below.
         radii = (self._radii.to(origins) * 1.01 + 1e-3)[:, None]
         one = torch.ones_like(origins[:, :1])
         # Two matrix products give, for every part and ray, the squared distance from the origin
@@ -197,11 +197,11 @@ class Posed:
         return Hits(distance, normal, colour, part)
 
     def _shadowed(self, points: Tensor, normals: Tensor) -> Tensor | None:
-        """Which surface points have a part between them and the sun. bool [N]"""
+        """Whether surface points lie in shadow. bool [N]"""
         if self.light is None or not self.light.shadow:
             return None
         sun = self.light.direction(points)
-        # Faces turned away receive no sun anyway.
+        # Faces that point away from the sun need no shadow ray.
         lit = (normals @ sun > 0).nonzero()[:, 0]
         starts = points[lit] + 1e-3 * normals[lit]
         shadowed = torch.zeros(len(points), dtype=torch.bool, device=points.device)

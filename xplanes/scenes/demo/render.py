@@ -1,4 +1,4 @@
-"""Pictures of an assembly, with smooth edges and straight alpha."""
+"""Rendering of posed assemblies to antialiased RGBA images, and the demo cameras."""
 
 import random
 
@@ -11,7 +11,7 @@ from xplanes.scenes.cameras import camera_around, focal_length, look_at, pixel_r
 from xplanes.scenes.demo.posed import Posed
 
 CAMERA_ANGLE_X = 0.6911112070083618
-"""Field of view of D-NeRF's cameras, in radians."""
+"""Horizontal field of view of D-NeRF's cameras, in radians."""
 
 CAMERA_DISTANCE = 4.031128874149275
 """Distance of D-NeRF's cameras from the origin."""
@@ -20,12 +20,12 @@ CAMERA_DISTANCE = 4.031128874149275
 def render_image(
     posed: Posed, camera_to_world: Tensor, resolution: int, samples: int = 2
 ) -> NDArray:
-    """Render one picture.
+    """Render one image.
 
     Args:
-        posed: What stands before the camera.
-        camera_to_world: Camera pose. [4, 4]
-        resolution: Rows and columns of the picture.
+        posed: The assembly at one timestep.
+        camera_to_world: Camera-to-world matrix. [4, 4]
+        resolution: Height and width in pixels.
         samples: Rays per pixel and axis.
 
     Returns:
@@ -50,7 +50,7 @@ def render_image(
 
 
 def hemisphere_cameras(count: int, draw: random.Random) -> Tensor:
-    """Cameras spread at random over the upper half of the sphere. [count, 4, 4]"""
+    """Cameras uniformly distributed over the upper hemisphere. [count, 4, 4]"""
     places = np.empty((count, 3))
     for place in places:
         height, turn = draw.uniform(0.02, 0.98), draw.uniform(0, 2 * np.pi)
@@ -60,5 +60,5 @@ def hemisphere_cameras(count: int, draw: random.Random) -> Tensor:
 
 
 def camera_at(azimuth: float, elevation: float) -> Tensor:
-    """Camera in a direction given in degrees, azimuth from +x towards +y. [4, 4]"""
+    """Camera at an azimuth (from +x towards +y) and elevation in degrees. [4, 4]"""
     return camera_around(azimuth, elevation, CAMERA_DISTANCE)

@@ -27,7 +27,7 @@ _FLOOR = -0.55
 
 
 def balls(variation: Variation) -> Assembly:
-    """Five balls jump to their own beat and turn as they fly; plate and posts are static."""
+    """Five balls bounce with different periods and spin; plate and posts are static."""
     joints: list[Joint] = []
     parts = _plate(variation)
     for number, (x, y, radius, height, count, phase, surface) in enumerate(_balls(variation)):
@@ -44,7 +44,7 @@ def balls(variation: Variation) -> Assembly:
 
 
 Ball = tuple[float, float, float, float, float, float, Surface]
-"""Place (x, y), radius, height of the jumps, their number, phase and surface."""
+"""Position (x, y), radius, bounce height, number of bounces, phase and surface."""
 
 
 def _balls(variation: Variation) -> list[Ball]:
@@ -203,13 +203,13 @@ def _limbs(
 
 
 _SIDES = (("left", 1.0, 0.0), ("right", -1.0, 0.5))
-"""Name, side of the body, and lag of the stride."""
+"""Name, side of the body, and phase of the stride."""
 
 _STRIDES = 2
 
 
 def walker(variation: Variation) -> Assembly:
-    """Arms and legs swing, the body rises and falls a little; the ground is static."""
+    """Arms and legs swing and the body bobs slightly; the ground is static."""
     phase = variation.phase()
     joints = [
         Joint("body", "world", (0.0, 0.0, -0.06), (0, 0, 0), "slide", (0, 0, 1),
@@ -306,7 +306,7 @@ _GROUND = -0.72
 
 
 def windmill(variation: Variation) -> Assembly:
-    """The sails turn and the cap follows the wind a little; the island is static."""
+    """The sails rotate and the cap turns slightly; the island is static."""
     joints = (
         Joint("cap", "world", (0.0, 0.0, 0.28), (0, 0, 0), "hinge", (0, 0, 1),
               Swing(0.0, 12.0, 1.0, variation.phase())),
@@ -396,7 +396,7 @@ def _sails(variation: Variation) -> list[Part]:
     ]
     for quarter in range(4):
         y, z = _around(90 * quarter, 1.0)
-        # The sail hangs beside its spar, on the side that follows in the turn.
+        # The sail is on the trailing side of its spar.
         middle = (0.0, 0.34 * y, 0.34 * z)
         beside = (0.0, 0.37 * y + 0.075 * z, 0.37 * z - 0.075 * y)
         turn = (90.0 * (quarter - 1), 0.0, 0.0)
@@ -532,12 +532,12 @@ def _fruit(variation: Variation) -> list[Part]:
 
 @dataclass(frozen=True)
 class DemoScene:
-    """A scene and where its fixed camera stands.
+    """A scene and the position of its fixed camera.
 
     Attributes:
-        build: Makes the scene in the colours of a variation.
-        azimuth: Direction of the fixed camera in degrees, from +x towards +y. The camera stands
-            level, on an axis of the world along which the scene is built.
+        build: Builds the scene with the colours and phases of a variation.
+        azimuth: Direction of the fixed camera in degrees, from +x towards +y. Its elevation
+            is 0, and it lies on a world axis along which the scene is built.
     """
 
     build: Callable[[Variation], Assembly]
@@ -557,14 +557,14 @@ def demo_scene(name: str) -> DemoScene:
     """The scene called ``name``.
 
     Raises:
-        SceneError: No scene has that name; the message lists those there are.
+        SceneError: If no scene has that name; the message lists all names.
     """
     if name in DEMO_SCENES:
         return DEMO_SCENES[name]
     close = difflib.get_close_matches(name, DEMO_SCENES, n=1)
     hint = f" Did you mean {close[0]!r}?" if close else ""
     raise SceneError(
-        f"no demo scene {name!r}; there are {', '.join(DEMO_SCENES)}.{hint} Scenes on disk need "
+        f"no demo scene {name!r}; available: {', '.join(DEMO_SCENES)}.{hint} Scenes on disk need "
         "data=dnerf."
     )
 

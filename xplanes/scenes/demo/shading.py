@@ -1,4 +1,4 @@
-"""Light that does not depend on where the camera stands."""
+"""View-independent (Lambertian) shading."""
 
 from dataclasses import dataclass
 
@@ -8,14 +8,14 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Light:
-    """A sun, a sky that is brighter above, and light from everywhere.
+    """A sun, a sky that is brightest at the zenith, and ambient light.
 
     Attributes:
         towards: Direction from the scene to the sun; any length.
-        sun: Strength of the sun on a face turned to it.
-        sky: Strength of the sky on a face turned up.
-        ambient: Strength of the light from everywhere.
-        shadow: Share of the sun that a shadow takes away; 0 casts no shadow rays.
+        sun: Intensity of the sun on a face towards it.
+        sky: Intensity of the sky on a face that points up.
+        ambient: Intensity of the ambient light.
+        shadow: Fraction of the sunlight that a shadow removes, in [0, 1]; 0 casts no shadow rays.
     """
 
     towards: tuple[float, float, float] = (0.35, -0.5, 0.8)
@@ -25,19 +25,19 @@ class Light:
     shadow: float = 0.6
 
     def direction(self, like: Tensor) -> Tensor:
-        """Unit direction to the sun, of the kind and device of ``like``. [3]"""
+        """Unit direction to the sun, with the type and device of ``like``. [3]"""
         return torch.nn.functional.normalize(like.new_tensor(self.towards), dim=0)
 
     def shade(self, colours: Tensor, normals: Tensor, shadowed: Tensor | None = None) -> Tensor:
-        """Lambert's law.
+        """Lambertian shading.
 
         Args:
             colours: Colours of the surfaces. [N, 3]
             normals: Outward unit normals. [N, 3]
-            shadowed: Which points the sun does not reach. bool [N]
+            shadowed: Whether points lie in shadow. bool [N]
 
         Returns:
-            Colours as seen, in [0, 1]. [N, 3]
+            Shaded colours, in [0, 1]. [N, 3]
         """
         facing = (normals @ self.direction(normals)).clamp_min(0) * self.sun
         if shadowed is not None:

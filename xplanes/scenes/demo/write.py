@@ -1,4 +1,4 @@
-"""Demo scenes as folders in the layout of D-NeRF's scenes."""
+"""Demo scenes on disk, in the format of D-NeRF's scenes."""
 
 import hashlib
 import json
@@ -28,19 +28,19 @@ from xplanes.scenes.views import Scene
 from xplanes.settings import Count, Steps
 
 VERSION = 2
-"""Raised when the same scene would come out as other pictures."""
+"""Version of the renderer; increase it whenever the images of a scene change."""
 
 RECORD = "demo.json"
-"""File that says what a folder holds; written last."""
+"""File that describes the content of a scene folder; written last."""
 
 USUAL_VIEWS = {"train": 50, "val": 10, "test": 12}
-"""Pictures of each split; other numbers are part of the folder's name."""
+"""Default number of views per split; other numbers become part of the folder name."""
 
 VIDEO_FRAMES = 50
 """Frames of the fixed-camera video."""
 
 DAY = 86_400.0
-"""Seconds after which an unfinished folder is nobody's any more."""
+"""Age in seconds from which an unfinished folder counts as abandoned."""
 
 _RENDERING = threading.Lock()
 
@@ -56,25 +56,25 @@ def ensure_demo_scene(
     test_views: int = USUAL_VIEWS["test"],
     announce: Callable[[str], None] | None = None,
 ) -> Path:
-    """Render a demo scene unless its folder is there already.
+    """Render a demo scene unless its folder exists already.
 
-    The folder appears complete or not at all, also when several processes ask for it at once.
+    The folder is created atomically, even if several processes render the same scene.
 
     Args:
-        root: Folder for demo scenes; made if missing.
+        root: Folder of the demo scenes; created if missing.
         name: Name of the scene.
-        resolution: Rows and columns of the pictures.
-        seed: Changes colours, phases of motions and cameras.
-        train_views: Training pictures, one random view per time, times evenly spaced.
-        val_views: Validation pictures.
-        test_views: Test pictures.
-        announce: Told in one line that a wait begins; printed when None.
+        resolution: Height and width of the images in pixels.
+        seed: Seed of colours, motion phases and cameras.
+        train_views: Number of training views; one random camera per timestep, evenly spaced times.
+        val_views: Number of validation views.
+        test_views: Number of test views.
+        announce: Receives a message before rendering; `print` when None.
 
     Returns:
         The scene's folder.
 
     Raises:
-        ValueError: No scene has that name, or a count is too small.
+        ValueError: If no scene has that name, or a count is below 1.
     """
     counts = {"train": train_views, "val": val_views, "test": test_views}
     for key, value in {
@@ -82,7 +82,7 @@ def ensure_demo_scene(
         **{f"{k}_views": v for k, v in counts.items()},
     }.items():
         if value < 1:
-            raise ValueError(f"{key} is {value}; a demo scene needs at least 1")
+            raise ValueError(f"{key} is {value}; it must be at least 1")
     assembly = build_demo_scene(name, seed)
     record = _record(name, assembly, resolution, seed, counts)
     folder = Path(root) / _folder_name(name, resolution, seed, counts)
@@ -90,7 +90,7 @@ def ensure_demo_scene(
         return folder
     total = sum(counts.values()) + VIDEO_FRAMES
     (announce or print)(
-        f"Rendering demo scene {name} ({total} pictures of {resolution} pixels) to {folder}"
+        f"Rendering demo scene {name} ({total} images of {resolution} px) to {folder}"
     )
     folder.parent.mkdir(parents=True, exist_ok=True)
     _clear_unfinished(folder)
@@ -107,18 +107,18 @@ def ensure_demo_scene(
 
 
 Shot = tuple[float, Tensor]
-"""Time and camera pose [4, 4] of a picture."""
+"""Time and camera-to-world matrix [4, 4] of a view."""
 
 
 def _shots(name: str, seed: int, counts: dict[str, int]) -> dict[str, list[Shot]]:
-    """Times and cameras of every split; each split draws from its own stream."""
+    """Times and cameras of every split; each split has its own random stream."""
     scene = demo_scene(name)
     shots = {}
     for split, count in counts.items():
         draw = random.Random(f"{split} {seed}")
         cameras = hemisphere_cameras(count, draw)
-        # Held-out pictures fall between the training times, one in each share of the whole; every
-        # split starts at 0 because readers of this format expect it.
+        # Times of held-out views are stratified. Every split begins at time 0, because readers of
+        # this format expect it.
         held_out = [0.0, *((i + draw.random()) / count for i in range(1, count))]
         times = _even(count) if split == "train" else held_out
         shots[split] = list(zip(times, cameras, strict=True))
@@ -147,7 +147,7 @@ def _write_split(
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Keep PyTorch to one thread: to share out these many small operations costs more."""
+    """Limit PyTorch to one thread: parallelising many small operations costs more than it gains."""
     with _RENDERING, threads(1):
         yield
 
@@ -161,7 +161,7 @@ def _record(
         "seed": seed,
         "resolution": resolution,
         "views": {**counts, "video": VIDEO_FRAMES},
-        # The parts and motions themselves, so that an edited scene is rendered anew.
+        # Parts and motions are hashed, so that an edited scene is rendered again.
         "assembly": hashlib.sha256(repr(assembly).encode()).hexdigest(),
     }
 
@@ -172,7 +172,7 @@ def _folder_name(name: str, resolution: int, seed: int, counts: dict[str, int]) 
 
 
 def _holds(folder: Path, record: dict[str, Any]) -> bool:
-    """Whether a folder is what the record says, with no file missing."""
+    """Whether a folder matches the record and has all its files."""
     try:
         if json.loads((folder / RECORD).read_text()) != record:
             return False
@@ -186,21 +186,21 @@ def _holds(folder: Path, record: dict[str, Any]) -> bool:
 
 
 def _sibling(folder: Path) -> Path:
-    """A new empty folder beside ``folder``, of a name that no other writer uses."""
+    """A new empty folder next to ``folder`` with a unique name."""
     sibling = folder.with_name(f".{folder.name}.{os.getpid()}.{secrets.token_hex(4)}")
     sibling.mkdir()
     return sibling
 
 
 def _clear_unfinished(folder: Path) -> None:
-    """Remove what renderers that were killed a day ago left beside ``folder``."""
+    """Remove abandoned temporary folders next to ``folder``."""
     for path in folder.parent.glob(f".{folder.name}.*"):
         if now() - path.stat().st_mtime > DAY:
             shutil.rmtree(path, ignore_errors=True)
 
 
 def _publish(fresh: Path, folder: Path, record: dict[str, Any]) -> None:
-    """Move a finished folder to its place, unless another writer was first."""
+    """Move a finished folder into place, unless another process was first."""
     while not _holds(folder, record):
         stale = _sibling(folder)
         try:
@@ -209,7 +209,7 @@ def _publish(fresh: Path, folder: Path, record: dict[str, Any]) -> None:
             fresh.rename(folder)
             return
         except OSError:
-            # Another writer moved the old folder away or its own into place: look again.
+            # Another process changed the folder in the meantime: check again.
             continue
         finally:
             shutil.rmtree(stale, ignore_errors=True)
@@ -219,9 +219,9 @@ def _publish(fresh: Path, folder: Path, record: dict[str, Any]) -> None:
 class DemoSettings(SceneSettings):
     """A procedural scene, rendered on first use."""
 
-    seed: Steps  # Varies colours, motion and cameras.
-    train_views: Count  # Training views, each at its own time.
-    test_views: Count  # Test views, at times of their own.
+    seed: Steps  # Seed of colours, motion phases and cameras.
+    train_views: Count  # Training views, each at its own timestep.
+    test_views: Count  # Test views, at other timesteps than the training views.
     val_views: Count  # Validation views.
 
     @property
@@ -251,5 +251,5 @@ class DemoSettings(SceneSettings):
             )
         except SceneError as problem:
             raise SceneError(
-                f"{problem} This is a demo scene: delete {folder}, and it is rendered again"
+                f"{problem} This is a demo scene: delete {folder} to render it again"
             ) from problem

@@ -55,7 +55,7 @@ def test_table(trained_run: Path, tmp_path: Path, capsys):
     assert capsys.readouterr().out == (tmp_path / "table.md").read_text()
 
 
-def test_download_says_how_to_go_on(tmp_path: Path, monkeypatch, capsys):
+def test_download_says_how_to_continue(tmp_path: Path, monkeypatch, capsys):
     from xplanes.scenes import download
 
     monkeypatch.setattr(download, "download_dnerf", lambda root: root)

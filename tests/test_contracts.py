@@ -187,7 +187,7 @@ def test_every_option_composes_reads_and_builds(overrides, tmp_path):
 
 
 @pytest.mark.parametrize("moving", [True, False])
-def test_a_still_scene_gets_no_time_planes(moving):
+def test_a_static_scene_gets_no_time_planes(moving):
     scene = scene_of(moving=moving)
     for name in MODELS:
         plain = small(f"model={name}")

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all, and what cannot be written is said in words."""
+"""Files are written atomically; write errors are reported with a message."""
 
 import errno
 import os
@@ -46,7 +46,7 @@ def test_a_block_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path)
         (errno.EIO, r"disk or its connection"),
     ],
 )
-def test_a_disk_that_refuses_is_said_in_words(tmp_path: Path, code: int, words: str) -> None:
+def test_a_disk_that_refuses_is_said_with_a_message(tmp_path: Path, code: int, words: str) -> None:
     path = tmp_path / "last.ckpt"
     write_text(path, "old")
     with pytest.raises(StorageError, match=rf"last\.ckpt cannot be written.*{words}"):

@@ -111,7 +111,7 @@ def test_arguments_of_lightnings_trainer_and_its_callbacks_work(extra, tmp_path:
     assert metrics["step"] == (1 if "fast" in extra[0] else 3)
 
 
-def test_misfits_of_the_trainer_are_said_in_words(tmp_path: Path) -> None:
+def test_misfits_of_the_trainer_are_said_with_a_message(tmp_path: Path) -> None:
     cases = [
         ({"gradient_clip_val": 1.0}, "gradient_clip_val=1.0"),
         ({"accumulate_grad_batches": 2}, "accumulate_grad_batches"),

@@ -130,7 +130,7 @@ def test_a_resumed_fit_ends_with_the_same_numbers(config: dict, tmp_path: Path) 
         assert torch.equal(resumed[name], value), name
 
 
-def test_clipping_and_accumulation_are_refused_in_words(config: dict, tmp_path: Path) -> None:
+def test_clipping_and_accumulation_are_refused_with_a_message(config: dict, tmp_path: Path) -> None:
     for options in ({"gradient_clip_val": 1.0}, {"accumulate_grad_batches": 2}):
         with pytest.raises(MisconfigurationException, match="manual optimization"):
             trainer(tmp_path, logger=False, **options).fit(

@@ -138,7 +138,7 @@ def test_two_processes_share_the_rays_and_end_with_one_model(scenes: str, tmp_pa
 
 
 @pytest.mark.slow
-def test_two_processes_stop_together_and_go_on(scenes: str, tmp_path: Path) -> None:
+def test_two_processes_stop_together_and_resume(scenes: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     checkpoint = run / "checkpoints" / "last.ckpt"
     process = start(run, scenes, "trainer=ddp", "trainer.max_steps=100000")

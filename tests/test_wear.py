@@ -1,4 +1,4 @@
-"""What killed processes leave behind is cleared, and what others damaged is said in words."""
+"""Leftovers of killed processes are removed; damaged files are reported with a message."""
 
 import os
 import shutil
@@ -90,7 +90,7 @@ def test_overrides_that_were_cut_short_are_not_taken_for_whole(tmp_path: Path) -
     assert "trainer.max_steps=400" in prepare([f"resume={tmp_path}"])
 
 
-def test_a_disk_that_fills_up_ends_a_run_in_words(
+def test_a_disk_that_fills_up_ends_a_run_with_a_message(
     trained_run: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     from lightning import Trainer

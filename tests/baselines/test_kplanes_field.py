@@ -82,7 +82,7 @@ def test_compiled_loops_equal_the_oracle_and_their_readable_twin(dtype, time):
             torch.testing.assert_close(fast, plain, **tolerance)
 
 
-def test_planes_start_as_published():
+def test_initial_planes_are_as_published():
     planes = PlaneProducts(4, 8, [1], 5, low=0.1, high=0.5)
     for name, plane in planes.planes():
         if "t" in name:

@@ -100,7 +100,7 @@ def test_a_baseline_can_be_trained_on_the_rays_of_others():
     assert plain["model"]["rays"] == ours["model"]["rays"]
 
 
-def test_the_command_line_has_the_last_word():
+def test_the_command_line_takes_precedence():
     rays = composed("model=kplanes", "model.rays.per_batch=7", "model.rays.background=white")
     rays = rays["model"]["rays"]
     assert rays["per_batch"] == 7

@@ -117,7 +117,7 @@ def test_planes_number_as_published():
     assert nine.compression(nine.field_planes(torch.zeros(1, 3), torch.zeros(1))).shape == (1, 144)
 
 
-def test_surface_starts_as_a_sphere():
+def test_initial_surface_is_a_sphere():
     field = surface(moves=False, width=256, filled=False)
     torch.manual_seed(1)
     places = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)

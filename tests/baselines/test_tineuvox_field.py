@@ -82,7 +82,7 @@ def test_grown_grid_is_loaded_into_a_fresh_field():
     assert int(fresh.voxels) == 8**3
 
 
-def test_opacity_of_a_cell_at_the_start():
+def test_initial_opacity_of_a_cell():
     for alpha in [1e-2, 1e-3]:
         made = field(alpha=alpha, unit=2.0)
         with torch.no_grad():

@@ -88,7 +88,7 @@ def test_six_planes_recover_shared_factors():
     assert loss(sparse, shared_factors(sparse)) < 1e-6 * sparse.square().sum()
 
 
-def test_rank_one_leaves_less_than_a_random_start():
+def test_rank_one_explains_more_than_random_initialisation():
     for plane_set in ["six", "nine"]:
         sparse = moving()
         rows = TIME_ROWS[plane_set]

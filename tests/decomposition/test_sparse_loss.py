@@ -83,7 +83,7 @@ def test_nine_planes_with_equal_twins_are_six_planes():
     assert six == nine
 
 
-def test_descent_from_noise_ends_at_the_rank_one_start():
+def test_gradient_descent_from_noise_reaches_the_rank_one_solution():
     _, sparse = example("nine")
     rows, frames = TIME_ROWS["nine"], torch.arange(FRAMES)
     best = sparse_product_loss(

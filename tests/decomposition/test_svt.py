@@ -15,7 +15,7 @@ def conditioned(rows, columns, condition, dtype=torch.float64):
     return ((left * values.double()) @ right).to(dtype)
 
 
-def test_gram_ties_to_the_exact_decomposition():
+def test_gram_matches_the_exact_decomposition():
     for condition, threshold in itertools.product([1e1, 1e3, 1e6], [0.5, 1e-2, 1e-4]):
         case = f"condition={condition}, threshold={threshold}"
         matrix = conditioned(3000, 20, condition)

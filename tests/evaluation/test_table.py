@@ -84,7 +84,7 @@ def test_columns_are_the_settings_that_differ(tmp_path):
 CURVE = "seconds,step,split,psnr,ssim\n"
 
 
-def test_the_curve_tells_the_start_and_the_time_to_20(tmp_path):
+def test_the_curve_gives_the_psnr_at_step_0_and_the_time_to_20_db(tmp_path):
     # Two seconds of preparation come first.
     cases = [
         ("0,0,test,8,0.1\n10,50,test,16,0.2\n20,90,test,24,0.3\n", "8.0", repr(2 + 15.0)),

@@ -98,7 +98,7 @@ def test_settings_that_make_no_triplanes_are_refused(tmp_path: Path, pictures):
         make("lrm=small", "lrm.weights=absent.pt")
 
 
-def test_pictures_that_are_not_there_are_named(tmp_path: Path):
+def test_missing_images_are_named(tmp_path: Path):
     with pytest.raises(SceneError, match="absent"):
         find_pictures([tmp_path / "absent.png"])
     with pytest.raises(SceneError, match="holds no pictures"):
@@ -107,7 +107,7 @@ def test_pictures_that_are_not_there_are_named(tmp_path: Path):
         find_pictures([])
 
 
-def test_opaque_pictures_are_remarked_upon(tmp_path: Path, few):
+def test_opaque_images_cause_a_message(tmp_path: Path, few):
     picture = tmp_path / "opaque.png"
     Image.fromarray(np.full((30, 30, 3), 90, np.uint8)).save(picture)
     said: list[str] = []

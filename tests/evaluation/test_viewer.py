@@ -1,4 +1,4 @@
-"""The viewer: its cameras are ours, and a browser gets pictures."""
+"""The viewer: camera conventions, and images sent to the browser."""
 
 import time
 from pathlib import Path
@@ -41,7 +41,7 @@ def test_cameras_come_back_as_ours(trained: TrainedRun):
         assert torch.allclose(back, pose, atol=1e-5)
 
 
-def test_a_picture_from_a_view_is_that_view(trained: TrainedRun):
+def test_an_image_from_a_view_is_that_view(trained: TrainedRun):
     views = trained.views
     fov = 2 * float(torch.atan(0.5 * views.height / views.intrinsics.focal[0, 1]))
     picture = draw(
@@ -58,7 +58,7 @@ def test_a_picture_from_a_view_is_that_view(trained: TrainedRun):
     assert (picture.int() - to_bytes(expected["colour"]).int()).abs().max() <= 1
 
 
-def test_a_browser_gets_a_picture_and_more_while_time_plays(trained: TrainedRun):
+def test_a_browser_gets_an_image_and_more_while_time_plays(trained: TrainedRun):
     pytest.importorskip("viser")
     viewer = Viewer(trained, 18080)
     try:

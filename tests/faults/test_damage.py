@@ -1,4 +1,4 @@
-"""Files cut short or changed: found out, made anew or refused in words."""
+"""Truncated or altered files: detected, then recomputed or refused with a message."""
 
 import os
 import shutil

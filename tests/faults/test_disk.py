@@ -1,4 +1,4 @@
-"""Disks that are full, limited or read-only: said in words, and nothing whole is lost."""
+"""Full, limited or read-only disks: reported with a message, without loss of complete files."""
 
 import os
 import subprocess

@@ -40,7 +40,7 @@ def go_on(nursery, config, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("number", range(RANDOM_MOMENTS))
-def test_random_moments(tally, nursery, shared, whole, tmp_path: Path, number: int) -> None:
+def test_random_times(tally, nursery, shared, whole, tmp_path: Path, number: int) -> None:
     """kill -9 at random times of a run, lrm=none and lrm=tiny"""
     lrm = ("none", "tiny")[number % 2]
     config = config_of(shared, lrm, tmp_path / "cache")

@@ -226,7 +226,7 @@ def test_nine_planes_with_equal_twins_are_six_planes():
         assert torch.equal(six, nine)
 
 
-def test_a_still_scene_ignores_the_rows_of_its_set():
+def test_a_static_scene_ignores_the_rows_of_its_set():
     space, _ = stacks("six")
     points, times = scattered(20)
     static = plane_features(space, None, points, times, PLANE_SETS["three"])
@@ -284,7 +284,7 @@ def test_half_precision_planes_take_the_torch_path():
     torch.testing.assert_close(value.float(), full, atol=0.4, rtol=0.1)
 
 
-def test_the_number_of_threads_changes_no_bit():
+def test_results_are_bit_identical_for_any_number_of_threads():
     space, time = stacks("nine", torch.float32, size=16, channels=8)
     points, times = scattered(5000, torch.float32)
     usual = both("nine", space, time, points, times)[0]

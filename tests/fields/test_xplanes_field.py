@@ -127,7 +127,7 @@ def test_the_time_planes_may_have_another_resolution_than_space():
     assert field(*scattered(5))[1].isfinite().all()
 
 
-def test_planes_that_do_not_fit_are_refused_in_words():
+def test_planes_that_do_not_fit_are_refused_with_a_message():
     for change, words in [
         ({"yz": None}, "needs xy, xz, yz, xt, yt, zt"),
         ({"qt": torch.zeros(4, 3, 6)}, "qt"),

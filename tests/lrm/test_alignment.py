@@ -170,7 +170,7 @@ def field_image(model, triplane, alignment, rays, samples=2000):
     return renderer.image(field, origins, directions, 0.5, torch.ones(3))["colour"]
 
 
-def test_openlrm_picture_through_our_field():
+def test_openlrm_image_through_our_field():
     for version, folder in VERSIONS.items():
         model, truth = load_reduced(folder), arrays(f"{folder}/render.npz")
         own = truth["planes"][:1]
@@ -196,7 +196,7 @@ def test_openlrm_picture_through_our_field():
         compare(found, expected, rtol=0, atol=1.5e-3, case=version)
 
 
-def test_triposr_picture_through_our_field(monkeypatch):
+def test_triposr_image_through_our_field(monkeypatch):
     model = load_reduced("triposr_tiny")
     triplane = arrays("triposr_tiny/render.npz")["scene_code"]
     alignment, rays = source_rays(model.view)
@@ -248,7 +248,7 @@ def world_query(model, triplane, alignment):
     return query
 
 
-def test_recorded_triposr_picture_by_way_of_the_world():
+def test_recorded_triposr_image_by_way_of_the_world():
     model = load_reduced("triposr_tiny")
     truth = arrays("triposr_tiny/render_canonical.npz")
     alignment, _ = source_rays(model.view)
@@ -263,7 +263,7 @@ def test_recorded_triposr_picture_by_way_of_the_world():
     compare(found, truth["images"].view(-1, 3))
 
 
-def test_recorded_openlrm_pictures_by_way_of_the_world():
+def test_recorded_openlrm_images_by_way_of_the_world():
     folder = VERSIONS["1.1"]
     model, truth = load_reduced(folder), arrays(f"{folder}/render.npz")
     alignment, _ = source_rays(model.view)

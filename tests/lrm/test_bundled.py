@@ -1,4 +1,4 @@
-"""Models in the package: whole, or refused by their checksum."""
+"""Bundled models: loaded, or refused by their checksum."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""Published files load strictly, and what does not fit is refused in words."""
+"""Published files load strictly, and what does not match is refused with a message."""
 
 import json
 import pickle

@@ -1,4 +1,4 @@
-"""Published configurations, and what is wrong with others."""
+"""Published configurations, and errors for invalid ones."""
 
 import pytest
 from torch import nn

@@ -1,4 +1,4 @@
-"""More or less room around a triplane: the same field where both cubes are."""
+"""Padding and cropping triplanes: the field is unchanged inside both cubes."""
 
 from itertools import product
 

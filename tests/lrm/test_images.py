@@ -1,4 +1,4 @@
-"""From pictures to what the models see, and windows on pictures."""
+"""Preprocessing of images for the models, and crops."""
 
 import pytest
 import torch
@@ -69,7 +69,7 @@ def test_foreground_fills_its_share():
     compare(middle, torch.full((2,), crop.side / 2), atol=1)
 
 
-def test_what_is_no_picture_is_refused():
+def test_other_tensors_than_images_are_refused():
     with pytest.raises(LRMError, match=r"\[N, 4, H, W\]"):
         prepare(torch.zeros(1, 3, 5, 5), "triposr", 5)
     for alpha in (torch.zeros(5, 5), torch.eye(5)[:1]):

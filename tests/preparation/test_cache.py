@@ -1,4 +1,4 @@
-"""Finished stages are found again, and nothing damaged is ever used."""
+"""The cache of stages: entries are reused, damaged ones never."""
 
 import logging
 import time
@@ -37,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_stage_is_made_once_and_comes_back_the_same(folder: Path):
+def test_a_stage_is_computed_once_and_loaded_unchanged(folder: Path):
     make = Maker()
     stage = StageCache(folder).stage("parts", INPUTS, make)
     assert (make.calls, stage.cached) == (0, True)
@@ -100,7 +100,7 @@ def damaged(path: Path, kind: str) -> None:
 DAMAGES = "truncated empty flipped foreign version report key checksum content seconds".split()
 
 
-def test_what_is_damaged_is_said_and_made_anew(tmp_path: Path, caplog):
+def test_damaged_entries_are_reported_and_recomputed(tmp_path: Path, caplog):
     for kind in DAMAGES:
         folder = tmp_path / kind
         StageCache(folder).stage("parts", INPUTS, Maker())
@@ -125,12 +125,12 @@ def test_every_byte_of_an_entry_may_flip(folder: Path):
         assert content["report"] == expected["report"]
 
 
-def test_a_new_version_of_the_code_makes_anew(folder: Path, monkeypatch):
+def test_a_new_version_of_the_code_recomputes(folder: Path, monkeypatch):
     monkeypatch.setattr(cache_module, "VERSION", cache_module.VERSION + 1)
     assert not StageCache(folder).stage("parts", INPUTS, Maker()).cached
 
 
-def test_switched_off_it_keeps_nothing(tmp_path: Path):
+def test_a_disabled_cache_stores_nothing(tmp_path: Path):
     make = Maker()
     for _ in range(2):
         StageCache(None).stage("parts", INPUTS, make)
@@ -139,7 +139,7 @@ def test_switched_off_it_keeps_nothing(tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_cannot_be_written_costs_the_cache_alone(tmp_path: Path, caplog):
+def test_a_folder_that_cannot_be_written_disables_the_cache_only(tmp_path: Path, caplog):
     (tmp_path / "file").write_text("")
     with caplog.at_level(logging.WARNING):
         stage = StageCache(tmp_path / "file").stage("parts", INPUTS, Maker())
@@ -147,7 +147,7 @@ def test_a_folder_that_cannot_be_written_costs_the_cache_alone(tmp_path: Path, c
     assert "cannot be written: stages are not cached" in caplog.text
 
 
-def test_an_entry_that_cannot_be_written_is_not_kept(tmp_path: Path, caplog, monkeypatch):
+def test_an_entry_that_cannot_be_written_is_not_cached(tmp_path: Path, caplog, monkeypatch):
     def refuse(*_args) -> None:
         raise OSError(28, "No space left on device")
 

@@ -1,4 +1,4 @@
-"""Frames to triplanes: each distinct frame once, nothing lost when it stops."""
+"""Frames to triplanes: each distinct frame once, resumable."""
 
 import pytest
 import torch
@@ -34,7 +34,7 @@ def run(model, frames, cache, batch=2, key="weights"):
     return encode(model, key, frames, crop, cache, CPU, batch=batch)
 
 
-def test_every_frame_gets_the_triplane_of_its_own_picture(tmp_path):
+def test_every_frame_gets_the_triplane_of_its_own_image(tmp_path):
     frames = frames_of(4)[[0, 1, 0, 2, 3, 1]]
     for name in SIDES:
         model = model_of(name)
@@ -68,7 +68,7 @@ def test_each_distinct_frame_is_encoded_once(tmp_path, monkeypatch):
     assert sum(seen) == 9
 
 
-def test_an_interrupted_video_goes_on_where_it_stopped(tmp_path, monkeypatch):
+def test_an_interrupted_video_is_resumed(tmp_path, monkeypatch):
     model, frames, cache = model_of(), frames_of(5), StageCache(tmp_path)
     expected = run(model, frames, StageCache(None)).triplanes
     original, seen = model.encode, []

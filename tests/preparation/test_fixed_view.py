@@ -207,7 +207,7 @@ def test_frames_are_picked_evenly():
     assert picked.times.tolist() == [0, 0, 0.5, 0.5, 0.5, 1, 1]
 
 
-def test_of_a_scene_of_one_moment_the_frame_of_that_moment_is_picked(tmp_path: Path):
+def test_a_scene_of_one_timestep_uses_the_frame_of_that_timestep(tmp_path: Path):
     static = ball_scene(moving=False)
     views = static.splits["train"]
     views = replace(views, times=torch.full_like(views.times, 0.5))
@@ -216,7 +216,7 @@ def test_of_a_scene_of_one_moment_the_frame_of_that_moment_is_picked(tmp_path: P
     assert made.views.times.tolist() == [0.5]
 
 
-def test_a_video_that_leaves_out_moments_is_refused():
+def test_a_video_with_missing_timesteps_is_refused():
     for times in ([0.0, 0.1, 0.2, 0.3], [0.6, 0.8, 1.0], [0, 0.05, 0.95, 1]):
         video = ball_views(len(times), 0.5, size=4, times=torch.tensor(times))
         words = r"no frame near time .*preparation\.fixed_view=train"
@@ -274,7 +274,9 @@ def test_a_video_that_is_not_there_is_refused(tmp_path: Path):
         video_of(settings(tmp_path, "preparation.fixed_view=video"), ball_scene(), tmp_path)
 
 
-def test_a_field_renders_the_scene_and_the_video_is_kept(tmp_path: Path, small_fields, monkeypatch):
+def test_a_field_renders_the_scene_and_the_video_is_cached(
+    tmp_path: Path, small_fields, monkeypatch
+):
     scene, cache = ball_scene(count=12, size=24), tmp_path / "cache"
     made, said = video_of(settings(tmp_path), scene, cache)
     assert len(said) == 1
@@ -294,14 +296,14 @@ def test_a_field_renders_the_scene_and_the_video_is_kept(tmp_path: Path, small_f
     assert torch.equal(again.views.images, made.views.images)
 
 
-def test_a_still_scene_is_rendered_once(tmp_path: Path, small_fields):
+def test_a_static_scene_is_rendered_once(tmp_path: Path, small_fields):
     made, _ = video_of(
         settings(tmp_path, "preparation.fixed_view_steps=5"), ball_scene(moving=False), tmp_path
     )
     assert len(made.views) == 1
 
 
-def test_an_interrupted_field_goes_on_where_it_stopped(tmp_path: Path, small_fields, monkeypatch):
+def test_an_interrupted_field_is_resumed(tmp_path: Path, small_fields, monkeypatch):
     scene, cache = ball_scene(count=12, size=24), tmp_path / "cache"
     method = settings(tmp_path, "preparation.fixed_view_steps=10")
 

@@ -209,7 +209,7 @@ def test_options_that_no_decoder_has_are_refused(tmp_path: Path):
         initialised(tmp_path, TriplaneSequence(SEQUENCE.triplanes, decoder, options))
 
 
-def test_a_scene_of_one_moment_takes_the_low_rank_part_alone(tmp_path: Path):
+def test_a_scene_of_one_timestep_uses_the_low_rank_part_only(tmp_path: Path):
     found, module = initialised(tmp_path, SEQUENCE, moving=False)
     assert set(found.values.planes) == {"xy", "xz", "yz"}
     assert module.field.time is None
@@ -245,7 +245,7 @@ def test_every_floating_type_gives_single_precision_planes(tmp_path: Path):
         assert found.report["xy"]["converged"], kind
 
 
-def test_seeds_change_the_noise_alone(finished):
+def test_seeds_change_the_noise_only(finished):
     folder, first, _ = finished
     other, _ = initialised(folder, SEQUENCE, "seed=1")
     assert torch.equal(first.values.planes["xy"], other.values.planes["xy"])
@@ -253,7 +253,9 @@ def test_seeds_change_the_noise_alone(finished):
     assert float(gap) == pytest.approx(0.01 * 2**0.5, rel=0.1)
 
 
-def test_an_open_decomposition_is_said_once_also_from_the_cache(tmp_path: Path, caplog, recwarn):
+def test_an_unconverged_decomposition_warns_once_also_from_the_cache(
+    tmp_path: Path, caplog, recwarn
+):
     for _ in range(2):
         caplog.clear()
         with caplog.at_level(logging.WARNING):

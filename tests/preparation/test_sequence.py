@@ -1,4 +1,4 @@
-"""Files of triplane sequences: back as they were, and refused in words."""
+"""Files of triplane sequences: round trip, and errors for invalid ones."""
 
 from dataclasses import replace
 from functools import partial
@@ -147,7 +147,7 @@ WRONG = {
 }
 
 
-def test_what_cannot_be_used_is_refused_in_words(tmp_path: Path):
+def test_what_cannot_be_used_is_refused_with_a_message(tmp_path: Path):
     path = tmp_path / "a.pt"
     for case, (content, words) in WRONG.items():
         torch.save(content, path)

@@ -1,4 +1,4 @@
-"""A model before its first step, and one that goes on with finer planes."""
+"""Initialisation of a model: random, or from a model with coarser planes."""
 
 from functools import partial
 
@@ -20,13 +20,13 @@ from xplanes.pretraining.settings import parse_pretraining, published_sizes
 SIZES = published_sizes(small_config().model, FOCAL)
 
 
-def test_seeds_make_models():
+def test_models_are_deterministic_given_the_seed():
     first, again, other = (init_model(small_sizes(), seed).state_dict() for seed in (0, 0, 1))
     assert same(first, again)
     assert not same(first, other)
 
 
-def test_planes_attend_to_the_picture_where_they_lie():
+def test_planes_attend_to_their_line_of_sight_in_the_image():
     config = small_sizes("model.image_size=96", "model.width=128", "model.low_resolution=12")
     model = init_model(config, 0)
     with torch.no_grad():
@@ -52,7 +52,7 @@ def test_planes_attend_to_the_picture_where_they_lie():
     assert abs(int(columns.argmax()) - 3) <= 1
 
 
-def test_finer_planes_go_on_from_coarser_ones():
+def test_finer_planes_are_initialised_from_coarser_ones():
     torch.manual_seed(0)
     earlier = init_model(small_sizes(), 0)
     finer = small_sizes("model.low_resolution=8")
@@ -69,7 +69,7 @@ def test_finer_planes_go_on_from_coarser_ones():
     )
 
 
-def test_weights_keep_their_meaning_on_the_way_through_a_file(tmp_path):
+def test_exported_weights_are_loaded_unchanged(tmp_path):
     model = init_model(small_sizes(), 2)
     path = export(model, SIZES, tmp_path, "small")
     loaded, found = load_bundled("small", tmp_path)

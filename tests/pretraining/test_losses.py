@@ -77,7 +77,7 @@ def test_compositing_of_a_wall():
     torch.testing.assert_close(rendered, wanted.expand(3))
 
 
-def test_a_picture_shows_the_box_and_white_around_it():
+def test_an_image_shows_the_box_and_white_around_it():
     torch.manual_seed(0)
     decoder, planes = Decoder(2, density_scale=50.0), randn(1, 3, 2, 4, 4)
     pose = torch.eye(4)

@@ -41,13 +41,13 @@ def content(pool):
     return [pool[i].tobytes() for i in range(len(pool))]
 
 
-def test_records_come_back_whatever_is_drawn_before(short_shards, tmp_path):
+def test_records_depend_on_their_seed_only(short_shards, tmp_path):
     pool = drawn(tmp_path)
     assert len(pool) == 6
     assert content(pool)[3] == draw_sample(3, 2, 16)[0].tobytes()
 
 
-def test_a_pool_goes_on_where_it_stopped(short_shards, tmp_path, monkeypatch):
+def test_an_interrupted_pool_is_resumed(short_shards, tmp_path, monkeypatch):
     whole = content(drawn(tmp_path / "whole"))
     calls, real = [], pool_module.draw_sample
 
@@ -67,7 +67,7 @@ def test_a_pool_goes_on_where_it_stopped(short_shards, tmp_path, monkeypatch):
     assert not calls
 
 
-def test_a_damaged_shard_is_drawn_again(short_shards, tmp_path):
+def test_a_damaged_shard_is_generated_again(short_shards, tmp_path):
     whole = content(drawn(tmp_path))
     path = tmp_path / "00001.npy"
     damaged = bytearray(path.read_bytes())
@@ -113,7 +113,7 @@ def test_batches_depend_on_seed_and_step_alone():
     assert not torch.equal(first.draw(4).points, first.draw(5).points)
 
 
-def test_every_object_shows_once_in_a_turn(monkeypatch):
+def test_every_object_is_used_once_per_epoch(monkeypatch):
     seen, data = [], batches(small_pool(6))
     real = PretrainingBatches._sample
     monkeypatch.setattr(
@@ -126,7 +126,7 @@ def test_every_object_shows_once_in_a_turn(monkeypatch):
     assert len(set(seen)) == 6
 
 
-def test_pictures_points_and_rays_lie_in_one_frame():
+def test_images_points_and_rays_lie_in_one_frame():
     """Points project to where the picture shows them, mirrored or not."""
     data = batches(small_pool(6))
     mirrored = set()

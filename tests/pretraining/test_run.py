@@ -1,4 +1,4 @@
-"""Pretraining of seconds: it learns, it goes on after a stop as if there had been none."""
+"""Short pretraining runs: losses fall, and resumed runs equal uninterrupted ones."""
 
 import copy
 import json
@@ -38,7 +38,7 @@ def state(run):
     return torch.load(run / CHECKPOINT, weights_only=True)
 
 
-def test_a_stopped_training_goes_on_as_if_it_had_not(tmp_path, pool_folder, monkeypatch, capsys):
+def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, pool_folder, monkeypatch, capsys):
     steps = "schedule.max_steps=6"
     assert command(tmp_path / "whole", pool_folder, steps) == 0
     real = Upkeep.on_train_batch_end
@@ -74,7 +74,7 @@ def finished(tmp_path_factory, pool_folder):
     return folder
 
 
-def test_another_model_does_not_go_on_in_the_same_folder(finished, pool_folder, capsys):
+def test_another_model_is_not_resumed_in_the_same_folder(finished, pool_folder, capsys):
     assert command(finished, pool_folder, "schedule.max_steps=1", "model.width=24") == 1
     assert f"run={finished}" in capsys.readouterr().err
 
@@ -130,7 +130,7 @@ def test_every_parameter_has_one_optimizer_and_rates_rise_stay_and_fall():
     assert rates == [0.25, 1, 1, 1, 0.5, 0]
 
 
-def test_losses_that_are_not_finite_end_in_words(monkeypatch):
+def test_non_finite_losses_end_training_with_a_message(monkeypatch):
     _, taught = module()
     optimizers = taught.configure_optimizers()
     taught.optimizers = lambda: optimizers
@@ -143,6 +143,6 @@ def test_losses_that_are_not_finite_end_in_words(monkeypatch):
     assert taught.steps == 0
 
 
-def test_wrong_settings_leave_the_command_in_words(capsys):
+def test_invalid_settings_end_the_command_with_a_message(capsys):
     assert main(["pretrain-lrm", "batch.objects=0"]) == 1
     assert "batch.objects=0" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Scores of a model that knows the answer, and of one that knows nothing."""
+"""Scores of an ideal model and of an untrained one."""
 
 import json
 
@@ -107,7 +107,7 @@ def test_scores_and_sheets_are_written(tmp_path, monkeypatch):
     assert (tmp_path / "failures.png").is_file()
 
 
-def test_a_quick_look_needs_no_drawing():
+def test_quick_scores_need_no_rendering_of_objects():
     values = QuickLook(small_pool(2), 2).scores(init_model(small_sizes(), 0))
     assert 0 <= values["iou"] <= 1
     assert 3 < values["psnr_novel"] < 30

@@ -1,4 +1,4 @@
-"""The models in the package are those that conf/ describes, small, and better than nothing."""
+"""The bundled models: sizes as in conf/, file size and quality."""
 
 import dataclasses
 
@@ -55,7 +55,7 @@ def test_a_dnerf_camera_is_its_own(models):
         assert found.frame.scale == pytest.approx(scale), name
 
 
-def test_it_reconstructs_what_it_never_saw(models, monkeypatch):
+def test_it_reconstructs_held_out_objects(models, monkeypatch):
     monkeypatch.setattr(score_module, "GRID", 24)
     _, subject = held_out(2)
     subject = dataclasses.replace(subject, cameras=subject.cameras[:2])

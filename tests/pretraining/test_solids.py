@@ -138,7 +138,7 @@ def test_the_camera_is_that_of_dnerf():
     assert np.linalg.norm(camera(12, 34)[:3, 3]) == pytest.approx(CAMERA_DISTANCE)
 
 
-def test_objects_come_back_and_differ_by_seed():
+def test_objects_are_deterministic_and_differ_by_seed():
     first, again, other = (procedural_object(seed) for seed in (4, 4, 5))
     assert all((a == b).all() for a, b in zip(first.arrays, again.arrays, strict=True))
     assert len(first.kinds) != len(other.kinds) or (first.sizes != other.sizes).any()
@@ -151,7 +151,7 @@ def test_objects_stay_where_cameras_see_them():
         assert max(np.abs(low).max(), np.abs(high).max()) < 1.2
 
 
-def test_training_held_out_and_demo_objects_are_different_things():
+def test_training_held_out_and_demo_objects_are_distinct():
     assert not set(TRAINING_SEEDS[:10]) & set(HELD_OUT_SEEDS[:10])
     assert TRAINING_SEEDS.stop <= HELD_OUT_SEEDS.start
     for seed in (-1, HELD_OUT_SEEDS.stop):

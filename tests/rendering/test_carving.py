@@ -27,7 +27,7 @@ def allowed_at(grid, points, time):
     return grid.allowed.view(shape)[int(grid.bins(torch.tensor([time]))), z, y, x]
 
 
-def test_a_still_ball_is_kept_and_the_corners_are_not():
+def test_a_static_ball_is_kept_and_the_corners_are_not():
     frame = cube_frame(1.4, ORIGIN)
     rendered = {size: ball_views(24, 0.5, size=size, times=torch.zeros(24)) for size in (24, 64)}
     for (size, views), resolution in itertools.product(rendered.items(), [6, 24]):
@@ -54,7 +54,7 @@ def test_content_close_to_wide_cameras_is_kept():
             assert grid.allowed.float().mean() < 0.5, case
 
 
-def test_a_still_ball_in_a_moving_scene_is_kept():
+def test_a_static_ball_in_a_moving_scene_is_kept():
     for count in [12, 50, 200]:
         # Times differ, so the grid does not know that the ball is static.
         grid = carved(ball_views(count, 0.5, size=24))
@@ -98,13 +98,13 @@ def test_what_only_joined_views_rule_out_fills_again():
     assert grid.occupied[cells].all()
 
 
-def test_a_still_scene_rules_out_for_good_what_any_view_shows_empty():
+def test_a_static_scene_rules_out_for_good_what_any_view_shows_empty():
     grid = carved(ball_views(24, 0.5, size=24, times=torch.zeros(24)), bins=1)
     assert torch.equal(grid.allowed, grid.occupied)
     assert not grid.allowed.all()
 
 
-def test_a_turned_and_moved_frame_carves_the_same_world():
+def test_a_rotated_and_translated_frame_carves_the_same_world():
     views = ball_views(
         24, 0.4, centre=lambda _: torch.tensor([0.3, -0.2, 0.1]), times=torch.zeros(24)
     )

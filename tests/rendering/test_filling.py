@@ -1,4 +1,4 @@
-"""A grid filled from a field: what shows stays, what is missing stays possible, the rest goes."""
+"""The occupancy grid filled from a field: which cells stay and which are pruned."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""The occupancy grid: what it believes after looks, and what it never believes again."""
+"""The occupancy grid: updates, decay, sweeps and pruned cells."""
 
 import math
 
@@ -120,7 +120,7 @@ def test_likely_cells_fill_wherever_they_are():
     assert grid.occupied.nonzero()[:, 0].tolist() == [3, 60]
 
 
-def test_a_cell_empties_when_its_start_has_decayed():
+def test_a_cell_empties_when_its_initial_density_has_decayed():
     for decay in [0.0, 0.5, 0.95]:
         grid, cell = grid_of(decay=decay), torch.tensor([7])
         looks = 0

@@ -82,7 +82,7 @@ def test_it_takes_the_same_samples_for_the_same_numbers():
     assert not all(map(torch.equal, first, other))
 
 
-def test_pictures_are_what_they_are_without_it():
+def test_images_do_not_depend_on_it():
     field, rays = field_of(), rays_of(40)
     plain = renderer_of(48)
     seen, thin = (r.render(field, *rays, WHITE) for r in (plain, replace(plain, thinning=2.0)))

@@ -234,6 +234,6 @@ def test_only_rays_far_from_silhouettes_move_in_time_and_not_far():
     assert moved["times"].max() <= 1
 
 
-def test_a_still_scene_has_no_other_times():
+def test_a_static_scene_has_no_other_times():
     static = replace(VIEWS, times=torch.zeros(len(VIEWS)))
     assert not batches_of(static, background_jitter=0.2).draw(0)["times"].any()

@@ -1,4 +1,4 @@
-"""The data module goes on where a checkpoint left off, and serves whole views."""
+"""The data module: resuming from a checkpoint, and evaluation views."""
 
 from types import SimpleNamespace
 

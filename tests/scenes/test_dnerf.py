@@ -181,7 +181,7 @@ def test_sixteen_bit_grey_keeps_its_range(tmp_path):
     assert (channels[3] == 255).all()
 
 
-def test_cmyk_is_refused_in_words(scene):
+def test_cmyk_is_refused_with_a_message(scene):
     Image.new("CMYK", (12, 12)).save(scene.path / "train" / "r_1.jpg")
     scene.frame(1)["file_path"] = "train/r_1.jpg"
     scene.write()

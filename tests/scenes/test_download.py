@@ -177,7 +177,7 @@ def test_a_folder_in_the_way_is_not_touched(tmp_path, server):
     assert not server.requests
 
 
-def test_goes_on_within_one_call_after_a_cut(tmp_path, server):
+def test_resumes_within_one_call_after_a_cut(tmp_path, server):
     server.limits = [50_000, 60_000]
     _, lines = download(tmp_path, server)
     assert_complete(tmp_path)
@@ -189,7 +189,7 @@ def test_goes_on_within_one_call_after_a_cut(tmp_path, server):
     assert any("trying again" in line for line in lines)
 
 
-def test_goes_on_at_the_next_call_after_a_cut(tmp_path, server, monkeypatch):
+def test_resumes_at_the_next_call_after_a_cut(tmp_path, server, monkeypatch):
     monkeypatch.setattr(fetch_module, "ATTEMPTS", 1)
     server.limits = [50_000]
     message = error(tmp_path, server)

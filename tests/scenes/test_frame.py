@@ -97,7 +97,7 @@ def test_a_given_half_side_is_taken():
     assert torch.equal(frame.rotation, torch.eye(3))
 
 
-def test_a_still_scene_s_cube_holds_it_closely():
+def test_the_cube_of_a_static_scene_is_tight():
     centre = torch.tensor([0.1, -0.2, 0.15])
     for radius in (0.2, 0.5, 1.0):
         views = ball_views(30, radius, centre=lambda _: centre, size=48, times=torch.zeros(30))
@@ -107,7 +107,7 @@ def test_a_still_scene_s_cube_holds_it_closely():
         assert 1 / frame.scale < radius + 0.35, radius
 
 
-def test_a_moving_scene_s_cube_holds_it_at_all_times():
+def test_the_cube_of_a_dynamic_scene_contains_it_at_all_times():
     for turns in (0.5, 1):
         path = swinging(0.7, turns)
         frame = scene_frame(ball_views(40, 0.3, centre=path, size=32))

@@ -462,7 +462,7 @@ def test_the_data_module_serves_views_at_their_own_size():
         assert batch["origins"].shape == batch["directions"].shape == (height * width, 3)
 
 
-def test_frames_of_different_lenses_do_not_stand_still():
+def test_frames_with_different_intrinsics_are_not_static():
     views = rendered([WIDE] * 3, surrounding(1, 4.0).repeat(3, 1, 1))
     assert frames_are_equal(views)
     focal = views.intrinsics.focal.clone()
@@ -483,7 +483,7 @@ def test_a_video_has_the_field_of_view_of_the_training_views():
     assert views.intrinsics.fov_y == pytest.approx(2 * math.atan(15 / 36.5))
 
 
-def test_a_picture_from_a_view_shows_it_whole():
+def test_an_image_from_a_view_shows_it_whole():
     views = mixed(4)
     for index in (0, 1):
         height, width = views.size(index)

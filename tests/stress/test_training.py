@@ -26,7 +26,9 @@ def test_scenes_without_content(tally, root, tmp_path, model, kind) -> None:
 @pytest.mark.parametrize("crop", ["true", "false"])
 @pytest.mark.parametrize("precision", ["32", "bf16"])
 @pytest.mark.parametrize("kind", SCENES)
-def test_a_start_from_scenes_without_content(tally, root, tmp_path, kind, precision, crop) -> None:
+def test_initialisation_from_scenes_without_content(
+    tally, root, tmp_path, kind, precision, crop
+) -> None:
     """The same scenes initialised from lrm=tiny, decoder in float32 and bfloat16"""
     changed = (
         f"model.precision={precision}",

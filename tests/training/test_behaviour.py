@@ -1,4 +1,4 @@
-"""What a run promises: it learns, repeats itself, and goes on where it stopped."""
+"""Runs: outputs, determinism, interruption and resuming."""
 
 import csv
 import json
@@ -337,7 +337,7 @@ def test_scoring_uses_the_device_that_trained(watched: Watched) -> None:
     assert watched.moves[-4:] == ends
 
 
-def test_only_the_pictures_that_are_shown_are_kept(watched: Watched) -> None:
+def test_only_displayed_images_are_kept_in_memory(watched: Watched) -> None:
     assert len(watched.pictures) == 3 * 3
     assert not any(colour() is not None for colour in watched.pictures)
     assert len(list((watched.folder / "media" / "step000040").glob("*.png"))) == 2
@@ -348,7 +348,7 @@ def test_the_best_is_written_before_the_last(watched: Watched) -> None:
     assert [name for step, name in watched.saved if step == 20] == ["best.ckpt", "last.ckpt"]
 
 
-def test_digits_cannot_be_kept_on_a_gpu(
+def test_deterministic_training_is_refused_on_a_gpu(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fit, "find_device", lambda _: torch.device("cuda"))
@@ -456,7 +456,7 @@ def test_a_bad_batch_takes_those_of_its_update_along(
     assert left == [False]
 
 
-def test_scene_of_one_moment_trains_without_planes_of_time(scenes: Path, tmp_path: Path) -> None:
+def test_scene_of_one_timestep_trains_without_time_planes(scenes: Path, tmp_path: Path) -> None:
     config = small_config(tmp_path, "trainer.max_steps=2", "callbacks.evaluation.at=[]")
     (original,) = scenes.glob("excavator*")
     folder = Path(shutil.copytree(original, tmp_path / original.name))
@@ -475,7 +475,7 @@ def test_scene_of_one_moment_trains_without_planes_of_time(scenes: Path, tmp_pat
     assert "field.time" not in state["state_dict"]
 
 
-def test_a_scene_without_motion_has_no_planes_of_time(scenes: Path, tmp_path: Path) -> None:
+def test_a_scene_without_motion_has_no_time_planes(scenes: Path, tmp_path: Path) -> None:
     cases = {
         ("data.scene=still_life",): "frames are equal",
         ("data.scene=still_life", "data.static=false"): None,

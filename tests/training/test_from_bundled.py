@@ -1,4 +1,4 @@
-"""The model in the package at work: what `python train.py` does by default."""
+"""Runs initialised from the bundled model, the default of `python train.py`."""
 
 import json
 from pathlib import Path
@@ -42,7 +42,7 @@ def told(folder: Path) -> dict:
     return json.loads((folder / "metrics.json").read_text())
 
 
-def test_the_default_start_is_a_model_of_the_package():
+def test_the_default_initialisation_is_a_bundled_model():
     assert composed().lrm.name in bundled_models()
 
 
@@ -56,13 +56,13 @@ def test_it_knows_the_scene_before_the_first_step(train, random, tmp_path: Path,
     assert content["seconds"]["prepare"]["lrm"] > 0
 
 
-def test_a_scene_of_one_moment_needs_one_triplane(train, tmp_path: Path):
+def test_a_scene_of_one_timestep_needs_one_triplane(train, tmp_path: Path):
     train(tmp_path / "run", "lrm=tiny", "data.views=1", "trainer.max_steps=1")
     assert told(tmp_path / "run")["lrm"]["frames"] == 1
     assert told(tmp_path / "run")["decomposition"] == {}
 
 
-def test_a_scene_without_motion_trains_as_a_still_one(train, tmp_path: Path):
+def test_a_scene_without_motion_trains_as_a_static_one(train, tmp_path: Path):
     folder = tmp_path / "run"
     train(folder, "lrm=tiny", "data.scene=still_life", "trainer.max_steps=1")
     assert (told(folder)["lrm"]["frames"], told(folder)["lrm"]["distinct"]) == (1, 1)

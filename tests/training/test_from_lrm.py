@@ -71,7 +71,7 @@ def uninterrupted(settings, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("stopped", ["encode", "from_sequence"])
-def test_a_stopped_preparation_goes_on_from_the_last_finished_stage(
+def test_a_stopped_preparation_resumes_from_the_last_finished_stage(
     settings, uninterrupted: Path, tmp_path: Path, monkeypatch, stopped
 ):
     folder = tmp_path / "run"

@@ -88,7 +88,7 @@ def trained(place: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_run_tells_how_it_started(trained: Path, place: Path) -> None:
+def test_the_run_reports_its_initialisation(trained: Path, place: Path) -> None:
     content = metrics(trained)
     assert set(content["decomposition"]) == {"xy", "xz", "yz", "unexplained"}
     wanted = "rank iterations residual converged sparsity drift low_rank_energy sparse_energy"
@@ -106,7 +106,7 @@ def test_the_run_tells_how_it_started(trained: Path, place: Path) -> None:
     assert content["skipped"]["frames"] == 0
 
 
-def test_the_parts_are_a_picture_and_the_loss_a_curve(trained: Path) -> None:
+def test_the_parts_are_logged_as_an_image_and_the_loss_as_a_curve(trained: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     with Image.open(trained / "media" / "decomposition.png") as picture:
@@ -159,7 +159,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
         assert metrics(folder)[key] == metrics(trained)[key]
 
 
-def test_planes_do_not_go_on_in_another_frame(empty_place: Path, tmp_path: Path) -> None:
+def test_planes_are_not_resumed_in_another_frame(empty_place: Path, tmp_path: Path) -> None:
     def save(scale: float) -> None:
         frame = Frame(scale, torch.eye(3), torch.zeros(3))
         sequence = TriplaneSequence(moving_sequence(), frame=frame)
@@ -185,7 +185,9 @@ def test_the_loss_changes_the_run(trained: Path, place: Path, tmp_path: Path) ->
     )
 
 
-def test_a_start_holds_the_planes(place: Path, tmp_path: Path) -> None:
+def test_the_regulariser_keeps_planes_near_their_initialisation(
+    place: Path, tmp_path: Path
+) -> None:
     def planes(name: str, *overrides: str) -> torch.Tensor:
         run(settings(place, UNSCORED, *overrides), tmp_path / name, [], resume=False)
         kept = weights(tmp_path / name)
@@ -204,7 +206,7 @@ def built(config: dict) -> XPlanesModel:
     return module.model
 
 
-def test_what_ties_the_planes_to_their_start_fades(place: Path) -> None:
+def test_regularisers_towards_the_initialisation_fade(place: Path) -> None:
     """Without other terms, a gradient is what it would be without fading times what is left."""
     quiet = [
         "model.loss.total_variation=0",
@@ -232,7 +234,7 @@ def test_what_ties_the_planes_to_their_start_fades(place: Path) -> None:
     assert not any(gradient.any() for gradient in gradients(96, "288") + gradients(104, "288"))
 
 
-def test_the_hold_falls_with_the_square_of_the_views(place: Path) -> None:
+def test_the_regulariser_scales_with_the_inverse_square_of_the_views(place: Path) -> None:
     def hold(lrm: str, views: int) -> float:
         overrides = [f"data.views={views}", "model.loss.initial_weight=8"]
         return built(settings(place, *overrides) | ({} if lrm == "file" else none)).initial_weight
@@ -243,7 +245,7 @@ def test_the_hold_falls_with_the_square_of_the_views(place: Path) -> None:
 
 
 @pytest.mark.parametrize("model", ["six_planes", "nine_planes"])
-def test_the_loss_pulls_random_planes_towards_the_sparse_part(
+def test_l_r_moves_random_planes_towards_the_sparse_part(
     place: Path, tmp_path: Path, model: str
 ) -> None:
     """Colours are taken out of the loss as far as they go, so that L_r alone is seen."""
@@ -319,7 +321,7 @@ def test_a_damaged_site_is_named(trained: Path, tmp_path: Path) -> None:
         load_run(folder)
 
 
-def test_a_decomposition_that_did_not_converge_is_said_once(
+def test_an_unconverged_decomposition_warns_once(
     place: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     config = settings(
@@ -336,7 +338,7 @@ def test_a_decomposition_that_did_not_converge_is_said_once(
     assert not metrics(tmp_path / "run")["decomposition"]["xy"]["converged"]
 
 
-def test_a_random_start_says_so_and_leaves_no_trace(
+def test_a_random_initialisation_is_reported_and_adds_no_state(
     place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = small_config(place / "scenes", "trainer.max_steps=2", UNSCORED)
@@ -348,7 +350,7 @@ def test_a_random_start_says_so_and_leaves_no_trace(
 
 
 @pytest.mark.parametrize("model", ["six_planes", "nine_planes"])
-def test_a_trained_fields_own_triplanes_start_a_field_that_renders_as_it(
+def test_triplanes_of_a_trained_field_initialise_a_field_with_equal_renders(
     place: Path, tmp_path: Path, model: str
 ) -> None:
     """Checks end to end that orientation, time, decoder and frame of a file match the field's."""

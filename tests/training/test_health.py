@@ -79,14 +79,14 @@ def test_one_bad_gradient_costs_one_step(scenes, tmp_path, monkeypatch) -> None:
         assert not_finite(state(folder)["state_dict"].items()) == [], value
 
 
-def test_gradients_that_stay_bad_end_training_in_words(scenes, tmp_path, monkeypatch) -> None:
+def test_gradients_that_stay_bad_end_training_with_a_message(scenes, tmp_path, monkeypatch) -> None:
     spoil_gradient(monkeypatch, math.nan, range(7, 1000))
     with pytest.raises(TrainingError, match=r"20 steps.*step 7.*gradient of field\.space.*resume="):
         run(small_config(scenes, *FEW), tmp_path / "all", [], resume=False)
     assert state(tmp_path / "all")["global_step"] == 5
 
 
-def test_a_start_that_cannot_be_trained_is_to_blame(scenes, tmp_path, monkeypatch) -> None:
+def test_an_initialisation_that_cannot_be_trained_is_named(scenes, tmp_path, monkeypatch) -> None:
     spoil_gradient(monkeypatch, 1e30, range(1000))
     with pytest.raises(TrainingError, match=r"step 0.*initialisation is to blame.*lrm=none"):
         run(small_config(scenes, *FEW), tmp_path / "start", [], resume=False)
@@ -161,7 +161,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_best(scenes, whole, folder, caplo
         assert torch.equal(value, state(folder)["state_dict"][name]), name
 
 
-def test_damaged_checkpoints_alone_are_refused_in_words(tmp_path: Path) -> None:
+def test_damaged_checkpoints_alone_are_refused_with_a_message(tmp_path: Path) -> None:
     assert find_resumable(tmp_path) is None
     for name in ("last.ckpt", "best.ckpt"):
         (tmp_path / name).write_bytes(b"half")

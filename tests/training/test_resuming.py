@@ -1,4 +1,4 @@
-"""What a run that goes on must have in common with what it began as."""
+"""Settings and data that a resumed run must share with the original one."""
 
 import json
 import shutil
@@ -38,7 +38,7 @@ def folder(trained: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(trained, tmp_path / "run"))
 
 
-def test_a_run_does_not_go_on_as_another(scenes: Path, folder: Path) -> None:
+def test_a_run_is_not_resumed_with_other_settings(scenes: Path, folder: Path) -> None:
     before = {name: (folder / name).read_bytes() for name in PAGES}
     refused = {
         "model=nine_planes": r"model\.name=nine_planes: .* trained with model\.name=six_planes",
@@ -72,7 +72,7 @@ def test_what_planes_and_frame_depend_on_is_kept(tmp_path: Path) -> None:
         require_same_settings(tmp_path, {}, now)
 
 
-def test_a_run_does_not_go_on_with_other_pictures(scenes: Path, folder: Path) -> None:
+def test_a_run_is_not_resumed_with_other_images(scenes: Path, folder: Path) -> None:
     record = json.loads((folder / "run.json").read_text())
     record["files"]["train"].reverse()
     (folder / "run.json").write_text(json.dumps(record))

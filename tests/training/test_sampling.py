@@ -1,4 +1,4 @@
-"""Where training samples rays, and where pictures do."""
+"""Numbers of samples in training steps and in images."""
 
 import pytest
 import torch
@@ -47,18 +47,18 @@ def test_the_first_steps_take_half_the_samples(sampling) -> None:
         assert len(seen.samples) == STEPS_OF_A_RAY[phase], step
 
 
-def test_pictures_on_the_way_are_as_coarse_as_the_first_steps(sampling) -> None:
+def test_images_on_the_way_are_as_coarse_as_the_first_steps(sampling) -> None:
     for step, phase in ((0, "first"), (9, "first"), (10, "pictures")):
         seen = sampling.renderer_at(step).render(fog, **along_the_diagonal())
         assert len(seen.samples) == STEPS_OF_A_RAY[phase], step
 
 
-def test_pictures_of_the_trained_field_have_samples_of_their_own(sampling) -> None:
+def test_images_of_the_trained_field_have_samples_of_their_own(sampling) -> None:
     seen = sampling.renderer.render(fog, **along_the_diagonal())
     assert len(seen.samples) == STEPS_OF_A_RAY["pictures"]
     assert sampling.renderer.grid is sampling.grid
 
 
-def test_no_samples_for_pictures_are_refused(tmp_path) -> None:
+def test_no_samples_for_images_are_refused(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"model\.sampler\.render_samples=0: must be above 0"):
         Method.read(small_config(tmp_path, "model.sampler.render_samples=0"))

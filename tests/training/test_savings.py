@@ -1,4 +1,4 @@
-"""What is skipped changes pictures by less than 0.05 dB, and keeps the cost of a step."""
+"""Skipped samples change images by less than 0.05 dB; the cost of a step is unchanged."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -70,7 +70,7 @@ def test_what_is_far_slower_costs_little_time():
     assert sum(cost[n] for n in used if n == 2) < 0.04 * 60
 
 
-def test_a_few_slow_steps_mislead_nobody():
+def test_a_few_slow_steps_do_not_change_the_choice():
     choice = ThreadChoice(2)
     calls = iter(range(10**6))
     drive(choice, lambda n, _: (0.5 if next(calls) % 9 == 0 else 0) + 0.02 * n, until=20)

@@ -224,7 +224,7 @@ def test_one_triplane_is_the_space_planes(tmp_path: Path, caplog):
         caplog.clear()
         with caplog.at_level(logging.WARNING):
             found, module = initialised(tmp_path, sequence, "model.resolution=16", moving=moving)
-        assert ("trains as a static one" in caplog.text) == moving
+        assert ("is trained as static" in caplog.text) == moving
         assert module.field.time is None
         assert (found.report, found.pictures, found.values.sparse) == ({}, {}, None)
         for index, name in enumerate(("xy", "xz", "yz")):

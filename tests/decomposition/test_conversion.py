@@ -6,8 +6,9 @@ import torch
 from torch.nn.functional import grid_sample
 
 from tests.refusals import assert_refused
-from xplanes.decomposition import TIME_PLANES, TIME_ROWS, space_planes, time_planes
+from xplanes.decomposition import space_planes, time_planes
 from xplanes.decomposition.conversion import frame_profiles
+from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 
 
 def triplanes(frames=5, channels=3, size=8, seed=0):
@@ -48,8 +49,9 @@ def test_oblong_triplanes_become_square_planes():
 
 def test_storage_order_and_rows_agree():
     axes = {"xy": ("xt", "yt"), "xz": ("xt", "zt"), "yz": ("yt", "zt")}
-    for plane_set, names in TIME_PLANES.items():
-        for pair, expected in zip(TIME_ROWS[plane_set], axes.values(), strict=True):
+    for plane_set in ("six", "nine"):
+        names = [name.rstrip("'") for name in TIME_PLANES[plane_set]]
+        for pair, expected in zip(PLANE_SETS[plane_set], axes.values(), strict=True):
             assert (names[pair[0]], names[pair[1]]) == expected
 
 
@@ -103,6 +105,7 @@ def test_profiles_follow_grid_sample():
 def test_refuses_options_out_of_range():
     for options, words in [
         ({"plane_set": "four"}, "six, nine"),
+        ({"plane_set": "three"}, "six, nine"),
         ({"plane_set": "six", "dynamic": "svd"}, "random, rank1"),
         ({"plane_set": "six", "noise": -1.0}, "noise"),
         ({"plane_set": "six", "resolution": 0}, "resolution"),

@@ -24,7 +24,7 @@ def sparse_product_loss(
         sparse: The sparse part of all frames, held fixed. [T, 3, C, H, W]
         frames: Numbers of the frames to use, repeats allowed. [B]
         rows: For xy, xz and yz the positions of the time planes of its first and second axis:
-            ``TIME_ROWS[plane_set]``.
+            ``PLANE_SETS[plane_set]``.
 
     Returns:
         The loss, differentiable with respect to the time planes. []

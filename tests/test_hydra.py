@@ -115,7 +115,7 @@ def test_misfits_of_the_trainer_are_said_in_words(tmp_path: Path) -> None:
     cases = [
         ({"gradient_clip_val": 1.0}, "gradient_clip_val=1.0"),
         ({"accumulate_grad_batches": 2}, "accumulate_grad_batches"),
-        ({"max_secnds": 3}, "max_secnds"),
+        ({"max_secnds": 3}, "trainer.max_secnds=3: Trainer has no such argument"),
         ({"accelerator": "tpu"}, "trainer.accelerator=tpu: must be one of auto, cpu, gpu"),
         ({"max_seconds": -1}, "trainer.max_seconds=-1: must be above 0"),
     ]
@@ -125,6 +125,7 @@ def test_misfits_of_the_trainer_are_said_in_words(tmp_path: Path) -> None:
         with pytest.raises(ConfigError) as caught:
             run(config, tmp_path / f"run_{words[:12]}", [], resume=False)
         assert words in str(caught.value), words
+        assert not (tmp_path / f"run_{words[:12]}").exists()
 
 
 def test_a_run_of_an_earlier_version_is_refused_with_its_version(tmp_path: Path) -> None:

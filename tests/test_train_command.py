@@ -232,6 +232,23 @@ def test_killed_and_resumed_run_ends_with_the_same_numbers(scenes: str, tmp_path
     assert exact(killed) == exact(whole)
 
 
+def test_a_resumed_run_finds_groups_of_the_users_own_again(scenes: str, tmp_path: Path) -> None:
+    conf, run = tmp_path / "conf", tmp_path / "run"
+    (conf / "model").mkdir(parents=True)
+    (conf / "model" / "own.yaml").write_text("defaults: [six_planes]\nname: own\n")
+    path = f"hydra.searchpath=[file://{conf}]"
+    result = train(scenes, path, "model=own", *SMALL, "trainer.max_steps=2", f"hydra.run.dir={run}")
+    assert result.returncode == 0, result.stderr
+    again = prepare([f"resume={run}", "trainer.max_steps=3"])
+    assert again[0] == path
+    moved = "hydra.searchpath=[file:///elsewhere]"
+    assert again[0] not in prepare([f"resume={run}", moved])
+    result = train(f"resume={run}", "trainer.max_steps=3")
+    assert result.returncode == 0, result.stderr
+    assert json.loads((run / "metrics.json").read_text())["step"] == 3
+    assert path in (run / "overrides.txt").read_text().splitlines()
+
+
 def test_a_field_renders_the_scene_inside_a_job(scenes: str, tmp_path: Path) -> None:
     # That field's own settings are composed while Hydra's job is under way.
     folder = tmp_path / "run"

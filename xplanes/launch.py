@@ -107,7 +107,9 @@ def _job(config: DictConfig) -> float:
             )
         auto = plain["resume"] == "auto" and (folder / "run.json").is_file()
         resume = auto or plain["resume"] not in (None, "auto")
-        return run(plain, folder, list(settings.overrides.task), resume=resume)
+        # A run that goes on must find the user's own groups again.
+        own = [text for text in settings.overrides.hydra if _split(text)[0] == "hydra.searchpath"]
+        return run(plain, folder, [*own, *settings.overrides.task], resume=resume)
     except KNOWN_ERRORS as error:
         if sweep:
             raise

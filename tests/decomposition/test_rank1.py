@@ -1,9 +1,12 @@
+import functools
+
 import pytest
 import torch
 
+from tests.refusals import assert_refused
 from xplanes.decomposition import time_planes, unexplained_energy
 from xplanes.decomposition.conversion import _joined, rank1_factors, shared_factors
-from xplanes.fields.xplanes import PLANE_SETS
+from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 
 
 def moving(frames=6, channels=3, size=12, seed=0):
@@ -113,9 +116,10 @@ FURTHER = {
 @pytest.mark.parametrize("plane_set", FURTHER)
 def test_plane_sets_of_others_recover_their_factors(monkeypatch, plane_set):
     rows = FURTHER[plane_set]
-    monkeypatch.setitem(PLANE_SETS, plane_set, rows)
-    generator = torch.Generator().manual_seed(1)
     count = 1 + max(place for pair in rows for place in pair)
+    monkeypatch.setitem(PLANE_SETS, plane_set, rows)
+    monkeypatch.setitem(TIME_PLANES, plane_set, tuple(f"plane {n}" for n in range(count)))
+    generator = torch.Generator().manual_seed(1)
     truth = [torch.randn(5, 8, 2, generator=generator, dtype=torch.float64) for _ in range(count)]
     sparse = torch.stack([products(truth[a], truth[b]) for a, b in rows], 1)
     planes = time_planes(sparse, plane_set=plane_set, noise=0)
@@ -126,6 +130,21 @@ def test_plane_sets_of_others_recover_their_factors(monkeypatch, plane_set):
     for group in _joined(rows):
         agreement = sum((blend[p, 1:] * blend[p, :-1]).sum(1) for p in group)
         assert (agreement >= -1e-12).all()
+
+
+def test_planes_without_a_product_and_without_a_name_are_refused(monkeypatch):
+    for rows, names in [
+        (((0, 1), (0, 2), (4, 2)), "xt yt zt wt yt'"),
+        (FURTHER["seven"], "xt yt zt"),
+        (FURTHER["seven"], "xt yt zt yt' more"),
+        (FURTHER["seven"], ""),
+    ]:
+        monkeypatch.setitem(PLANE_SETS, "own", rows)
+        monkeypatch.setitem(TIME_PLANES, "own", tuple(names.split()))
+        for dynamic in ("rank1", "random"):
+            call = functools.partial(time_planes, moving(), plane_set="own", dynamic=dynamic)
+            words = rf"plane_set='own'.*TIME_PLANES names {len(names.split())}"
+            assert_refused(ValueError, words, call, (rows, names))
 
 
 def test_factors_that_products_join_flip_together():
@@ -146,5 +165,8 @@ def test_nothing_moves():
 
 
 def test_six_planes_need_square_triplanes():
-    with pytest.raises(ValueError, match="square"):
-        time_planes(torch.ones(2, 3, 1, 4, 6), plane_set="six", resolution=4)
+    oblong = torch.ones(2, 3, 1, 4, 6)
+    with pytest.raises(ValueError, match=r"plane_set='six'.*square triplanes, not 4 x 6"):
+        time_planes(oblong, plane_set="six", resolution=4)
+    # Nine share none, so that each plane has its own axis.
+    assert time_planes(oblong, plane_set="nine", resolution=4).shape == (6, 2, 4, 1)

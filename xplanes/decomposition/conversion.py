@@ -14,7 +14,7 @@ from torch import Tensor
 
 from xplanes.decomposition.decompose import check_triplanes
 from xplanes.fields.lookup import Rows
-from xplanes.fields.xplanes import PLANE_SETS
+from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 
 
 def space_weights(size_out: int, size_in: int, like: Tensor) -> Tensor:
@@ -270,8 +270,13 @@ def time_planes(
     if count < 1:
         raise ValueError(f"time_resolution is {time_resolution}: it must be at least 1")
     rows = PLANE_SETS[plane_set]
-    places = [place for pair in rows for place in pair]
-    shape = (max(places) + 1, count, size, channels)
+    places, names = [place for pair in rows for place in pair], TIME_PLANES.get(plane_set, ())
+    if set(places) != set(range(len(names))):
+        raise ValueError(
+            f"plane_set={plane_set!r}: PLANE_SETS multiplies the planes {sorted(set(places))}, but "
+            f"TIME_PLANES names {len(names)}; each of those must be in a product, and no other"
+        )
+    shape = (len(names), count, size, channels)
     kind = sparse.dtype if sparse.dtype == torch.float64 else torch.float32
     planes = noise * torch.randn(
         shape,

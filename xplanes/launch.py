@@ -66,7 +66,7 @@ class SettingsCheck(Callback):
         names = [str(name) for name in config if name != "hydra"]
         try:
             plain = to_plain(OmegaConf.masked_copy(config, names))
-            check(plain, Path(config.hydra.run.dir))
+            check(plain, Path.cwd())  # Settings may lack what the run's own name consists of.
         except KNOWN_ERRORS as error:
             sys.exit(f"error: {error}")  # Hydra makes warnings of other exceptions.
 

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 
 from tests.training.runs import SMALL
-from xplanes.launch import prepare
+from xplanes.config import CONF
+from xplanes.launch import SettingsCheck, prepare
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -45,11 +47,40 @@ def test_misspelled_key_names_its_neighbours() -> None:
     assert "Traceback" not in result.stderr
 
 
-def test_setting_out_of_range_stops_before_anything_is_written(tmp_path: Path) -> None:
-    result = train("model.rays.per_batch=0", f"hydra.run.dir={tmp_path / 'run'}")
+REFUSED = (
+    "model.rays.per_batch=0",
+    "trainer.max_seconds=-1",
+    "trainer.accelerator=tpu",
+    "callbacks.evaluation.at=[2]",
+    "+trainer.foo=1",
+    "logger.tensorboard._target_=os.system",
+    "model.name=${no.such}",
+)
+
+
+def test_settings_are_checked_before_the_run_directory_is_made(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for override in REFUSED:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose("train", [override], return_hydra_config=True)
+        with pytest.raises(SystemExit) as caught:
+            SettingsCheck().on_run_start(config)
+        words = str(caught.value)
+        assert words.startswith("error: "), words
+        assert override.removeprefix("+").split("=")[0] in words, words
+        assert "\n" not in words, words
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("override", ["model.rays.per_batch=0", "+trainer.foo=1"])
+def test_setting_out_of_range_stops_before_anything_is_written(
+    override: str, tmp_path: Path
+) -> None:
+    result = train(override, f"hydra.run.dir={tmp_path / 'run'}")
     assert result.returncode == 1
-    assert "model.rays.per_batch=0" in result.stderr
-    assert not (tmp_path / "run" / "run.json").exists()
+    assert result.stderr.count("\n") == 1, result.stderr
+    assert override.removeprefix("+").split("=")[0] in result.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_missing_scene_says_where_to_get_one(tmp_path: Path) -> None:
@@ -199,6 +230,23 @@ def test_killed_and_resumed_run_ends_with_the_same_numbers(scenes: str, tmp_path
     result = train(f"resume={killed}")
     assert result.returncode == 0, result.stderr
     assert exact(killed) == exact(whole)
+
+
+def test_a_resumed_run_finds_groups_of_the_users_own_again(scenes: str, tmp_path: Path) -> None:
+    conf, run = tmp_path / "conf", tmp_path / "run"
+    (conf / "model").mkdir(parents=True)
+    (conf / "model" / "own.yaml").write_text("defaults: [six_planes]\nname: own\n")
+    path = f"hydra.searchpath=[file://{conf}]"
+    result = train(scenes, path, "model=own", *SMALL, "trainer.max_steps=2", f"hydra.run.dir={run}")
+    assert result.returncode == 0, result.stderr
+    again = prepare([f"resume={run}", "trainer.max_steps=3"])
+    assert again[0] == path
+    moved = "hydra.searchpath=[file:///elsewhere]"
+    assert again[0] not in prepare([f"resume={run}", moved])
+    result = train(f"resume={run}", "trainer.max_steps=3")
+    assert result.returncode == 0, result.stderr
+    assert json.loads((run / "metrics.json").read_text())["step"] == 3
+    assert path in (run / "overrides.txt").read_text().splitlines()
 
 
 def test_a_field_renders_the_scene_inside_a_job(scenes: str, tmp_path: Path) -> None:

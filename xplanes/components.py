@@ -1,6 +1,7 @@
 """From nodes of a configuration to objects: the one place where classes are chosen by name."""
 
 import importlib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -84,6 +85,11 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
         cause = error.__cause__
         if isinstance(cause, ConfigError):
             raise ConfigError(f"{key}.{cause}") from None
+        unknown = re.search(r"unexpected keyword argument '(\w+)'", str(cause))
+        if isinstance(cause, TypeError) and unknown and (name := unknown[1]) in arguments:
+            raise ConfigError(
+                f"{key}.{name}={arguments[name]}: {cls.__name__} has no such argument; leave it out"
+            ) from error
         raise ConfigError(f"{key}: {cause or error}") from error
 
 

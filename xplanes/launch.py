@@ -13,8 +13,9 @@ from typing import Any
 import hydra
 import yaml
 from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from xplanes import __version__
 from xplanes.config import CONF, near_names, to_plain
@@ -51,9 +52,23 @@ def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
         with contextlib.redirect_stderr(printed):
             hydra.main(config_path=str(CONF), config_name="train", version_base="1.3")(job)()
     except SystemExit as end:
-        if end.code and not begun:
+        if isinstance(end.code, int) and end.code and not begun:  # A text is our own message.
             print(near_names(printed.copy.getvalue()).strip(), file=sys.stderr)
         raise
+
+
+class SettingsCheck(Callback):
+    """Refuses settings before Hydra makes the run directory; jobs of a sweep check their own."""
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        from xplanes.pipeline import KNOWN_ERRORS, check
+
+        names = [str(name) for name in config if name != "hydra"]
+        try:
+            plain = to_plain(OmegaConf.masked_copy(config, names))
+            check(plain, Path.cwd())  # Settings may lack what the run's own name consists of.
+        except KNOWN_ERRORS as error:
+            sys.exit(f"error: {error}")  # Hydra makes warnings of other exceptions.
 
 
 class _Copied(io.TextIOBase):
@@ -92,7 +107,9 @@ def _job(config: DictConfig) -> float:
             )
         auto = plain["resume"] == "auto" and (folder / "run.json").is_file()
         resume = auto or plain["resume"] not in (None, "auto")
-        return run(plain, folder, list(settings.overrides.task), resume=resume)
+        # A run that goes on must find the user's own groups again.
+        own = [text for text in settings.overrides.hydra if _split(text)[0] == "hydra.searchpath"]
+        return run(plain, folder, [*own, *settings.overrides.task], resume=resume)
     except KNOWN_ERRORS as error:
         if sweep:
             raise

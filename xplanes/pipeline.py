@@ -78,7 +78,7 @@ def run(config: dict[str, Any], folder: Path, overrides: list[str], *, resume: b
             what to do.
         KeyboardInterrupt: If the user stopped it; the state is saved.
     """
-    experiment = Experiment.read(config)
+    experiment = check(config, folder)
     if int(os.environ.get("LOCAL_RANK", "0")):
         train(experiment, folder, resume=resume)
         return float("nan")
@@ -94,6 +94,21 @@ def run(config: dict[str, Any], folder: Path, overrides: list[str], *, resume: b
         if (words := storage_error(problem)) is None:
             raise
         raise words from problem
+
+
+def check(config: dict[str, Any], folder: Path) -> Experiment:
+    """The experiment of a configuration, once all of its settings are taken; nothing is written.
+
+    Args:
+        config: The resolved configuration, builtins only.
+        folder: The run directory, which need not exist.
+
+    Raises:
+        ConfigError: If settings are missing, out of range, or contradict one another.
+    """
+    experiment = Experiment.read(config)
+    experiment.check_trainer(folder)
+    return experiment
 
 
 def _has_checkpoint(folder: Path) -> bool:

@@ -3,9 +3,11 @@
 import functools
 import itertools
 
+import pytest
 import yaml
 
 from xplanes.config import CONF, compose_plain
+from xplanes.errors import ConfigError
 from xplanes.evaluation.sweep import RunRow, flatten
 from xplanes.evaluation.tabulate import differing
 from xplanes.experiment import Experiment
@@ -82,6 +84,22 @@ def test_a_baseline_brings_its_published_steps():
             assert config.trainer["max_steps"] == steps, case
             longer = composed(f"model={model}", *experiment, "trainer.max_steps=7")
             assert longer["trainer"]["max_steps"] == 7, case
+
+
+def test_a_model_brings_its_initialisation_and_changes_no_other_group():
+    for path in sorted((CONF / "model").glob("*.yaml")):
+        chosen = [node for node in yaml.safe_load(path.read_text())["defaults"] if node != "_self_"]
+        groups = {name for node in chosen if isinstance(node, dict) for name in node}
+        assert groups <= {"sampler", "override sampler", "/lrm@_global_.lrm"}, path.name
+        own = "tiny" if path.stem in ("six_planes", "nine_planes") else "none"
+        for before in ([], ["lrm=mini"]):
+            plain = composed(*before, f"model={path.stem}")
+            assert plain["lrm"]["name"] == (before[0][4:] if before else own), path.name
+    with pytest.raises(ConfigError, match=r"^lrm=tiny with model=kplanes: .* set lrm=none"):
+        Experiment.read(composed("model=kplanes", "lrm=tiny"))
+    lacking = {name: node for name, node in composed().items() if name != "lrm"}
+    with pytest.raises(ConfigError, match=r"^lrm: model=six_planes chooses none; write `- /lrm"):
+        Experiment.read(lacking)
 
 
 def test_a_baseline_has_its_published_settings():

@@ -6,8 +6,9 @@ import torch
 from torch.nn.functional import grid_sample
 
 from tests.refusals import assert_refused
-from xplanes.decomposition import TIME_PLANES, TIME_ROWS, space_planes, time_planes
-from xplanes.decomposition.conversion import frame_profiles
+from xplanes.decomposition import space_planes, time_planes
+from xplanes.decomposition.conversion import frame_profiles, space_weights
+from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 
 
 def triplanes(frames=5, channels=3, size=8, seed=0):
@@ -48,8 +49,9 @@ def test_oblong_triplanes_become_square_planes():
 
 def test_storage_order_and_rows_agree():
     axes = {"xy": ("xt", "yt"), "xz": ("xt", "zt"), "yz": ("yt", "zt")}
-    for plane_set, names in TIME_PLANES.items():
-        for pair, expected in zip(TIME_ROWS[plane_set], axes.values(), strict=True):
+    for plane_set in ("six", "nine"):
+        names = [name.rstrip("'") for name in TIME_PLANES[plane_set]]
+        for pair, expected in zip(PLANE_SETS[plane_set], axes.values(), strict=True):
             assert (names[pair[0]], names[pair[1]]) == expected
 
 
@@ -83,8 +85,33 @@ def test_frames_own_rows_and_other_row_counts_interpolate():
     fine = time_planes(sparse, plane_set="nine", noise=0, time_resolution=9)
     assert torch.allclose(fine[:, ::2], own)
     assert torch.allclose(fine[:, 1::2], (own[:, 1:] + own[:, :-1]) / 2)
+    ends = time_planes(sparse, plane_set="nine", noise=0, time_resolution=2)
+    assert torch.allclose(ends, own[:, [0, 4]])
     single = time_planes(sparse, plane_set="nine", noise=0, time_resolution=1)
     assert torch.allclose(single[:, 0], own[:, 2])
+
+
+def test_other_resolutions_of_time_planes_sample_the_same_function():
+    own = time_planes(triplanes(), plane_set="six", noise=0)
+    for resolution in [4, 8, 12]:
+        planes = time_planes(triplanes(), plane_set="six", noise=0, resolution=resolution)
+        expected = space_weights(resolution, 8, own) @ own
+        assert torch.allclose(planes, expected), resolution
+
+
+@pytest.mark.parametrize("plane_set", ["six", "nine"])
+def test_precision_follows_the_sparse_part(plane_set):
+    for given, expected in [
+        (torch.float64, torch.float64),
+        (torch.float32, torch.float32),
+        (torch.bfloat16, torch.float32),
+    ]:
+        sparse = triplanes().to(given)
+        planes = time_planes(sparse, plane_set=plane_set, noise=0)
+        assert planes.dtype == expected, given
+        # Half precision is of the input alone.
+        full = time_planes(sparse.to(expected), plane_set=plane_set, noise=0)
+        assert torch.equal(planes, full), given
 
 
 def test_profiles_follow_grid_sample():
@@ -103,6 +130,7 @@ def test_profiles_follow_grid_sample():
 def test_refuses_options_out_of_range():
     for options, words in [
         ({"plane_set": "four"}, "six, nine"),
+        ({"plane_set": "three"}, "six, nine"),
         ({"plane_set": "six", "dynamic": "svd"}, "random, rank1"),
         ({"plane_set": "six", "noise": -1.0}, "noise"),
         ({"plane_set": "six", "resolution": 0}, "resolution"),

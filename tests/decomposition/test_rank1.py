@@ -1,8 +1,12 @@
+import functools
+
 import pytest
 import torch
 
-from xplanes.decomposition import TIME_ROWS, time_planes, unexplained_energy
-from xplanes.decomposition.conversion import rank1_factors, shared_factors
+from tests.refusals import assert_refused
+from xplanes.decomposition import time_planes, unexplained_energy
+from xplanes.decomposition.conversion import _joined, rank1_factors, shared_factors
+from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 
 
 def moving(frames=6, channels=3, size=12, seed=0):
@@ -62,7 +66,7 @@ def test_signs_do_not_jump_between_frames():
 
 
 def loss(sparse, factors):
-    pairs = TIME_ROWS["six"]
+    pairs = PLANE_SETS["six"]
     return sum(
         (sparse[:, index] - products(factors[a], factors[b])).square().sum()
         for index, (a, b) in enumerate(pairs)
@@ -71,7 +75,7 @@ def loss(sparse, factors):
 
 def test_six_planes_end_where_no_single_plane_can_be_improved():
     sparse = moving()
-    factors = shared_factors(sparse)
+    factors = shared_factors(sparse, PLANE_SETS["six"])
     value = loss(sparse, factors)
     for index in range(3):
         for _ in range(3):
@@ -84,14 +88,14 @@ def test_six_planes_end_where_no_single_plane_can_be_improved():
 def test_six_planes_recover_shared_factors():
     generator = torch.Generator().manual_seed(1)
     truth = [torch.randn(5, 8, 2, generator=generator, dtype=torch.float64) for _ in range(3)]
-    sparse = torch.stack([products(truth[a], truth[b]) for a, b in TIME_ROWS["six"]], 1)
-    assert loss(sparse, shared_factors(sparse)) < 1e-6 * sparse.square().sum()
+    sparse = torch.stack([products(truth[a], truth[b]) for a, b in PLANE_SETS["six"]], 1)
+    assert loss(sparse, shared_factors(sparse, PLANE_SETS["six"])) < 1e-6 * sparse.square().sum()
 
 
 def test_rank_one_explains_more_than_random_initialisation():
     for plane_set in ["six", "nine"]:
         sparse = moving()
-        rows = TIME_ROWS[plane_set]
+        rows = PLANE_SETS[plane_set]
         left = {
             dynamic: unexplained_energy(
                 time_planes(sparse, plane_set=plane_set, dynamic=dynamic), sparse, rows=rows
@@ -102,14 +106,67 @@ def test_rank_one_explains_more_than_random_initialisation():
         assert left["rank1"] < 0.6, plane_set
 
 
+FURTHER = {
+    "seven": ((0, 1), (0, 2), (3, 2)),  # A second yt.
+    "eight": ((0, 1), (2, 3), (4, 3)),  # Only zt is shared; xy has a pair of its own.
+    "swapped": ((2, 0), (2, 1), (0, 1)),  # six in another storage order
+}
+
+
+@pytest.mark.parametrize("plane_set", FURTHER)
+def test_plane_sets_of_others_recover_their_factors(monkeypatch, plane_set):
+    rows = FURTHER[plane_set]
+    count = 1 + max(place for pair in rows for place in pair)
+    monkeypatch.setitem(PLANE_SETS, plane_set, rows)
+    monkeypatch.setitem(TIME_PLANES, plane_set, tuple(f"plane {n}" for n in range(count)))
+    generator = torch.Generator().manual_seed(1)
+    truth = [torch.randn(5, 8, 2, generator=generator, dtype=torch.float64) for _ in range(count)]
+    sparse = torch.stack([products(truth[a], truth[b]) for a, b in rows], 1)
+    planes = time_planes(sparse, plane_set=plane_set, noise=0)
+    assert planes.shape == (count, 5, 8, 2)
+    assert unexplained_energy(planes, sparse, rows=rows) < 1e-6
+    # Halfway between frames too: signs do not jump.
+    blend = time_planes(sparse.abs(), plane_set=plane_set, noise=0)
+    for group in _joined(rows):
+        agreement = sum((blend[p, 1:] * blend[p, :-1]).sum(1) for p in group)
+        assert (agreement >= -1e-12).all()
+
+
+def test_planes_without_a_product_and_without_a_name_are_refused(monkeypatch):
+    for rows, names in [
+        (((0, 1), (0, 2), (4, 2)), "xt yt zt wt yt'"),
+        (FURTHER["seven"], "xt yt zt"),
+        (FURTHER["seven"], "xt yt zt yt' more"),
+        (FURTHER["seven"], ""),
+    ]:
+        monkeypatch.setitem(PLANE_SETS, "own", rows)
+        monkeypatch.setitem(TIME_PLANES, "own", tuple(names.split()))
+        for dynamic in ("rank1", "random"):
+            call = functools.partial(time_planes, moving(), plane_set="own", dynamic=dynamic)
+            words = rf"plane_set='own'.*TIME_PLANES names {len(names.split())}"
+            assert_refused(ValueError, words, call, (rows, names))
+
+
+def test_factors_that_products_join_flip_together():
+    assert _joined(PLANE_SETS["six"]) == [{0, 1, 2}]
+    assert _joined(PLANE_SETS["nine"]) == [{0, 1}, {2, 3}, {4, 5}]
+    assert _joined(FURTHER["seven"]) == [{0, 1, 2, 3}]
+    assert _joined(FURTHER["eight"]) == [{0, 1}, {2, 3, 4}]
+    assert _joined(((0, 1), (2, 3), (1, 2))) == [{0, 1, 2, 3}]
+
+
 def test_nothing_moves():
     sparse = torch.zeros(3, 3, 2, 4, 4)
-    for plane_set, rows in TIME_ROWS.items():
+    for plane_set in ["six", "nine"]:
+        rows = PLANE_SETS[plane_set]
         planes = time_planes(sparse, plane_set=plane_set, noise=0)
         assert not planes.any()
         assert unexplained_energy(planes, sparse, rows=rows) == 0
 
 
 def test_six_planes_need_square_triplanes():
-    with pytest.raises(ValueError, match="square"):
-        time_planes(torch.ones(2, 3, 1, 4, 6), plane_set="six", resolution=4)
+    oblong = torch.ones(2, 3, 1, 4, 6)
+    with pytest.raises(ValueError, match=r"plane_set='six'.*square triplanes, not 4 x 6"):
+        time_planes(oblong, plane_set="six", resolution=4)
+    # Nine share none, so that each plane has its own axis.
+    assert time_planes(oblong, plane_set="nine", resolution=4).shape == (6, 2, 4, 1)

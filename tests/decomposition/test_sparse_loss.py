@@ -5,7 +5,8 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample
 
-from xplanes.decomposition import TIME_ROWS, sparse_product_loss, time_planes
+from xplanes.decomposition import sparse_product_loss, time_planes
+from xplanes.fields.xplanes import PLANE_SETS
 
 FRAMES, CHANNELS, HEIGHT, WIDTH = 5, 2, 6, 6
 
@@ -24,7 +25,7 @@ def full_sum(planes, sparse, plane_set):
     """Entry by entry: every cell of every frame looked up with grid_sample on its own."""
     rows, total = planes.shape[1], 0.0
     for frame, index in itertools.product(range(FRAMES), range(3)):
-        first, second = TIME_ROWS[plane_set][index]
+        first, second = PLANE_SETS[plane_set][index]
 
         def value(plane, cell, size, frame=frame):
             along = (cell + 0.5) / size * 2 - 1
@@ -45,13 +46,15 @@ def test_all_frames_give_the_full_sum():
     ):
         case = f"plane_set={plane_set}, resolution={resolution}, rows={rows}"
         planes, sparse = example(plane_set, resolution, rows)
-        value = sparse_product_loss(planes, sparse, torch.arange(FRAMES), rows=TIME_ROWS[plane_set])
+        value = sparse_product_loss(
+            planes, sparse, torch.arange(FRAMES), rows=PLANE_SETS[plane_set]
+        )
         assert value == pytest.approx(full_sum(planes, sparse, plane_set).item(), rel=1e-10), case
 
 
 def test_the_mean_over_all_draws_is_the_full_loss():
     planes, sparse = example("nine")
-    rows = TIME_ROWS["nine"]
+    rows = PLANE_SETS["nine"]
     full = sparse_product_loss(planes, sparse, torch.arange(FRAMES), rows=rows)
     for draws in [1, 2]:
         values = [
@@ -68,7 +71,7 @@ def test_gradients():
             sparse_product_loss,
             sparse=sparse,
             frames=torch.tensor([0, 3, 3]),
-            rows=TIME_ROWS[plane_set],
+            rows=PLANE_SETS[plane_set],
         )
         assert torch.autograd.gradcheck(loss, planes.requires_grad_()), plane_set
 
@@ -78,14 +81,14 @@ def test_nine_planes_with_equal_twins_are_six_planes():
     xt, yt, zt = planes
     twins = torch.stack([xt, yt, xt, zt, yt, zt])
     frames = torch.tensor([1, 4])
-    six = sparse_product_loss(planes, sparse, frames, rows=TIME_ROWS["six"])
-    nine = sparse_product_loss(twins, sparse, frames, rows=TIME_ROWS["nine"])
+    six = sparse_product_loss(planes, sparse, frames, rows=PLANE_SETS["six"])
+    nine = sparse_product_loss(twins, sparse, frames, rows=PLANE_SETS["nine"])
     assert six == nine
 
 
 def test_gradient_descent_from_noise_reaches_the_rank_one_solution():
     _, sparse = example("nine")
-    rows, frames = TIME_ROWS["nine"], torch.arange(FRAMES)
+    rows, frames = PLANE_SETS["nine"], torch.arange(FRAMES)
     best = sparse_product_loss(
         time_planes(sparse, plane_set="nine", noise=0), sparse, frames, rows=rows
     )
@@ -109,7 +112,7 @@ def test_gradient_descent_from_noise_reaches_the_rank_one_solution():
 def test_one_frame_and_half_precision_targets():
     planes, sparse = example("six", rows=1)
     value = sparse_product_loss(
-        planes.float(), sparse[:1].half(), torch.tensor([0]), rows=TIME_ROWS["six"]
+        planes.float(), sparse[:1].half(), torch.tensor([0]), rows=PLANE_SETS["six"]
     )
     assert value.dtype == torch.float32
     assert torch.isfinite(value)

@@ -14,11 +14,12 @@ from tests.refusals import assert_refused
 from tests.synthetic import ball_scene
 from tests.training.runs import small_config
 from xplanes import decomposition, pipeline
-from xplanes.decomposition import TIME_ROWS, unexplained_energy
+from xplanes.decomposition import unexplained_energy
 from xplanes.decomposition.conversion import DYNAMIC, STATIC
 from xplanes.decomposition.rpca import METHODS, SCALES
 from xplanes.errors import ConfigError
 from xplanes.fields import Decoder
+from xplanes.fields.xplanes import PLANE_SETS
 from xplanes.models.initialisation import STAGES, DecompositionSettings, Initialisation, Method
 from xplanes.preparation import TriplaneSequence, save_triplanes
 from xplanes.preparation import stages as stages_module
@@ -99,7 +100,7 @@ def test_a_rank_one_initialisation_explains_what_moves(finished):
             f"model.time_resolution={rows}",
         )
         field = module.field
-        count = len(TIME_ROWS[field.plane_set][-1]) * 3 if model == "nine_planes" else 3
+        count = len(PLANE_SETS[field.plane_set][-1]) * 3 if model == "nine_planes" else 3
         assert field.space.shape == (3, resolution, resolution, 8), case
         assert field.time.shape == (count, rows, resolution, 8), case
         unexplained = found.report["unexplained"]

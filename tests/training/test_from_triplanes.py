@@ -9,13 +9,14 @@ from PIL import Image
 
 from tests.preparation.sequences import moving_sequence
 from tests.training.runs import small_config
-from xplanes.decomposition import TIME_ROWS, decompose, unexplained_energy
+from xplanes.decomposition import decompose, unexplained_energy
 from xplanes.decomposition.conversion import frame_profiles
 from xplanes.errors import ConfigError
 from xplanes.evaluation.evaluate import evaluate
 from xplanes.evaluation.runs import load_run
 from xplanes.experiment import Experiment
 from xplanes.fields import Decoder, XPlanes
+from xplanes.fields.xplanes import PLANE_SETS
 from xplanes.files import read_rows
 from xplanes.models.x_planes import XPlanesModel
 from xplanes.pipeline import run
@@ -266,7 +267,7 @@ def test_l_r_moves_random_planes_towards_the_sparse_part(
             "model.warmup_steps=1",
         )
         run(settings(place, *overrides), folder, [], resume=False)
-        rows = TIME_ROWS[model.removesuffix("_planes")]
+        rows = PLANE_SETS[model.removesuffix("_planes")]
         left[weight] = unexplained_energy(weights(folder)["field.time"], sparse, rows=rows)
     initial = metrics(tmp_path / "100")["decomposition"]["unexplained"]["after"]
     assert initial == pytest.approx(1, abs=0.1)

@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from tests.preparation.sequences import blob
-from xplanes.decomposition import TIME_ROWS, sparse_product_loss
+from xplanes.decomposition import sparse_product_loss
 from xplanes.decomposition.sparse_loss import SparseProduct
+from xplanes.fields.xplanes import PLANE_SETS
 from xplanes.streams import step_generator
 
 FRAMES = 5
@@ -15,14 +16,14 @@ def case(plane_set="six", count=2):
     generator = torch.Generator().manual_seed(0)
     planes = torch.randn(3 if plane_set == "six" else 6, 4, 6, 2, generator=generator)
     sparse = blob(FRAMES, 2, 6)
-    return SparseProduct(sparse, TIME_ROWS[plane_set], count), planes, sparse
+    return SparseProduct(sparse, PLANE_SETS[plane_set], count), planes, sparse
 
 
 @pytest.mark.parametrize("plane_set", ["six", "nine"])
 def test_the_mean_over_steps_is_the_gradient_over_all_frames(plane_set):
     product, planes, sparse = case(plane_set)
     leaf = planes.clone().requires_grad_()
-    rows = TIME_ROWS[plane_set]
+    rows = PLANE_SETS[plane_set]
     sparse_product_loss(leaf, sparse, torch.arange(FRAMES), rows=rows).backward()
     total = torch.zeros_like(planes)
     steps = 2000
@@ -53,5 +54,5 @@ def test_it_works_where_gradients_are_switched_off():
 
 def test_the_value_is_the_same_at_each_call_and_exact_over_all_frames():
     product, planes, sparse = case(count=FRAMES)
-    whole = sparse_product_loss(planes, sparse, torch.arange(FRAMES), rows=TIME_ROWS["six"])
+    whole = sparse_product_loss(planes, sparse, torch.arange(FRAMES), rows=PLANE_SETS["six"])
     assert product.value(planes) == product.value(planes) == pytest.approx(float(whole))

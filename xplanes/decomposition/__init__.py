@@ -1,14 +1,12 @@
 """From a triplane sequence to low-rank and sparse parts, and from these to planes."""
 
-from xplanes.decomposition.conversion import TIME_PLANES, TIME_ROWS, space_planes, time_planes
+from xplanes.decomposition.conversion import space_planes, time_planes
 from xplanes.decomposition.decompose import ORIENTATIONS, Decomposition, decompose
 from xplanes.decomposition.rpca import RobustPCA, robust_pca
 from xplanes.decomposition.sparse_loss import sparse_product_loss, unexplained_energy
 
 __all__ = [
     "ORIENTATIONS",
-    "TIME_PLANES",
-    "TIME_ROWS",
     "Decomposition",
     "RobustPCA",
     "decompose",

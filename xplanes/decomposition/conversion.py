@@ -7,11 +7,14 @@ sampled with ``align_corners=False`` and zero outside, as LRM planes are; time t
 row ``t * (Rt - 1)``, so with Rt = T each frame owns a row.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from xplanes.decomposition.decompose import check_triplanes
-from xplanes.fields.xplanes import PLANE_SETS
+from xplanes.fields.lookup import Rows
+from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 
 
 def space_weights(size_out: int, size_in: int, like: Tensor) -> Tensor:
@@ -95,43 +98,72 @@ def rank1_factors(planes: Tensor) -> tuple[Tensor, Tensor]:
     return wide * signs, tall * signs
 
 
-def shared_factors(sparse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Time planes xt, yt, zt of six planes, each shared by two orientations.
+def shared_factors(sparse: Tensor, rows: Rows) -> list[Tensor]:
+    """Time planes that are shared by several orientations, each orientation a product of two.
 
-    Alternating least squares per frame and channel: with two factors fixed the third has a closed
-    form, so the product loss never rises. Each factor is initialised with the mean of its two
-    candidates among the rank-1 pairs of each orientation, with their signs made equal.
+    Alternating least squares per frame and channel: with all other factors fixed one has a closed
+    form, so the product loss never rises. Each factor is initialised from the rank-1 pairs of each
+    orientation, as the mean of its candidates with their signs made equal.
 
     Args:
         sparse: The sparse part, square planes. [T, 3, C, N, N]
+        rows: For xy, xz and yz the two factors of their product, by position.
 
     Returns:
-        Factors along x, y and z. [T, N, C], [T, N, C], [T, N, C]
+        Factors by position. [T, N, C] each
     """
     few = max(1, _SLICES // sparse.shape[2])
-    parts = [_shared_in_cache(frames) for frames in sparse.split(few)]
-    x, y, z = (torch.cat(factors) for factors in zip(*parts, strict=True))
-    signs = _running_signs(x, y, z)
-    # Products of pairs keep their sign only if all three factors are flipped together.
-    return x * signs, y * signs, z * signs
+    parts = [_shared_in_cache(frames, rows) for frames in sparse.split(few)]
+    factors = [torch.cat(pieces) for pieces in zip(*parts, strict=True)]
+    # Products keep their values only if all factors that they join are flipped together.
+    for group in _joined(rows):
+        signs = _running_signs(*(factors[place] for place in group))
+        for place in group:
+            factors[place] = factors[place] * signs
+    return factors
 
 
-def _shared_in_cache(sparse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    pairs = [[f.mT[..., None] for f in rank1_factors(sparse[:, i])] for i in range(3)]
-    (x1, y1), (x2, z1), (y2, z2) = pairs
-    x2, z1 = (factor * _sign(x1, x2) for factor in (x2, z1))
-    y2, z2 = (factor * _sign(y1, y2) for factor in (y2, z2))
-    x, y, z = (x1 + x2) / 2, (y1 + y2) / 2, (z1 + z2 * _sign(z1, z2)) / 2
-    xy, xz, yz = sparse.to(x.dtype).unbind(1)
+def _shared_in_cache(sparse: Tensor, rows: Rows) -> list[Tensor]:
+    found: dict[int, list[Tensor]] = {}
+    for index, places in enumerate(rows):
+        pair = [factor.mT[..., None] for factor in rank1_factors(sparse[:, index])]
+        for place in places:
+            if place in found:  # A pair may be flipped as a whole.
+                sign = _sign(found[place][0], pair[places.index(place)])
+                pair = [factor * sign for factor in pair]
+                break
+        for place, factor in zip(places, pair, strict=True):
+            first = found.setdefault(place, [])
+            first.append(factor * _sign(first[0], factor) if first else factor)
+    factors = [
+        sum(found[place][1:], found[place][0]) / len(found[place]) for place in sorted(found)
+    ]
+    planes = sparse.to(factors[0].dtype).unbind(1)
     for _ in range(_SWEEPS):
-        x = _solve(xy.mT @ y + xz.mT @ z, y, z)
-        y = _solve(xy @ x + yz.mT @ z, x, z)
-        z = _solve(xz @ x + yz @ y, x, y)
-    return x[..., 0].mT, y[..., 0].mT, z[..., 0].mT
+        for place in range(len(factors)):
+            # The width belongs to the first factor of a product, the rows to the second.
+            uses = [(plane.mT, b) for plane, (a, b) in zip(planes, rows, strict=True) if a == place]
+            uses += [(plane, a) for plane, (a, b) in zip(planes, rows, strict=True) if b == place]
+            factors[place] = _solve([(plane, factors[other]) for plane, other in uses])
+    return [factor[..., 0].mT for factor in factors]
 
 
-def _solve(right_side: Tensor, first: Tensor, second: Tensor) -> Tensor:
-    weight = first.square().sum(-2, keepdim=True) + second.square().sum(-2, keepdim=True)
+def _joined(rows: Rows) -> list[set[int]]:
+    """Factors that products join, directly or through others."""
+    groups: list[set[int]] = []
+    for pair in rows:
+        touched = [group for group in groups if group & set(pair)]
+        groups = [group for group in groups if group not in touched]
+        groups.append(set(pair).union(*touched))
+    return groups
+
+
+def _solve(products: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+    """The factor that, times the other of each product, is nearest to the product's plane."""
+    right_side = sum(plane @ other for plane, other in products)
+    weight = sum(other.square().sum(-2, keepdim=True) for _, other in products)
+    assert isinstance(right_side, Tensor)
+    assert isinstance(weight, Tensor)
     return torch.where(weight > 0, right_side / weight.clamp_min(1e-30), 0)
 
 
@@ -156,15 +188,6 @@ def _running_signs(*factors: Tensor) -> Tensor:
 
 STATIC = ("middle", "median", "mean")
 DYNAMIC = ("random", "rank1")
-
-TIME_PLANES = {
-    "six": ("xt", "yt", "zt"),
-    "nine": ("xt", "yt", "xt", "zt", "yt", "zt"),
-}
-"""Time planes of each plane set, in storage order."""
-
-TIME_ROWS = {name: PLANE_SETS[name] for name in TIME_PLANES}
-"""For xy, xz and yz: indices of the time planes of the first and second axis."""
 
 
 def space_planes(
@@ -212,13 +235,14 @@ def time_planes(
 ) -> Tensor:
     """Space-time planes whose products approximate the sparse part (X-Planes, Eq. 14-16).
 
-    "rank1" minimises the product loss frame by frame on the triplanes' own grid: in closed form for
-    nine planes, by alternating least squares for six. "random" is the paper's initialisation near
-    zero. Noise is added to both, because a product of two zeros has a zero gradient.
+    "rank1" minimises the product loss frame by frame on the triplanes' own grid: in closed form
+    where no two products share a plane, as in "nine", else by alternating least squares. "random"
+    is the paper's initialisation near zero. Noise is added to both, because a product of two zeros
+    has a zero gradient.
 
     Args:
         sparse: The dynamic part. [T, 3, C, H, W]
-        plane_set: "six" (xt, yt, zt shared) or "nine" (xt, yt, xt, zt, yt, zt: one pair per row).
+        plane_set: A plane set of the field with time planes, such as "six" or "nine".
         dynamic: "rank1" or "random".
         resolution: R in cells; None keeps that of the triplanes, which must then be square.
         time_resolution: Rt; None for T, one row per frame.
@@ -226,14 +250,14 @@ def time_planes(
         generator: Generator of the noise.
 
     Returns:
-        Time planes in the order of ``TIME_PLANES``. [P, Rt, R, C]
+        Time planes in the order of the plane set. [P, Rt, R, C]
 
     Raises:
         ValueError: For a wrong shape or option.
     """
     check_triplanes(sparse, "sparse")
     for name, value, allowed in (
-        ("plane_set", plane_set, TIME_ROWS),
+        ("plane_set", plane_set, [name for name, rows in PLANE_SETS.items() if rows]),
         ("dynamic", dynamic, DYNAMIC),
     ):
         if value not in allowed:
@@ -245,7 +269,14 @@ def time_planes(
     count = frames if time_resolution is None else time_resolution
     if count < 1:
         raise ValueError(f"time_resolution is {time_resolution}: it must be at least 1")
-    shape = (len(TIME_PLANES[plane_set]), count, size, channels)
+    rows = PLANE_SETS[plane_set]
+    places, names = [place for pair in rows for place in pair], TIME_PLANES.get(plane_set, ())
+    if set(places) != set(range(len(names))):
+        raise ValueError(
+            f"plane_set={plane_set!r}: PLANE_SETS multiplies the planes {sorted(set(places))}, but "
+            f"TIME_PLANES names {len(names)}; each of those must be in a product, and no other"
+        )
+    shape = (len(names), count, size, channels)
     kind = sparse.dtype if sparse.dtype == torch.float64 else torch.float32
     planes = noise * torch.randn(
         shape,
@@ -256,12 +287,16 @@ def time_planes(
     if dynamic == "random":
         return planes
 
-    if plane_set == "nine":
-        factors = [factor for index in range(3) for factor in rank1_factors(sparse[:, index])]
+    if len(set(places)) == len(places):
+        own = [factor for index in range(3) for factor in rank1_factors(sparse[:, index])]
+        factors = [own[places.index(place)] for place in sorted(places)]
     elif height == width:
-        factors = list(shared_factors(sparse))
+        factors = shared_factors(sparse, rows)
     else:
-        raise ValueError(f"six planes share axes and need square triplanes, not {height} x {width}")
+        raise ValueError(
+            f"plane_set={plane_set!r} shares planes between axes and needs square triplanes, not "
+            f"{height} x {width}"
+        )
     ticks = torch.linspace(0, 1, count, dtype=torch.float64, device=sparse.device)
     for plane, factor in zip(planes, factors, strict=True):
         if len(factor) != count:

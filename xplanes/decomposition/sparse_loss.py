@@ -23,8 +23,8 @@ def sparse_product_loss(
         time_planes: Time planes of any resolution. [P, Rt, R, C]
         sparse: The sparse part of all frames, held fixed. [T, 3, C, H, W]
         frames: Indices of the frames; may repeat. [B]
-        rows: For xy, xz and yz: indices of the time planes of the first and second axis,
-            ``TIME_ROWS[plane_set]``.
+        rows: For xy, xz and yz the positions of the time planes of its first and second axis:
+            ``PLANE_SETS[plane_set]``.
 
     Returns:
         The loss, differentiable with respect to the time planes. []

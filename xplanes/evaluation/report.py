@@ -73,7 +73,7 @@ def header(
 
 
 def _estimated(experiment: Experiment, data: SceneDataModule, expected: Estimate) -> str:
-    """Seconds and memory that the run is going to take, in words."""
+    """Seconds that the run is going to take, in words."""
     trainer = experiment.trainer
     steps = float(trainer.get("max_steps", -1)) if trainer.get("max_steps", -1) > 0 else math.inf
     train = min(steps * expected.step, trainer.get("max_seconds") or math.inf)
@@ -88,10 +88,7 @@ def _estimated(experiment: Experiment, data: SceneDataModule, expected: Estimate
         pixels += VIDEO_PIXELS
     images = pixels / expected.image_rays
     whole = f"{train + images:.0f} s" if train < math.inf else "no end of training"
-    return (
-        f"at most {whole}, {images:.0f} s of it for scores and images; about "
-        f"{expected.memory / 2**30:.1f} GB of memory"
-    )
+    return f"at most {whole}, {images:.0f} s of it for scores and images"
 
 
 def summary(
@@ -212,6 +209,7 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             f"{100 * skipped['background']:.0f}% of pixels as background; "
             f"{metrics['samples_per_ray']:.1f} samples a ray remained, gradients of "
             f"{100 * (1 - skipped['gradients']):.0f}% of them{plateau}",
+            f"memory   {metrics['peak_memory_bytes'] / 2**30:.1f} GB at its peak",
             f"wrote    {run}",
             f"         metrics.json  curve.csv  checkpoints/last.ckpt  {metrics.get('media', '')}",
             f"next     tensorboard --logdir {run}",

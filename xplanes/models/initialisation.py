@@ -200,6 +200,11 @@ class Method:
                 f"seed={seed}: must be a whole number, not negative and below 4294967296 (2^32)"
             )
         model = build(config["model"], ModelSettings, "model")
+        if "lrm" not in config:
+            raise ConfigError(
+                f"lrm: model={model.name} chooses none; write `- /lrm@_global_.lrm: none`, or the "
+                "LRM that it takes unless told otherwise, into the defaults of the model's file"
+            )
         lrm = build(config["lrm"], InitialiserSettings, "lrm")
         if not (isinstance(lrm, RandomSettings) or model.takes_initialisation):
             raise ConfigError(

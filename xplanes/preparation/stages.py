@@ -11,13 +11,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from xplanes.decomposition import (
-    TIME_ROWS,
     decompose,
     space_planes,
     time_planes,
     unexplained_energy,
 )
-from xplanes.fields.xplanes import SPACE_PLANES, TIME_PLANES
+from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES
 from xplanes.lrm.images import Crop
 from xplanes.lrm.model import LRM
 from xplanes.models.initialisation import DecompositionSettings
@@ -236,7 +235,7 @@ def convert_stage(
         space = space_planes(low_rank, static=config.static, resolution=model.resolution)
         content: dict[str, Any] = {"space": space.cpu(), "time": None, "unexplained": {}}
         if sparse is not None:
-            moved, rows = sparse.to(device), TIME_ROWS[model.plane_set]
+            moved, rows = sparse.to(device), PLANE_SETS[model.plane_set]
             begun = begin(config.dynamic, moved)
             content["time"] = begun.cpu()
             content["unexplained"] = {

@@ -21,7 +21,7 @@ from xplanes.scenes.views import Scene
 from xplanes.settings import Count, Positive, Steps
 from xplanes.training.checkpoints import AtomicCheckpointIO, Checkpoints, find_resumable
 from xplanes.training.clock import TrainingClock, find_callback
-from xplanes.training.evaluation import Evaluation, device_memory
+from xplanes.training.evaluation import Evaluation
 from xplanes.training.interrupt import Interrupt
 from xplanes.training.module import RadianceModule
 
@@ -199,12 +199,10 @@ class Estimate:
     Attributes:
         step: Seconds of a step.
         image_rays: Rays of images that are rendered in a second.
-        memory: Bytes of memory in training, at most.
     """
 
     step: float
     image_rays: float
-    memory: int
 
 
 def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
@@ -241,10 +239,7 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
         float(views.times[0]),
         data.scene.background.to(device),
     )
-    rate = len(chosen) / (time.perf_counter() - began)
-    # Gradients and Adam's two moments are still to come.
-    coming = 3 * sum(p.numel() * p.element_size() for p in module.parameters() if p.requires_grad)
-    return Estimate(min(seconds), rate, device_memory(device) + coming)
+    return Estimate(min(seconds), len(chosen) / (time.perf_counter() - began))
 
 
 def quiet_lightning() -> None:

@@ -17,7 +17,13 @@ CAMERA_DISTANCE = 4.031128874149275
 """Distance of D-NeRF's cameras from the origin."""
 
 
-def film(posed: Posed, camera_to_world: Tensor, resolution: int, samples: int = 2) -> NDArray:
+def film(
+    posed: Posed,
+    camera_to_world: Tensor,
+    resolution: int,
+    samples: int = 2,
+    angle_x: float = CAMERA_ANGLE_X,
+) -> NDArray:
     """Render one picture.
 
     Args:
@@ -25,6 +31,7 @@ def film(posed: Posed, camera_to_world: Tensor, resolution: int, samples: int = 
         camera_to_world: Camera pose. [4, 4]
         resolution: Rows and columns of the picture.
         samples: Rays per pixel and axis.
+        angle_x: Field of view in radians.
 
     Returns:
         Straight-alpha RGBA. uint8 [resolution, resolution, 4]
@@ -35,12 +42,11 @@ def film(posed: Posed, camera_to_world: Tensor, resolution: int, samples: int = 
         camera_to_world.float(),
         rows.flatten(),
         columns.flatten(),
-        focal=focal_length(CAMERA_ANGLE_X, resolution),
+        focal=focal_length(angle_x, resolution),
         height=resolution,
         width=resolution,
     )
-    hits = posed.cast(origins, directions)
-    layers = torch.cat([hits.colour, (hits.part >= 0).float()[:, None]], dim=-1)
+    layers = posed.render(origins, directions)
     layers = layers.reshape(resolution, samples, resolution, samples, 4).mean(dim=(1, 3))
     alpha = layers[..., 3:]
     straight = torch.cat([layers[..., :3] / alpha.clamp_min(1e-6), alpha], dim=-1)

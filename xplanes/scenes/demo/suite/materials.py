@@ -160,7 +160,7 @@ def dark(variation: Variation) -> Assembly:
         Part(Cylinder(0.2, 0.3), coal, position=(0.0, 0.36, -0.25)),
         Part(Torus(0.2, 0.035), black, position=(0.0, 0.36, 0.05)),
         Part(Cylinder(0.06, 0.34), steel, "piston"),
-        Part(Box((0.24, 0.1, 0.05)), grey, "piston", (0, 0, 0.38)),
+        Part(Box((0.24, 0.1, 0.05)), grey, "piston", (0, 0, 0.22)),
         Part(Cylinder(0.04, 0.4), steel, "governor", (0, 0, 0.35)),
         Part(Cylinder(0.16, 0.05), black, "governor", (0, 0, -0.02)),
     ]
@@ -332,7 +332,7 @@ def transparent_test(variation: Variation) -> Assembly:
              position=(0, 0, -0.28)),
     ]  # fmt: skip
     for number, (angle, surface) in enumerate(
-        ((0, _glass(pink, 0.38)), (120, _glass(cyan, 0.38)), (240, _glass(lime, 0.38)))
+        ((0, _glass(pink, 0.22)), (120, _glass(cyan, 0.22)), (240, _glass(lime, 0.22)))
     ):
         place = around(3, 0.68)[number]
         parts += [

@@ -15,6 +15,9 @@ MISS = math.inf
 class Primitive(ABC):
     """A closed solid; ``inside`` is strict, the surface itself is outside."""
 
+    quick: ClassVar[bool] = True
+    """Whether a hit takes a few operations, so that few rays at a time are fastest."""
+
     @property
     @abstractmethod
     def extent(self) -> tuple[float, float, float]:

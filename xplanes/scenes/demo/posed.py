@@ -118,7 +118,8 @@ class Posed:
         low, high = (corner.to(origins) for corner in self.bounds())
         block = Box(tuple((0.5 * (high - low) + 1e-3).tolist()))
         reached = block.hit(origins - 0.5 * (low + high), directions).isfinite()
-        for rays in reached.nonzero()[:, 0].split(CHUNK):
+        chunk = CHUNK if all(part.shape.quick for part in self.parts) else 6 * CHUNK
+        for rays in reached.nonzero()[:, 0].split(chunk):
             for whole, chunk in zip(hits, self._cast(origins[rays], directions[rays]), strict=True):
                 whole[rays] = chunk
         return hits

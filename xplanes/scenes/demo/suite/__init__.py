@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from xplanes.scenes.demo.assembly import Assembly
 from xplanes.scenes.demo.capture import Rig
 from xplanes.scenes.demo.motions import Variation
-from xplanes.scenes.demo.suite import materials
+from xplanes.scenes.demo.suite import materials, shapes
 from xplanes.scenes.errors import SceneError
 
 __all__ = ["KINDS", "SUITE_SCENES", "SuiteScene", "suite_scene"]
@@ -41,6 +41,14 @@ SUITE_SCENES: dict[str, SuiteScene] = {
     "dark_test": SuiteScene(materials.dark_test),
     "wires": SuiteScene(materials.wires),
     "wires_test": SuiteScene(materials.wires_test),
+    "deformation": SuiteScene(shapes.deformation),
+    "deformation_test": SuiteScene(shapes.deformation_test),
+    "topology": SuiteScene(shapes.topology),
+    "topology_test": SuiteScene(shapes.topology_test),
+    "scaling": SuiteScene(shapes.scaling),
+    "scaling_test": SuiteScene(shapes.scaling_test),
+    "static": SuiteScene(shapes.static),
+    "static_test": SuiteScene(shapes.static_test),
     "transparent": SuiteScene(materials.transparent),
     "transparent_test": SuiteScene(materials.transparent_test),
 }

@@ -3,6 +3,7 @@
 from xplanes.scenes.demo.assembly import Assembly, Joint, Part
 from xplanes.scenes.demo.geometry import (
     Box,
+    Bricks,
     Capsule,
     Checker,
     Cylinder,
@@ -349,6 +350,71 @@ def transparent_test(variation: Variation) -> Assembly:
         Part(ball(0.07), Plain((0.95, 0.6, 0.15)), "sand"),
     ]
     return Assembly(tuple(parts), tuple(joints), _SOFT)
+
+
+def texture(variation: Variation) -> Assembly:
+    """A cube, a ball, a drum and a wall, all with patterns finer than two hundredths of the scene.
+
+    They turn and rock, so that the patterns move.
+    """
+    ink, paper = variation.natural("#20242e"), (0.95, 0.94, 0.9)
+    red, blue = variation.paint("#c83a30"), variation.paint("#2a5ab8")
+    joints = [
+        *moving("cube", (-0.32, -0.2, -0.1), (0, 0, 15), turn=Steady(0, 150)),
+        *moving("ball", (0.42, -0.3, -0.2), turn=Steady(0, -200), axis=(0.3, 0, 1)),
+        *moving("drum", (0.3, 0.45, -0.15), turn=Swing(0, 60, 1), z=Swing(0, 0.1, 2)),
+    ]
+    parts = [
+        Part(Box((0.85, 0.85, 0.04)), Checker((variation.natural("#d8d0bc"), ink), (0.05, 0.05, 1)),
+             position=(0, 0, -0.56)),
+        Part(Box((0.3, 0.3, 0.3)), Checker((red, paper, blue, paper, ink), (0.04, 0.04, 0.04)),
+             "cube"),
+        Part(ball(0.28), Checker((variation.paint("#2f9a58"), (0.97, 0.9, 0.4)),
+             (0.045, 0.045, 0.045)), "ball"),
+        Part(Cylinder(0.24, 0.26), Bricks(variation.natural("#b0553a"), paper, 0.075, 0.04, 0.009,
+             around=0.24, tone=0.5), "drum"),
+        Part(Torus(0.24, 0.05), Sectors((ink, variation.natural("#e0b840")), 60), "drum",
+             (0, 0, 0.3)),
+        Part(Box((0.03, 0.3, 0.35)), Stripes((blue, paper, red, paper), 1, 0.03),
+             position=(-0.8, 0.35, -0.17)),
+        Part(Ellipsoid((0.3, 0.16, 0.12)), Plain(variation.natural("#8a9a4a"), 0.5, 0.06),
+             position=(-0.35, 0.5, -0.42)),
+    ]  # fmt: skip
+    return Assembly(tuple(parts), tuple(joints))
+
+
+def texture_test(variation: Variation) -> Assembly:
+    """A spotted fish of fine scales, a striped snake of rings, and a carpet that is carried by."""
+    sand, stone = variation.natural("#cdb98c"), variation.natural("#8a8578")
+    joints = [
+        *moving("fish", (0.05, 0.1, 0.15), turn=Steady(30, 220), z=Swing(0, 0.12, 2)),
+        *moving("tail", (-0.4, 0, 0), parent="fish", turn=Swing(0, 28, 4)),
+        *moving("carpet", (0.0, -0.45, -0.12), x=Swing(0, 0.3, 1),
+                turn=Swing(0, 14, 2), axis=(0, 1, 0)),
+        *moving("rings", (-0.55, 0.5, -0.5), turn=Swing(0, 90, 1)),
+    ]  # fmt: skip
+    scales = Bricks(variation.paint("#3a88b0"), variation.natural("#16324a"), 0.06, 0.03, 0.008,
+                    around=0.25, tone=0.6)  # fmt: skip
+    weave = Checker((variation.paint("#a8304a"), variation.natural("#e8c060"),
+                     variation.natural("#203050")), (0.035, 0.05, 0.035))  # fmt: skip
+    parts = [
+        Part(Cylinder(0.9, 0.05), Plain(sand, 0.45, 0.09), position=(0, 0, -0.58)),
+        Part(Ellipsoid((0.4, 0.16, 0.24)), scales, "fish"),
+        Part(Box((0.15, 0.02, 0.2)), Stripes((variation.paint("#e08838"), (0.2, 0.15, 0.2)), 2,
+             0.025), "tail", (-0.12, 0, 0)),
+        Part(Ellipsoid((0.14, 0.02, 0.1)), Stripes((variation.paint("#e08838"), (0.2, 0.15, 0.2)),
+             0, 0.025), "fish", (0, 0, 0.26)),
+        *(Part(ball(0.04), Plain((0.95, 0.95, 0.8)), "fish", (0.3, y, 0.07)) for y in (-0.1, 0.1)),
+        Part(Box((0.4, 0.015, 0.27)), weave, "carpet"),
+        *(Part(Torus(0.2 - 0.035 * i, 0.05), Sectors((variation.paint("#58a038"),
+               (0.94, 0.92, 0.5), variation.natural("#2a2a24")), 45 - 9 * i), "rings",
+               (0, 0, 0.02 + 0.085 * i)) for i in range(4)),
+        Part(Box((0.14, 0.14, 0.22)), Bricks(stone, (0.9, 0.88, 0.82), 0.07, 0.035, 0.008,
+             tone=0.6), "world", (0.58, 0.4, -0.32), (0, 0, 25)),
+        Part(Box((0.16, 0.16, 0.025)), Checker(((0.15, 0.15, 0.17), (0.9, 0.9, 0.88)),
+             (0.032, 0.032, 1)), "world", (0.58, 0.4, -0.075), (0, 0, 25)),
+    ]  # fmt: skip
+    return Assembly(tuple(parts), tuple(joints), Light(towards=(0.5, -0.6, 0.7), shadow=0.45))
 
 
 def _glass(colour: tuple[float, float, float], opacity: float) -> Surface:

@@ -12,8 +12,14 @@ from torch.nn.functional import normalize
 from xplanes.scenes.demo.geometry import MISS, Box, Colour, Primitive, Surface
 from xplanes.scenes.demo.motions import Motion
 
-STEPS = 100
-"""Steps of a ray at most; one that has not arrived by then passes by."""
+STEPS = 48
+"""Steps by the bound of the distance; rays that graze the surface need more."""
+
+SAMPLES = 256
+"""Evenly spaced places at which the rest of such a ray is searched."""
+
+HALVINGS = 10
+"""Halvings of the space between two of them."""
 
 NEAR = 5e-5
 """A ray has arrived where the bound of the distance is below this."""
@@ -74,7 +80,33 @@ class Implicit(Primitive):
             distance[rays[arrived]] = travelled[arrived]
             travelled = travelled + gap.clamp_min(NEAR)
             active &= (gap >= NEAR) & (travelled < leaves)
+        if active.any():
+            rays, origins, directions, travelled, leaves, sign = (
+                kept[active] for kept in (rays, origins, directions, travelled, leaves, sign)
+            )
+            leaves = torch.minimum(leaves, travelled + 2 * self.radius_around)
+            distance[rays] = self._search(origins, directions, travelled, leaves, sign)
         return torch.where(distance > 0, distance, MISS)
+
+    def _search(
+        self, origins: Tensor, directions: Tensor, start: Tensor, stop: Tensor, sign: Tensor
+    ) -> Tensor:
+        """First change of sign between two distances, inf where there is none. [N]"""
+
+        def passed(distance: Tensor) -> Tensor:
+            return self.value(origins + distance[:, None] * directions) * sign < 0
+
+        shares = torch.linspace(0, 1, SAMPLES, dtype=start.dtype, device=start.device)
+        grid = start[:, None] + shares * (stop - start)[:, None]
+        points = origins[:, None] + grid[..., None] * directions[:, None]
+        beyond = self.value(points.flatten(0, 1)).reshape(grid.shape) * sign[:, None] < 0
+        last = beyond.to(torch.uint8).argmax(dim=1, keepdim=True)
+        high, low = grid.gather(1, last)[:, 0], grid.gather(1, (last - 1).clamp_min(0))[:, 0]
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            after = passed(middle)
+            low, high = torch.where(after, low, middle), torch.where(after, middle, high)
+        return torch.where(beyond.any(dim=1), low, MISS)
 
     def normal(self, points: Tensor) -> Tensor:
         gradient = torch.zeros_like(points)
@@ -230,9 +262,19 @@ class Bent(Implicit):
     def value(self, points: Tensor) -> Tensor:
         straight, along = self._straight(points)
         radius = self.radius + (self.tip - self.radius) * along / self.length
-        beyond = straight[:, 2] - along
-        gap = torch.stack([straight[:, 0], straight[:, 1], beyond], dim=-1).norm(dim=-1) - radius
-        return gap / math.hypot(1.0, (self.tip - self.radius) / self.length)
+        away = torch.stack([straight[:, 0], straight[:, 1], straight[:, 2] - along], dim=-1)
+        gap = away.norm(dim=-1) - radius
+        # The other end may be thicker, and nearer for that.
+        angle = self._angle()
+        reach = self.length / angle
+        top = points.new_tensor([reach * (1 - math.cos(angle)), 0.0, reach * math.sin(angle)])
+        gap = torch.minimum(gap, points.norm(dim=-1) - self.radius)
+        gap = torch.minimum(gap, (points - top).norm(dim=-1) - self.tip)
+        # Nearer to the middle of the arc a step leads further along it.
+        centre, thick = abs(reach), max(self.radius, self.tip)
+        nearest = torch.hypot(points[:, 0] - reach, points[:, 2]).clamp_max(centre - thick)
+        taper = (self.tip - self.radius) / self.length * centre / nearest.clamp_min(0.05 * centre)
+        return gap / torch.hypot(torch.ones_like(taper), taper)
 
     def _angle(self) -> float:
         # A straight stalk is an arc of a circle too large for single precision.

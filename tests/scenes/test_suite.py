@@ -8,11 +8,12 @@ from itertools import combinations, pairwise
 import numpy as np
 import pytest
 import torch
+import yaml
 from PIL import Image
 
 from tests.refusals import assert_refused
 from xplanes.components import build
-from xplanes.config import compose_plain
+from xplanes.config import CONF, compose_plain
 from xplanes.scenes.cameras import focal_length, pixel_rays
 from xplanes.scenes.demo.assembly import Assembly, Part
 from xplanes.scenes.demo.film import CAMERA_ANGLE_X, CAMERA_DISTANCE, film
@@ -315,6 +316,14 @@ def test_a_folder_in_the_layout_of_d_nerf(tmp_path):
         announce=pytest.fail,
     )
     assert again == data.folder
+
+
+@pytest.mark.parametrize(("experiment", "ending"), [("suite", ""), ("suite_test", "_test")])
+def test_the_experiments_list_every_kind(experiment, ending):
+    text = (CONF / "experiment" / f"{experiment}.yaml").read_text(encoding="utf-8")
+    listed = yaml.safe_load(text)["hydra"]["sweeper"]["params"]["data.scene"].split(",")
+    assert listed == [kind + ending for kind in KINDS]
+    assert len(listed) == 16
 
 
 def test_unknown_names_are_refused_with_the_nearest():

@@ -70,7 +70,7 @@ COMPOSITIONS = [
     ["data=demo", "lrm=none", "decomposition=default", "trainer=default", "preparation=default"],
     ["data=dnerf", "lrm=tiny", "decomposition=paper", "trainer=cpu", "callbacks=threads"],
     ["lrm=mini", "trainer=debug", "model/sampler=occupancy", "logger=none", "model=six_planes"],
-    ["lrm=base", "trainer=ddp", "model=nine_planes", "callbacks=default"],
+    ["data=suite", "lrm=base", "trainer=ddp", "model=nine_planes", "callbacks=default"],
     ["lrm=large", "trainer=gpu", "logger=tensorboard"],
     ["lrm=small", "model/sampler=proposal", "logger=csv"],
     ["lrm=xlarge", "model/sampler=kplanes", "logger=wandb"],

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from xplanes.scenes.demo.geometry import Primitive, Surface
-from xplanes.scenes.demo.motions import Motion
+from xplanes.scenes.demo.motions import Motion, Steady
 from xplanes.scenes.demo.posed import Hits, Posed, PosedPart
 from xplanes.scenes.demo.shading import Light
 
@@ -28,7 +28,8 @@ class Joint:
         parent: Joint that carries it; must come earlier in the assembly.
         position: Its origin in the parent's frame.
         rotation: Angles about the parent's x, y and z, applied in this order, in degrees.
-        kind: A hinge rotates about ``axis`` (degrees); a slide translates along it (world units).
+        kind: A hinge turns about ``axis`` by degrees, a slide moves along it by lengths, and a
+            scale multiplies the size of all that the joint carries.
         axis: Axis in the joint's own frame; any length.
         motion: State of the joint over time; required unless it is fixed.
     """
@@ -37,7 +38,7 @@ class Joint:
     parent: str = WORLD
     position: Vector = (0.0, 0.0, 0.0)
     rotation: Vector = (0.0, 0.0, 0.0)
-    kind: Literal["fixed", "hinge", "slide"] = "fixed"
+    kind: Literal["fixed", "hinge", "slide", "scale"] = "fixed"
     axis: Vector = (0.0, 0.0, 1.0)
     motion: Motion | None = None
 
@@ -81,9 +82,13 @@ class Assembly:
         for part in self.parts:
             _require(part.joint, known, f"joint of a part ({part.shape})")
 
-    def placed(self, position: Vector, rotation: Vector = (0.0, 0.0, 0.0)) -> "Assembly":
-        """The whole assembly, rigidly moved (position and angles as for a joint)."""
+    def placed(
+        self, position: Vector, rotation: Vector = (0.0, 0.0, 0.0), scale: float = 1.0
+    ) -> "Assembly":
+        """The whole assembly moved and scaled as one (position and angles as of a joint)."""
         site = Joint("site", WORLD, position, rotation)
+        if scale != 1:
+            site = replace(site, kind="scale", motion=Steady(scale, 0.0))
         joints = [replace(j, parent="site") if j.parent == WORLD else j for j in self.joints]
         parts = [replace(p, joint="site") if p.joint == WORLD else p for p in self.parts]
         return Assembly(tuple(parts), (site, *joints), self.light)
@@ -91,15 +96,21 @@ class Assembly:
     def pose(self, time: float, dtype: torch.dtype = torch.float32) -> Posed:
         """The assembly at ``time`` in [0, 1], with poses in ``dtype``."""
         frames = {WORLD: torch.eye(4, dtype=torch.float64)}
+        scales = {WORLD: 1.0}
         for joint in self.joints:
-            frame = frames[joint.parent] @ _frame(joint.position, joint.rotation)
-            if joint.motion is not None:
-                frame = frame @ _moved(joint, joint.motion.at(time))
-            frames[joint.name] = frame
+            scale = scales[joint.parent]
+            frame = frames[joint.parent] @ _frame(joint.position, joint.rotation, scale)
+            if joint.kind == "scale" and joint.motion is not None:
+                scale *= joint.motion.at(time)
+            elif joint.motion is not None:
+                frame = frame @ _moved(joint, joint.motion.at(time), scale)
+            frames[joint.name], scales[joint.name] = frame, scale
         posed = []
         for part in self.parts:
-            frame = (frames[part.joint] @ _frame(part.position, part.rotation)).to(dtype)
-            posed.append(PosedPart(part.shape, part.surface, frame[:3, :3], frame[:3, 3]))
+            scale = scales[part.joint]
+            frame = (frames[part.joint] @ _frame(part.position, part.rotation, scale)).to(dtype)
+            shape, surface = part.shape.at(time), part.surface.at(time)
+            posed.append(PosedPart(shape, surface, frame[:3, :3], frame[:3, 3], scale))
         return Posed(tuple(posed), self.light)
 
     def cast(self, origins: Tensor, directions: Tensor, time: float) -> Hits:
@@ -120,24 +131,24 @@ def _require(name: str, known: set[str], role: str) -> None:
         raise ValueError(f"{role}: no joint {name!r} before it; known are {sorted(known)}")
 
 
-def _frame(position: Vector, rotation: Vector) -> Tensor:
-    """A rigid frame from a position and angles about x, y and z in degrees. [4, 4]"""
+def _frame(position: Vector, rotation: Vector, scale: float = 1.0) -> Tensor:
+    """A rigid frame from a scaled position and angles about x, y and z in degrees. [4, 4]"""
     frame = torch.eye(4, dtype=torch.float64)
     for axis, angle in zip(torch.eye(3, dtype=torch.float64), rotation, strict=True):
         if angle:
             frame[:3, :3] = _turn(axis, angle) @ frame[:3, :3]
-    frame[:3, 3] = torch.tensor(position, dtype=torch.float64)
+    frame[:3, 3] = scale * torch.tensor(position, dtype=torch.float64)
     return frame
 
 
-def _moved(joint: Joint, state: float) -> Tensor:
+def _moved(joint: Joint, state: float, scale: float) -> Tensor:
     """Movement of a hinge or slide in its own frame. [4, 4]"""
     axis = normalize(torch.tensor(joint.axis, dtype=torch.float64), dim=0)
     frame = torch.eye(4, dtype=torch.float64)
     if joint.kind == "hinge":
         frame[:3, :3] = _turn(axis, state)
     else:
-        frame[:3, 3] = axis * state
+        frame[:3, 3] = axis * state * scale
     return frame
 
 

@@ -2,7 +2,8 @@
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -13,6 +14,9 @@ MISS = math.inf
 
 class Primitive(ABC):
     """A closed solid; ``inside`` is strict, the surface itself is outside."""
+
+    quick: ClassVar[bool] = True
+    """Whether a hit takes a few operations, so that few rays at a time are fastest."""
 
     @property
     @abstractmethod
@@ -43,6 +47,14 @@ class Primitive(ABC):
     @abstractmethod
     def signed_distance(self, points: Tensor) -> Tensor:
         """Distance to the surface, negative inside. [N]"""
+
+    def at(self, time: float) -> Self:
+        """The shape at ``time``; itself, unless it deforms."""
+        return self
+
+    def material(self, points: Tensor) -> Tensor:
+        """Where points of the shape lie before it deforms, so that patterns stick to it. [N, 3]"""
+        return points
 
     def inside(self, points: Tensor) -> Tensor:
         """Whether points lie inside the shape. bool [N]"""
@@ -257,6 +269,13 @@ def rgb(code: str) -> Colour:
 class Surface(ABC):
     """A colour for every point of a part."""
 
+    lit: ClassVar[bool] = True
+    """Whether the light of the scene shades it."""
+
+    def at(self, time: float) -> Self:
+        """The surface at ``time``; itself, unless it changes."""
+        return self
+
     @abstractmethod
     def colour(self, points: Tensor) -> Tensor:
         """Colours at points in the part's own coordinates. [N, 3]"""
@@ -361,8 +380,47 @@ class Bricks(Surface):
         return torch.where(in_joint[:, None], joints, bricks.clamp(0, 1))
 
 
-# Patterns are evaluated slightly below the surface: rounding would otherwise choose the colour of a
-# face that lies exactly on the border between two cells.
+@dataclass(frozen=True)
+class Unlit(Surface):
+    """A surface that shows its colours as painted, whatever the light."""
+
+    base: Surface
+    lit: ClassVar[bool] = False
+
+    def at(self, time: float) -> "Unlit":
+        return Unlit(self.base.at(time))
+
+    def colour(self, points: Tensor) -> Tensor:
+        return self.base.colour(points)
+
+
+@dataclass(frozen=True)
+class Translucent(Surface):
+    """A thin shell and a filling that let some of the light through.
+
+    Attributes:
+        base: Colours of both.
+        shell: Opacity of the shell seen head-on; it rises towards the outline.
+        density: Absorption of the filling per unit length.
+    """
+
+    base: Surface
+    shell: float = 0.0
+    density: float = 0.0
+
+    def at(self, time: float) -> "Translucent":
+        return replace(self, base=self.base.at(time))
+
+    def colour(self, points: Tensor) -> Tensor:
+        return self.base.colour(points)
+
+    def opacity(self, cosine: Tensor) -> Tensor:
+        """Opacity of the shell under an angle to its normal. [N]"""
+        return 1 - (1 - self.shell) ** (1 / cosine.abs().clamp_min(0.12))
+
+
+# Patterns are read a little below the surface: a face that lies exactly on the border between
+# two cells would otherwise take the colour of either at random.
 _INWARD = 0.998
 
 

@@ -7,8 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from xplanes.scenes.demo.geometry import MISS, Box, Primitive, Surface
+from xplanes.scenes.demo.geometry import MISS, Box, Primitive, Surface, Translucent
 from xplanes.scenes.demo.shading import Light
+
+MAX_SURFACES = 24
+"""Surfaces that a ray passes through at most."""
 
 CHUNK = 16384
 """Rays per chunk, so that temporaries fit in the cache."""
@@ -23,28 +26,40 @@ class PosedPart:
         surface: Its colours.
         rotation: From part to world coordinates. [3, 3]
         translation: The part's centre in the world. [3]
+        scale: World units per unit of the part's coordinates.
     """
 
     shape: Primitive
     surface: Surface
     rotation: Tensor
     translation: Tensor
+    scale: float = 1.0
 
     def to_own(self, points: Tensor) -> Tensor:
-        """World points in the part's coordinates. [N, 3]"""
-        return (points - self.translation.to(points)) @ self.rotation.to(points)
+        """World positions in the part's coordinates. [N, 3]"""
+        return (points - self.translation.to(points)) @ self.rotation.to(points) / self.scale
 
     def hit(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """Distance along each ray to the part, inf for a miss. [N]"""
-        return self.shape.hit(self.to_own(origins), directions @ self.rotation.to(directions))
+        """Distance along each ray to the part, inf where missed. [N]"""
+        own = directions @ self.rotation.to(directions)
+        return self.shape.hit(self.to_own(origins), own) * self.scale
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """Distance of world positions to the part, negative inside. [N]"""
+        return self.shape.signed_distance(self.to_own(points)) * self.scale
+
+    @property
+    def radius_around(self) -> float:
+        """Radius of the smallest ball around the part's centre that holds it."""
+        return self.shape.radius_around * self.scale
 
     def inside(self, points: Tensor) -> Tensor:
         """Whether world points lie inside the part. bool [N]"""
         return self.shape.inside(self.to_own(points))
 
     def colour(self, points: Tensor) -> Tensor:
-        """Unlit colours of the part at world points. [N, 3]"""
-        return self.surface.colour(self.to_own(points))
+        """Colours of the part at world positions, without light. [N, 3]"""
+        return self.surface.colour(self.shape.material(self.to_own(points)))
 
 
 class Hits(NamedTuple):
@@ -76,13 +91,16 @@ class Posed:
     light: Light | None = None
     _centres: Tensor = field(init=False, repr=False, compare=False)
     _radii: Tensor = field(init=False, repr=False, compare=False)
+    _lit: Tensor = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not self.parts:
             raise ValueError("an assembly needs at least one part")
         object.__setattr__(self, "_centres", torch.stack([p.translation for p in self.parts]))
-        radii = torch.tensor([p.shape.radius_around for p in self.parts])
+        radii = torch.tensor([p.radius_around for p in self.parts])
         object.__setattr__(self, "_radii", radii)
+        lit = torch.tensor([p.surface.lit for p in self.parts])
+        object.__setattr__(self, "_lit", lit)
 
     def cast(self, origins: Tensor, directions: Tensor) -> Hits:
         """First hit of each ray.
@@ -100,10 +118,75 @@ class Posed:
         low, high = (corner.to(origins) for corner in self.bounds())
         block = Box(tuple((0.5 * (high - low) + 1e-3).tolist()))
         reached = block.hit(origins - 0.5 * (low + high), directions).isfinite()
-        for rays in reached.nonzero()[:, 0].split(CHUNK):
+        chunk = CHUNK if all(part.shape.quick for part in self.parts) else 6 * CHUNK
+        for rays in reached.nonzero()[:, 0].split(chunk):
             for whole, chunk in zip(hits, self._cast(origins[rays], directions[rays]), strict=True):
                 whole[rays] = chunk
         return hits
+
+    def render(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """What each ray sees through all that is translucent.
+
+        Shells and fillings are composited as a radiance field does it, by emission and absorption.
+
+        Args:
+            origins: Where the rays start, outside of all parts. [N, 3]
+            directions: Unit directions. [N, 3]
+
+        Returns:
+            Colour times opacity, and opacity. [N, 4]
+        """
+        if not any(isinstance(part.surface, Translucent) for part in self.parts):
+            hits = self.cast(origins, directions)
+            return torch.cat([hits.colour, (hits.part >= 0).float()[:, None]], dim=-1)
+        rgba = directions.new_zeros(len(directions), 4)
+        through = torch.ones_like(directions[:, 0])
+        rays = torch.arange(len(directions), device=directions.device)
+        for _ in range(MAX_SURFACES):
+            hits = self.cast(origins, directions)
+            found = hits.distance.isfinite()
+            rays, origins, directions, through = (
+                kept[found] for kept in (rays, origins, directions, through)
+            )
+            if len(rays) == 0:
+                break
+            hits = Hits(*(value[found] for value in hits))
+            for layer in (
+                self._filling(origins, directions, hits.distance),
+                self._crossing(directions, hits),
+            ):
+                rgba[rays] += through[:, None] * layer
+                through = through * (1 - layer[:, 3])
+            # On from just beyond the surface.
+            origins = origins + (hits.distance + 1e-4)[:, None] * directions
+            seen = through > 1 / 512
+            rays, origins, directions, through = (
+                kept[seen] for kept in (rays, origins, directions, through)
+            )
+        return rgba
+
+    def _filling(self, origins: Tensor, directions: Tensor, distance: Tensor) -> Tensor:
+        """Emission and opacity of what fills the way to the next surface. [N, 4]"""
+        middle = origins + 0.5 * distance[:, None] * directions
+        density, glow = torch.zeros_like(distance), torch.zeros_like(directions)
+        for part in self.parts:
+            surface = part.surface
+            if isinstance(surface, Translucent) and surface.density:
+                own = surface.density * part.inside(middle).to(distance)
+                density = density + own
+                glow = glow + own[:, None] * part.colour(middle)
+        opacity = 1 - (-density * distance).exp()
+        colour = glow / density.clamp_min(1e-9)[:, None]
+        return torch.cat([opacity[:, None] * colour, opacity[:, None]], dim=-1)
+
+    def _crossing(self, directions: Tensor, hits: Hits) -> Tensor:
+        """Emission and opacity of surfaces that are hit. [N, 4]"""
+        opacity = torch.ones_like(hits.distance)
+        cosine = (directions * hits.normal).sum(dim=-1)
+        for number, part in enumerate(self.parts):
+            if isinstance(part.surface, Translucent):
+                opacity = torch.where(hits.part == number, part.surface.opacity(cosine), opacity)
+        return torch.cat([opacity[:, None] * hits.colour, opacity[:, None]], dim=-1)
 
     def nearest(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Distance to the first part on each ray, and its index (inf, -1 for a miss). [N], [N]"""
@@ -124,8 +207,8 @@ class Posed:
         return result
 
     def signed_distance(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance to the nearest part, and that part's index. [N], [N]"""
-        gaps = torch.stack([p.shape.signed_distance(p.to_own(points)) for p in self.parts])
+        """Distance to the nearest part, negative inside, and that part's number. [N], [N]"""
+        gaps = torch.stack([p.signed_distance(points) for p in self.parts])
         distance, part = gaps.min(dim=0)
         return distance, part
 
@@ -150,7 +233,7 @@ class Posed:
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Corners of the axis-aligned bounding box of all parts. [3], [3]"""
         reach = torch.stack(
-            [p.rotation.abs() @ p.rotation.new_tensor(p.shape.extent) for p in self.parts]
+            [p.rotation.abs() @ p.rotation.new_tensor(p.shape.extent) * p.scale for p in self.parts]
         )
         return (self._centres - reach).amin(dim=0), (self._centres + reach).amax(dim=0)
 
@@ -190,20 +273,23 @@ class Posed:
             chosen, posed = (own == number).nonzero()[:, 0], self.parts[number]
             local = posed.to_own(points[chosen])
             normals[chosen] = posed.shape.normal(local) @ posed.rotation.to(points).T
-            colours[chosen] = posed.surface.colour(local)
+            colours[chosen] = posed.surface.colour(posed.shape.material(local))
         if self.light is not None:
-            colours = self.light.shade(colours, normals, self._shadowed(points, normals))
+            shaded = self.light.shade(colours, normals, self._shadowed(points, normals, own))
+            colours = torch.where(self._lit.to(own.device)[own, None], shaded, colours)
         normal[found], colour[found] = normals, colours
         return Hits(distance, normal, colour, part)
 
-    def _shadowed(self, points: Tensor, normals: Tensor) -> Tensor | None:
-        """Whether surface points lie in shadow. bool [N]"""
+    def _shadowed(self, points: Tensor, normals: Tensor, part: Tensor) -> Tensor | None:
+        """Which surface points of parts [N] have a part between them and the sun. bool [N]"""
         if self.light is None or not self.light.shadow:
             return None
         sun = self.light.direction(points)
         # Faces that point away from the sun need no shadow ray.
         lit = (normals @ sun > 0).nonzero()[:, 0]
-        starts = points[lit] + 1e-3 * normals[lit]
+        # Smaller things cast their shadows from closer by.
+        gap = 1e-3 * points.new_tensor([posed.scale for posed in self.parts])[part[lit]]
+        starts = points[lit] + gap[:, None] * normals[lit]
         shadowed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
         shadowed[lit] = self.nearest(starts, sun.expand_as(starts))[1] >= 0
         return shadowed

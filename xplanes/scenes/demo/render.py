@@ -18,15 +18,20 @@ CAMERA_DISTANCE = 4.031128874149275
 
 
 def render_image(
-    posed: Posed, camera_to_world: Tensor, resolution: int, samples: int = 2
+    posed: Posed,
+    camera_to_world: Tensor,
+    resolution: int,
+    samples: int = 2,
+    angle_x: float = CAMERA_ANGLE_X,
 ) -> NDArray:
-    """Render one image.
+    """Render one picture.
 
     Args:
         posed: The assembly at one timestep.
         camera_to_world: Camera-to-world matrix. [4, 4]
         resolution: Height and width in pixels.
         samples: Rays per pixel and axis.
+        angle_x: Field of view in radians.
 
     Returns:
         Straight-alpha RGBA. uint8 [resolution, resolution, 4]
@@ -37,12 +42,11 @@ def render_image(
         camera_to_world.float(),
         rows.flatten(),
         columns.flatten(),
-        focal=focal_length(CAMERA_ANGLE_X, resolution),
+        focal=focal_length(angle_x, resolution),
         height=resolution,
         width=resolution,
     )
-    hits = posed.cast(origins, directions)
-    layers = torch.cat([hits.colour, (hits.part >= 0).float()[:, None]], dim=-1)
+    layers = posed.render(origins, directions)
     layers = layers.reshape(resolution, samples, resolution, samples, 4).mean(dim=(1, 3))
     alpha = layers[..., 3:]
     straight = torch.cat([layers[..., :3] / alpha.clamp_min(1e-6), alpha], dim=-1)

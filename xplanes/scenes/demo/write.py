@@ -7,20 +7,23 @@ import random
 import secrets
 import shutil
 import threading
+from abc import ABC
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from time import time as now
-from typing import Any
+from typing import Any, ClassVar
 
 from PIL import Image
-from torch import Tensor
 
 from xplanes.backend import threads
 from xplanes.scenes.demo.assembly import Assembly
-from xplanes.scenes.demo.render import CAMERA_ANGLE_X, camera_at, hemisphere_cameras, render_image
+from xplanes.scenes.demo.capture import Capture, even_times, held_out_times
+from xplanes.scenes.demo.motions import Variation
+from xplanes.scenes.demo.render import camera_at, hemisphere_cameras, render_image
 from xplanes.scenes.demo.scenes import build_demo_scene, demo_scene
+from xplanes.scenes.demo.suite import suite_scene
 from xplanes.scenes.dnerf import read_scene
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.source import SceneSettings
@@ -29,6 +32,9 @@ from xplanes.settings import Count, Steps
 
 VERSION = 2
 """Version of the renderer; increase it whenever the images of a scene change."""
+
+SUITE_VERSION = 1
+"""The same for the scenes of the suite."""
 
 RECORD = "demo.json"
 """File that describes the content of a scene folder; written last."""
@@ -77,85 +83,9 @@ def ensure_demo_scene(
         ValueError: If no scene has that name, or a count is below 1.
     """
     counts = {"train": train_views, "val": val_views, "test": test_views}
-    for key, value in {
-        "resolution": resolution,
-        **{f"{k}_views": v for k, v in counts.items()},
-    }.items():
-        if value < 1:
-            raise ValueError(f"{key} is {value}; it must be at least 1")
+    _require_some(resolution, counts)
     assembly = build_demo_scene(name, seed)
-    record = _record(name, assembly, resolution, seed, counts)
-    folder = Path(root) / _folder_name(name, resolution, seed, counts)
-    if _holds(folder, record):
-        return folder
-    total = sum(counts.values()) + VIDEO_FRAMES
-    (announce or print)(
-        f"Rendering demo scene {name} ({total} images of {resolution} px) to {folder}"
-    )
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    _clear_unfinished(folder)
-    fresh = _sibling(folder)
-    try:
-        with _one_thread():
-            for split, shots in _shots(name, seed, counts).items():
-                _write_split(fresh, split, shots, assembly, resolution)
-        (fresh / RECORD).write_text(json.dumps(record, indent=2) + "\n")
-        _publish(fresh, folder, record)
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
-    return folder
-
-
-Shot = tuple[float, Tensor]
-"""Time and camera-to-world matrix [4, 4] of a view."""
-
-
-def _shots(name: str, seed: int, counts: dict[str, int]) -> dict[str, list[Shot]]:
-    """Times and cameras of every split; each split has its own random stream."""
-    scene = demo_scene(name)
-    shots = {}
-    for split, count in counts.items():
-        draw = random.Random(f"{split} {seed}")
-        cameras = hemisphere_cameras(count, draw)
-        # Times of held-out views are stratified. Every split begins at time 0, because readers of
-        # this format expect it.
-        held_out = [0.0, *((i + draw.random()) / count for i in range(1, count))]
-        times = _even(count) if split == "train" else held_out
-        shots[split] = list(zip(times, cameras, strict=True))
-    camera = camera_at(scene.azimuth, 0.0)
-    shots["video"] = [(time, camera) for time in _even(VIDEO_FRAMES)]
-    return shots
-
-
-def _even(count: int) -> list[float]:
-    return [i / max(count - 1, 1) for i in range(count)]
-
-
-def _write_split(
-    folder: Path, split: str, shots: list[Shot], assembly: Assembly, resolution: int
-) -> None:
-    (folder / split).mkdir()
-    frames = []
-    for number, (time, camera) in enumerate(shots):
-        file = f"./{split}/r_{number:03d}"
-        picture = render_image(assembly.pose(time), camera, resolution)
-        Image.fromarray(picture).save(folder / f"{file}.png", compress_level=6)
-        frames.append({"file_path": file, "time": time, "transform_matrix": camera.tolist()})
-    index = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
-    (folder / f"transforms_{split}.json").write_text(json.dumps(index, indent=1) + "\n")
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Limit PyTorch to one thread: parallelising many small operations costs more than it gains."""
-    with _RENDERING, threads(1):
-        yield
-
-
-def _record(
-    name: str, assembly: Assembly, resolution: int, seed: int, counts: dict[str, int]
-) -> dict[str, Any]:
-    return {
+    record = {
         "version": VERSION,
         "scene": name,
         "seed": seed,
@@ -164,6 +94,126 @@ def _record(
         # Parts and motions are hashed, so that an edited scene is rendered again.
         "assembly": hashlib.sha256(repr(assembly).encode()).hexdigest(),
     }
+    return _ensure(
+        Path(root) / _folder_name(name, resolution, seed, counts),
+        f"demo scene {name}",
+        assembly,
+        _demo_capture(name, seed, counts),
+        record,
+        announce or print,
+    )
+
+
+def ensure_suite_scene(
+    root: Path,
+    name: str,
+    *,
+    resolution: int,
+    seed: int = 0,
+    train_views: int = USUAL_VIEWS["train"],
+    val_views: int = USUAL_VIEWS["val"],
+    test_views: int = USUAL_VIEWS["test"],
+    announce: Callable[[str], None] | None = None,
+) -> Path:
+    """Render a scene of the suite unless its folder is there already.
+
+    The arguments, the folder and the errors are those of `ensure_demo_scene`. There is no video of
+    a fixed camera.
+    """
+    counts = {"train": train_views, "val": val_views, "test": test_views}
+    _require_some(resolution, counts)
+    scene = suite_scene(name)
+    assembly = scene.build(Variation(name, seed))
+    capture = scene.rig.capture(counts, f"{name} {seed}")
+    content = repr((SUITE_VERSION, assembly, scene.rig))
+    record = {
+        "version": SUITE_VERSION,
+        "scene": name,
+        "seed": seed,
+        "resolution": resolution,
+        "views": counts,
+        "content": hashlib.sha256(content.encode()).hexdigest(),
+    }
+    return _ensure(
+        Path(root) / _folder_name(name, resolution, seed, counts),
+        f"suite scene {name}",
+        assembly,
+        capture,
+        record,
+        announce or print,
+    )
+
+
+def _require_some(resolution: int, counts: dict[str, int]) -> None:
+    for key, value in {
+        "resolution": resolution,
+        **{f"{k}_views": v for k, v in counts.items()},
+    }.items():
+        if value < 1:
+            raise ValueError(f"{key} is {value}; it must be at least 1")
+
+
+def _ensure(
+    folder: Path,
+    title: str,
+    assembly: Assembly,
+    capture: Capture,
+    record: dict[str, Any],
+    announce: Callable[[str], None],
+) -> Path:
+    """Render a scene to a folder, unless the folder is what the record says."""
+    if _holds(folder, record):
+        return folder
+    total, resolution = sum(record["views"].values()), record["resolution"]
+    announce(f"Rendering {title} ({total} images of {resolution} px) to {folder}")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    _clear_unfinished(folder)
+    fresh = _sibling(folder)
+    try:
+        with _one_thread():
+            for split in capture.shots:
+                _write_split(fresh, split, capture, assembly, resolution)
+        (fresh / RECORD).write_text(json.dumps(record, indent=2) + "\n")
+        _publish(fresh, folder, record)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+    return folder
+
+
+def _demo_capture(name: str, seed: int, counts: dict[str, int]) -> Capture:
+    """Times and cameras of a demo scene; each split draws from its own stream."""
+    shots = {}
+    for split, count in counts.items():
+        draw = random.Random(f"{split} {seed}")
+        cameras = hemisphere_cameras(count, draw)
+        times = even_times(count) if split == "train" else held_out_times(count, draw)
+        shots[split] = list(zip(times, cameras, strict=True))
+    camera = camera_at(demo_scene(name).azimuth, 0.0)
+    shots["video"] = [(time, camera) for time in even_times(VIDEO_FRAMES)]
+    return Capture(shots)
+
+
+def _write_split(
+    folder: Path, split: str, capture: Capture, assembly: Assembly, resolution: int
+) -> None:
+    (folder / split).mkdir()
+    frames = []
+    for number, (time, camera) in enumerate(capture.shots[split]):
+        file = f"./{split}/r_{number:03d}"
+        picture = render_image(
+            assembly.pose(time), camera, resolution, capture.samples, capture.angle_x
+        )
+        Image.fromarray(picture).save(folder / f"{file}.png", compress_level=6)
+        frames.append({"file_path": file, "time": time, "transform_matrix": camera.tolist()})
+    index = {"camera_angle_x": capture.angle_x, "frames": frames}
+    (folder / f"transforms_{split}.json").write_text(json.dumps(index, indent=1) + "\n")
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Keep PyTorch to one thread: to share out these many small operations costs more."""
+    with _RENDERING, threads(1):
+        yield
 
 
 def _folder_name(name: str, resolution: int, seed: int, counts: dict[str, int]) -> str:
@@ -216,7 +266,7 @@ def _publish(fresh: Path, folder: Path, record: dict[str, Any]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoSettings(SceneSettings):
+class ProceduralSettings(SceneSettings, ABC):
     """A procedural scene, rendered on first use."""
 
     seed: Steps  # Seed of colours, motion phases and cameras.
@@ -224,9 +274,11 @@ class DemoSettings(SceneSettings):
     test_views: Count  # Test views, at other timesteps than the training views.
     val_views: Count  # Validation views.
 
+    ensure: ClassVar[Callable[..., Path]]
+
     @property
     def folder(self) -> Path:
-        return ensure_demo_scene(
+        return type(self).ensure(
             Path(self.root),
             self.scene,
             resolution=self.resolution or 128,
@@ -253,3 +305,17 @@ class DemoSettings(SceneSettings):
             raise SceneError(
                 f"{problem} This is a demo scene: delete {folder} to render it again"
             ) from problem
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoSettings(ProceduralSettings):
+    """A procedural scene, rendered on first use."""
+
+    ensure = staticmethod(ensure_demo_scene)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteSettings(ProceduralSettings):
+    """A scene of the suite, rendered on first use."""
+
+    ensure = staticmethod(ensure_suite_scene)

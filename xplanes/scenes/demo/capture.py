@@ -1,0 +1,131 @@
+"""When a scene's pictures are taken, and where the cameras stand."""
+
+import math
+import random
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from xplanes.scenes.cameras import camera_around
+from xplanes.scenes.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE
+
+Shot = tuple[float, Tensor]
+"""Time and camera pose [4, 4] of a picture."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """The pictures of a scene.
+
+    Attributes:
+        shots: Times and cameras of each split.
+        angle_x: Field of view of all cameras, in radians.
+        samples: Rays per pixel and axis.
+    """
+
+    shots: Mapping[str, Sequence[Shot]]
+    angle_x: float = CAMERA_ANGLE_X
+    samples: int = 2
+
+
+def even_times(count: int) -> list[float]:
+    """Times evenly spaced from 0 to 1."""
+    return [i / max(count - 1, 1) for i in range(count)]
+
+
+def held_out_times(count: int, draw: random.Random) -> list[float]:
+    """Times between those of training: one in each share of the whole.
+
+    The first is 0, because readers of D-NeRF's format expect every split to start there.
+    """
+    return [0.0, *((i + draw.random()) / count for i in range(1, count))]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The cameras of a scene: all of them look at one point from one distance.
+
+    Attributes:
+        distance: Distance of the cameras from the target.
+        target: Point in the middle of every picture.
+        azimuths: First and last direction in degrees, from +x towards +y.
+        elevations: Lowest and highest angle above the horizontal plane, in degrees.
+        fixed: Number of cameras that training views come from, in turns; None gives each training
+            view a camera of its own. Validation and test views look from between them.
+        end: Time of the last training view.
+        angle_x: Field of view in radians.
+        samples: Rays per pixel and axis.
+    """
+
+    distance: float = CAMERA_DISTANCE
+    target: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    azimuths: tuple[float, float] = (0.0, 360.0)
+    elevations: tuple[float, float] = (1.0, 78.0)
+    fixed: int | None = None
+    end: float = 1.0
+    angle_x: float = CAMERA_ANGLE_X
+    samples: int = 2
+
+    def capture(self, counts: Mapping[str, int], seed: str) -> Capture:
+        """Times and cameras of some numbers of views.
+
+        Args:
+            counts: Views of each split; ``train`` has even times, others lie between them.
+            seed: What the cameras are drawn from; every split has a stream of its own.
+        """
+        shots = {}
+        for split, count in counts.items():
+            draw = random.Random(f"{seed} {split}")
+            training = split == "train"
+            if self.fixed is not None:
+                places = self._fixed(self.fixed, random.Random(f"{seed} fixed"))
+                places = (
+                    [places[i % self.fixed] for i in range(count)]
+                    if training
+                    else [self._between(places, draw) for _ in range(count)]
+                )
+            else:
+                places = [self._anywhere(draw) for _ in range(count)]
+            times = even_times(count) if training else held_out_times(count, draw)
+            shots[split] = [
+                (time * self.end, self._camera(*place))
+                for time, place in zip(times, places, strict=True)
+            ]
+        return Capture(shots, self.angle_x, self.samples)
+
+    def _camera(self, azimuth: float, elevation: float) -> Tensor:
+        target = torch.tensor(self.target, dtype=torch.float64)
+        return camera_around(azimuth, elevation, self.distance, target)
+
+    def _anywhere(self, draw: random.Random) -> tuple[float, float]:
+        """Azimuth and elevation, evenly over the part of the sphere."""
+        low, high = (math.sin(math.radians(angle)) for angle in self.elevations)
+        return draw.uniform(*self.azimuths), math.degrees(math.asin(draw.uniform(low, high)))
+
+    def _fixed(self, count: int, draw: random.Random) -> list[tuple[float, float]]:
+        """Evenly spaced azimuths; elevations are low and high by turns."""
+        start, stop = self.azimuths
+        low, high = self.elevations
+        step = (stop - start) / count
+        return [
+            (
+                start + step * (i + 0.5 + draw.uniform(-0.15, 0.15)),
+                low + (high - low) * (draw.uniform(0.0, 0.4) + 0.6 * (i % 2)),
+            )
+            for i in range(count)
+        ]
+
+    def _between(
+        self, places: Sequence[tuple[float, float]], draw: random.Random
+    ) -> tuple[float, float]:
+        """Somewhere between two neighbours."""
+        first = draw.randrange(
+            len(places) if self.azimuths[1] - self.azimuths[0] >= 360 else len(places) - 1
+        )
+        (left, low), (right, high) = places[first], places[(first + 1) % len(places)]
+        if right < left:
+            right += 360
+        share = draw.uniform(0.25, 0.75)
+        return left + share * (right - left), low + share * (high - low)

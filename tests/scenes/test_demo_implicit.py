@@ -148,7 +148,8 @@ def test_a_scale_joint_scales_all_that_it_carries():
         assert torch.allclose(low, 2.5 * high)
     near, far = camera_at(30, 20), camera_at(30, 20)
     far[:3, 3] *= 2.5
-    difference = render_image(plain, near, 48).astype(int) - render_image(scaled, far, 48).astype(int)
+    images = (render_image(plain, near, 48), render_image(scaled, far, 48))
+    difference = images[0].astype(int) - images[1].astype(int)
     assert (abs(difference).max(axis=-1) > 2).mean() < 0.005
 
 

@@ -28,8 +28,8 @@ class Joint:
         parent: Joint that carries it; must come earlier in the assembly.
         position: Its origin in the parent's frame.
         rotation: Angles about the parent's x, y and z, applied in this order, in degrees.
-        kind: A hinge turns about ``axis`` by degrees, a slide moves along it by lengths, and a
-            scale multiplies the size of all that the joint carries.
+        kind: A hinge rotates about ``axis`` (degrees), a slide translates along it (world units), a
+            scale multiplies the size of everything that the joint carries.
         axis: Axis in the joint's own frame; any length.
         motion: State of the joint over time; required unless it is fixed.
     """
@@ -85,7 +85,7 @@ class Assembly:
     def placed(
         self, position: Vector, rotation: Vector = (0.0, 0.0, 0.0), scale: float = 1.0
     ) -> "Assembly":
-        """The whole assembly moved and scaled as one (position and angles as of a joint)."""
+        """The whole assembly, moved and scaled (position and angles as for a joint)."""
         site = Joint("site", WORLD, position, rotation)
         if scale != 1:
             site = replace(site, kind="scale", motion=Steady(scale, 0.0))

@@ -1,4 +1,4 @@
-"""When a scene's pictures are taken, and where the cameras stand."""
+"""Cameras and times of the views of a procedural scene."""
 
 import math
 import random
@@ -12,12 +12,12 @@ from xplanes.scenes.cameras import camera_around
 from xplanes.scenes.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE
 
 Shot = tuple[float, Tensor]
-"""Time and camera pose [4, 4] of a picture."""
+"""Time and camera-to-world matrix [4, 4] of a view."""
 
 
 @dataclass(frozen=True)
 class Capture:
-    """The pictures of a scene.
+    """The views of a scene.
 
     Attributes:
         shots: Times and cameras of each split.
@@ -36,24 +36,24 @@ def even_times(count: int) -> list[float]:
 
 
 def held_out_times(count: int, draw: random.Random) -> list[float]:
-    """Times between those of training: one in each share of the whole.
+    """Stratified random times in [0, 1].
 
-    The first is 0, because readers of D-NeRF's format expect every split to start there.
+    The first is 0, because readers of D-NeRF's format expect every split to begin there.
     """
     return [0.0, *((i + draw.random()) / count for i in range(1, count))]
 
 
 @dataclass(frozen=True)
 class Rig:
-    """The cameras of a scene: all of them look at one point from one distance.
+    """The cameras of a scene, which look at one point from one distance.
 
     Attributes:
         distance: Distance of the cameras from the target.
-        target: Point in the middle of every picture.
-        azimuths: First and last direction in degrees, from +x towards +y.
-        elevations: Lowest and highest angle above the horizontal plane, in degrees.
-        fixed: Number of cameras that training views come from, in turns; None gives each training
-            view a camera of its own. Validation and test views look from between them.
+        target: Point that all cameras look at.
+        azimuths: Range of azimuths in degrees, from +x towards +y.
+        elevations: Range of elevations in degrees.
+        fixed: Number of fixed training cameras, used in turn; None draws a camera for each view.
+            Validation and test cameras lie between the fixed ones.
         end: Time of the last training view.
         angle_x: Field of view in radians.
         samples: Rays per pixel and axis.
@@ -69,11 +69,11 @@ class Rig:
     samples: int = 2
 
     def capture(self, counts: Mapping[str, int], seed: str) -> Capture:
-        """Times and cameras of some numbers of views.
+        """Draw times and cameras.
 
         Args:
-            counts: Views of each split; ``train`` has even times, others lie between them.
-            seed: What the cameras are drawn from; every split has a stream of its own.
+            counts: Number of views per split; times of ``train`` are evenly spaced.
+            seed: Seed; each split has its own random stream.
         """
         shots = {}
         for split, count in counts.items():
@@ -100,12 +100,12 @@ class Rig:
         return camera_around(azimuth, elevation, self.distance, target)
 
     def _anywhere(self, draw: random.Random) -> tuple[float, float]:
-        """Azimuth and elevation, evenly over the part of the sphere."""
+        """Azimuth and elevation, uniformly distributed over the region of the sphere."""
         low, high = (math.sin(math.radians(angle)) for angle in self.elevations)
         return draw.uniform(*self.azimuths), math.degrees(math.asin(draw.uniform(low, high)))
 
     def _fixed(self, count: int, draw: random.Random) -> list[tuple[float, float]]:
-        """Evenly spaced azimuths; elevations are low and high by turns."""
+        """Azimuths with even spacing and some jitter; low and high elevations alternate."""
         start, stop = self.azimuths
         low, high = self.elevations
         step = (stop - start) / count
@@ -120,7 +120,7 @@ class Rig:
     def _between(
         self, places: Sequence[tuple[float, float]], draw: random.Random
     ) -> tuple[float, float]:
-        """Somewhere between two neighbours."""
+        """Azimuth and elevation between two neighbouring cameras."""
         first = draw.randrange(
             len(places) if self.azimuths[1] - self.azimuths[0] >= 360 else len(places) - 1
         )

@@ -16,7 +16,7 @@ class Primitive(ABC):
     """A closed solid; ``inside`` is strict, the surface itself is outside."""
 
     quick: ClassVar[bool] = True
-    """Whether a hit takes a few operations, so that few rays at a time are fastest."""
+    """Whether `hit` needs few operations, so that small chunks of rays are fastest."""
 
     @property
     @abstractmethod
@@ -49,11 +49,11 @@ class Primitive(ABC):
         """Distance to the surface, negative inside. [N]"""
 
     def at(self, time: float) -> Self:
-        """The shape at ``time``; itself, unless it deforms."""
+        """The shape at ``time``; a rigid shape returns itself."""
         return self
 
     def material(self, points: Tensor) -> Tensor:
-        """Where points of the shape lie before it deforms, so that patterns stick to it. [N, 3]"""
+        """Undeformed positions of points, at which surfaces are evaluated. [N, 3]"""
         return points
 
     def inside(self, points: Tensor) -> Tensor:
@@ -270,10 +270,10 @@ class Surface(ABC):
     """A colour for every point of a part."""
 
     lit: ClassVar[bool] = True
-    """Whether the light of the scene shades it."""
+    """Whether the light shades it."""
 
     def at(self, time: float) -> Self:
-        """The surface at ``time``; itself, unless it changes."""
+        """The surface at ``time``; a constant surface returns itself."""
         return self
 
     @abstractmethod
@@ -382,7 +382,7 @@ class Bricks(Surface):
 
 @dataclass(frozen=True)
 class Unlit(Surface):
-    """A surface that shows its colours as painted, whatever the light."""
+    """A surface that no light shades."""
 
     base: Surface
     lit: ClassVar[bool] = False
@@ -396,12 +396,12 @@ class Unlit(Surface):
 
 @dataclass(frozen=True)
 class Translucent(Surface):
-    """A thin shell and a filling that let some of the light through.
+    """A thin semi-transparent shell around a homogeneous absorbing medium.
 
     Attributes:
-        base: Colours of both.
-        shell: Opacity of the shell seen head-on; it rises towards the outline.
-        density: Absorption of the filling per unit length.
+        base: Colours of shell and medium.
+        shell: Opacity of the shell at normal incidence.
+        density: Density of the medium, per unit length.
     """
 
     base: Surface
@@ -415,12 +415,12 @@ class Translucent(Surface):
         return self.base.colour(points)
 
     def opacity(self, cosine: Tensor) -> Tensor:
-        """Opacity of the shell under an angle to its normal. [N]"""
+        """Opacity of the shell, given cosines of the angle to the normal. [N]"""
         return 1 - (1 - self.shell) ** (1 / cosine.abs().clamp_min(0.12))
 
 
-# Patterns are read a little below the surface: a face that lies exactly on the border between
-# two cells would otherwise take the colour of either at random.
+# Patterns are evaluated slightly below the surface: rounding would otherwise choose the colour of a
+# face that lies exactly on the border between two cells.
 _INWARD = 0.998
 
 

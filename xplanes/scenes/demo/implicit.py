@@ -1,4 +1,4 @@
-"""Solids that deform, hit by rays that march along a bound of the distance."""
+"""Deformable solids as implicit functions, intersected by sphere tracing."""
 
 import math
 from abc import abstractmethod
@@ -13,24 +13,24 @@ from xplanes.scenes.demo.geometry import MISS, Box, Colour, Primitive, Surface
 from xplanes.scenes.demo.motions import Motion
 
 STEPS = 48
-"""Steps by the bound of the distance; rays that graze the surface need more."""
+"""Steps of sphere tracing; grazing rays need more."""
 
 SAMPLES = 256
-"""Evenly spaced places at which the rest of such a ray is searched."""
+"""Even samples along the rest of a grazing ray."""
 
 HALVINGS = 10
-"""Halvings of the space between two of them."""
+"""Bisections between two of these samples."""
 
 NEAR = 5e-5
-"""A ray has arrived where the bound of the distance is below this."""
+"""Distance bound below which a ray hits."""
 
 
 @dataclass(frozen=True)
 class Implicit(Primitive):
-    """A solid where a function of position and time is negative.
+    """A solid in which a function of position and time is negative.
 
     Attributes:
-        time: When it is looked at.
+        time: Timestep of the shape, in [0, 1].
     """
 
     quick: ClassVar[bool] = False
@@ -42,7 +42,7 @@ class Implicit(Primitive):
 
     @abstractmethod
     def value(self, points: Tensor) -> Tensor:
-        """Negative inside, zero on the surface, and outside at most the distance to it. [N]"""
+        """Negative inside; outside, positive and at most the distance to the surface. [N]"""
 
     @property
     def radius_around(self) -> float:
@@ -56,20 +56,20 @@ class Implicit(Primitive):
         leaves = torch.full_like(travelled, MISS)
         rays = travelled.isfinite().nonzero()[:, 0]
         starts = origins[rays] + travelled[rays, None] * directions[rays]
-        # From a little way in, the box is left where the ray next meets it.
+        # From slightly inside, the next hit of the box is its exit.
         step = 1e-4 * directions[rays]
         leaves[rays] = travelled[rays] + Box(half).hit(starts + step, directions[rays]) + 1e-4
         distance = torch.full_like(travelled, MISS)
         origins, directions = origins[rays], directions[rays]
         travelled, leaves = travelled[rays], leaves[rays]
-        # From inside a ray marches until it is outside.
+        # A ray that starts inside hits where it leaves.
         sign = self.value(starts).sign()
         active = travelled < leaves
         for _ in range(STEPS):
             remaining = int(active.sum())
             if remaining == 0:
                 break
-            # To leave out rays costs more than a few steps of rays that are done.
+            # Compaction costs more than a few steps of finished rays.
             if remaining < 0.7 * len(rays):
                 rays, origins, directions, travelled, leaves, sign = (
                     kept[active] for kept in (rays, origins, directions, travelled, leaves, sign)
@@ -116,20 +116,20 @@ class Implicit(Primitive):
         return normalize(gradient, dim=-1)
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Sign and zero are exact, elsewhere the bound of the distance. [N]"""
+        """A lower bound of the distance; the sign is exact. [N]"""
         return self.value(points)
 
 
 @dataclass(frozen=True)
 class Drop:
-    """A ball whose centre and radius move.
+    """A ball with a moving centre and a changing radius.
 
     Attributes:
-        centre: Its middle.
-        radius: Its radius.
-        x: Way along x over time, and likewise y and z; None stands still.
-        y: Way along y.
-        z: Way along z.
+        centre: Centre at rest.
+        radius: Radius at rest.
+        x: Offset along x over time; None for none. Likewise y and z.
+        y: Offset along y.
+        z: Offset along z.
         size: Factor of the radius over time.
     """
 
@@ -141,7 +141,7 @@ class Drop:
     size: Motion | None = None
 
     def at(self, time: float) -> tuple[float, float, float, float]:
-        """Centre and radius at a time."""
+        """Centre and radius at ``time``."""
         ways = (0.0 if way is None else way.at(time) for way in (self.x, self.y, self.z))
         x, y, z = (place + way for place, way in zip(self.centre, ways, strict=True))
         return x, y, z, self.radius * (1.0 if self.size is None else self.size.at(time))
@@ -149,12 +149,12 @@ class Drop:
 
 @dataclass(frozen=True, kw_only=True)
 class Fluid(Implicit):
-    """Balls that merge where they come near each other, and part again.
+    """Metaballs: a smooth union of balls, which merge and separate.
 
     Attributes:
         drops: The balls.
-        blend: Width over which they merge.
-        half: Half sides of a box that holds them at all times.
+        blend: Width of the smooth transition.
+        half: Half sides of a box that contains the balls at all times.
     """
 
     drops: tuple[Drop, ...]
@@ -169,12 +169,12 @@ class Fluid(Implicit):
         return -self.blend * (-self._gaps(points) / self.blend).logsumexp(dim=-1)
 
     def shares(self, points: Tensor) -> Tensor:
-        """How much each ball counts at some points. [N, drops]"""
+        """Weight of each ball at points. [N, drops]"""
         return (-self._gaps(points) / self.blend).softmax(dim=-1)
 
     def _gaps(self, points: Tensor) -> Tensor:
         balls = points.new_tensor([drop.at(self.time) for drop in self.drops])
-        # Sums of products instead of a [N, drops, 3] tensor of differences.
+        # Expanded squares need no [N, drops, 3] tensor of differences.
         squares = (
             points.square().sum(dim=-1, keepdim=True)
             - 2 * points @ balls[:, :3].T
@@ -185,7 +185,7 @@ class Fluid(Implicit):
 
 @dataclass(frozen=True)
 class Blend(Surface):
-    """The colours of a fluid's balls, which mix where these merge."""
+    """The colours of metaballs, mixed by their weights."""
 
     fluid: Fluid
     paints: tuple[Colour, ...]
@@ -226,7 +226,7 @@ class Twisted(Implicit):
         inner = points.new_tensor([side - self.rounding for side in self.half])
         out = self.material(points).abs() - inner
         gap = out.clamp_min(0).norm(dim=-1) + out.amax(dim=-1).clamp_max(0) - self.rounding
-        # The corners of the box around it lie furthest from the axis.
+        # The corners of the bounding box have the largest distance to the axis.
         return gap / _shear(abs(self._rate()) * math.sqrt(2) * math.hypot(*self.half[:2]))
 
     def _rate(self) -> float:
@@ -235,11 +235,11 @@ class Twisted(Implicit):
 
 @dataclass(frozen=True, kw_only=True)
 class Bent(Implicit):
-    """A round stalk that stands on the origin along z and bends in the xz plane as a whole.
+    """A round stalk from the origin along z, bent to a circular arc in the xz plane.
 
     Attributes:
-        length: Length of its axis, which bending keeps.
-        radius: Radius at the foot.
+        length: Length of its axis, which bending preserves.
+        radius: Radius at the origin.
         tip: Radius at the other end.
         bend: Degrees by which the other end is turned towards x, over time; less than 360.
     """
@@ -264,30 +264,30 @@ class Bent(Implicit):
         radius = self.radius + (self.tip - self.radius) * along / self.length
         away = torch.stack([straight[:, 0], straight[:, 1], straight[:, 2] - along], dim=-1)
         gap = away.norm(dim=-1) - radius
-        # The other end may be thicker, and nearer for that.
+        # The other end may be nearer if it is thicker.
         angle = self._angle()
         reach = self.length / angle
         top = points.new_tensor([reach * (1 - math.cos(angle)), 0.0, reach * math.sin(angle)])
         gap = torch.minimum(gap, points.norm(dim=-1) - self.radius)
         gap = torch.minimum(gap, (points - top).norm(dim=-1) - self.tip)
-        # Nearer to the middle of the arc a step leads further along it.
+        # Arc length changes faster near the centre of the circle.
         centre, thick = abs(reach), max(self.radius, self.tip)
         nearest = torch.hypot(points[:, 0] - reach, points[:, 2]).clamp_max(centre - thick)
         taper = (self.tip - self.radius) / self.length * centre / nearest.clamp_min(0.05 * centre)
         return gap / torch.hypot(torch.ones_like(taper), taper)
 
     def _angle(self) -> float:
-        # A straight stalk is an arc of a circle too large for single precision.
+        # float32 cannot represent the circle of an almost straight stalk.
         angle = math.radians(self.bend.at(self.time))
         return math.copysign(max(abs(angle), 0.01), angle)
 
     def _straight(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Points before the stalk bends, and where along it the nearest lies. [N, 3], [N]"""
+        """Undeformed points, and arc length of the nearest point on the axis. [N, 3], [N]"""
         angle = self._angle()
         centre, sign = self.length / angle, math.copysign(1.0, angle)
         x, y, z = points.unbind(dim=-1)
         turn = sign * torch.atan2(sign * z, sign * (centre - x))
-        # Angles jump on the far side, as far from one end as from the other.
+        # The angle wraps where both ends are equally far.
         jump = 0.5 * abs(angle) - math.pi
         turn = sign * torch.where(turn < jump, turn + 2 * math.pi, turn)
         along = (turn * centre).clamp(0, self.length)
@@ -301,13 +301,13 @@ class Bent(Implicit):
 
 @dataclass(frozen=True, kw_only=True)
 class Waving(Implicit):
-    """A sheet in the xz plane through which waves run along x, and which is held at x = -half.
+    """A sheet in the xz plane with waves that travel along x; fixed at its left edge.
 
     Attributes:
-        half: Half its length along x, half its thickness, half its height.
-        reach: How far the free end swings along y.
-        waves: Waves in its length.
-        phase: Turns of the wave over time.
+        half: Half sides: length, thickness, height.
+        reach: Amplitude along y at the free edge.
+        waves: Number of waves over its length.
+        phase: Phase of the wave in cycles, over time.
     """
 
     half: tuple[float, float, float]
@@ -335,15 +335,15 @@ class Waving(Implicit):
 
 @dataclass(frozen=True, kw_only=True)
 class Lobed(Implicit):
-    """A ball with lobes around z that swell and shrink.
+    """A ball with lobes around z whose height changes; stretching preserves the volume.
 
     Attributes:
         radius: Radius of the ball.
         lobes: Number of lobes around z.
-        swell: Height of the lobes in radii, over time.
-        most: The most of it, either way.
-        stretch: Factor of its height over time; the girth makes up for it.
-        tallest: The largest and smallest of these factors, smallest first.
+        swell: Height of the lobes over time, in radii.
+        most: Maximum absolute value of ``swell``.
+        stretch: Factor of the extent along z over time.
+        tallest: Minimum and maximum of ``stretch``.
     """
 
     radius: float
@@ -373,11 +373,11 @@ class Lobed(Implicit):
         lobes = sine.square() * (self.lobes * torch.atan2(y, x)).cos()
         swell = self.swell.at(self.time)
         gap = length - self.radius * (1 + swell * lobes)
-        # Near the middle the lobes come closer than the bound knows; it lies deep inside.
+        # The bound may fail near the centre, which lies deep inside.
         slope = math.hypot(1.0, abs(swell) * (self.lobes + 2) / (1 - abs(swell)))
         return gap / (slope * max(math.sqrt(height), 1 / height))
 
 
 def _shear(slope: float) -> float:
-    """How much a shear stretches distances at most."""
+    """Largest singular value of a shear."""
     return 0.5 * slope + math.hypot(1.0, 0.5 * slope)

@@ -11,7 +11,7 @@ from xplanes.scenes.demo.geometry import MISS, Box, Primitive, Surface, Transluc
 from xplanes.scenes.demo.shading import Light
 
 MAX_SURFACES = 24
-"""Surfaces that a ray passes through at most."""
+"""Maximum number of surfaces that a ray passes through."""
 
 CHUNK = 16384
 """Rays per chunk, so that temporaries fit in the cache."""
@@ -26,7 +26,7 @@ class PosedPart:
         surface: Its colours.
         rotation: From part to world coordinates. [3, 3]
         translation: The part's centre in the world. [3]
-        scale: World units per unit of the part's coordinates.
+        scale: World units per unit of part coordinates.
     """
 
     shape: Primitive
@@ -36,21 +36,21 @@ class PosedPart:
     scale: float = 1.0
 
     def to_own(self, points: Tensor) -> Tensor:
-        """World positions in the part's coordinates. [N, 3]"""
+        """World points in the part's coordinates. [N, 3]"""
         return (points - self.translation.to(points)) @ self.rotation.to(points) / self.scale
 
     def hit(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """Distance along each ray to the part, inf where missed. [N]"""
+        """Distance along each ray to the part, inf for a miss. [N]"""
         own = directions @ self.rotation.to(directions)
         return self.shape.hit(self.to_own(origins), own) * self.scale
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Distance of world positions to the part, negative inside. [N]"""
+        """Distance of world points to the part, negative inside. [N]"""
         return self.shape.signed_distance(self.to_own(points)) * self.scale
 
     @property
     def radius_around(self) -> float:
-        """Radius of the smallest ball around the part's centre that holds it."""
+        """Radius of the bounding sphere around the part's centre."""
         return self.shape.radius_around * self.scale
 
     def inside(self, points: Tensor) -> Tensor:
@@ -58,7 +58,7 @@ class PosedPart:
         return self.shape.inside(self.to_own(points))
 
     def colour(self, points: Tensor) -> Tensor:
-        """Colours of the part at world positions, without light. [N, 3]"""
+        """Unlit colours of the part at world points. [N, 3]"""
         return self.surface.colour(self.shape.material(self.to_own(points)))
 
 
@@ -125,16 +125,14 @@ class Posed:
         return hits
 
     def render(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """What each ray sees through all that is translucent.
-
-        Shells and fillings are composited as a radiance field does it, by emission and absorption.
+        """Composite all surfaces and media along each ray, from front to back.
 
         Args:
-            origins: Where the rays start, outside of all parts. [N, 3]
+            origins: Ray origins, outside all parts. [N, 3]
             directions: Unit directions. [N, 3]
 
         Returns:
-            Colour times opacity, and opacity. [N, 4]
+            Premultiplied colour and opacity. [N, 4]
         """
         if not any(isinstance(part.surface, Translucent) for part in self.parts):
             hits = self.cast(origins, directions)
@@ -152,12 +150,12 @@ class Posed:
                 break
             hits = Hits(*(value[found] for value in hits))
             for layer in (
-                self._filling(origins, directions, hits.distance),
-                self._crossing(directions, hits),
+                self._media(origins, directions, hits.distance),
+                self._surfaces(directions, hits),
             ):
                 rgba[rays] += through[:, None] * layer
                 through = through * (1 - layer[:, 3])
-            # On from just beyond the surface.
+            # Continue just beyond the surface.
             origins = origins + (hits.distance + 1e-4)[:, None] * directions
             seen = through > 1 / 512
             rays, origins, directions, through = (
@@ -165,8 +163,8 @@ class Posed:
             )
         return rgba
 
-    def _filling(self, origins: Tensor, directions: Tensor, distance: Tensor) -> Tensor:
-        """Emission and opacity of what fills the way to the next surface. [N, 4]"""
+    def _media(self, origins: Tensor, directions: Tensor, distance: Tensor) -> Tensor:
+        """Premultiplied colour and opacity of the media before the next surface. [N, 4]"""
         middle = origins + 0.5 * distance[:, None] * directions
         density, glow = torch.zeros_like(distance), torch.zeros_like(directions)
         for part in self.parts:
@@ -179,8 +177,8 @@ class Posed:
         colour = glow / density.clamp_min(1e-9)[:, None]
         return torch.cat([opacity[:, None] * colour, opacity[:, None]], dim=-1)
 
-    def _crossing(self, directions: Tensor, hits: Hits) -> Tensor:
-        """Emission and opacity of surfaces that are hit. [N, 4]"""
+    def _surfaces(self, directions: Tensor, hits: Hits) -> Tensor:
+        """Premultiplied colour and opacity of the surfaces at hits. [N, 4]"""
         opacity = torch.ones_like(hits.distance)
         cosine = (directions * hits.normal).sum(dim=-1)
         for number, part in enumerate(self.parts):
@@ -207,7 +205,7 @@ class Posed:
         return result
 
     def signed_distance(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Distance to the nearest part, negative inside, and that part's number. [N], [N]"""
+        """Signed distance to the nearest part, and that part's index. [N], [N]"""
         gaps = torch.stack([p.signed_distance(points) for p in self.parts])
         distance, part = gaps.min(dim=0)
         return distance, part
@@ -281,13 +279,13 @@ class Posed:
         return Hits(distance, normal, colour, part)
 
     def _shadowed(self, points: Tensor, normals: Tensor, part: Tensor) -> Tensor | None:
-        """Which surface points of parts [N] have a part between them and the sun. bool [N]"""
+        """Whether surface points of parts [N] lie in shadow. bool [N]"""
         if self.light is None or not self.light.shadow:
             return None
         sun = self.light.direction(points)
         # Faces that point away from the sun need no shadow ray.
         lit = (normals @ sun > 0).nonzero()[:, 0]
-        # Smaller things cast their shadows from closer by.
+        # The offset scales with the part, so that small parts cast correct shadows.
         gap = 1e-3 * points.new_tensor([posed.scale for posed in self.parts])[part[lit]]
         starts = points[lit] + gap[:, None] * normals[lit]
         shadowed = torch.zeros(len(points), dtype=torch.bool, device=points.device)

@@ -24,7 +24,7 @@ def render_image(
     samples: int = 2,
     angle_x: float = CAMERA_ANGLE_X,
 ) -> NDArray:
-    """Render one picture.
+    """Render one image.
 
     Args:
         posed: The assembly at one timestep.

@@ -115,10 +115,9 @@ def ensure_suite_scene(
     test_views: int = USUAL_VIEWS["test"],
     announce: Callable[[str], None] | None = None,
 ) -> Path:
-    """Render a scene of the suite unless its folder is there already.
+    """Render a scene of the suite unless its folder exists already.
 
-    The arguments, the folder and the errors are those of `ensure_demo_scene`. There is no video of
-    a fixed camera.
+    Arguments, folder and errors are those of `ensure_demo_scene`. There is no fixed-view video.
     """
     counts = {"train": train_views, "val": val_views, "test": test_views}
     _require_some(resolution, counts)
@@ -161,7 +160,7 @@ def _ensure(
     record: dict[str, Any],
     announce: Callable[[str], None],
 ) -> Path:
-    """Render a scene to a folder, unless the folder is what the record says."""
+    """Render a scene to a folder unless the folder matches the record."""
     if _holds(folder, record):
         return folder
     total, resolution = sum(record["views"].values()), record["resolution"]
@@ -181,7 +180,7 @@ def _ensure(
 
 
 def _demo_capture(name: str, seed: int, counts: dict[str, int]) -> Capture:
-    """Times and cameras of a demo scene; each split draws from its own stream."""
+    """Times and cameras of a demo scene; each split has its own random stream."""
     shots = {}
     for split, count in counts.items():
         draw = random.Random(f"{split} {seed}")
@@ -200,10 +199,9 @@ def _write_split(
     frames = []
     for number, (time, camera) in enumerate(capture.shots[split]):
         file = f"./{split}/r_{number:03d}"
-        picture = render_image(
-            assembly.pose(time), camera, resolution, capture.samples, capture.angle_x
-        )
-        Image.fromarray(picture).save(folder / f"{file}.png", compress_level=6)
+        posed = assembly.pose(time)
+        image = render_image(posed, camera, resolution, capture.samples, capture.angle_x)
+        Image.fromarray(image).save(folder / f"{file}.png", compress_level=6)
         frames.append({"file_path": file, "time": time, "transform_matrix": camera.tolist()})
     index = {"camera_angle_x": capture.angle_x, "frames": frames}
     (folder / f"transforms_{split}.json").write_text(json.dumps(index, indent=1) + "\n")
@@ -211,7 +209,7 @@ def _write_split(
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Keep PyTorch to one thread: to share out these many small operations costs more."""
+    """Limit PyTorch to one thread: parallelising many small operations costs more than it gains."""
     with _RENDERING, threads(1):
         yield
 

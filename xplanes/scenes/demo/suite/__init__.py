@@ -1,7 +1,7 @@
-"""A suite of scenes, as unlike each other as what people capture: to tune on and to test on.
+"""A suite of procedural scenes for tuning and testing settings.
 
-Every kind of scene exists twice, with other shapes, motions, colours and cameras: ``KIND`` is for
-tuning, ``KIND_test`` for testing what was tuned.
+Each kind has two scenes with different shapes, motions, colours and cameras: ``KIND`` for tuning
+and ``KIND_test`` for testing.
 """
 
 import difflib
@@ -23,7 +23,7 @@ class SuiteScene:
     """A scene of the suite.
 
     Attributes:
-        build: Makes the scene in the colours of a variation.
+        build: Builds the assembly with the colours of a variation.
         rig: Its cameras and times.
     """
 
@@ -36,7 +36,7 @@ SUITE_SCENES: dict[str, SuiteScene] = {
         materials.white_floor, Rig(distance=10.4, elevations=(22.0, 44.0), fixed=12)
     ),
     "white_floor_test": SuiteScene(
-        materials.white_floor_test, Rig(distance=10.5, elevations=(22.0, 48.0), fixed=12)
+        materials.white_floor_test, Rig(distance=10.5, elevations=(27.0, 50.0), fixed=12)
     ),
     "dark": SuiteScene(materials.dark),
     "dark_test": SuiteScene(materials.dark_test),
@@ -75,10 +75,10 @@ SUITE_SCENES: dict[str, SuiteScene] = {
     "static": SuiteScene(shapes.static),
     "static_test": SuiteScene(shapes.static_test),
 }
-"""The scenes by name, each kind followed by its test scene."""
+"""Scenes by name; the test scene of a kind follows its tuning scene."""
 
 KINDS = tuple(name for name in SUITE_SCENES if not name.endswith("_test"))
-"""What the kinds are called: the names of the scenes to tune on."""
+"""Names of the kinds, which are the names of the tuning scenes."""
 
 
 def suite_scene(name: str) -> SuiteScene:

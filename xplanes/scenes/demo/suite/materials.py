@@ -1,4 +1,4 @@
-"""Scenes that differ in what things are made of and look like."""
+"""Scenes with particular materials and appearance."""
 
 from xplanes.scenes.demo.assembly import Assembly, Joint, Part
 from xplanes.scenes.demo.geometry import (
@@ -21,7 +21,7 @@ from xplanes.scenes.demo.shading import Light
 from xplanes.scenes.demo.suite.pieces import around, ball, chain, moving, numbered, rod
 
 WHITE = Unlit(Plain((1.0, 1.0, 1.0)))
-"""Paper white in every picture: no light and no shadow shows on it."""
+"""Pure white in every view, without shading."""
 
 
 def white_floor(variation: Variation) -> Assembly:
@@ -285,7 +285,7 @@ def wires_test(variation: Variation) -> Assembly:
 
 
 _SOFT = Light(sun=0.4, sky=0.2, ambient=0.5, shadow=0.0)
-"""Without shadows, which glass would cast as if it were opaque."""
+"""A light without shadows, since those of translucent parts would be opaque."""
 
 
 def transparent(variation: Variation) -> Assembly:
@@ -353,10 +353,7 @@ def transparent_test(variation: Variation) -> Assembly:
 
 
 def texture(variation: Variation) -> Assembly:
-    """A cube, a ball, a drum and a wall, all with patterns finer than two hundredths of the scene.
-
-    They turn and rock, so that the patterns move.
-    """
+    """Rotating cube, ball and drum with fine patterns."""
     ink, paper = variation.natural("#20242e"), (0.95, 0.94, 0.9)
     red, blue = variation.paint("#c83a30"), variation.paint("#2a5ab8")
     joints = [
@@ -384,7 +381,7 @@ def texture(variation: Variation) -> Assembly:
 
 
 def texture_test(variation: Variation) -> Assembly:
-    """A spotted fish of fine scales, a striped snake of rings, and a carpet that is carried by."""
+    """A fish with fine scales, striped rings and a flying carpet."""
     sand, stone = variation.natural("#cdb98c"), variation.natural("#8a8578")
     joints = [
         *moving("fish", (0.05, 0.1, 0.15), turn=Steady(30, 220), z=Swing(0, 0.12, 2)),

@@ -1,4 +1,4 @@
-"""Scenes that differ in how things move: fast, hidden by turns, or for a part of the time."""
+"""Scenes with particular motions: fast, occluded, or ending early."""
 
 from xplanes.scenes.demo.assembly import Assembly, Joint, Part
 from xplanes.scenes.demo.geometry import (

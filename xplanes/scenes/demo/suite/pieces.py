@@ -1,4 +1,4 @@
-"""What the scenes of the suite are put together from."""
+"""Helpers to build the scenes of the suite."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -29,19 +29,19 @@ def moving(
     axis: Vector = AXES["z"],
     size: Motion | None = None,
 ) -> list[Joint]:
-    """Joints that slide along x, y and z, then turn, then scale; the last has the name.
+    """A chain of joints that translates, rotates and scales; the last one is called ``name``.
 
     Args:
-        name: Name for the parts to be carried.
-        position: Place from which it slides.
-        rotation: Angles about x, y and z in degrees.
-        parent: Joint that carries all of it.
-        x: Way along x; y and z likewise.
-        y: Way along y.
-        z: Way along z.
-        turn: Degrees about ``axis``.
-        axis: Axis of the turn.
-        size: Factor of the size.
+        name: Name of the last joint.
+        position: Origin in the parent's frame.
+        rotation: Angles about x, y and z, in degrees.
+        parent: Parent joint.
+        x: Translation along x over time; y and z likewise.
+        y: Translation along y.
+        z: Translation along z.
+        turn: Rotation about ``axis`` over time, in degrees.
+        axis: Axis of the rotation.
+        size: Scale factor over time.
     """
     joints: list[Joint] = []
 
@@ -64,11 +64,11 @@ def moving(
 
 
 def rod(start: Vector, stop: Vector, radius: float, surface: Surface, joint: str = WORLD) -> Part:
-    """A rod with round ends between two points."""
+    """A capsule between two points."""
     way = [b - a for a, b in zip(start, stop, strict=True)]
     length = math.hypot(*way)
     x, y, z = ((a + b) / 2 for a, b in zip(start, stop, strict=True))
-    # Tilted about y, then turned about z.
+    # Rotated about y, then about z.
     tilt = math.degrees(math.acos(max(-1.0, min(1.0, way[2] / length))))
     turn = math.degrees(math.atan2(way[1], way[0]))
     return Part(Capsule(radius, length / 2), surface, joint, (x, y, z), (0.0, tilt, turn))
@@ -77,17 +77,17 @@ def rod(start: Vector, stop: Vector, radius: float, surface: Surface, joint: str
 def chain(
     points: Sequence[Vector], radius: float, surface: Surface, joint: str = WORLD
 ) -> list[Part]:
-    """Rods from each point to the next."""
+    """Capsules along a polyline."""
     pairs = zip(points[:-1], points[1:], strict=True)
     return [rod(start, stop, radius, surface, joint) for start, stop in pairs]
 
 
 def around(count: int, radius: float, height: float = 0.0, start: float = 0.0) -> list[Vector]:
-    """Points evenly spaced on a level circle around the z axis, the first at ``start`` degrees."""
+    """Points with even spacing on a horizontal circle around z, from ``start`` degrees on."""
     angles = [math.radians(start) + 2 * math.pi * i / count for i in range(count)]
     return [(radius * math.cos(a), radius * math.sin(a), height) for a in angles]
 
 
 def numbered(count: int, start: float = 0.0) -> Iterator[tuple[int, float]]:
-    """Numbers with the directions of `around` in degrees."""
+    """Indices and azimuths in degrees of the points of `around`."""
     return ((i, start + 360.0 * i / count) for i in range(count))

@@ -1,4 +1,4 @@
-"""Scenes that differ in where things and cameras are, and how large they are."""
+"""Scenes with particular positions, scales and camera arrangements."""
 
 from xplanes.scenes.demo.assembly import Assembly, Part, Vector
 from xplanes.scenes.demo.geometry import (
@@ -19,13 +19,13 @@ from xplanes.scenes.demo.shading import Light
 from xplanes.scenes.demo.suite.pieces import around, ball, moving, rod
 
 AWAY: Vector = (3.6, -2.8, 2.0)
-"""Middle of the scene off the centre that is for tuning."""
+"""Centre of the scene ``off_centre``."""
 
 AWAY_TEST: Vector = (-2.2, 4.4, -1.4)
-"""Middle of the other."""
+"""Centre of the scene ``off_centre_test``."""
 
 LARGE, SMALL = 10.0, 0.1
-"""How many times as large as usual the two scenes of another scale are."""
+"""Scale of ``scale`` and ``scale_test`` relative to the other scenes."""
 
 
 def off_centre(variation: Variation) -> Assembly:
@@ -264,7 +264,7 @@ def fixed_cameras_test(variation: Variation) -> Assembly:
 
 
 def _darker(paint: Colour) -> Colour:
-    """A colour a little darker."""
+    """A slightly darker colour."""
     red, green, blue = paint
     return 0.82 * red, 0.82 * green, 0.82 * blue
 

@@ -1,4 +1,4 @@
-"""Scenes in which things change their shape: they deform, merge, part, grow and shrink."""
+"""Scenes with changing shapes (deformation, topology, scaling), and static ones."""
 
 from xplanes.scenes.demo.assembly import Assembly, Joint, Part
 from xplanes.scenes.demo.geometry import (

@@ -37,7 +37,7 @@ def test_hybrid_run_learns_resumes_and_is_loaded(scenes, tmp_path, monkeypatch):
     "overrides",
     [
         ("model=kplanes_explicit", *FAST, *PROPOSAL),
-        ("model=kplanes", "model/sampler=occupancy", *FAST, *OCCUPANCY, "trainer.max_steps=40"),
+        ("model=kplanes", "model/sampler=occupancy", *FAST, *OCCUPANCY, "trainer.max_steps=60"),
         (
             "model/sampler=proposal",
             "model.resolution=16",

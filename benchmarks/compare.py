@@ -1,21 +1,25 @@
-"""Two versions side by side: training throughput, PSNR and start-up, in interleaved runs.
+"""Two versions side by side: training throughput, PSNR and start-up, in paired runs.
 
     python benchmarks/compare.py --before FOLDER --after FOLDER [--rounds 3] [--lego FOLDER]
-        [--seconds 30] [--old KEY=VALUE ...] [--new KEY=VALUE ...] [--out FOLDER]
+        [--steps 1000] [--old KEY=VALUE ...] [--new KEY=VALUE ...] [--out FOLDER]
 
-FOLDER is a checkout of each version (`git worktree add FOLDER COMMIT`). Rounds alternate between
-the two; the version before runs twice in each round, so that its spread is that of the machine.
-Settings that only one version knows are given with --old and --new. Nothing else should run.
+FOLDER is a checkout of each version (`git worktree add FOLDER COMMIT`). Two runs train at the same
+time, each on half of the cores, and then once more with the halves swapped: what else the machine
+does, and a slower core, meet both alike. A pair's ratio is the geometric mean of the two. Pairs of
+the version before with itself show what is left of the noise. Settings that only one version knows
+are given with --old and --new.
 """
 
 import argparse
 import json
+import math
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +27,15 @@ from runner import RESULTS, lego, machine, markdown
 
 from xplanes.files import write_text
 
-COLUMNS = ("scene", "version", "steps/s", "PSNR, dB", "s until the first step", "s in all")
+COLUMNS = ("scene", "pair", "steps/s, ratio", "start-up, ratio", "steps/s", "PSNR, dB")
+
+
+@dataclass(frozen=True)
+class Version:
+    """A checkout and the settings that only it knows."""
+
+    checkout: Path
+    overrides: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -33,37 +45,93 @@ class Measured:
     steps: float
     psnr: float
     start: float
-    total: float
 
 
-def measure(checkout: Path, overrides: list[str], work: Path) -> Measured:
-    """Train once with a version's code."""
-    run = Path(tempfile.mkdtemp(dir=work)) / "run"
-    environment = os.environ | {"PYTHONPATH": str(checkout)}
-    began = time.perf_counter()
-    subprocess.run(
-        [sys.executable, str(checkout / "train.py"), *overrides, f"hydra.run.dir={run}"],
-        cwd=work,
-        env=environment,
-        check=True,
-        stdout=subprocess.DEVNULL,
+def train_together(
+    versions: Sequence[Version], overrides: Sequence[str], work: Path
+) -> list[Measured]:
+    """Train once with each version, at the same time, on equal shares of the cores."""
+    cores = sorted(os.sched_getaffinity(0))
+    share = max(1, len(cores) // len(versions))
+    runs, processes, began = [], [], []
+    for index, version in enumerate(versions):
+        run = Path(tempfile.mkdtemp(dir=work)) / "run"
+        own = cores[index * share : (index + 1) * share]
+        environment = os.environ | {
+            "PYTHONPATH": str(version.checkout),
+            "OMP_NUM_THREADS": str(share),
+        }
+        command = [sys.executable, str(version.checkout / "train.py"), *overrides]
+        command += [*version.overrides, f"hydra.run.dir={run}"]
+        began.append(time.perf_counter())
+        processes.append(
+            subprocess.Popen(
+                ["taskset", "-c", ",".join(map(str, own)), *command],
+                cwd=work,
+                env=environment,
+                stdout=subprocess.DEVNULL,
+            )
+        )
+        runs.append(run)
+    ended: dict[int, float] = {}
+    while len(ended) < len(processes):
+        for index, process in enumerate(processes):
+            if index not in ended and process.poll() is not None:
+                ended[index] = time.perf_counter()
+                if process.returncode:
+                    raise SystemExit(f"{versions[index].checkout}: exit {process.returncode}")
+        time.sleep(0.05)
+    found = []
+    for index, run in enumerate(runs):
+        metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+        seconds = metrics["seconds"]
+        total = ended[index] - began[index]
+        found.append(
+            Measured(
+                metrics["step"] / seconds["train"],
+                metrics["test"]["psnr"],
+                total - seconds["train"] - seconds["evaluate"],
+            )
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two versions in one round, with the cores swapped half-way."""
+
+    steps: float
+    start: float
+    second: tuple[Measured, Measured]
+
+
+def pair(first: Version, second: Version, overrides: Sequence[str], work: Path) -> Pair:
+    """The second version over the first."""
+    a, b = train_together([first, second], overrides, work)
+    d, c = train_together([second, first], overrides, work)
+    return Pair(
+        math.sqrt(b.steps / a.steps * d.steps / c.steps),
+        math.sqrt(b.start / a.start * d.start / c.start),
+        (b, d),
     )
-    total = time.perf_counter() - began
-    metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
-    seconds = metrics["seconds"]
-    start = total - seconds["train"] - seconds["evaluate"]
-    return Measured(metrics["step"] / seconds["train"], metrics["test"]["psnr"], start, total)
 
 
-def row(scene: str, version: str, runs: list[Measured]) -> tuple:
+def row(scene: str, name: str, pairs: list[Pair]) -> tuple:
     """Mean and standard deviation of each figure."""
 
-    def of(name: str, digits: int) -> str:
-        values = [getattr(run, name) for run in runs]
+    def of(values: list[float], digits: int) -> str:
         spread = statistics.stdev(values) if len(values) > 1 else 0.0
         return f"{statistics.mean(values):.{digits}f} ± {spread:.{digits}f}"
 
-    return scene, version, of("steps", 1), of("psnr", 2), of("start", 1), of("total", 1)
+    runs = [run for found in pairs for run in found.second]
+    return (
+        scene,
+        name,
+        of([found.steps for found in pairs], 3),
+        of([found.start for found in pairs], 3),
+        of([run.steps for run in runs], 1),
+        of([run.psnr for run in runs], 2),
+    )
 
 
 def main() -> None:
@@ -71,13 +139,15 @@ def main() -> None:
     parser.add_argument("--before", type=Path, required=True)
     parser.add_argument("--after", type=Path, required=True)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=30)
+    parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--lego", type=Path)
     parser.add_argument("--old", nargs="*", default=[])
     parser.add_argument("--new", nargs="*", default=[])
     parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
-    scenes = {"excavator, 128 px": []}
+    before = Version(args.before.resolve(), tuple(args.old))
+    after = Version(args.after.resolve(), tuple(args.new))
+    scenes = {"excavator, 128 px": ["lrm=none"]}
     if args.lego is not None:
         scenes["lego, 200 px, val"] = [
             *lego(args.lego.resolve()),
@@ -88,26 +158,20 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
         for scene, overrides in scenes.items():
-            common = [*overrides, f"trainer.max_seconds={args.seconds:g}"]
-            runs: dict[str, list[Measured]] = {"before": [], "before again": [], "after": []}
-            for version, checkout, own in (
-                ("before", args.before, args.old),
-                ("after", args.after, args.new),
-            ):
-                measure(checkout, [*common, *own, "trainer.max_seconds=2"], work)  # Compiles.
-                print(f"{scene}: {version} is compiled", flush=True)
+            common = [*overrides, "trainer.max_seconds=null"]
+            train_together([before, after], [*common, "trainer.max_steps=20"], work)  # Compiles.
+            pairs: dict[str, list[Pair]] = {"before / before": [], "after / before": []}
             for number in range(args.rounds):
-                for version in runs:
-                    old = version != "after"
-                    checkout, own = (args.before, args.old) if old else (args.after, args.new)
-                    found = measure(checkout, [*common, f"seed={number}", *own], work)
-                    runs[version].append(found)
-                    print(f"{scene}, {version}, seed {number}: {found}", flush=True)
-            rows += [row(scene, version, found) for version, found in runs.items()]
+                chosen = [*common, f"trainer.max_steps={args.steps}", f"seed={number}"]
+                for kind, second in zip(pairs, (before, after), strict=True):
+                    pairs[kind].append(pair(before, second, chosen, work))
+                    print(f"{scene}, {kind}, seed {number}: {pairs[kind][-1]}", flush=True)
+            rows += [row(scene, kind, found) for kind, found in pairs.items()]
     page = f"""# Two versions side by side
 
-{machine()}; means and standard deviations of {args.rounds} seeds, runs interleaved,
-{args.seconds:g} s of training each. "before again" repeats "before": their difference is noise.
+{machine()}; means and standard deviations of {args.rounds} seeds, {args.steps} steps each, two runs
+at a time on half of the cores each, the halves swapped. Ratios above 1 are more steps per second
+and a longer start-up. The first line of each scene compares the version before with itself: noise.
 
 {markdown(COLUMNS, rows)}
 """

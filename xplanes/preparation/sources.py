@@ -224,7 +224,9 @@ def _settled(
     if views.is_static or frames == 1:
         model = replace(model, plane_set="three")
     if model.plane_set != "three":
-        model = replace(model, time_resolution=model.time_resolution or time_rows(views.times))
+        # Frames of the video tell of more timesteps than few training views do.
+        rows = model.time_resolution or max(time_rows(views.times), frames)
+        model = replace(model, time_resolution=rows)
     if sequence.decoder_config is not None:
         try:
             decoder = replace(model.decoder, **dict(sequence.decoder_config))

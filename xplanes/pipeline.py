@@ -225,7 +225,7 @@ def train(
         "evaluate": scoring,
     }
     skipped = data.batches_for(module, 0).skipped
-    metrics = summary(trainer, module, scores, data.test_split, seconds, skipped)
+    metrics = summary(trainer, module, scores, data, seconds, skipped)
     metrics["skipped"] |= found.skipped
     metrics["decomposition"] = found.report
     metrics["lrm"] = found.lrm

@@ -68,12 +68,12 @@ def test_columns_are_the_settings_that_differ(tmp_path):
     text = write_tables(tmp_path)
     header = [cell.strip() for cell in text.splitlines()[4].strip("|").split("|")]
     assert header == [
-        *("run", "model", "psnr", "ssim", "step 0", "s to 20 dB", "steps"),
+        *("run", "model", "psnr", "ssim", "floaters", "step 0", "s to 20 dB", "steps"),
         *("prepare s", "train s", "samples/ray", "params", "status"),
     ]
     row = [cell.strip() for cell in text.splitlines()[6].strip("|").split("|")]
     assert row == [
-        *("0_a", "six_planes", "20.00", "0.5000", "", "", "300"),
+        *("0_a", "six_planes", "20.00", "0.5000", "", "", "", "300"),
         *("2.0", "60.2", "12.5", "1,234,567", "finished"),
     ]
     assert "2 runs: 2 finished. Scores of the test split." in text

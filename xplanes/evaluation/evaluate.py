@@ -39,12 +39,12 @@ def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
             trained.scene.background,
         )
         rows.append(_row(score, images, tag, metric))
-    names = [name for name in rows[0] if name not in ("file", "time")] if rows else []
+    names = dict.fromkeys(name for row in rows for name in row if name not in ("file", "time"))
     return {
         "split": trained.split,
         "checkpoint": trained.checkpoint,
         "step": trained.step,
-        "test": {name: mean([row[name] for row in rows]) for name in names},
+        "test": {name: mean([row[name] for row in rows if name in row]) for name in names},
         "views": rows,
         "not_computed": missing,
         "seconds": time.perf_counter() - began,
@@ -66,7 +66,7 @@ def _lpips(trained: TrainedRun, network: str | None) -> tuple[str, Metric | None
 
 
 def _row(score: ViewScore, images: ViewImages, tag: str, metric: Metric | None) -> dict[str, Any]:
-    row = {"file": score.file, "time": score.time, "psnr": score.psnr, "ssim": score.ssim}
+    row = {"file": score.file, "time": score.time, **score.scores}
     return row if metric is None else {**row, tag: metric(images.colour, images.truth)}
 
 
@@ -94,4 +94,7 @@ def score_table(scores: dict[str, Any]) -> str:
 
 
 def _numbers(row: dict[str, Any], names: list[str]) -> str:
-    return "".join(f"{row[name]:>12.{2 if name == 'psnr' else 4}f}" for name in names)
+    return "".join(
+        f"{row[name]:>12.{2 if name == 'psnr' else 4}f}" if name in row else " " * 12
+        for name in names
+    )

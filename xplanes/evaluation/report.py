@@ -16,11 +16,14 @@ from xplanes.process import train_command
 from xplanes.rendering.pictures import write_png
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.training.clock import TrainingClock, find_callback, training_seconds
-from xplanes.training.evaluation import ViewScore, device_memory, log_image, mean
+from xplanes.training.evaluation import ViewScore, blank_psnr, device_memory, log_image, mean_scores
 from xplanes.training.fit import Estimate, Trainer
 from xplanes.training.module import RadianceModule
 from xplanes.training.plateau import PlateauStop
 from xplanes.training.step_threads import StepThreads
+
+LITTLE = 0.5
+"""PSNR in dB above that of empty images below which a run shows nothing."""
 
 VIDEO_PIXELS = 48 * 200 * 200
 """Pixels of the video at the end."""
@@ -95,7 +98,7 @@ def summary(
     trainer: Trainer,
     module: RadianceModule,
     scores: Sequence[ViewScore],
-    split: str,
+    data: SceneDataModule,
     seconds: dict[str, Any],
     background_skipped: float,
 ) -> dict[str, Any]:
@@ -107,12 +110,10 @@ def summary(
     counts = module.counts
     candidates = max(1, counts["candidates"])
     return {
-        "split": split,
-        "test": {
-            "psnr": mean([s.psnr for s in scores]),
-            "ssim": mean([s.ssim for s in scores]),
-        },
-        "views": [{"file": s.file, "time": s.time, "psnr": s.psnr, "ssim": s.ssim} for s in scores],
+        "split": data.test_split,
+        "test": mean_scores(scores),
+        "blank_psnr": blank_psnr(data.scene.splits[data.test_split], data.scene.background),
+        "views": [{"file": s.file, "time": s.time, **s.scores} for s in scores],
         "step": trainer.global_step,
         "seconds": seconds,
         "rays_per_second": counts["rays"] / max(clock, 1e-9),
@@ -127,6 +128,7 @@ def summary(
         },
         "converged": None if ending is None else ending[0],
         "steps_skipped": module.unusable,
+        "restarts": module.restarts,
         "threads": torch.get_num_threads() if threads is None else threads.count,
         "loops": backend.name(module.device),
         "parameters": sum(p.numel() for p in module.parameters()),
@@ -194,13 +196,23 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             f"{metrics['converged']}"
         )
     prepare = sum(seconds["prepare"].values())
+    floaters = ""
+    if "floaters" in metrics["test"]:
+        floaters = f"  floaters {100 * metrics['test']['floaters']:.2f}%"
+    blank = []
+    if metrics["test"]["psnr"] < metrics["blank_psnr"] + LITTLE:
+        blank.append(
+            f"warning  hardly better than images of background alone ({metrics['blank_psnr']:.2f} "
+            "dB): this run shows nothing yet"
+        )
     warm_up = f"compiling {seconds['warm_up']:.1f} s · " if seconds["warm_up"] >= 1 else ""
     return "\n".join(
         [
             "",
             f"{metrics['split']:<9}psnr {metrics['test']['psnr']:.2f}  ssim "
-            f"{metrics['test']['ssim']:.4f}  over {len(metrics['views'])} views, step "
+            f"{metrics['test']['ssim']:.4f}{floaters}  over {len(metrics['views'])} views, step "
             f"{metrics['step']}",
+            *blank,
             f"time     prepare {prepare:.1f} s + train {seconds['train']:.1f} s · {warm_up}scoring "
             f"{seconds['evaluate']:.1f} s · {seconds['total']:.1f} s in all · "
             f"{metrics['rays_per_second'] / 1000:.1f}k rays/s",

@@ -26,7 +26,14 @@ LABELS = {
     "samples_per_ray": "samples/ray",
     "parameters": "params",
 }
-FORMATS = {"psnr": ".2f", "start_psnr": ".2f", "ssim": ".4f", "steps": ".0f", "parameters": ",.0f"}
+FORMATS = {
+    "psnr": ".2f",
+    "start_psnr": ".2f",
+    "ssim": ".4f",
+    "floaters": ".4f",
+    "steps": ".0f",
+    "parameters": ",.0f",
+}
 LONGEST = 120
 """Letters of a status in markdown; the CSV has all of it."""
 

@@ -112,6 +112,10 @@ class ModelSettings(Settings, ABC):
     def build(self, site: Site, initial: InitialValues | None = None) -> Model:
         """The model for a scene."""
 
+    def stronger(self) -> "ModelSettings":
+        """These settings with what helps where a field came to show nothing, or fog."""
+        return self
+
     def frame(self, views: Views, half_side: float | None) -> Frame:
         """The frame in which the field lives: the scene's cube, if the model has none of its own.
 
@@ -149,6 +153,30 @@ class LossTerm(Settings, ABC):
 def colour_error(rendering: Rendering, rays: Batch) -> Tensor:
     """Mean squared error of the rays' colours. []"""
     return (rendering.colour - rays["target"]).square().mean()
+
+
+def opacity_error(rendering: Rendering, rays: Batch) -> Tensor:
+    """Mean squared error of the rays' opacity against the images' alpha. []"""
+    return (rendering.opacity - rays["alpha"]).square().mean()
+
+
+def background_opacity(rendering: Rendering, rays: Batch) -> Tensor:
+    """Opacity of the rays at pixels with alpha 0, summed and divided by the number of all rays. []
+
+    Its gradient does not fade as opacity falls: faint floaters go as well.
+    """
+    return (rendering.opacity * (rays["alpha"] == 0)).mean()
+
+
+def opacity_shortfall(rendering: Rendering, rays: Batch) -> Tensor:
+    """Mean squared amount by which rays are too transparent for their colours. []
+
+    For images without alpha: a colour ``c`` in front of a background ``b`` takes an opacity of at
+    least ``|c - b| / max(b, 1 - b)``, whatever the colour of the surface.
+    """
+    background = rays["background"]
+    gap = (rays["target"] - background).abs() / torch.maximum(background, 1 - background)
+    return (gap.amax(dim=-1) - rendering.opacity).relu().square().mean()
 
 
 def warm_cosine(step: int, progress: float, *, warmup: int, final: float) -> float:

@@ -7,7 +7,7 @@ products of the space-time planes to the sparse part of the LRM's triplanes (Eq.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -23,8 +23,18 @@ from xplanes.fields.regularisers import (
     total_variation,
 )
 from xplanes.fields.xplanes import XPlanes, random_planes
-from xplanes.models.base import InitialValues, Model, ModelSettings, warm_cosine
+from xplanes.models.base import (
+    InitialValues,
+    Model,
+    ModelSettings,
+    background_opacity,
+    opacity_error,
+    opacity_shortfall,
+    warm_cosine,
+)
+from xplanes.rendering.base import Rendering
 from xplanes.rendering.sampler import Group, Site
+from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
 from xplanes.streams import Stream, TrainingState, step_generator
 
@@ -39,6 +49,7 @@ class DecoderSettings(Settings):
     density: Literal["softplus", "exp"]  # Activation of the density.
     density_scale: Positive  # Factor on the density.
     density_bias: float  # Initial bias of the density logit; lower is emptier.
+    colour_bias: float  # Initial bias of the colour logits; above 0 nears the white background.
     colour_margin: Weight  # Margin by which colours may exceed [0, 1].
     freeze: bool  # Do not train the decoder.
 
@@ -47,6 +58,8 @@ class DecoderSettings(Settings):
 class XPlanesLoss(Settings):
     """Weights of the terms of the loss beyond the colour's mean squared error."""
 
+    opacity: Weight  # Weight of the opacity's squared error against the images' alpha.
+    floaters: Weight  # Weight of the mean opacity of rays at pixels with alpha 0.
     total_variation: Weight  # Weight of total variation.
     time_smoothness: Weight  # Weight of time smoothness (squared second differences).
     time_magnitude: Weight  # Weight of the squared values of time planes.
@@ -82,6 +95,11 @@ class XPlanesSettings(ModelSettings):
     @property
     def is_static(self) -> bool:
         return self.plane_set == "three"
+
+    def stronger(self) -> "XPlanesSettings":
+        loss = replace(self.loss, opacity=10 * max(self.loss.opacity, 0.1))
+        decoder = replace(self.decoder, colour_bias=max(self.decoder.colour_bias, 2.0))
+        return replace(self, loss=loss, decoder=decoder)
 
     def build(self, site: Site, initial: InitialValues | None = None) -> "XPlanesModel":
         return XPlanesModel(self, self.build_field(site, initial), site, initial)
@@ -121,6 +139,7 @@ class XPlanesSettings(ModelSettings):
         else:
             with torch.no_grad():
                 decoder.layers[-1].bias[0] += options.density_bias  # type: ignore[index]
+                decoder.layers[-1].bias[1:] += options.colour_bias  # type: ignore[index]
         decoder.requires_grad_(not options.freeze)
         return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set)
 
@@ -146,6 +165,8 @@ class XPlanesModel(Model):
         views = len(site.times)
         steps = self.weights.initial_steps
         self.fade = None if steps is None else steps / views
+        self.opacity = self.weights.opacity
+        self._opaque = site.views is not None and site.views.is_opaque
         self.product: SparseProduct | None = None
         self.initial_weight, self._initial = 0.0, []
         if initial is not None:
@@ -176,6 +197,15 @@ class XPlanesModel(Model):
         if decoder:
             groups.append({"params": decoder, "lr": settings.decoder_lr, "name": "decoder"})
         return groups
+
+    def losses(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
+        terms = super().losses(rendering, rays, state)
+        if self.opacity:
+            error = opacity_shortfall if self._opaque else opacity_error
+            terms["opacity"] = self.opacity * error(rendering, rays)
+        if self.weights.floaters:
+            terms["floaters"] = self.weights.floaters * background_opacity(rendering, rays)
+        return terms
 
     def rate(self, step: int, progress: float) -> float:
         settings = self.settings

@@ -28,6 +28,9 @@ from xplanes.training.module import RadianceModule
 
 logger = logging.getLogger(__name__)
 
+VISIBLE = 0.05
+"""Opacity above which a background pixel shows a floater."""
+
 SHOWN = 4
 """Views whose images go to the logger at each evaluation."""
 
@@ -41,12 +44,25 @@ class ViewScore:
         time: Its time, from 0 to 1.
         psnr: In dB.
         ssim: Structural similarity.
+        floaters: Share of background pixels (alpha 0 in the true image) that are not transparent;
+            NaN where the image has none.
     """
 
     file: str
     time: float
     psnr: float
     ssim: float
+    floaters: float
+
+    @property
+    def scores(self) -> dict[str, float]:
+        """The numbers by name, those that are known."""
+        found = {"psnr": self.psnr, "ssim": self.ssim, "floaters": self.floaters}
+        return {
+            name: value
+            for name, value in found.items()
+            if name != "floaters" or not math.isnan(value)
+        }
 
 
 @dataclass(frozen=True)
@@ -100,8 +116,30 @@ def score_view(
         time=float(views.times[index]),
         psnr=psnr(colour, truth),
         ssim=ssim(colour, truth),
+        floaters=floaters(image["opacity"].float(), views.image(index)[..., 3]),
     )
     return score, ViewImages(truth, colour, image["depth"].float(), image["opacity"].float())
+
+
+def floaters(opacity: Tensor, alpha: Tensor) -> float:
+    """Share of pixels with alpha 0 whose rendered opacity is above `VISIBLE`. [H, W], uint8 [H, W]
+
+    NaN without such pixels.
+    """
+    return float((opacity[alpha == 0] > VISIBLE).float().mean())
+
+
+def mean_scores(scores: Sequence[ViewScore]) -> dict[str, float]:
+    """Means over views of each score that any of them has."""
+    names = ("psnr", "ssim", "floaters")
+    found = {name: [s.scores[name] for s in scores if name in s.scores] for name in names}
+    return {name: mean(values) for name, values in found.items() if values}
+
+
+def blank_psnr(views: Views, background: Tensor) -> float:
+    """Mean PSNR in dB of images that show nothing but the background."""
+    truths = (views.composite(index, background) for index in range(len(views)))
+    return mean([psnr(background.expand_as(truth), truth) for truth in truths])
 
 
 def spread(count: int, total: int) -> list[int]:

@@ -21,6 +21,7 @@ from xplanes.scenes.views import Scene
 from xplanes.settings import Count, Positive, Steps
 from xplanes.training.checkpoints import AtomicCheckpointIO, Checkpoints, find_resumable
 from xplanes.training.clock import TrainingClock, find_callback
+from xplanes.training.collapse import CollapseWatch
 from xplanes.training.evaluation import Evaluation
 from xplanes.training.interrupt import Interrupt
 from xplanes.training.module import RadianceModule
@@ -164,7 +165,7 @@ def fit_quietly(
         max_seconds=max_seconds,
         # A Trainer sets this for the whole process, and the run's own was there first.
         deterministic=device.type == "cpu" and torch.are_deterministic_algorithms_enabled(),
-        callbacks=[Checkpoints(checkpoint_every)],
+        callbacks=[CollapseWatch(), Checkpoints(checkpoint_every)],
         default_root_dir=folder,
         logger=False,
         enable_progress_bar=False,

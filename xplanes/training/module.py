@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, cast
 
 import torch
@@ -25,12 +26,19 @@ from xplanes.scenes.views import Scene
 from xplanes.streams import TrainingState
 from xplanes.training.clock import training_seconds
 
+ANOTHER_SEED = 1_000_003
+"""Added to the seed of a field that begins anew."""
+
 PATIENCE = 20
 """Steps in a row with a loss or gradient that is not finite after which training gives up."""
 
 COUNTS = ("rays", "candidates", "empty", "occluded", "samples", "passed")
 """What a run counts: rays, samples in their box, those dropped as empty or occluded, those left,
 and those whose gradients reached the field."""
+
+
+OPACITIES = 5
+"""Batches from one look at the rays' opacity to the next."""
 
 
 class TrainingError(RuntimeError):
@@ -74,8 +82,10 @@ class RadianceModule(LightningModule):
         self.counts = dict.fromkeys(COUNTS, 0)
         self.unusable = 0
         self.unusable_in_a_row = 0
+        self.restarts = 0
+        """How often the field has begun anew, see `restart`."""
         self.last: dict[str, float] = {}
-        """Loss and PSNR of the last batch, and the last scores of views."""
+        """Loss and PSNR of the last batch, mean opacities, and the last scores of views."""
         self._steps = math.inf
         self._loaded_step = 0
         self._schedules: list[Any] = []
@@ -267,6 +277,8 @@ class RadianceModule(LightningModule):
         self._count(rendering.samples, len(rays["times"]))
         error = float(colour_error(rendering, rays).detach())
         self.last |= {"loss": value, "psnr": -10 * math.log10(max(error, 1e-10))}
+        if self.batches % OPACITIES == 0:
+            self.last |= mean_opacities(rendering, rays)
         self._log_terms(terms, state)
         if self.between_updates:
             self._update(optimizer, state, rendering)
@@ -362,6 +374,29 @@ class RadianceModule(LightningModule):
         precision = "" if self.field.precision == "32" else ", or set model.precision=32"
         return f"{self._parts[0].advice}{precision}; resume= continues from the last checkpoint"
 
+    def restart(self) -> None:
+        """Initialise the field anew, with another seed and the model's stronger settings.
+
+        For one process that trains; steps and budget go on.
+        """
+        assert self.site is not None
+        device = self.device
+        self._assemble_stronger()
+        self.to(device)
+        model, sampler = self._parts
+        optimizer = cast(LightningOptimizer, self.optimizers()).optimizer
+        for group, fresh in zip(
+            optimizer.param_groups, [*model.groups(), *sampler.groups()], strict=True
+        ):
+            group["params"] = fresh["params"]
+        optimizer.state.clear()
+
+    def _assemble_stronger(self) -> None:
+        assert self.site is not None
+        self.restarts += 1
+        site = replace(self.site, seed=self.site.seed + ANOTHER_SEED)
+        self._assemble(self._settings.stronger(), site)
+
     # Scores
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
@@ -407,6 +442,7 @@ class RadianceModule(LightningModule):
             "rays": self.rays,
             "counts": dict(self.counts),
             "unusable": self.unusable,
+            "restarts": self.restarts,
         }
         if self.site is not None:
             checkpoint["site"] = {
@@ -425,6 +461,10 @@ class RadianceModule(LightningModule):
                 self._rebuild(site, frame)
             else:
                 self._require_frame(site, frame)
+            if self.site is not None and self.site.views is not None:
+                while self.restarts < progress["restarts"]:
+                    self._assemble_stronger()
+            self.restarts = progress["restarts"]
             self._loaded_step = checkpoint["global_step"]
             self.batches, self.unusable = progress["batches"], progress["unusable"]
             self.rays, self.counts = progress["rays"], dict(progress["counts"])
@@ -494,6 +534,19 @@ def _precision(settings: ModelSettings, device: torch.device) -> str:
     if settings.precision == "auto":
         return "bf16" if fast_bf16(device) else "32"
     return settings.precision
+
+
+def mean_opacities(rendering: Rendering, rays: Batch) -> dict[str, float]:
+    """Mean opacity of rays that must show something, and of those that must not; NaN for none.
+
+    The former are opaque and of another colour than the background; the latter are transparent.
+    """
+    opacity = rendering.opacity.detach()
+    far = (rays["target"] - rays["background"]).abs().amax(dim=-1) > 0.2
+    return {
+        "foreground": float(opacity[far & (rays["alpha"] > 0.5)].mean()),
+        "background": float(opacity[rays["alpha"] == 0].mean()),
+    }
 
 
 NamedTensors = Iterable[tuple[str, Tensor]]

@@ -1,0 +1,168 @@
+"""A field that shows nothing is noticed, said and begun anew; opacity is supervised."""
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.training.runs import small_config
+from xplanes.errors import ConfigError
+from xplanes.models.base import background_opacity, opacity_error, opacity_shortfall
+from xplanes.pipeline import run
+from xplanes.rendering.base import Rendering
+from xplanes.training import collapse
+from xplanes.training.checkpoints import Checkpoints
+from xplanes.training.collapse import CollapseWatch, verdict
+from xplanes.training.evaluation import blank_psnr, floaters
+from xplanes.training.module import RadianceModule, mean_opacities
+
+QUICK = ("trainer.max_steps=24", "callbacks.evaluation.at=[]", "callbacks.checkpoints.every=14")
+
+
+def rendered(opacity: torch.Tensor, colour: torch.Tensor) -> Rendering:
+    empty = torch.zeros(0)
+    return Rendering(colour, opacity, empty, empty, samples=None, cut=None)  # type: ignore[arg-type]
+
+
+def test_opacity_is_compared_with_alpha_or_with_what_a_colour_takes() -> None:
+    opacity = torch.tensor([0.2, 0.9, 0.5], dtype=torch.float64, requires_grad=True)
+    rays = {
+        "alpha": torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64),
+        "target": torch.tensor([[1.0, 1, 1], [1, 0.3, 1], [0.25, 0.5, 1]], dtype=torch.float64),
+        "background": torch.ones(3, 3, dtype=torch.float64),
+    }
+    rendering = rendered(opacity, rays["target"])
+    known = opacity_error(rendering, rays)
+    assert known.item() == pytest.approx((0.04 + 0.01 + 0.25) / 3)
+    least = opacity_shortfall(rendering, rays)
+    # White takes none; 0.7 is passed; a red of 0.25 takes 0.75 of black at least.
+    assert least.item() == pytest.approx(0.25**2 / 3)
+    assert torch.autograd.grad(least, opacity)[0].tolist() == pytest.approx([0, 0, -0.5 / 3])
+    air = background_opacity(rendering, rays)
+    assert air.item() == pytest.approx(0.2 / 3)
+    assert torch.autograd.grad(air, opacity)[0].tolist() == pytest.approx([1 / 3, 0, 0])
+    # Before a grey background a colour may lie on either side.
+    grey = rays | {"background": torch.full((3, 3), 0.5, dtype=torch.float64)}
+    needed = torch.tensor([1.0, 1.0, 1.0])
+    assert float(opacity_shortfall(rendering, grey)) == pytest.approx(
+        float((needed - opacity.detach()).square().mean())
+    )
+
+
+def test_opacities_of_foreground_and_background() -> None:
+    rays = {
+        "alpha": torch.tensor([0.0, 0.0, 1.0, 1.0, 0.4]),
+        "target": torch.tensor([[1.0], [1], [0.2], [0.9], [0.2]]).expand(5, 3),
+        "background": torch.ones(5, 3),
+    }
+    found = mean_opacities(rendered(torch.tensor([0.1, 0.3, 0.7, 0.0, 0.0]), rays["target"]), rays)
+    assert found == pytest.approx({"foreground": 0.7, "background": 0.2})
+    opaque = rays | {"alpha": torch.ones(5), "target": torch.ones(5, 3)}
+    found = mean_opacities(rendered(torch.zeros(5), opaque["target"]), opaque)
+    assert all(math.isnan(value) for value in found.values())
+
+
+def test_a_verdict_needs_rays_that_tell() -> None:
+    nothing, sound, unknown = (0.01, 0.01), (0.9, 0.02), (math.nan, math.nan)
+    assert "shows nothing" in verdict([nothing] * 9 + [unknown], fog=False)
+    assert verdict([sound] * 9 + [nothing], fog=True) == ""
+    assert verdict([unknown] * 9, fog=True) == ""
+    assert "fog" in verdict([(0.9, 0.8)], fog=True)
+    assert verdict([(0.9, 0.8)], fog=False) == ""
+    with pytest.raises(ConfigError, match=r"restarts=-1"):
+        CollapseWatch(restarts=-1)
+
+
+@pytest.fixture
+def dead(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every field is taken for a dead one, and after few steps."""
+    monkeypatch.setattr(collapse, "WINDOW", 10)
+    monkeypatch.setattr(collapse, "NOTHING", 2.0)
+
+
+def test_a_dead_field_begins_anew_once_and_then_a_warning_is_enough(
+    scenes: Path, tmp_path: Path, dead: None, caplog: pytest.LogCaptureFixture
+) -> None:
+    fields = []
+    restart = RadianceModule.restart
+
+    def noted(self: RadianceModule) -> None:
+        before = self.field
+        restart(self)
+        assert self.field is not before
+        held = {p for group in self.optimizers().param_groups for p in group["params"]}  # type: ignore[union-attr]
+        assert held == set(self.field.parameters())
+        fields.append(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RadianceModule, "restart", noted)
+        run(small_config(scenes, *QUICK), tmp_path / "run", [], resume=False)
+    assert len(fields) == 1
+    words = [r.getMessage() for r in caplog.records if "shows nothing" in r.getMessage()]
+    assert ["anew" in line for line in words] == [True, False]
+    assert "at step 10" in words[0]
+    assert "data.half_side" in words[1]
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["restarts"] == 1
+    assert fields[0].model.opacity == 1.0
+
+
+def test_a_run_that_began_anew_resumes_to_the_same_numbers(
+    scenes: Path, tmp_path: Path, dead: None
+) -> None:
+    config = small_config(scenes, *QUICK, "trainer.deterministic=true")
+    run(config, tmp_path / "whole", [], resume=False)
+    save = Checkpoints._save_last
+
+    def cut_off(self: Checkpoints, *rest) -> None:
+        save(self, *rest)
+        raise OSError("cut off")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Checkpoints, "_save_last", cut_off)
+        with pytest.raises(OSError, match="cut off"):
+            run(config, tmp_path / "parts", [], resume=False)
+    run(config, tmp_path / "parts", [], resume=True)
+    whole, parts = (
+        json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("whole", "parts")
+    )
+    for key in ("test", "views", "restarts", "samples_per_ray"):
+        assert whole[key] == parts[key], key
+
+
+def test_floaters_are_background_pixels_that_show_something() -> None:
+    alpha = torch.tensor([[0, 0, 0, 255], [0, 0, 128, 255]], dtype=torch.uint8)
+    opacity = torch.tensor([[0.0, 0.06, 0.04, 1], [1, 0, 1, 1]])
+    assert floaters(opacity, alpha) == pytest.approx(2 / 5)
+    assert math.isnan(floaters(opacity, torch.full_like(alpha, 255)))
+
+
+def test_a_run_that_shows_nothing_says_so(
+    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The decoder's density bias leaves the field empty, and there is no step to change it."""
+    config = small_config(
+        scenes, "trainer.max_steps=1", "model.decoder.density_bias=-60", "data.seed=0"
+    )
+    run(config, tmp_path / "run", [], resume=False)
+    assert "this run shows nothing yet" in capsys.readouterr().out
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["test"]["psnr"] == pytest.approx(metrics["blank_psnr"], abs=0.01)
+    assert metrics["test"]["floaters"] == 0
+    with (tmp_path / "run" / "curve.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == 2
+
+
+def test_blank_images_are_the_background() -> None:
+    from tests.synthetic import ball_scene
+
+    views = ball_scene().splits["test"]
+    black = blank_psnr(views, torch.zeros(3))
+    expected = [
+        -10 * math.log10(float(views.composite(i, torch.zeros(3)).double().square().mean()))
+        for i in range(len(views))
+    ]
+    assert black == pytest.approx(sum(expected) / len(expected))

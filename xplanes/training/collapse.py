@@ -1,0 +1,113 @@
+"""Fields that show nothing, or fog: noticed within seconds, and trained anew once."""
+
+import logging
+import math
+from typing import Any
+
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback
+
+from xplanes.errors import ConfigError
+from xplanes.training.module import RadianceModule
+
+logger = logging.getLogger(__name__)
+
+WINDOW = 100
+"""Steps over which opacities are averaged."""
+
+NOTHING = 0.05
+"""Mean opacity of foreground rays below which a field shows nothing."""
+
+FOG = 0.5
+"""Mean opacity of background rays above which a field is fog."""
+
+FIRST_FOG = 400
+"""Steps in which fog may still lift by itself."""
+
+
+class CollapseWatch(Callback):
+    """Notices a field that shows nothing where the images show something, or fog where they do not.
+
+    The field is then initialised anew with another seed and with the settings that its model holds
+    against this (`ModelSettings.stronger`). If that does not help, a warning says so, and training
+    goes on to the end of its budget.
+
+    Args:
+        restarts: How often the field may begin anew; 0 for a warning alone.
+
+    Attributes:
+        restarted: Steps at which it did.
+        collapsed: What was seen last, in words; empty while all is well.
+    """
+
+    def __init__(self, restarts: int = 1) -> None:
+        if restarts < 0:
+            raise ConfigError(f"restarts={restarts}: must be 0 or more")
+        self.restarts = restarts
+        self.restarted: list[int] = []
+        self.collapsed = ""
+        self._seen: list[tuple[float, float]] = []
+        self._begun = 0
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        assert isinstance(pl_module, RadianceModule)
+        last = pl_module.last
+        self._seen.append((last.get("foreground", math.nan), last.get("background", math.nan)))
+        if len(self._seen) < WINDOW or not pl_module.between_updates:
+            return
+        age = trainer.global_step - self._begun
+        found = verdict(self._seen, fog=age > FIRST_FOG)
+        self._seen = []
+        if not found:
+            self.collapsed = ""
+            return
+        if len(self.restarted) < self.restarts and trainer.world_size == 1:
+            logger.warning(
+                "%s at step %d: it is initialised anew, with another seed and stronger supervision "
+                "of opacity",
+                found,
+                trainer.global_step,
+            )
+            pl_module.restart()
+            self.restarted.append(trainer.global_step)
+            self._begun = trainer.global_step
+        elif not self.collapsed:
+            self.collapsed = found
+            logger.warning(
+                "%s at step %d. Check the poses, the times and data.half_side with a few images of "
+                "media/, then try model.loss.opacity=1 or smaller learning rates",
+                found,
+                trainer.global_step,
+            )
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "restarted": self.restarted,
+            "collapsed": self.collapsed,
+            "seen": self._seen,
+            "begun": self._begun,
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.restarted, self.collapsed = list(state_dict["restarted"]), state_dict["collapsed"]
+        self._seen = [tuple(pair) for pair in state_dict["seen"]]
+        self._begun = state_dict["begun"]
+
+
+def verdict(seen: list[tuple[float, float]], *, fog: bool) -> str:
+    """What mean opacities of foreground and background rays say of a field; empty if it is sound.
+
+    Args:
+        seen: One pair for each step, from 0 to 1; NaN where a batch had no such rays.
+        fog: Whether fog counts.
+    """
+    foreground, background = (
+        [value for value in values if not math.isnan(value)] for values in zip(*seen, strict=True)
+    )
+    if foreground and math.fsum(foreground) < NOTHING * len(foreground):
+        return "the field shows nothing where the images show something"
+    if fog and background and math.fsum(background) > FOG * len(background):
+        return "the field is fog where the images show background"
+    return ""

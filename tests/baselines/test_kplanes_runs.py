@@ -78,7 +78,7 @@ def test_triplanes_and_losses_of_others_are_refused(scenes):
         for name in ("kplanes", "six_planes")
     }
     for model, other, key in (
-        ("kplanes", "six_planes", "time_magnitude"),
+        ("kplanes", "six_planes", "opacity"),
         ("six_planes", "kplanes", "variation"),
     ):
         config = baseline_config(scenes, f"model={model}")

@@ -111,12 +111,13 @@ def test_a_rank_one_initialisation_explains_what_moves(finished):
         assert again == pytest.approx(unexplained["after"], rel=1e-5), case
 
 
-def test_left_open_rows_of_time_frame_and_decoder_are_those_of_a_random_initialisation(
+def test_left_open_rows_of_time_follow_the_video_and_the_rest_a_random_initialisation(
     finished, tmp_path: Path
 ):
     _, found, module = finished
     random = built(Method.read(small_config(tmp_path)))
-    assert module.field.time.shape[1] == random.field.time.shape[1] == 3
+    assert random.field.time.shape[1] == 3
+    assert module.field.time.shape[1] == len(SEQUENCE.triplanes) == 8
     assert found.frame is FRAME
     assert found.values.decoder is None
     assert len(module.field.decoder.layers) == 4

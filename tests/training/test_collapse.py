@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.baselines.runs import KPLANES, PROPOSAL, baseline_config
 from tests.training.runs import small_config
 from xplanes.errors import ConfigError
 from xplanes.models.base import background_opacity, opacity_error, opacity_shortfall
@@ -101,13 +102,23 @@ def test_a_dead_field_begins_anew_once_and_then_a_warning_is_enough(
         patch.setattr(RadianceModule, "restart", noted)
         run(small_config(scenes, *QUICK), tmp_path / "run", [], resume=False)
     assert len(fields) == 1
-    words = [r.getMessage() for r in caplog.records if "shows nothing" in r.getMessage()]
+    words = [r.getMessage() for r in caplog.records if "field shows nothing" in r.getMessage()]
     assert ["anew" in line for line in words] == [True, False]
     assert "at step 10" in words[0]
     assert "data.half_side" in words[1]
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["restarts"] == 1
     assert fields[0].model.opacity == 1.0
+
+
+def test_a_baseline_is_left_as_published(
+    scenes: Path, tmp_path: Path, dead: None, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = baseline_config(scenes, "model=kplanes", *KPLANES, *PROPOSAL, "trainer.max_steps=11")
+    run(config, tmp_path / "run", [], resume=False)
+    words = [r.getMessage() for r in caplog.records if "field shows nothing" in r.getMessage()]
+    assert ["anew" in line for line in words] == [False]
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["restarts"] == 0
 
 
 def test_a_run_that_began_anew_resumes_to_the_same_numbers(

@@ -112,9 +112,12 @@ class ModelSettings(Settings, ABC):
     def build(self, site: Site, initial: InitialValues | None = None) -> Model:
         """The model for a scene."""
 
-    def stronger(self) -> "ModelSettings":
-        """These settings with what helps where a field came to show nothing, or fog."""
-        return self
+    def stronger(self) -> "ModelSettings | None":
+        """These settings with what helps where a field came to show nothing, or fog.
+
+        None where no such settings are known: the field is then left as it is.
+        """
+        return None
 
     def frame(self, views: Views, half_side: float | None) -> Frame:
         """The frame in which the field lives: the scene's cube, if the model has none of its own.

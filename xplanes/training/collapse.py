@@ -29,8 +29,8 @@ class CollapseWatch(Callback):
     """Notices a field that shows nothing where the images show something, or fog where they do not.
 
     The field is then initialised anew with another seed and with the settings that its model holds
-    against this (`ModelSettings.stronger`). If that does not help, a warning says so, and training
-    goes on to the end of its budget.
+    against this (`ModelSettings.stronger`). If that does not help, or the model has none, as the
+    published baselines, a warning says so, and training goes on to the end of its budget.
 
     Args:
         restarts: How often the field may begin anew; 0 for a warning alone.
@@ -63,7 +63,8 @@ class CollapseWatch(Callback):
         if not found:
             self.collapsed = ""
             return
-        if len(self.restarted) < self.restarts and trainer.world_size == 1:
+        alone = trainer.world_size == 1
+        if len(self.restarted) < self.restarts and alone and pl_module.can_restart:
             logger.warning(
                 "%s at step %d: it is initialised anew, with another seed and stronger supervision "
                 "of opacity",
@@ -77,7 +78,7 @@ class CollapseWatch(Callback):
             self.collapsed = found
             logger.warning(
                 "%s at step %d. Check the poses, the times and data.half_side with a few images of "
-                "media/, then try model.loss.opacity=1 or smaller learning rates",
+                "media/, then try another seed or smaller learning rates",
                 found,
                 trainer.global_step,
             )

@@ -374,6 +374,11 @@ class RadianceModule(LightningModule):
         precision = "" if self.field.precision == "32" else ", or set model.precision=32"
         return f"{self._parts[0].advice}{precision}; resume= continues from the last checkpoint"
 
+    @property
+    def can_restart(self) -> bool:
+        """Whether the model has settings that help a field that shows nothing."""
+        return self._settings.stronger() is not None
+
     def restart(self) -> None:
         """Initialise the field anew, with another seed and the model's stronger settings.
 
@@ -392,10 +397,12 @@ class RadianceModule(LightningModule):
         optimizer.state.clear()
 
     def _assemble_stronger(self) -> None:
+        stronger = self._settings.stronger()
         assert self.site is not None
+        assert stronger is not None
         self.restarts += 1
         site = replace(self.site, seed=self.site.seed + ANOTHER_SEED)
-        self._assemble(self._settings.stronger(), site)
+        self._assemble(stronger, site)
 
     # Scores
 

@@ -151,12 +151,12 @@ def test_a_signal_after_the_last_step_is_heard(
 
 
 def test_without_a_validation_split_training_views_are_held_out_or_nothing_is_the_best(
-    scenes: Path, tmp_path: Path
+    tmp_path: Path,
 ) -> None:
     few = (*FEW, "callbacks.evaluation.at=[0]", "media=false", "lrm=none")
     for views, held_out in ((10, 0), (20, 2)):
         options = (f"data.train_views={views}", "data.val_views=1", "data.test_views=2")
-        demo = small_config(scenes, *few, *options)
+        demo = small_config(tmp_path / "demo", *few, *options)
         made = SceneDataModule(demo["data"]).settings.folder
         folder = Path(shutil.copytree(made, tmp_path / "scenes" / str(views)))
         (folder / "transforms_val.json").unlink()

@@ -47,7 +47,6 @@ class CollapseWatch(Callback):
         self.restarted: list[int] = []
         self.collapsed = ""
         self._seen: list[tuple[float, float]] = []
-        self._begun = 0
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -57,7 +56,7 @@ class CollapseWatch(Callback):
         self._seen.append((last.get("foreground", math.nan), last.get("background", math.nan)))
         if len(self._seen) < WINDOW or not pl_module.between_updates:
             return
-        age = trainer.global_step - self._begun
+        age = trainer.global_step - (self.restarted[-1] if self.restarted else 0)
         found = verdict(self._seen, fog=age > FIRST_FOG)
         self._seen = []
         if not found:
@@ -73,7 +72,6 @@ class CollapseWatch(Callback):
             )
             pl_module.restart()
             self.restarted.append(trainer.global_step)
-            self._begun = trainer.global_step
         elif not self.collapsed:
             self.collapsed = found
             logger.warning(
@@ -88,13 +86,11 @@ class CollapseWatch(Callback):
             "restarted": self.restarted,
             "collapsed": self.collapsed,
             "seen": self._seen,
-            "begun": self._begun,
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.restarted, self.collapsed = list(state_dict["restarted"]), state_dict["collapsed"]
         self._seen = [tuple(pair) for pair in state_dict["seen"]]
-        self._begun = state_dict["begun"]
 
 
 def verdict(seen: list[tuple[float, float]], *, fog: bool) -> str:

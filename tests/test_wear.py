@@ -50,9 +50,8 @@ def test_rendering_a_scene_clears_what_is_a_day_old(tmp_path: Path, monkeypatch)
     assert (old.exists(), new.exists(), folder.exists()) == (False, True, True)
 
 
-def test_a_damaged_demo_scene_says_to_delete_it(trained_run: Path, tmp_path: Path) -> None:
+def test_a_damaged_demo_scene_says_to_delete_it(tmp_path: Path) -> None:
     config = small_config(tmp_path / "scenes")
-    shutil.copytree(trained_run.parents[1] / "scenes", tmp_path / "scenes")
     data = Experiment.read(config).data
     data.read()
     (picture,) = (tmp_path / "scenes").glob("excavator*/train/r_003.png")

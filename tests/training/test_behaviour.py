@@ -458,7 +458,7 @@ def test_a_bad_batch_takes_those_of_its_update_along(
 
 def test_scene_of_one_timestep_trains_without_time_planes(scenes: Path, tmp_path: Path) -> None:
     config = small_config(tmp_path, "trainer.max_steps=2", "callbacks.evaluation.at=[]")
-    (original,) = scenes.glob("excavator*")
+    original = next(scenes.glob("excavator*"))
     folder = Path(shutil.copytree(original, tmp_path / original.name))
     for path in folder.glob("transforms_*.json"):
         content = json.loads(path.read_text())

@@ -128,6 +128,28 @@ def test_misfits_of_the_trainer_are_said_with_a_message(tmp_path: Path) -> None:
         assert not (tmp_path / f"run_{words[:12]}").exists()
 
 
+def test_an_unknown_argument_of_a_logger_is_refused_before_anything_is_written(
+    tmp_path: Path,
+) -> None:
+    config = small_config(tmp_path / "scenes", "logger=tensorboard")
+    config["logger"]["tensorboard"]["foo"] = 1
+    with pytest.raises(ConfigError, match=r"logger\.tensorboard\.foo=1: .* no such argument"):
+        run(config, tmp_path / "run", [], resume=False)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_last_lines_name_tensorboard_only_where_it_has_something_to_show(
+    tmp_path: Path, capsys
+) -> None:
+    for logger, shown in (("none", False), ("tensorboard", True)):
+        config = small_config(tmp_path / "scenes", f"logger={logger}", "trainer.max_steps=2")
+        run(config, tmp_path / logger, [], resume=False)
+        lines = capsys.readouterr().out.splitlines()
+        (line,) = [line for line in lines if line.startswith("next ")]
+        assert ("tensorboard --logdir" in line) == shown
+        assert f"xplanes render {tmp_path / logger}" in "\n".join(lines)
+
+
 def test_a_run_of_an_earlier_version_is_refused_with_its_version(tmp_path: Path) -> None:
     (tmp_path / "overrides.txt").write_text("loss.every=4\n")
     (tmp_path / "run.json").write_text(json.dumps({"xplanes": "0.1.0", "status": "interrupted"}))

@@ -1,5 +1,6 @@
 """A whole run: its method, data, trainer, callbacks and logger, from a configuration."""
 
+import inspect
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -8,7 +9,7 @@ from typing import Any
 
 import torch
 from lightning.pytorch.callbacks import Callback
-from lightning.pytorch.loggers import Logger
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
 
 from xplanes.components import build, plugins
 from xplanes.errors import ConfigError
@@ -116,10 +117,7 @@ class Experiment:
             callbacks = [
                 build(node, Callback, f"callbacks.{name}") for name, node in self.callbacks.items()
             ]
-            loggers = [
-                build(node, Logger, f"logger.{name}", save_dir=str(run))
-                for name, node in self.logger.items()
-            ]
+            loggers = [_logger(name, node, run) for name, node in self.logger.items()]
             return build(
                 self.trainer,
                 Trainer,
@@ -133,3 +131,28 @@ class Experiment:
 def _nodes(content: Any) -> dict[str, Mapping[str, Any]]:
     """Components by name; those that were set to null are left out."""
     return {str(name): node for name, node in (content or {}).items() if node is not None}
+
+
+def _logger(name: str, node: Mapping[str, Any], run: Path) -> Logger:
+    """The logger of a node.
+
+    TensorBoard's hands arguments that it does not know to its writer, which refuses them only when
+    the first curve is written.
+
+    Raises:
+        ConfigError: If it refuses its arguments.
+    """
+    logger = build(node, Logger, f"logger.{name}", save_dir=str(run))
+    if isinstance(logger, TensorBoardLogger):
+        from torch.utils.tensorboard import SummaryWriter
+
+        known = [
+            inspect.signature(cls.__init__).parameters for cls in (type(logger), SummaryWriter)
+        ]
+        for key, value in node.items():
+            if key != "_target_" and not any(key in parameters for parameters in known):
+                raise ConfigError(
+                    f"logger.{name}.{key}={value}: {type(logger).__name__} has no such argument; "
+                    "leave it out"
+                )
+    return logger

@@ -205,6 +205,7 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             f"warning  hardly better than images of background alone ({metrics['blank_psnr']:.2f} "
             "dB): this run shows nothing yet"
         )
+    curves = [f"tensorboard --logdir {run}"] if any(run.rglob("events.out.tfevents.*")) else []
     warm_up = f"compiling {seconds['warm_up']:.1f} s · " if seconds["warm_up"] >= 1 else ""
     return "\n".join(
         [
@@ -224,8 +225,8 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             f"memory   {metrics['peak_memory_bytes'] / 2**30:.1f} GB at its peak",
             f"wrote    {run}",
             f"         metrics.json  curve.csv  checkpoints/last.ckpt  {metrics.get('media', '')}",
-            f"next     tensorboard --logdir {run}",
-            f"         xplanes render {run}",
+            *(f"next     {line}" for line in curves),
+            f"{'' if curves else 'next':<9}xplanes render {run}",
             f"         {train_command()} resume={run} {more}",
         ]
     )

@@ -25,11 +25,11 @@ STEP = 0.07
 
 
 def grid_of(resolution=6, bins=3, *, seed=0, filled=0.4, dense=20.0):
-    """A grid of random densities; some cells are empty but keep a little density."""
+    """A grid whose cells let through a random share of light at most; some are empty."""
     generator = torch.Generator().manual_seed(seed)
     grid = OccupancyGrid(resolution, bins, step=STEP)
-    uniform = torch.rand(len(grid.density), generator=generator)
-    grid.density.copy_(dense * torch.rand(len(uniform), generator=generator))
+    uniform = torch.rand(len(grid.least), generator=generator)
+    grid.least.copy_(dense * torch.rand(len(uniform), generator=generator))
     grid.occupied.copy_(uniform < filled)
     return grid
 
@@ -56,7 +56,7 @@ def by_oracle(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0):
     return oracle(
         *(ray.double().numpy() for ray in rays),
         grid.occupied.view(shape).numpy(),
-        grid.density.view(shape).double().numpy(),
+        grid.least.view(shape).double().numpy(),
         step=step,
         skip=skip_empty,
         occlusion=occlusion,
@@ -217,8 +217,7 @@ def test_an_empty_grid_leaves_nothing():
 
 def test_the_first_opaque_cell_hides_what_lies_behind_but_not_itself():
     grid = OccupancyGrid(4, 1, step=STEP)
-    grid.density.zero_()
-    grid.density.view(4, 4, 4)[2] = 1e4  # a slab at 0 <= z < 0.5
+    grid.least.view(4, 4, 4)[2] = 1e4  # a slab at 0 <= z < 0.5
     rays = (
         torch.tensor([[0.1, 0.1, 3.0]]).double(),
         torch.tensor([[0.0, 0.0, -1.0]]).double(),
@@ -237,7 +236,7 @@ def test_the_first_opaque_cell_hides_what_lies_behind_but_not_itself():
 def test_huge_densities_on_one_ray_do_not_disturb_the_next():
     for huge in [1e8, 1e20, 1e30, 3e38, math.inf]:
         grid, rays = grid_of(8, 1, filled=1.1, dense=3.0), rays_of(400)
-        grid.density[::7] = huge
+        grid.least[::7] = huge
         ours = march(*rays, grid, step=STEP, occlusion=0.2)
         theirs = twin(rays, grid, occlusion=0.2)
         assert torch.equal(ours.ray, theirs.ray), huge

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from xplanes.rendering.marching import march
 from xplanes.rendering.occupancy import OccupancyGrid
 
 STEP = 0.05
@@ -144,6 +145,46 @@ def test_a_cell_with_content_stays_and_an_empty_one_comes_back():
     assert grid.density[9] == pytest.approx(0.3)
 
 
+def test_the_least_density_falls_at_once_and_rises_slowly():
+    grid, cell = grid_of(), torch.tensor([4])
+    assert grid.least[4] == 0
+    for _ in range(5):
+        grid.observe(cell, torch.tensor([5.0]))
+    assert 1 < grid.least[4] < 3
+    for _ in range(60):
+        grid.observe(cell, torch.tensor([5.0]))
+    assert grid.least[4] == pytest.approx(5, rel=0.01)
+    grid.observe(torch.tensor([4, 4, 4]), torch.tensor([5.0, 0.2, 7.0]))
+    assert grid.least[4] == pytest.approx(0.2)
+    assert grid.density[4] == 7
+
+
+def test_what_is_there_only_at_times_hides_nothing():
+    passing, solid = grid_of(), grid_of()
+    cells = torch.arange(len(solid.density))
+    for look in range(100):
+        passing.observe(cells, torch.full((len(cells),), 50.0 * (look % 2)))
+        solid.observe(cells, torch.full((len(cells),), 50.0))
+    ray = [torch.tensor([v]) for v in ([-2.0, 0.1, 0.1], [1.0, 0.0, 0.0])]
+    rest = torch.zeros(1), torch.full((1,), 0.5)
+    whole, behind = (
+        march(*ray, *rest, grid, step=STEP, occlusion=1e-5) for grid in (passing, solid)
+    )
+    assert passing.occupied.all()
+    assert (passing.density > 20).all()
+    assert whole.occluded == 0
+    assert behind.occluded > 0
+
+
+def test_a_sweep_sees_that_a_cell_lets_light_through():
+    grid, generator = grid_of(), torch.Generator().manual_seed(0)
+    cells = torch.arange(len(grid.density))
+    for _ in range(60):
+        grid.observe(cells, torch.full((len(cells),), 50.0))
+    grid.sweep(lambda points, times: (points, torch.full_like(times, 3.0)), generator)
+    assert (grid.least == 3).all()
+
+
 def test_the_threshold_is_opacity_over_one_step():
     grid, cells = grid_of(decay=0.0), torch.arange(3)
     grid.observe(cells, torch.tensor([0.0099, 0.01, 0.0101]) / STEP)
@@ -182,6 +223,7 @@ def test_a_cell_recovers_from_an_impossible_density():
         grid, cell = grid_of(), torch.tensor([2])
         grid.observe(cell, torch.tensor([bad]))
         assert grid.density.isfinite().all(), bad
+        assert grid.least.isfinite().all(), bad
         for _ in range(60):
             grid.observe(cell, torch.zeros(1))
         assert not grid.occupied[2], bad

@@ -86,7 +86,7 @@ def test_the_derivative_by_density_is_that_of_the_closed_form():
 def test_dropping_what_lies_behind_costs_less_than_its_threshold():
     rays = rays_of(300)
     renderer = renderer_of(128, occlusion=0.0)
-    renderer.grid.density.fill_(5.0)
+    renderer.grid.least.fill_(5.0)
     all_of_it = renderer.render(fog(5.0), *rays, WHITE)
     for occlusion in (1e-4, 1e-2):
         quick = GridRenderer(renderer.grid, 128, occlusion=occlusion)

@@ -21,7 +21,7 @@ def cell(place, size):
 
 @njit(parallel=True, **EXACT)
 def count_samples(
-    start, slope, near, far, jitter, bins, occupied, density, size, step, limit, skip, counts
+    start, slope, near, far, jitter, bins, occupied, least, size, step, limit, skip, counts
 ):
     """Candidates, samples in occupied cells, and those not behind a surface, for each ray."""
     for r in prange(len(near)):
@@ -38,7 +38,7 @@ def count_samples(
                 found += 1
                 if depth < limit:
                     visible += 1
-                    depth += density[index] * step
+                    depth += least[index] * step
             distance = near[r] + (candidates + jitter[r]) * step
         counts[0, r], counts[1, r], counts[2, r] = candidates, found, visible
 

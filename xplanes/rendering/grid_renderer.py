@@ -138,8 +138,8 @@ class OccupancySettings(SamplerSettings):
     def check(self) -> None:
         if self.occlusion >= 1:
             raise ConfigError(
-                f"occlusion={self.occlusion}: must be below 1, or no light counts as seen; 1e-5 is "
-                "the default, skip_occluded=false skips nothing"
+                f"occlusion={self.occlusion}: must be below 1, or no light counts as seen; 0.001 "
+                "is the default, skip_occluded=false skips nothing"
             )
         if self.grid_resolution**3 * self.time_bins > 2**28:
             raise ConfigError(
@@ -252,7 +252,7 @@ class OccupancySampler(Sampler):
     def _agree(self) -> None:
         """Go on with the first process's grid: each has seen the samples of its own rays."""
         if distributed.is_available() and distributed.is_initialized():
-            for part in (self.grid.density, self.grid.occupied):
+            for part in (self.grid.density, self.grid.least, self.grid.occupied):
                 distributed.broadcast(part, src=0)
 
     def scalars(self) -> dict[str, float]:

@@ -61,7 +61,7 @@ def march(
         grid: Tells which cells are empty.
         step: Distance between samples.
         skip_empty: Whether samples in empty cells are dropped.
-        occlusion: Samples behind which the grid's densities leave less light than this are dropped;
+        occlusion: Samples that the grid's least densities leave less light than this are dropped;
             0 keeps all.
 
     Returns:
@@ -104,7 +104,7 @@ def march_reference(
     distances, cells = distances[ray, place], cells[ray, place]
     candidates, found = int(inside.sum()), len(ray)
     if math.isfinite(limit) and found:
-        depth = (grid.density[cells].double() * step).clamp_max(OPAQUE)
+        depth = (grid.least[cells].double() * step).clamp_max(OPAQUE)
         depth = depth_before(depth, ray, _starts(ray, len(near)))
         visible = (depth < limit).nonzero()[:, 0]
         ray, distances, cells = ray[visible], distances[visible], cells[visible]
@@ -148,7 +148,7 @@ def _march_cpu(
     counts = torch.empty(3, len(near), dtype=torch.int64)
     size = grid.resolution
     cpu.count_samples(
-        *rays, bins, occupied, grid.density.numpy(), size, step, limit, skip, counts.numpy()
+        *rays, bins, occupied, grid.least.numpy(), size, step, limit, skip, counts.numpy()
     )
     candidates, found, kept = counts.sum(dim=1).tolist()
     starts = counts[2].cumsum(0) - counts[2]

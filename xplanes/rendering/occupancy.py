@@ -7,6 +7,9 @@ from torch import Tensor, nn
 from xplanes.rendering.box import Field
 from xplanes.rendering.compositing import OPAQUE
 
+TRUST = 0.1
+"""Share by which the least density of a cell rises towards what a look shows."""
+
 
 class OccupancyGrid(nn.Module):
     """The density that the field last showed in each cell of the cube [-1, 1]^3 and each time bin.
@@ -15,6 +18,11 @@ class OccupancyGrid(nn.Module):
     sample step. Cells start as occupied and lose their density by ``decay`` at each look that does
     not confirm it. Cells that are not ``allowed`` (silhouettes show them empty) never fill; those
     that are not ``likely`` fill only beside an occupied cell.
+
+    ``least`` is what every recent look at a cell has shown: it falls to a smaller density at once
+    and rises slowly. A cell that a surface passes through, or a thing at some times of its bin,
+    has a high density but lets light through; only by ``least`` can it be told to hide what lies
+    behind it.
 
     Args:
         resolution: Cells along each side.
@@ -25,6 +33,7 @@ class OccupancyGrid(nn.Module):
     """
 
     density: Tensor
+    least: Tensor
     occupied: Tensor
     allowed: Tensor
     likely: Tensor
@@ -47,6 +56,7 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("allowed", torch.ones(cells, dtype=torch.bool))
         self.register_buffer("likely", torch.ones(cells, dtype=torch.bool))
         self.register_buffer("density", torch.full((cells,), 4 * self.empty_density))
+        self.register_buffer("least", torch.zeros(cells))
         self.register_buffer("occupied", torch.ones(cells, dtype=torch.bool))
 
     def bins(self, times: Tensor) -> Tensor:
@@ -82,6 +92,9 @@ class OccupancyGrid(nn.Module):
         density = self._usable(density)
         seen = torch.maximum(self.density[cells] * self.decay, density) * self.allowed[cells]
         self.density.scatter_reduce_(0, cells, seen, "amax", include_self=False)
+        least = self.least[cells]
+        least = torch.minimum(density, torch.lerp(least, density, TRUST))
+        self.least.scatter_reduce_(0, cells, least, "amin", include_self=False)
         self.occupied[cells] = self.density[cells] > self.empty_density
 
     @torch.no_grad()
@@ -112,6 +125,7 @@ class OccupancyGrid(nn.Module):
         floor = self.empty_density / max(self.decay, 1e-3) * 1.001
         kept = seen.clamp_min(floor)
         lost = self.density.clamp_max(0.5 * self.empty_density)
+        torch.minimum(self.least, seen, out=self.least)
         self.density.copy_(torch.where(keep, kept, lost))
         self.occupied.copy_(keep)
 

@@ -197,7 +197,7 @@ def _rendered(
     away = (train.camera_to_world[:, :3, 3] - frame.centre).norm(dim=-1).mean()
     back = float(away - (pose[:3, 3] - frame.centre).norm())
     inputs = [
-        train.images,
+        train.identity,
         train.camera_to_world,
         train.times,
         [train.intrinsics.focal, train.intrinsics.centre, train.intrinsics.size],

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.images import read_images
@@ -33,6 +32,7 @@ class BlenderSettings(SceneSettings):
             splits=splits,
             views=self.views,
             eval_views=self.eval_views,
+            cache=self.image_cache,
         )
 
 
@@ -43,6 +43,7 @@ def read_scene(
     splits: Sequence[str],
     views: int | None = None,
     eval_views: int | None = None,
+    cache: Path | None = None,
 ) -> Scene:
     """Read a scene and check all of it, so that nothing fails after training has begun.
 
@@ -53,6 +54,7 @@ def read_scene(
         views: Number of views to keep of the train split, spread evenly over time;
             None keeps all.
         eval_views: The same for every other split, at most.
+        cache: Folder of images that are too large for memory; that of the user when None.
 
     Returns:
         The scene, with ``video`` where transforms_video.json exists.
@@ -77,8 +79,8 @@ def read_scene(
     _require_times(folder, listed.get("train"), others)
     return Scene(
         folder.resolve().name,
-        {split: _load(transforms, resolution) for split, transforms in listed.items()},
-        video=None if video is None else _load(video, resolution),
+        {split: _load(transforms, resolution, cache) for split, transforms in listed.items()},
+        video=None if video is None else _load(video, resolution, cache),
     )
 
 
@@ -159,32 +161,29 @@ def _list_video(folder: Path) -> Transforms | None:
     return transforms
 
 
-def _load(transforms: Transforms, resolution: int | None) -> Views:
-    images, native, sizes = read_images(transforms.paths, resolution)
-    _warn_of_empty(images, transforms)
+def _load(transforms: Transforms, resolution: int | None, cache: Path | None) -> Views:
+    images, native, sizes = read_images(transforms.paths, resolution, cache)
     known = [
         lens.scaled(file, size)
         for lens, file, size in zip(transforms.lenses, native, sizes, strict=True)
     ]
     focal, centre = torch.tensor(known, dtype=torch.float64).unbind(dim=1)
-    return Views(
+    views = Views(
         images=images,
         camera_to_world=transforms.camera_to_world,
         times=transforms.times,
         intrinsics=Intrinsics(focal, centre, torch.tensor(sizes)),
         files=transforms.files,
     )
+    _warn_of_empty(views, transforms)
+    return views
 
 
-def _warn_of_empty(images: Tensor, transforms: Transforms) -> None:
-    empty = [
-        file
-        for file, image in zip(transforms.files, images, strict=True)
-        if not image[..., 3].any()
-    ]
+def _warn_of_empty(views: Views, transforms: Transforms) -> None:
+    empty = [file for index, file in enumerate(views.files) if not views.silhouette(index)[0].any()]
     if empty:
         warnings.warn(
-            f"{len(empty)} of {len(images)} images show nothing (alpha is 0 everywhere): "
+            f"{len(empty)} of {len(views)} images show nothing (alpha is 0 everywhere): "
             f"{', '.join(empty[:5])}{', ...' if len(empty) > 5 else ''} in "
             f"{transforms.paths[0].parent}.",
             stacklevel=4,

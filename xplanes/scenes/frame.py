@@ -184,8 +184,7 @@ def _reach(views: Views, centre: Tensor) -> float:
     """Largest distance from ``centre`` at which a ray through the foreground passes it."""
     largest = 0.0
     for index in range(len(views)):
-        seen = (views.image(index)[..., 3] > 0).flatten()
-        origins, directions = (ray[seen] for ray in views.image_rays(index))
+        origins, directions = views.foreground_rays(index)
         if len(origins):
             offset = centre - origins
             along = (offset * directions).sum(dim=-1, keepdim=True)

@@ -2,7 +2,7 @@
 
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from xplanes.scenes import store
 from xplanes.scenes.errors import SceneError
 
 Size = tuple[int, int]
@@ -43,17 +44,21 @@ def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
         SceneError: A file cannot be decoded, sizes differ, or the resolution cannot be met.
     """
     common_size(paths)
-    return read_images(paths, resolution)[0]
+    native = [_read_header(path)[0] for path in paths]
+    return _into_memory(paths, final_sizes(paths, native, resolution))
 
 
 def read_images(
-    paths: Sequence[Path], resolution: int | None
-) -> tuple[Tensor, list[Size], list[Size]]:
+    paths: Sequence[Path], resolution: int | None, cache: Path | None = None
+) -> tuple[Tensor | store.StoredImages, list[Size], list[Size]]:
     """Decode images of any sizes and reduce them to ``resolution`` pixels square.
+
+    Images that take more than `store.IN_MEMORY` bytes are decoded once to a file of the cache.
 
     Args:
         paths: Image files, PNG or JPEG, at least one. [V]
         resolution: Pixels per side; None keeps the sizes of the files.
+        cache: Folder of decoded images; that of the user when None.
 
     Returns:
         Colour, multiplied by alpha before it was averaged, and alpha, smaller images padded with
@@ -62,20 +67,55 @@ def read_images(
 
     Raises:
         SceneError: A file cannot be decoded, or the resolution cannot be met.
+        StorageError: The cache cannot be written.
     """
-    native = [(height, width) for width, height in map(_read_size, paths)]
-    sizes = native
-    if resolution is not None:
-        for path, (height, width) in zip(paths, native, strict=True):
-            check_resolution(path, width, height, resolution)
-        sizes = [(resolution, resolution)] * len(paths)
+    headers = [_read_header(path) for path in paths]
+    native = [size for size, _ in headers]
+    sizes = final_sizes(paths, native, resolution)
+    if not store.is_needed(sizes):
+        return _into_memory(paths, sizes), native, sizes
+    channels = 4 if any(alpha for _, alpha in headers) else 3
+
+    def job(index: int) -> store.Job:
+        def decode() -> Iterator[tuple[int, np.ndarray]]:
+            yield index, read_image(paths[index], sizes[index])[..., :channels]
+
+        return decode
+
+    jobs = [job(index) for index in range(len(paths))]
+    return store.decoded(paths, "images", sizes, channels, jobs, cache), native, sizes
+
+
+def read_image(path: Path, size: Size) -> np.ndarray:
+    """Decode one image and reduce it to a size: premultiplied colour, alpha. uint8 [H, W, 4]"""
+    height, width = size
+    return shrink(load_premultiplied(path), width, height)
+
+
+def final_sizes(
+    paths: Sequence[Path], native: Sequence[Size], resolution: int | None
+) -> list[Size]:
+    """Height and width of each image after it is reduced.
+
+    Raises:
+        SceneError: If an image of these native sizes cannot be reduced to the resolution.
+    """
+    if resolution is None:
+        return list(native)
+    for path, (height, width) in zip(paths, native, strict=True):
+        check_resolution(path, width, height, resolution)
+    return [(resolution, resolution)] * len(paths)
+
+
+def _into_memory(paths: Sequence[Path], sizes: Sequence[Size]) -> Tensor:
+    """Decode images to one tensor, padded at the bottom and on the right. uint8 [V, H, W, 4]"""
     largest = max(height for height, _ in sizes), max(width for _, width in sizes)
     same = len(set(sizes)) == 1
     images = (torch.empty if same else torch.zeros)(len(paths), *largest, 4, dtype=torch.uint8)
 
     def fill(index: int) -> None:
         height, width = sizes[index]
-        pixels = shrink(load_premultiplied(paths[index]), width, height)
+        pixels = read_image(paths[index], sizes[index])
         images[index, :height, :width] = torch.from_numpy(pixels)
 
     # Pillow decodes and resamples without the interpreter lock, so threads are enough.
@@ -84,20 +124,21 @@ def read_images(
         list(pool.map(fill, range(len(paths))))
     finally:
         pool.shutdown(cancel_futures=True)
-    return images, native, sizes
+    return images
 
 
 def common_size(paths: Sequence[Path]) -> tuple[int, int]:
     """Width and height that all files share, read from their headers alone."""
-    sizes = [_read_size(path) for path in paths]
-    for path, size in zip(paths, sizes, strict=True):
-        if size != sizes[0]:
+    sizes = [_read_header(path)[0] for path in paths]
+    first_height, first_width = sizes[0]
+    for path, (height, width) in zip(paths, sizes, strict=True):
+        if (height, width) != sizes[0]:
             raise SceneError(
-                f"{path} has {size[0]}x{size[1]} pixels, but {paths[0]} has "
-                f"{sizes[0][0]}x{sizes[0][1]}. All images must have one size: "
+                f"{path} has {width}x{height} pixels, but {paths[0]} has "
+                f"{first_width}x{first_height}. All images must have one size: "
                 f"export or resize them alike."
             )
-    return sizes[0]
+    return first_width, first_height
 
 
 def check_resolution(path: Path, width: int, height: int, resolution: int) -> None:
@@ -186,10 +227,12 @@ def _straight_channels(path: Path, picture: Image.Image) -> np.ndarray:
     return channels
 
 
-def _read_size(path: Path) -> tuple[int, int]:
+def _read_header(path: Path) -> tuple[Size, bool]:
+    """Height and width of an image file, and whether it may have alpha."""
     try:
         with Image.open(path, formats=FORMATS) as picture:
-            return picture.size
+            alpha = "A" in picture.getbands() or "transparency" in picture.info
+            return (picture.height, picture.width), alpha
     except UNREADABLE as problem:
         raise _unreadable(path, problem) from problem
 

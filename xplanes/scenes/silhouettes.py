@@ -48,7 +48,7 @@ def may_hold(views: Views, points: Tensor, *, radius: float) -> Tensor:
     """
     inside = torch.ones(len(views), len(points), dtype=torch.bool)
     for index, pose in enumerate(views.camera_to_world):
-        (height, width), alpha = views.size(index), views.image(index)[..., 3]
+        (height, width), (mask, cell) = views.size(index), views.silhouette(index)
         focal_x, focal_y = views.intrinsics.focal[index].tolist()
         centre_x, centre_y = views.intrinsics.centre[index].tolist()
         local = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -62,9 +62,9 @@ def may_hold(views: Views, points: Tensor, *, radius: float) -> Tensor:
         # How far a ball of this radius reaches from the pixel of its centre, on either axis.
         slant = torch.hypot(depth, local[:, :2].abs().amax(dim=-1))
         focal = max(focal_x, focal_y)
-        margin = (focal * radius * slant / (depth * (depth - radius))).ceil()[seen]
-        steps = _steps_to_foreground(alpha > 0, int(margin.max()))
-        inside[index, seen] = steps[row[seen].long(), column[seen].long()] <= margin
+        margin = (focal * radius * slant / (depth * (depth - radius)) / cell).ceil()[seen]
+        steps = _steps_to_foreground(mask, int(margin.max()))
+        inside[index, seen] = steps[row[seen].long() // cell, column[seen].long() // cell] <= margin
     return inside
 
 

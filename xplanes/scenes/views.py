@@ -1,13 +1,15 @@
-"""Posed, timed images of a scene, held in memory as bytes."""
+"""Posed, timed images of a scene, as bytes in memory or in a file of tiles."""
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from xplanes.scenes.cameras import cast_rays
+from xplanes.scenes.store import LIT, SOLID, TILE, StoredImages, TileFile
 
 SAME_CAMERA = 1e-4
 """Share by which intrinsics of one camera differ at most."""
@@ -90,7 +92,8 @@ class Views:
     which nothing may take for pixels. `image`, `composite` and `image_rays` leave the padding out.
 
     Attributes:
-        images: Colour, already multiplied by alpha, and alpha. uint8 [V, H, W, 4]
+        images: Colour, already multiplied by alpha, and alpha: a tensor, or what reads them from a
+            file of tiles. uint8 [V, H, W, 4]
         camera_to_world: Rigid camera poses. [V, 4, 4]
         times: Time of each image, from 0 to 1. [V]
         intrinsics: Focal lengths, principal points and sizes. A number stands for centred images
@@ -98,7 +101,7 @@ class Views:
         files: Name of each image, relative to the scene's folder.
     """
 
-    images: Tensor
+    images: Tensor | StoredImages
     camera_to_world: Tensor
     times: Tensor
     intrinsics: Intrinsics
@@ -143,6 +146,9 @@ class Views:
     @property
     def is_opaque(self) -> bool:
         """Whether no pixel lets the background through whole: alpha says nothing then."""
+        if isinstance(self.images, StoredImages):
+            flags = (self.images.flags(index) for index in range(len(self)))
+            return all(bool((of_image & SOLID).all()) for of_image in flags)
         return all(bool((self.image(index)[..., 3] > 0).all()) for index in range(len(self)))
 
     @property
@@ -156,9 +162,19 @@ class Views:
         return bool((self.times == self.times[0]).all())
 
     @property
+    def is_stored(self) -> bool:
+        """Whether the images are in a file of tiles, not in memory."""
+        return isinstance(self.images, StoredImages)
+
+    @property
     def nbytes(self) -> int:
-        """Bytes that the images take in memory."""
-        return self.images.numel()
+        """Bytes that the images take in memory, or on disk."""
+        return self.images.nbytes
+
+    @property
+    def identity(self) -> Any:
+        """What tells these images from others: their bytes, or what they were decoded from."""
+        return self.images if isinstance(self.images, Tensor) else self.images.identity
 
     def size(self, index: int) -> tuple[int, int]:
         """Height and width of image ``index``."""
@@ -166,9 +182,32 @@ class Views:
         return height, width
 
     def image(self, index: int) -> Tensor:
-        """Image ``index`` without padding, not copied. uint8 [h, w, 4]"""
+        """Image ``index`` without padding, for reading only. uint8 [h, w, 4]"""
+        if isinstance(self.images, StoredImages):
+            return self.images.image(index)
         height, width = self.size(index)
         return self.images[index, :height, :width]
+
+    def in_memory(self) -> Tensor:
+        """All images, with padding. uint8 [V, H, W, 4]"""
+        if isinstance(self.images, Tensor):
+            return self.images
+        whole = torch.zeros(self.images.shape, dtype=torch.uint8)
+        for index in range(len(self)):
+            height, width = self.size(index)
+            whole[index, :height, :width] = self.images.image(index)
+        return whole
+
+    def silhouette(self, index: int) -> tuple[Tensor, int]:
+        """Where image ``index`` has alpha above 0, in square cells.
+
+        Returns:
+            Whether any pixel of a cell has, and the cells' side in pixels: 1, but `TILE` for images
+            in a file of tiles, of which nothing is read. bool [rows, columns]
+        """
+        if isinstance(self.images, StoredImages):
+            return (self.images.flags(index) & LIT) > 0, TILE
+        return self.image(index)[..., 3] > 0, 1
 
     def valid(self) -> Tensor:
         """Which pixels are no padding. bool [V, H, W]"""
@@ -180,8 +219,11 @@ class Views:
     def subset(self, indices: Tensor) -> "Views":
         """The views at ``indices``, in that order. [K]"""
         intrinsics = self.intrinsics.subset(indices)
-        images = self.images[indices]
-        if len(intrinsics) and self.is_padded:
+        if isinstance(self.images, StoredImages):
+            images = self.images.subset(indices)
+        else:
+            images = self.images[indices]
+        if isinstance(images, Tensor) and len(intrinsics) and self.is_padded:
             height, width = intrinsics.size.amax(dim=0).tolist()
             images = images[:, :height, :width].contiguous()
         return Views(
@@ -203,17 +245,51 @@ class Views:
         focal, centre = self.intrinsics.focal[index], self.intrinsics.centre[index]
         return camera_rays(self.camera_to_world[index], focal, height, width, centre)
 
+    def foreground_rays(self, index: int) -> tuple[Tensor, Tensor]:
+        """Rays through the pixels of image ``index`` with alpha above 0. [N, 3], [N, 3]
+
+        Of images in a file of tiles, rays through the corners of the tiles that hold such pixels.
+        """
+        mask, cell = self.silhouette(index)
+        if cell == 1:
+            origins, directions = self.image_rays(index)
+            return origins[mask.flatten()], directions[mask.flatten()]
+        first = mask.nonzero() * cell
+        last = torch.minimum(first + cell, self.intrinsics.size[index]) - 1
+        corners = torch.cat([first, last, torch.stack([first[:, 0], last[:, 1]], dim=1)])
+        rows, columns = torch.cat([corners, torch.stack([last[:, 0], first[:, 1]], dim=1)]).T
+        return cast_rays(
+            self.camera_to_world[index],
+            rows.float(),
+            columns.float(),
+            focal=self.intrinsics.focal[index],
+            centre=self.intrinsics.centre[index],
+        )
+
 
 def joined(first: Views, second: Views) -> Views:
     """The views of both."""
-    height, width = max(first.height, second.height), max(first.width, second.width)
+    if isinstance(first.images, Tensor) and isinstance(second.images, Tensor):
+        height, width = max(first.height, second.height), max(first.width, second.width)
+        parts = [_padded(images, height, width) for images in (first.images, second.images)]
+        images = torch.cat(parts)
+    else:
+        images = _tiled(first).joined(_tiled(second))
     return Views(
-        torch.cat([_padded(views.images, height, width) for views in (first, second)]),
+        images,
         torch.cat([first.camera_to_world, second.camera_to_world]),
         torch.cat([first.times, second.times]),
         first.intrinsics.joined(second.intrinsics),
         first.files + second.files,
     )
+
+
+def _tiled(views: Views) -> StoredImages:
+    """The images in tiles."""
+    if isinstance(views.images, StoredImages):
+        return views.images
+    file = TileFile.of(views.image(index) for index in range(len(views)))
+    return StoredImages.all_of(file)
 
 
 def _padded(images: Tensor, height: int, width: int) -> Tensor:

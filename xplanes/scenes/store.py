@@ -338,6 +338,13 @@ def _write(
         )
 
         def run(job: Job) -> None:
+            try:
+                decode(job)
+            except BaseException:
+                stop.set()  # Other jobs may be long.
+                raise
+
+        def decode(job: Job) -> None:
             for index, pixels in job():
                 if stop.is_set():
                     return

@@ -55,9 +55,12 @@ class RayBatches:
         self.background = settings.background
         widths = views.intrinsics.size[:, 1].tolist()
         near = foreground(views, [max(1, round(NEAR_SILHOUETTE * width)) for width in widths])
-        far = ~near & views.valid() if views.is_padded else ~near
+        far = ~near
+        if views.is_cut:
+            valid = views.valid()
+            near, far = near & valid, far & valid
         self.near, self.far = (pool.flatten().nonzero()[:, 0] for pool in (near, far))
-        natural = len(self.far) / views.pixels
+        natural = len(self.far) / (len(self.near) + len(self.far))
         skip = settings.skip_background and 0 < natural < 1
         self.far_share = min(settings.background_share, natural) if skip else natural
         jitter = skip and not views.is_static
@@ -83,12 +86,14 @@ class RayBatches:
         )
         height, width = self.views.height, self.views.width
         view = pixel // (height * width)
+        intrinsics = self.views.intrinsics
         origins, directions = cast_rays(
             self.views.camera_to_world[view],
             (pixel // width % height).float(),
             (pixel % width).float(),
-            focal=self.views.intrinsics.focal[view],
-            centre=self.views.intrinsics.centre[view],
+            focal=intrinsics.focal[view],
+            centre=intrinsics.centre[view],
+            lenses=None if intrinsics.lenses is None else intrinsics.lenses.subset(view),
         )
         origins, directions = self.frame.rays(origins, directions)
         colour = self.views.images.view(-1, 4)[pixel].float() / 255

@@ -21,7 +21,7 @@ DECODE = """
 import sys, time
 from pathlib import Path
 from xplanes.scenes import store
-from xplanes.scenes.images import read_images
+from xplanes.scenes.images import native_sizes, read_images
 
 store.IN_MEMORY, cut, pause = 0, store.to_tiles, float(sys.argv[3])
 calls = []
@@ -32,7 +32,8 @@ def slow(pixels):
     return cut(pixels)
 
 store.to_tiles = slow
-images = read_images(sorted(Path(sys.argv[1]).iterdir()), None, Path(sys.argv[2]))[0]
+paths = sorted(Path(sys.argv[1]).iterdir())
+images = read_images(paths, native_sizes(paths), cache=Path(sys.argv[2]))
 print(sum(int(images.image(i).sum()) for i in range(len(images))), len(calls))
 """
 """Decodes slowly; prints the sum of all pixels, and how many images it decoded."""

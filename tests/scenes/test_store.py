@@ -19,7 +19,8 @@ from xplanes.scenes import store
 from xplanes.scenes.batches import AHEAD, RayBatches, RaySettings
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import cube_frame, scene_frame
-from xplanes.scenes.images import read_images
+from xplanes.scenes.images import final_sizes, native_sizes
+from xplanes.scenes.images import read_images as read_sized
 from xplanes.scenes.silhouettes import may_hold
 from xplanes.scenes.store import TILE, StoredImages, TileFile
 from xplanes.scenes.views import Views, joined
@@ -47,6 +48,12 @@ def pictures(folder: Path, sizes, *, alpha: bool, seed=0) -> list[Path]:
         paths.append(folder / f"{index:03d}.png")
         Image.fromarray(pixels).save(paths[-1])
     return paths
+
+
+def read_images(paths: list[Path], resolution: int | None, cache: Path | None = None):
+    native = native_sizes(paths)
+    sizes = final_sizes(paths, native, resolution)
+    return read_sized(paths, sizes, cache=cache), native, sizes
 
 
 @pytest.fixture

@@ -7,10 +7,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from xplanes.scenes.cameras import cast_rays
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.silhouettes import foreground
-from xplanes.scenes.store import LIT, TILE, StoredImages
+from xplanes.scenes.store import LIT, TILE, StoredImages, count_in_tiles
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Settings, Share
 from xplanes.streams import step_generator
@@ -71,13 +70,16 @@ class RayBatches:
         widths = views.intrinsics.size[:, 1].tolist()
         margins = [max(1, round(NEAR_SILHOUETTE * width)) for width in widths]
         if isinstance(views.images, StoredImages):
-            self.near, self.far = _tile_pools(views.images, margins)
+            self.near, self.far = _tile_pools(views, views.images, margins)
         else:
             near = foreground(views, margins)
-            far = ~near & views.valid() if views.is_padded else ~near
+            far = ~near
+            if views.is_cut:
+                valid = views.valid()
+                near, far = near & valid, far & valid
             self.near, self.far = (_PixelPool(pool) for pool in (near, far))
         self._prefetched = -1
-        natural = len(self.far) / views.pixels
+        natural = len(self.far) / (len(self.near) + len(self.far))
         skip = settings.skip_background and 0 < natural < 1
         self.far_share = min(settings.background_share, natural) if skip else natural
         jitter = skip and not views.is_static
@@ -101,13 +103,7 @@ class RayBatches:
         else:
             drawn = self._from_memory(self.views.images, uniform)
         far, view, row, column, colour = drawn
-        origins, directions = cast_rays(
-            self.views.camera_to_world[view],
-            row.float(),
-            column.float(),
-            focal=self.views.intrinsics.focal[view],
-            centre=self.views.intrinsics.centre[view],
-        )
+        origins, directions = self.views.pixel_rays(view, row.float(), column.float())
         origins, directions = self.frame.rays(origins, directions)
         colour = colour.float() / 255
         shape = (self.rays, 3)
@@ -157,14 +153,30 @@ class RayBatches:
         top, left = tile // columns * TILE, tile % columns * TILE
         height, width = (size[:, 0] - top).clamp(max=TILE), (size[:, 1] - left).clamp(max=TILE)
         inside = torch.rand(len(tile), per_tile, generator=generator, dtype=torch.float64)
-        pixels = (height * width)[:, None]
-        pixel = torch.minimum((inside * pixels).long(), pixels - 1)
+        if self.views.intrinsics.sights is None:
+            pixels = (height * width)[:, None]
+            pixel = torch.minimum((inside * pixels).long(), pixels - 1)
+        else:
+            pixel = self._with_rays(view, top, left, inside)
         row, column = pixel // width[:, None], pixel % width[:, None]
         colour = images.pixels(view, tile, row * TILE + column)
         rays = slice(0, self.rays)  # The last tile may have to give fewer.
         far, view = (of_tile.repeat_interleave(per_tile)[rays] for of_tile in (far, view))
         row, column = (top[:, None] + row).flatten()[rays], (left[:, None] + column).flatten()[rays]
         return far, view, row, column, colour.flatten(0, 1)[rays]
+
+    def _with_rays(self, view: Tensor, top: Tensor, left: Tensor, inside: Tensor) -> Tensor:
+        """Pixels of tiles among those that their lenses map a direction to. [K, P] -> [K, P]"""
+        found = []
+        for index, row, column, uniform in zip(
+            view.tolist(), top.tolist(), left.tolist(), inside, strict=True
+        ):
+            shown = self.views.intrinsics.has_ray(index)
+            if shown is None:
+                shown = torch.ones(self.views.size(index), dtype=torch.bool)
+            tile = _PixelPool(shown[row : row + TILE, column : column + TILE])
+            found.append(tile.pick(uniform)[:, 0])
+        return torch.stack(found)
 
     @property
     def _per_tile(self) -> int:
@@ -192,7 +204,11 @@ class RayBatches:
 
 
 class _PixelPool:
-    """Pixels to draw from, of images in memory. bool [V, H, W]"""
+    """Pixels to draw from.
+
+    Args:
+        chosen: Which pixels of some images or of a tile. bool, of any shape
+    """
 
     def __init__(self, chosen: Tensor) -> None:
         self.pixels = chosen.flatten().nonzero()[:, 0]
@@ -226,7 +242,9 @@ class _TilePool:
         return self.places[torch.searchsorted(self.ends, place, right=True)].long()
 
 
-def _tile_pools(images: StoredImages, margins: list[int]) -> tuple[_TilePool, _TilePool]:
+def _tile_pools(
+    views: Views, images: StoredImages, margins: list[int]
+) -> tuple[_TilePool, _TilePool]:
     """Tiles within some pixels of the silhouettes, and all others."""
     places, pixels, near = [], [], []
     for index, margin in enumerate(margins):
@@ -234,11 +252,13 @@ def _tile_pools(images: StoredImages, margins: list[int]) -> tuple[_TilePool, _T
         reach = -(-margin // TILE)
         near.append(F.max_pool2d(lit, 2 * reach + 1, stride=1, padding=reach).flatten() > 0)
         height, width = (_lengths(side) for side in images.sizes[index].tolist())
-        pixels.append((height[:, None] * width).flatten())
+        shown = views.intrinsics.has_ray(index)
+        count = height[:, None] * width if shown is None else count_in_tiles(shown)
+        pixels.append(count.flatten())
         number = torch.arange(len(pixels[-1]), dtype=torch.int32)
         places.append(torch.stack([torch.full_like(number, index), number], dim=1))
-    place, count, chosen = torch.cat(places), torch.cat(pixels), torch.cat(near)
-    first, second = (_TilePool(place[part], count[part]) for part in (chosen, ~chosen))
+    place, counts, chosen = torch.cat(places), torch.cat(pixels), torch.cat(near)
+    first, second = (_TilePool(place[part], counts[part]) for part in (chosen, ~chosen))
     return first, second
 
 

@@ -1,5 +1,6 @@
 """Image files decoded, multiplied by alpha and reduced to the working resolution."""
 
+import hashlib
 import os
 import struct
 from collections.abc import Iterator, Sequence
@@ -31,11 +32,11 @@ UNREADABLE = (
 
 
 def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
-    """Decode images of one size and reduce them to ``resolution`` pixels square.
+    """Decode images of one size and reduce them to a width.
 
     Args:
         paths: Image files, PNG or JPEG, at least one. [V]
-        resolution: Pixels per side; None keeps the size of the files.
+        resolution: Width in pixels; None keeps the size of the files.
 
     Returns:
         Colour, multiplied by alpha before it was averaged, and alpha. uint8 [V, H, W, 4]
@@ -44,70 +45,97 @@ def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
         SceneError: A file cannot be decoded, sizes differ, or the resolution cannot be met.
     """
     common_size(paths)
-    native = [_read_header(path)[0] for path in paths]
-    return _into_memory(paths, final_sizes(paths, native, resolution))
+    return _into_memory(paths, final_sizes(paths, native_sizes(paths), resolution))
 
 
-def read_images(
-    paths: Sequence[Path], resolution: int | None, cache: Path | None = None
-) -> tuple[Tensor | store.StoredImages, list[Size], list[Size]]:
-    """Decode images of any sizes and reduce them to ``resolution`` pixels square.
-
-    Images that take more than `store.IN_MEMORY` bytes are decoded once to a file of the cache.
-
-    Args:
-        paths: Image files, PNG or JPEG, at least one. [V]
-        resolution: Pixels per side; None keeps the sizes of the files.
-        cache: Folder of decoded images; that of the user when None.
-
-    Returns:
-        Colour, multiplied by alpha before it was averaged, and alpha, smaller images padded with
-        zeros at the bottom and on the right: uint8 [V, H, W, 4]. Then the height and width of each
-        file, and those of each image without padding.
+def native_sizes(paths: Sequence[Path]) -> list[Size]:
+    """Heights and widths of image files, read from their headers alone.
 
     Raises:
-        SceneError: A file cannot be decoded, or the resolution cannot be met.
-        StorageError: The cache cannot be written.
+        SceneError: If a file is no image.
     """
-    headers = [_read_header(path) for path in paths]
-    native = [size for size, _ in headers]
-    sizes = final_sizes(paths, native, resolution)
-    if not store.is_needed(sizes):
-        return _into_memory(paths, sizes), native, sizes
-    channels = 4 if any(alpha for _, alpha in headers) else 3
-
-    def job(index: int) -> store.Job:
-        def decode() -> Iterator[tuple[int, np.ndarray]]:
-            yield index, read_image(paths[index], sizes[index])[..., :channels]
-
-        return decode
-
-    jobs = [job(index) for index in range(len(paths))]
-    return store.decoded(paths, "images", sizes, channels, jobs, cache), native, sizes
-
-
-def read_image(path: Path, size: Size) -> np.ndarray:
-    """Decode one image and reduce it to a size: premultiplied colour, alpha. uint8 [H, W, 4]"""
-    height, width = size
-    return shrink(load_premultiplied(path), width, height)
+    return [_read_header(path)[0] for path in paths]
 
 
 def final_sizes(
     paths: Sequence[Path], native: Sequence[Size], resolution: int | None
 ) -> list[Size]:
-    """Height and width of each image after it is reduced.
+    """Heights and widths of images that are reduced to one width, with their own aspect ratios.
+
+    Args:
+        paths: Image files. [V]
+        native: Their sizes. [V]
+        resolution: Width in pixels; None keeps the sizes.
 
     Raises:
-        SceneError: If an image of these native sizes cannot be reduced to the resolution.
+        SceneError: If an image is narrower.
     """
     if resolution is None:
         return list(native)
     for path, (height, width) in zip(paths, native, strict=True):
         check_resolution(path, width, height, resolution)
-    return [(resolution, resolution)] * len(paths)
+    return [(max(1, round(height * resolution / width)), resolution) for height, width in native]
 
 
-def _into_memory(paths: Sequence[Path], sizes: Sequence[Size]) -> Tensor:
+def read_images(
+    paths: Sequence[Path],
+    sizes: Sequence[Size],
+    masks: Sequence[Path | None] = (),
+    has_ray: Sequence[Tensor | None] = (),
+    cache: Path | None = None,
+) -> Tensor | store.StoredImages:
+    """Decode images of any sizes and reduce them.
+
+    Images that take more than `store.IN_MEMORY` bytes are decoded once to a file of the cache.
+
+    Args:
+        paths: Image files, PNG or JPEG, at least one. [V]
+        sizes: Height and width of each image after that. [V]
+        masks: Files that alpha is multiplied by; none where it is empty. [V]
+        has_ray: Pixels of the reduced images that show anything, of each image bool [h, w], or None
+            for all; all of all images where it is empty. [V]
+        cache: Folder of decoded images; that of the user when None.
+
+    Returns:
+        Colour, multiplied by alpha before it was averaged, and alpha, smaller images padded with
+        zeros at the bottom and on the right. uint8 [V, H, W, 4]
+
+    Raises:
+        SceneError: A file cannot be decoded, or a mask does not fit its image.
+        StorageError: The cache cannot be written.
+    """
+    if not store.is_needed(sizes):
+        return _into_memory(paths, sizes, masks, has_ray)
+    cut = any(masks) or any(shown is not None for shown in has_ray)
+    channels = 4 if cut or any(_read_header(path)[1] for path in paths) else 3
+
+    def job(index: int) -> store.Job:
+        def decode() -> Iterator[tuple[int, np.ndarray]]:
+            yield index, _read_shown(paths, sizes, masks, has_ray, index)[..., :channels]
+
+        return decode
+
+    sources = [*paths, *(mask for mask in masks if mask is not None)]
+    recipe = ["images", [mask is not None for mask in masks], _digests(has_ray)]
+    jobs = [job(index) for index in range(len(paths))]
+    return store.decoded(sources, recipe, sizes, channels, jobs, cache)
+
+
+def _digests(masks: Sequence[Tensor | None]) -> list[str]:
+    """Hashes of masks, most of which are one and the same tensor."""
+    known: dict[int, str] = {id(None): ""}
+    for mask in masks:
+        if mask is not None and id(mask) not in known:
+            known[id(mask)] = hashlib.sha256(mask.numpy().tobytes()).hexdigest()
+    return [known[id(mask)] for mask in masks]
+
+
+def _into_memory(
+    paths: Sequence[Path],
+    sizes: Sequence[Size],
+    masks: Sequence[Path | None] = (),
+    has_ray: Sequence[Tensor | None] = (),
+) -> Tensor:
     """Decode images to one tensor, padded at the bottom and on the right. uint8 [V, H, W, 4]"""
     largest = max(height for height, _ in sizes), max(width for _, width in sizes)
     same = len(set(sizes)) == 1
@@ -115,7 +143,7 @@ def _into_memory(paths: Sequence[Path], sizes: Sequence[Size]) -> Tensor:
 
     def fill(index: int) -> None:
         height, width = sizes[index]
-        pixels = read_image(paths[index], sizes[index])
+        pixels = _read_shown(paths, sizes, masks, has_ray, index)
         images[index, :height, :width] = torch.from_numpy(pixels)
 
     # Pillow decodes and resamples without the interpreter lock, so threads are enough.
@@ -125,6 +153,48 @@ def _into_memory(paths: Sequence[Path], sizes: Sequence[Size]) -> Tensor:
     finally:
         pool.shutdown(cancel_futures=True)
     return images
+
+
+def _read_shown(
+    paths: Sequence[Path],
+    sizes: Sequence[Size],
+    masks: Sequence[Path | None],
+    has_ray: Sequence[Tensor | None],
+    index: int,
+) -> np.ndarray:
+    """One of the images, with alpha 0 where it shows nothing. uint8 [h, w, 4]"""
+    pixels = read_image(paths[index], sizes[index], masks[index] if masks else None)
+    if has_ray and (shown := has_ray[index]) is not None:
+        pixels[~shown.numpy()] = 0
+    return pixels
+
+
+def read_image(path: Path, size: Size, mask: Path | None = None) -> np.ndarray:
+    """Decode one image, multiply it by its mask, and reduce it. uint8 [H, W, 4]"""
+    channels = load_premultiplied(path)
+    if mask is not None:
+        channels *= _read_mask(mask, path, channels.shape[1:])
+    height, width = size
+    return shrink(channels, width, height)
+
+
+def _read_mask(path: Path, image: Path, size: tuple[int, ...]) -> np.ndarray:
+    """A mask as factors from 0, where it is black, to 1. float32 [H, W]"""
+    try:
+        with Image.open(path, formats=FORMATS) as picture:
+            if picture.mode in SIXTEEN_BIT_MODES:
+                values = np.asarray(picture, np.float32) / 257
+            else:
+                values = np.asarray(picture.convert("L"), np.float32)
+    except UNREADABLE as problem:
+        raise _unreadable(path, problem) from problem
+    if values.shape != size:
+        raise SceneError(
+            f"{path} has {values.shape[1]}x{values.shape[0]} pixels, but {image}, whose mask it "
+            f"is, has {size[1]}x{size[0]}. Export the mask at the size of the image."
+        )
+    # Zeros and ones are meant as black and white.
+    return values if values.max() == 1 else values / 255
 
 
 def common_size(paths: Sequence[Path]) -> tuple[int, int]:
@@ -148,16 +218,11 @@ def check_resolution(path: Path, width: int, height: int, resolution: int) -> No
             f"data.resolution={resolution} is not a size. Give 1 to {width} pixels, or null "
             f"to keep the {width}x{height} pixels of {path}."
         )
-    if width != height:
-        raise SceneError(
-            f"{path} has {width}x{height} pixels, and data.resolution={resolution} stands for a "
-            f"square. Set data.resolution=null to keep the images as they are; shrinking the files "
-            f"leaves camera_angle_x as it is, cropping them does not."
-        )
     if resolution > width:
         raise SceneError(
-            f"data.resolution={resolution} is more than the {width} pixels of {path}. Enlarged "
-            f"images hold no more detail: give at most {width}, or null for the native size."
+            f"data.resolution={resolution} is more than the {width} pixels that {path} is wide. "
+            f"Enlarged images hold no more detail: give at most {width}, or null for the native "
+            f"size."
         )
 
 

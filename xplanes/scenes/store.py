@@ -392,6 +392,14 @@ def to_tiles(pixels: np.ndarray) -> np.ndarray:
     return tiles.reshape(rows * columns, TILE**2, channels)
 
 
+def count_in_tiles(mask: Tensor) -> Tensor:
+    """How many pixels of each tile a mask holds. bool [h, w] -> int64 [rows, columns]"""
+    height, width = mask.shape
+    rows, columns = _grid(height, width)
+    padded = F.pad(mask, (0, columns * TILE - width, 0, rows * TILE - height))
+    return padded.view(rows, TILE, columns, TILE).sum(dim=(1, 3))
+
+
 def _alpha_flags(pixels: np.ndarray) -> np.ndarray:
     """`LIT` and `SOLID` of an image's tiles. uint8 [h, w, 4] -> uint8 [tiles]"""
     seen = torch.from_numpy(np.ascontiguousarray(pixels[..., 3] > 0)).float()[None]

@@ -1,6 +1,7 @@
 import json
 import math
 import warnings
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from xplanes.scenes.cameras import focal_length, look_at
 from xplanes.scenes.dnerf import SceneError, read_scene
 from xplanes.scenes.images import load_images, load_premultiplied, shrink
 from xplanes.scenes.lenses import COEFFICIENTS
+from xplanes.scenes.transforms import read_transforms
 
 LEGO = Path(__file__).parents[3] / "shared" / "scenes" / "lego"
 ANGLE = 0.7
@@ -632,6 +634,22 @@ def test_masks_become_alpha(scene):
     expected = whole.reshape(4, 3, 4, 3, 4).mean(axis=(1, 3))
     found = scene.read(resolution=4).splits["train"].image(1).numpy()
     assert np.abs(found - expected).max() <= 0.5 + 1e-3
+
+
+def test_a_listing_keeps_what_belongs_to_an_image(scene):
+    listing = read_transforms(scene.path / "transforms_train.json")
+    named = replace(
+        listing,
+        masks=(None, *(path.with_suffix(".mask") for path in listing.paths[1:])),
+        cameras=tuple("abcde"),
+    )
+    part = named.subset([3, 0])
+    assert part.files == ("train/r_3.png", "train/r_0.png")
+    assert part.masks == (listing.paths[3].with_suffix(".mask"), None)
+    assert part.cameras == ("d", "a")
+    assert part.times.tolist() == [0.75, 0]
+    assert torch.equal(part.camera_to_world[0], listing.camera_to_world[3])
+    assert listing.subset([1]).masks == listing.subset([1]).cameras == ()
 
 
 def test_masks_that_do_not_fit(scene):

@@ -1,14 +1,11 @@
 """Image files decoded, multiplied by alpha and reduced to the working resolution."""
 
 import hashlib
-import os
 import struct
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 from torch import Tensor
 
@@ -45,7 +42,8 @@ def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
         SceneError: A file cannot be decoded, sizes differ, or the resolution cannot be met.
     """
     common_size(paths)
-    return _into_memory(paths, final_sizes(paths, native_sizes(paths), resolution))
+    sizes = final_sizes(paths, native_sizes(paths), resolution)
+    return store.in_memory(sizes, _jobs(paths, sizes))
 
 
 def native_sizes(paths: Sequence[Path]) -> list[Size]:
@@ -54,7 +52,7 @@ def native_sizes(paths: Sequence[Path]) -> list[Size]:
     Raises:
         SceneError: If a file is no image.
     """
-    return [_read_header(path)[0] for path in paths]
+    return [read_header(path)[0] for path in paths]
 
 
 def final_sizes(
@@ -104,69 +102,48 @@ def read_images(
         SceneError: A file cannot be decoded, or a mask does not fit its image.
         StorageError: The cache cannot be written.
     """
+    jobs = _jobs(paths, sizes, masks, has_ray)
     if not store.is_needed(sizes):
-        return _into_memory(paths, sizes, masks, has_ray)
+        return store.in_memory(sizes, jobs)
     cut = any(masks) or any(shown is not None for shown in has_ray)
-    channels = 4 if cut or any(_read_header(path)[1] for path in paths) else 3
-
-    def job(index: int) -> store.Job:
-        def decode() -> Iterator[tuple[int, np.ndarray]]:
-            yield index, _read_shown(paths, sizes, masks, has_ray, index)[..., :channels]
-
-        return decode
-
+    channels = 4 if cut or any(read_header(path)[1] for path in paths) else 3
     sources = [*paths, *(mask for mask in masks if mask is not None)]
-    recipe = ["images", [mask is not None for mask in masks], _digests(has_ray)]
-    jobs = [job(index) for index in range(len(paths))]
+    recipe = ["images", [mask is not None for mask in masks], digests(has_ray)]
     return store.decoded(sources, recipe, sizes, channels, jobs, cache)
 
 
-def _digests(masks: Sequence[Tensor | None]) -> list[str]:
+def _jobs(
+    paths: Sequence[Path],
+    sizes: Sequence[Size],
+    masks: Sequence[Path | None] = (),
+    has_ray: Sequence[Tensor | None] = (),
+) -> list[store.Job]:
+    """What decodes the images, one each."""
+
+    def job(index: int) -> store.Job:
+        def decode() -> Iterator[tuple[int, np.ndarray]]:
+            pixels = read_image(paths[index], sizes[index], masks[index] if masks else None)
+            yield index, cleared(pixels, has_ray[index] if has_ray else None)
+
+        return decode
+
+    return [job(index) for index in range(len(paths))]
+
+
+def cleared(pixels: np.ndarray, shown: Tensor | None) -> np.ndarray:
+    """Pixels with zeros where they show nothing. uint8 [h, w, C], bool [h, w]"""
+    if shown is not None:
+        pixels[~shown.numpy()] = 0
+    return pixels
+
+
+def digests(masks: Sequence[Tensor | None]) -> list[str]:
     """Hashes of masks, most of which are one and the same tensor."""
     known: dict[int, str] = {id(None): ""}
     for mask in masks:
         if mask is not None and id(mask) not in known:
             known[id(mask)] = hashlib.sha256(mask.numpy().tobytes()).hexdigest()
     return [known[id(mask)] for mask in masks]
-
-
-def _into_memory(
-    paths: Sequence[Path],
-    sizes: Sequence[Size],
-    masks: Sequence[Path | None] = (),
-    has_ray: Sequence[Tensor | None] = (),
-) -> Tensor:
-    """Decode images to one tensor, padded at the bottom and on the right. uint8 [V, H, W, 4]"""
-    largest = max(height for height, _ in sizes), max(width for _, width in sizes)
-    same = len(set(sizes)) == 1
-    images = (torch.empty if same else torch.zeros)(len(paths), *largest, 4, dtype=torch.uint8)
-
-    def fill(index: int) -> None:
-        height, width = sizes[index]
-        pixels = _read_shown(paths, sizes, masks, has_ray, index)
-        images[index, :height, :width] = torch.from_numpy(pixels)
-
-    # Pillow decodes and resamples without the interpreter lock, so threads are enough.
-    pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1, len(paths)))
-    try:
-        list(pool.map(fill, range(len(paths))))
-    finally:
-        pool.shutdown(cancel_futures=True)
-    return images
-
-
-def _read_shown(
-    paths: Sequence[Path],
-    sizes: Sequence[Size],
-    masks: Sequence[Path | None],
-    has_ray: Sequence[Tensor | None],
-    index: int,
-) -> np.ndarray:
-    """One of the images, with alpha 0 where it shows nothing. uint8 [h, w, 4]"""
-    pixels = read_image(paths[index], sizes[index], masks[index] if masks else None)
-    if has_ray and (shown := has_ray[index]) is not None:
-        pixels[~shown.numpy()] = 0
-    return pixels
 
 
 def read_image(path: Path, size: Size, mask: Path | None = None) -> np.ndarray:
@@ -199,7 +176,7 @@ def _read_mask(path: Path, image: Path, size: tuple[int, ...]) -> np.ndarray:
 
 def common_size(paths: Sequence[Path]) -> tuple[int, int]:
     """Width and height that all files share, read from their headers alone."""
-    sizes = [_read_header(path)[0] for path in paths]
+    sizes = [read_header(path)[0] for path in paths]
     first_height, first_width = sizes[0]
     for path, (height, width) in zip(paths, sizes, strict=True):
         if (height, width) != sizes[0]:
@@ -292,7 +269,7 @@ def _straight_channels(path: Path, picture: Image.Image) -> np.ndarray:
     return channels
 
 
-def _read_header(path: Path) -> tuple[Size, bool]:
+def read_header(path: Path) -> tuple[Size, bool]:
     """Height and width of an image file, and whether it may have alpha."""
     try:
         with Image.open(path, formats=FORMATS) as picture:

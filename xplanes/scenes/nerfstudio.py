@@ -34,6 +34,7 @@ class NerfstudioSettings(SceneSettings):
             eval_every=self.eval_every,
             views=self.views,
             eval_views=self.eval_views,
+            cache=self.image_cache,
         )
 
 
@@ -45,6 +46,7 @@ def read_capture(
     eval_every: int = 8,
     views: int | None = None,
     eval_views: int | None = None,
+    cache: Path | None = None,
 ) -> Scene:
     """Read a capture and check all of it.
 
@@ -60,6 +62,7 @@ def read_capture(
         views: Number of views to keep of the train split, spread evenly over time;
             None keeps all.
         eval_views: The same for every other split, at most.
+        cache: Folder of images that are too large for memory; that of the user when None.
 
     Raises:
         MissingSplitError: If there is no split of a name.
@@ -87,7 +90,7 @@ def read_capture(
     chosen = thinned(chosen, views, eval_views, folder)
     return Scene(
         folder.resolve().name,
-        {split: read_views(part, resolution) for split, part in chosen.items()},
+        {split: read_views(part, resolution, cache) for split, part in chosen.items()},
     )
 
 

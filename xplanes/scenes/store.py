@@ -44,7 +44,7 @@ LIT, SOLID = 1, 2
 """What a tile's byte says: some pixel has alpha above 0; all pixels have."""
 
 Job = Callable[[], Iterable[tuple[int, np.ndarray]]]
-"""Decodes some of the images: gives their numbers and pixels, uint8 [h, w, C]."""
+"""Decodes some of the images: gives their numbers and pixels, uint8 [h, w, 3 or 4]."""
 
 
 class StoredImages:
@@ -241,8 +241,29 @@ def default_cache() -> Path:
 
 def is_needed(sizes: Sequence[tuple[int, int]]) -> bool:
     """Whether images of these heights and widths are too much for memory."""
-    height, width = (max(side) for side in zip(*sizes, strict=True))
+    height, width = _largest(sizes)
     return 4 * len(sizes) * height * width > IN_MEMORY
+
+
+def in_memory(sizes: Sequence[tuple[int, int]], jobs: Sequence[Job]) -> Tensor:
+    """Decode images to one tensor, padded with zeros at the bottom and on the right.
+
+    Args:
+        sizes: Height and width of each image. [V]
+        jobs: Decode the images, each some of them. They run in threads.
+
+    Returns:
+        Premultiplied colour and alpha. uint8 [V, H, W, 4]
+    """
+    empty = torch.empty if len(set(sizes)) == 1 else torch.zeros
+    images = empty(len(sizes), *_largest(sizes), 4, dtype=torch.uint8)
+
+    def keep(index: int, pixels: np.ndarray) -> None:
+        height, width = sizes[index]
+        images[index, :height, :width] = torch.from_numpy(_with_channels(pixels, 4))
+
+    _run(jobs, keep)
+    return images
 
 
 def decoded(
@@ -293,7 +314,7 @@ def decoded(
         for leftover in folder.glob(f".{path.name}{MARK}*"):
             leftover.unlink(missing_ok=True)
         _require_space(folder, length)
-        height, width = (max(side) for side in zip(*sizes, strict=True))
+        height, width = _largest(sizes)
         print(
             f"{len(sizes)} images of up to {width}x{height} px take {length / 2**30:.1f} GB "
             f"decoded, too much for memory: decoding them once to {path} (it can be deleted when "
@@ -326,7 +347,7 @@ def _write(
     first = _firsts(sizes)
     flags = np.zeros(first[-1], np.uint8)
     written = np.zeros(len(sizes), bool)
-    turn, stop = threading.Lock(), threading.Event()
+    turn = threading.Lock()
     with path.open("r+b", buffering=0) as file:
         file.truncate(length)
         bar = tqdm(
@@ -337,42 +358,60 @@ def _write(
             disable=not sys.stderr.isatty(),
         )
 
-        def run(job: Job) -> None:
-            try:
-                decode(job)
-            except BaseException:
-                stop.set()  # Other jobs may be long.
-                raise
+        def keep(index: int, pixels: np.ndarray) -> None:
+            pixels = _with_channels(pixels, channels)
+            assert pixels.shape == (*sizes[index], channels)
+            if channels == 4:
+                flags[first[index] : first[index + 1]] = _alpha_flags(pixels)
+            content = to_tiles(pixels).data.cast("B")
+            with turn:
+                file.seek(first[index] * TILE**2 * channels)
+                # A write may take less than it is given, at most 2 GB on Linux.
+                while len(content):
+                    content = content[file.write(content) :]
+                bar.update()
+            written[index] = True
 
-        def decode(job: Job) -> None:
-            for index, pixels in job():
-                if stop.is_set():
-                    return
-                assert pixels.shape == (*sizes[index], channels)
-                part = slice(first[index], first[index + 1])
-                if channels == 4:
-                    flags[part] = _alpha_flags(pixels)
-                content = to_tiles(pixels).data.cast("B")
-                with turn:
-                    file.seek(first[index] * TILE**2 * channels)
-                    # A write may take less than it is given, at most 2 GB on Linux.
-                    while len(content):
-                        content = content[file.write(content) :]
-                    bar.update()
-                written[index] = True
-
-        # Decoders work without the interpreter lock, so threads are enough.
-        pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1, len(jobs)))
         try:
-            list(pool.map(run, jobs))
+            _run(jobs, keep)
         finally:
-            stop.set()
-            pool.shutdown(cancel_futures=True)
             bar.close()
         assert written.all()
         if channels == 4:
             file.seek(first[-1] * TILE**2 * channels)
             file.write(flags.tobytes())
+
+
+def _run(jobs: Sequence[Job], keep: Callable[[int, np.ndarray], None]) -> None:
+    """Run jobs in threads, until one fails; each image is handed on as it is decoded."""
+    stop = threading.Event()
+
+    def run(job: Job) -> None:
+        try:
+            for index, pixels in job():
+                if stop.is_set():
+                    return
+                keep(index, pixels)
+        except BaseException:
+            stop.set()  # Other jobs may be long.
+            raise
+
+    # Decoders work without the interpreter lock, so threads are enough.
+    pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1, len(jobs)))
+    try:
+        list(pool.map(run, jobs))
+    finally:
+        stop.set()
+        pool.shutdown(cancel_futures=True)
+
+
+def _with_channels(pixels: np.ndarray, channels: int) -> np.ndarray:
+    """Pixels with so many channels: alpha is cut off, or 255. uint8 [h, w, C]"""
+    if pixels.shape[-1] >= channels:
+        return pixels[..., :channels]
+    whole = np.full((*pixels.shape[:2], channels), 255, np.uint8)
+    whole[..., : pixels.shape[-1]] = pixels
+    return whole
 
 
 def to_tiles(pixels: np.ndarray) -> np.ndarray:
@@ -407,6 +446,11 @@ def _alpha_flags(pixels: np.ndarray) -> np.ndarray:
     lit = F.max_pool2d(seen, TILE, ceil_mode=True)
     bare = F.max_pool2d(1 - seen, TILE, ceil_mode=True)
     return (LIT * (lit > 0) + SOLID * (bare == 0)).flatten().byte().numpy()
+
+
+def _largest(sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """Largest height and largest width."""
+    return max(height for height, _ in sizes), max(width for _, width in sizes)
 
 
 def _grid(height: int, width: int) -> tuple[int, int]:

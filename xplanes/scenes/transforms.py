@@ -81,7 +81,7 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
         files=tuple(image.relative_to(folder).as_posix() for image in paths),
         camera_to_world=torch.from_numpy(poses).float(),
         times=torch.tensor(times or [0.0] * len(frames), dtype=torch.float32),
-        calibrations=tuple(_calibration(str(path), content, *each) for each in named),
+        calibrations=tuple(read_calibration(str(path), content, *each) for each in named),
         timed=bool(times),
         masks=masks if any(masks) else (),
     )
@@ -151,10 +151,20 @@ def _times(path: Path, named: list[tuple[str, dict[str, Any]]], any_unit: bool) 
     return [(time - first) / (last - first) if last > first else 0.0 for time in times]
 
 
-def _calibration(
+def read_calibration(
     where: str, content: Mapping[str, Any], label: str, frame: Mapping[str, Any]
 ) -> Calibration:
-    """The camera of a frame: its own keys, those of the file where it has none."""
+    """The camera of a frame: its own keys, those of the file where it has none.
+
+    Args:
+        where: The file, for messages.
+        content: What it holds.
+        label: The file and frame, for messages.
+        frame: What the frame holds.
+
+    Raises:
+        SceneError: If a key is missing or out of range, or the lens is one that is not read.
+    """
     shared, own = _pixels(where, content), _pixels(label, frame)
     name, keys = where, content
     if "camera_angle_x" in frame and "fl_x" not in own:

@@ -21,6 +21,7 @@ from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import cube_frame, scene_frame
 from xplanes.scenes.images import final_sizes, native_sizes
 from xplanes.scenes.images import read_images as read_sized
+from xplanes.scenes.lenses import Lenses, LensModel
 from xplanes.scenes.silhouettes import may_hold
 from xplanes.scenes.store import TILE, StoredImages, TileFile
 from xplanes.scenes.views import Views, joined
@@ -196,6 +197,35 @@ def test_every_pixel_is_drawn_as_often_as_any_other() -> None:
     within = counts[0, :64, :64].flatten()
     chi_squared = float(((within - within.mean()) ** 2 / within.mean()).sum())
     assert abs(chi_squared - 4095) < 5 * (2 * 4095) ** 0.5
+
+
+def test_no_pixel_is_drawn_that_a_fisheye_lens_leaves_dark() -> None:
+    views = numbered([(150, 150)] * 2)
+    lenses = replace(Lenses.pinholes(2), model=torch.full((2,), int(LensModel.FISHEYE)), limit=None)
+    intrinsics = replace(views.intrinsics, focal=torch.full((2, 2), 30.0), lenses=lenses)
+    shown = intrinsics.has_ray(0)
+    assert shown is not None
+    assert 0.5 < shown.float().mean() < 0.99
+    images = [views.image(index).clone() for index in range(2)]
+    for image in images:
+        image[~shown] = 0
+    tiles = StoredImages.all_of(TileFile.of(images))
+    views = replace(views, images=tiles, intrinsics=intrinsics)
+    assert views.is_opaque
+    batches = RayBatches(views, FRAME, replace(RAYS, per_batch=4000), seed=0)
+    assert len(batches.near) + len(batches.far) == 2 * int(shown.sum())
+    drawn = torch.zeros(150, 150)
+    for step in range(60):
+        batch = batches.draw(step)
+        assert (batch["alpha"] == 1).all()
+        row, column = (batch["target"][:, 1:] * 255).round().long().T
+        drawn.index_put_((row, column), torch.ones(4000), accumulate=True)
+        _, expected = views.image_rays(0)
+        own = (batch["target"][:, 0] * 255).round() == 0
+        place = row[own] * 150 + column[own]
+        assert torch.allclose(batch["directions"][own], expected[place], atol=1e-5)
+    assert not drawn[~shown].any()
+    assert drawn[shown].min() > 0
 
 
 def test_tiles_far_from_silhouettes_get_the_asked_share() -> None:

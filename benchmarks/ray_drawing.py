@@ -137,8 +137,8 @@ tiles, written in {writing:.0f} s; {settings.per_batch} rays a batch; a step is 
 
 {markdown(COLUMNS, rows)}
 
-"private MB": memory of the process alone (USS) after the draws. Images in memory, for scenes of up to
-{store.IN_MEMORY / 2**30:g} GB: a draw of scattered pixels.
+"private MB": memory of the process alone (USS) after the draws. Images in memory, for
+scenes of up to {store.IN_MEMORY / 2**30:g} GB: a draw of scattered pixels.
 """
     write_text(RESULTS / "ray_drawing.md", page)
     print(page)

@@ -211,15 +211,20 @@ class _PixelPool:
     """
 
     def __init__(self, chosen: Tensor) -> None:
-        self.pixels = chosen.flatten().nonzero()[:, 0]
+        self.count = int(chosen.sum())
+        self.pixels = None
+        """Their numbers; None where all are chosen, which takes no memory."""
+        if self.count < chosen.numel():
+            kind = torch.int32 if chosen.numel() < 2**31 else torch.int64
+            self.pixels = chosen.flatten().nonzero()[:, 0].to(kind)
 
     def __len__(self) -> int:
-        return len(self.pixels)
+        return self.count
 
     def pick(self, uniform: Tensor) -> Tensor:
         """Pixels at places given by numbers from 0 to 1. [K] -> [K, 1]"""
-        place = (uniform * len(self)).long().clamp_(max=len(self) - 1)
-        return self.pixels[place, None]
+        place = (uniform * len(self)).long().clamp_(max=len(self) - 1)[:, None]
+        return place if self.pixels is None else self.pixels[place].long()
 
 
 class _TilePool:

@@ -133,7 +133,8 @@ def main() -> None:
 
 {count} images of {SIZE[1]} x {SIZE[0]} pixels without alpha, {size / 2**30:.1f} GB as a file of
 tiles, written in {writing:.0f} s; {settings.per_batch} rays a batch; a step is {args.step_ms:g} ms;
-{STEPS} steps, the first ones included; {machine()}. `{command()}`
+{STEPS} steps, the first ones included; {machine()}, of which {os.getloadavg()[0]:.1f} processes
+wanted time on average. `{command()}`
 
 {markdown(COLUMNS, rows)}
 

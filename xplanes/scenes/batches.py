@@ -126,12 +126,10 @@ class RayBatches:
     def _choose(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Which choices are far from silhouettes, and the place of each. [K, 3] -> [K], [K, 2]"""
         far = uniform[:, 0] < self.far_share
-        place = torch.where(
-            far[:, None],
-            (self.far if len(self.far) else self.near).pick(uniform[:, 1]),
-            (self.near if len(self.near) else self.far).pick(uniform[:, 1]),
-        )
-        return far, place
+        if not (len(self.near) and len(self.far)):
+            return far, (self.near if len(self.near) else self.far).pick(uniform[:, 1])
+        near_place, far_place = self.near.pick(uniform[:, 1]), self.far.pick(uniform[:, 1])
+        return far, torch.where(far[:, None], far_place, near_place)
 
     def _from_memory(self, images: Tensor, uniform: Tensor) -> tuple[Tensor, ...]:
         """Far, view, row, column and colour of rays through scattered pixels. [R], [R, 4]"""

@@ -26,6 +26,7 @@ def scripts(folder: Path) -> dict[str, list[list[str]]]:
         "lego_curves": [given],
         "skips": [given],
         "rendering": [given],
+        "ray_drawing": [[]],
         "stages": [[]],
         "pareto": [given],
         "lrm_sizes": [[]],

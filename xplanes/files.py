@@ -35,7 +35,7 @@ def storage_error(problem: OSError, path: Path | None = None) -> StorageError | 
     room = ""
     if problem.errno in (errno.ENOSPC, errno.EDQUOT):
         try:
-            room = f" ({shutil.disk_usage(_existing(place)).free / 2**20:.1f} MB free)"
+            room = f" ({shutil.disk_usage(existing(place)).free / 2**20:.1f} MB free)"
         except OSError:
             room = ""
     reason = os.strerror(problem.errno or 0)
@@ -59,7 +59,7 @@ _ONLY_WRITING = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 """Problems that reading cannot have."""
 
 
-def _existing(path: Path) -> Path:
+def existing(path: Path) -> Path:
     """The path itself or the nearest folder above it that exists."""
     return next((p for p in (path, *path.absolute().parents) if p.exists()), Path("/"))
 
@@ -70,7 +70,7 @@ def require_writable(folder: Path) -> None:
     Raises:
         StorageError: If it cannot.
     """
-    place = _existing(folder.absolute())
+    place = existing(folder.absolute())
     try:
         if not place.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, "", str(place))

@@ -477,7 +477,7 @@ def test_a_video_has_the_field_of_view_of_the_training_views():
     square = ball_views(3, RADIUS, size=20, angle=0.7)
     assert square.intrinsics.focal_at(50) == pytest.approx(focal_length(0.7, 50))
     assert square.intrinsics.fov_y == pytest.approx(0.7)
-    assert lens({"train": square}, "orbit", 50) == (square.intrinsics.focal_at(50), None)
+    assert lens({"train": square}, "orbit", 50) == (square.intrinsics.focal_at(50), None, None)
     views = mixed(5)  # three of them wide
     assert views.intrinsics.focal_at(88) == pytest.approx((41.0 + 36.5) / 2 * 2)
     assert views.intrinsics.fov_y == pytest.approx(2 * math.atan(15 / 36.5))
@@ -490,7 +490,8 @@ def test_an_image_from_a_view_shows_it_whole():
         longer = max(height, width)
         for factor in (1, 3):
             size = factor * longer
-            focal, centre = lens({"train": views}, f"view:{views.files[index]}", size)
+            focal, centre, own = lens({"train": views}, f"view:{views.files[index]}", size)
+            assert own is None
             _, found = camera_rays(views.camera_to_world[index], focal, size, size, centre)
             found = found.view(size, size, 3)[factor // 2 :: factor, factor // 2 :: factor]
             top, left = (longer - height) // 2, (longer - width) // 2

@@ -3,7 +3,7 @@
 import difflib
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -20,6 +20,7 @@ from xplanes.rendering.box import Field
 from xplanes.rendering.pictures import colour_map, to_bytes
 from xplanes.scenes.cameras import orbit
 from xplanes.scenes.frame import Frame
+from xplanes.scenes.lenses import Lenses
 from xplanes.scenes.views import Views, camera_rays
 
 ELEVATION = 20.0
@@ -48,6 +49,7 @@ def render_path(
     focal: float | Tensor,
     size: int,
     centre: Tensor | None = None,
+    lens: Lenses | None = None,
     background: Tensor,
     what: str = "colour",
 ) -> Iterator[Tensor]:
@@ -62,6 +64,7 @@ def render_path(
         focal: Focal length in pixels of these frames, or those along x and y. [2]
         size: Pixels per side.
         centre: Principal point in pixels; the middle when None. [2]
+        lens: Lens of these frames; a pinhole when None.
         background: Colour behind the scene. [3]
         what: ``colour``, or ``depth`` as colours whose scale is the same in all frames.
 
@@ -70,7 +73,7 @@ def render_path(
     """
     device = renderer.device
     for pose, time in zip(poses, times.tolist(), strict=True):
-        origins, directions = frame.rays(*camera_rays(pose, focal, size, size, centre))
+        origins, directions = frame.rays(*camera_rays(pose, focal, size, size, centre, lens))
         rays = origins.to(device), directions.to(device)
         image = renderer.image(field, *rays, time, background.to(device))
         picture = image["colour"]
@@ -254,7 +257,7 @@ def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = N
     require_writable(target.parent)
     views = trained.scene.splits["train"]
     size = max(views.height, views.width) if options.size is None else options.size
-    focal, centre = lens(trained.scene.splits, options.path, size)
+    focal, centre, distortion = lens(trained.scene.splits, options.path, size)
     frames = render_path(
         trained.module.field,
         trained.module.renderer,
@@ -264,6 +267,7 @@ def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = N
         focal=focal,
         size=size,
         centre=centre,
+        lens=distortion,
         background=trained.scene.background,
         what=options.what,
     )
@@ -307,19 +311,24 @@ def poses(trained: TrainedRun, options: VideoOptions) -> Tensor:
     return pose.expand(options.count, 4, 4)
 
 
-def lens(splits: dict[str, Views], path: str, size: int) -> tuple[float | Tensor, Tensor | None]:
-    """Focal length and principal point of square pictures along a path, for `render_path`.
+def lens(
+    splits: dict[str, Views], path: str, size: int
+) -> tuple[float | Tensor, Tensor | None, Lenses | None]:
+    """Focal length, principal point and lens of square pictures along a path, for `render_path`.
 
     Those of a view show that view whole; the others show as much as the training views.
     """
     if not path.startswith("view:"):
-        return splits["train"].intrinsics.focal_at(size), None
+        return splits["train"].intrinsics.focal_at(size), None, None
     views, index = find_view(splits, path.removeprefix("view:"))
     height, width = views.size(index)
     longer = max(height, width)
     room = torch.tensor([longer - width, longer - height]) / 2
-    focal, centre = views.intrinsics.focal[index], views.intrinsics.centre[index]
-    return focal * size / longer, (centre + room) * size / longer
+    intrinsics, scale = views.intrinsics, size / longer
+    own = intrinsics.lens(index)
+    if own is not None:
+        own = replace(own, skew=own.skew * scale)
+    return intrinsics.focal[index] * scale, (intrinsics.centre[index] + room) * scale, own
 
 
 def view_pose(splits: dict[str, Views], name: str) -> Tensor:

@@ -48,6 +48,7 @@ def header(
         counts += " (held out of train)"
     train = scene.splits["train"]
     size = sum(views.nbytes for views in scene.splits.values()) / 2**20
+    where = " (training views on disk)" if train.is_stored else ""
     trainable = sum(p.numel() for p in module.parameters() if p.requires_grad)
     frozen = sum(p.numel() for p in module.parameters()) - trainable
     moving = ""
@@ -63,7 +64,7 @@ def header(
         f"{backend.name(device)}",
         "run": str(run),
         "data": f"{experiment.data.name} {scene.name} · {counts} views · "
-        f"{train.outline} · {size:.1f} MB · cube {2 / frame.scale:.2f} wide",
+        f"{train.outline} · {size:.1f} MB{where} · cube {2 / frame.scale:.2f} wide",
         "model": f"{experiment.method.model.name} {module.field.outline} · "
         f"{trainable:,} parameters, {frozen:,} frozen{moving}",
         "from": module.initialisation.words,

@@ -122,6 +122,15 @@ def check_camera(video: Views) -> None:
             f"{width}x{height} pixels, but LRMs expect it at the centre: crop its frames, or "
             f"{way_out}"
         )
+    if intrinsics.lenses is not None:
+        straight = camera_rays(video.camera_to_world[0], focal_x, height, width)[1]
+        bent = (video.image_rays(0)[1] - straight).norm(dim=-1).max()
+        if float(bent) * focal_x > OFF_CENTRE * width:
+            raise SceneError(
+                "the fixed camera's lens distorts its frames by more than "
+                f"{OFF_CENTRE * width:.3g} pixels, but LRMs expect a pinhole: undistort them, or "
+                f"{way_out}"
+            )
 
 
 def pick_frames(video: Views, timesteps: Tensor) -> Views:
@@ -197,10 +206,10 @@ def _rendered(
     away = (train.camera_to_world[:, :3, 3] - frame.centre).norm(dim=-1).mean()
     back = float(away - (pose[:3, 3] - frame.centre).norm())
     inputs = [
-        train.images,
+        train.identity,
         train.camera_to_world,
         train.times,
-        [train.intrinsics.focal, train.intrinsics.centre, train.intrinsics.size],
+        _intrinsics_key(train.intrinsics),
         frame_content(own_frame),
         rendering.model.plain(),
         [method.seed, options.fixed_view_seconds, options.fixed_view_steps],
@@ -230,6 +239,13 @@ def _rendered(
         f"trained for {options.fixed_view_seconds:g} s"
     )
     return FixedView(views, frame.centre, stage.seconds, words)
+
+
+def _intrinsics_key(intrinsics: Intrinsics) -> list[Tensor]:
+    key = [intrinsics.focal, intrinsics.centre, intrinsics.size]
+    if (lenses := intrinsics.lenses) is not None:
+        key += [lenses.model, lenses.coefficients, lenses.skew]
+    return key
 
 
 def _train(

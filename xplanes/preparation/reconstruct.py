@@ -126,7 +126,7 @@ def reconstruct(
     model, frame, device = lrm.model, place.frame, place.device
     video = fixed_view(method, place, model.view, model.image_size, cache)
     alignment = align_to(video, model, options)
-    frames = video.views.images
+    frames = video.views.in_memory()
     if bool((frames[..., 3] == 255).all()):
         logger.warning(
             "the frames of the fixed-view video have no transparency: %s will reconstruct the "
@@ -193,7 +193,7 @@ def align_to(video: FixedView, model: LRM, options: ImageLRMSettings) -> Alignme
         target=video.target,
         view=model.view,
         matching=options.matching,
-        crop=picture_crop(views.images, crop=True) if options.crop else None,
+        crop=picture_crop(views.in_memory(), crop=True) if options.crop else None,
     )
 
 

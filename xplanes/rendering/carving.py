@@ -9,6 +9,7 @@ from xplanes.scenes.silhouettes import join_in_time, may_hold
 from xplanes.scenes.views import Views
 
 CHUNK = 2**17
+"""Points that are looked at together, for up to 512 views; fewer for more."""
 
 
 def carve(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
@@ -33,8 +34,9 @@ def carve(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
     radius = 3**0.5 / size / frame.scale
     allowed = torch.empty(bins, size**3, dtype=torch.bool)
     likely = torch.empty_like(allowed)
-    for start in range(0, size**3, CHUNK):
-        part = slice(start, start + CHUNK)
+    chunk = min(CHUNK, max(1, 512 * CHUNK // len(views)))
+    for start in range(0, size**3, chunk):
+        part = slice(start, start + chunk)
         alone = may_hold(views, world[part], radius=radius)
         joined = join_in_time(alone, views.times)
         for index, cover in enumerate(covers):

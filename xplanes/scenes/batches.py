@@ -4,11 +4,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from xplanes.scenes.cameras import cast_rays
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.silhouettes import foreground
+from xplanes.scenes.store import LIT, TILE, StoredImages, count_in_tiles
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Settings, Share
 from xplanes.streams import step_generator
@@ -17,6 +18,15 @@ Batch = dict[str, Tensor]
 
 NEAR_SILHOUETTE = 0.02
 """Share of the image's side around silhouettes that counts as near."""
+
+PER_TILE = 16
+"""Rays from one tile, of images in a file of tiles."""
+
+LEAST_TILES = 32
+"""Tiles of a batch at least, if it has as many rays."""
+
+AHEAD = 8
+"""Batches whose tiles the system is told to read in advance."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +49,10 @@ class RayBatches:
     of at their share of the pixels. They show nothing but background; a few keep the air clear of
     floaters. Space far from a silhouette counts as empty shortly before and after, too.
 
+    Of images in a file of tiles each batch takes `PER_TILE` pixels of each of some tiles, so that
+    it reads few places of the disk; every pixel is still as likely as any other. The tiles near the
+    silhouettes are those that they reach, with all of their pixels.
+
     Args:
         views: Training views.
         frame: The field's frame, in which rays are served.
@@ -54,10 +68,18 @@ class RayBatches:
         self.rays, self.seed, self.rank = settings.per_batch, seed, rank
         self.background = settings.background
         widths = views.intrinsics.size[:, 1].tolist()
-        near = foreground(views, [max(1, round(NEAR_SILHOUETTE * width)) for width in widths])
-        far = ~near & views.valid() if views.is_padded else ~near
-        self.near, self.far = (pool.flatten().nonzero()[:, 0] for pool in (near, far))
-        natural = len(self.far) / views.pixels
+        margins = [max(1, round(NEAR_SILHOUETTE * width)) for width in widths]
+        if isinstance(views.images, StoredImages):
+            self.near, self.far = _tile_pools(views, views.images, margins)
+        else:
+            near = foreground(views, margins)
+            far = ~near
+            if views.is_cut:
+                valid = views.valid()
+                near, far = near & valid, far & valid
+            self.near, self.far = (_PixelPool(pool) for pool in (near, far))
+        self._prefetched = -1
+        natural = len(self.far) / (len(self.near) + len(self.far))
         skip = settings.skip_background and 0 < natural < 1
         self.far_share = min(settings.background_share, natural) if skip else natural
         jitter = skip and not views.is_static
@@ -75,23 +97,15 @@ class RayBatches:
         """
         generator = step_generator(self.seed, step, self.rank)
         uniform = torch.rand(self.rays, 3, generator=generator, dtype=torch.float64)
-        far = uniform[:, 0] < self.far_share
-        pixel = torch.where(
-            far,
-            _pick(self.far if len(self.far) else self.near, uniform[:, 1]),
-            _pick(self.near if len(self.near) else self.far, uniform[:, 1]),
-        )
-        height, width = self.views.height, self.views.width
-        view = pixel // (height * width)
-        origins, directions = cast_rays(
-            self.views.camera_to_world[view],
-            (pixel // width % height).float(),
-            (pixel % width).float(),
-            focal=self.views.intrinsics.focal[view],
-            centre=self.views.intrinsics.centre[view],
-        )
+        if isinstance(self.views.images, StoredImages):
+            self._prefetch(step)
+            drawn = self._from_tiles(self.views.images, uniform, generator)
+        else:
+            drawn = self._from_memory(self.views.images, uniform)
+        far, view, row, column, colour = drawn
+        origins, directions = self.views.pixel_rays(view, row.float(), column.float())
         origins, directions = self.frame.rays(origins, directions)
-        colour = self.views.images.view(-1, 4)[pixel].float() / 255
+        colour = colour.float() / 255
         shape = (self.rays, 3)
         if self.background == "random":
             background = torch.rand(shape, generator=generator)
@@ -109,6 +123,75 @@ class RayBatches:
             "jitter": uniform[:, 2].float(),
         }
 
+    def _choose(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
+        """Which choices are far from silhouettes, and the place of each. [K, 3] -> [K], [K, 2]"""
+        far = uniform[:, 0] < self.far_share
+        if not (len(self.near) and len(self.far)):
+            return far, (self.near if len(self.near) else self.far).pick(uniform[:, 1])
+        near_place, far_place = self.near.pick(uniform[:, 1]), self.far.pick(uniform[:, 1])
+        return far, torch.where(far[:, None], far_place, near_place)
+
+    def _from_memory(self, images: Tensor, uniform: Tensor) -> tuple[Tensor, ...]:
+        """Far, view, row, column and colour of rays through scattered pixels. [R], [R, 4]"""
+        far, place = self._choose(uniform)
+        pixel = place[:, 0]
+        height, width = self.views.height, self.views.width
+        view, row, column = pixel // (height * width), pixel // width % height, pixel % width
+        return far, view, row, column, images.view(-1, 4)[pixel]
+
+    def _from_tiles(
+        self, images: StoredImages, uniform: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, ...]:
+        """Far, view, row, column and colour of rays, some through each of few tiles."""
+        per_tile = self._per_tile
+        far, place = self._choose(uniform[::per_tile])
+        view, tile = place.unbind(dim=1)
+        size = self.views.intrinsics.size[view]
+        columns = (size[:, 1] + TILE - 1) // TILE
+        top, left = tile // columns * TILE, tile % columns * TILE
+        height, width = (size[:, 0] - top).clamp(max=TILE), (size[:, 1] - left).clamp(max=TILE)
+        inside = torch.rand(len(tile), per_tile, generator=generator, dtype=torch.float64)
+        if self.views.intrinsics.sights is None:
+            pixels = (height * width)[:, None]
+            pixel = torch.minimum((inside * pixels).long(), pixels - 1)
+        else:
+            pixel = self._with_rays(view, top, left, inside)
+        row, column = pixel // width[:, None], pixel % width[:, None]
+        colour = images.pixels(view, tile, row * TILE + column)
+        rays = slice(0, self.rays)  # The last tile may have to give fewer.
+        far, view = (of_tile.repeat_interleave(per_tile)[rays] for of_tile in (far, view))
+        row, column = (top[:, None] + row).flatten()[rays], (left[:, None] + column).flatten()[rays]
+        return far, view, row, column, colour.flatten(0, 1)[rays]
+
+    def _with_rays(self, view: Tensor, top: Tensor, left: Tensor, inside: Tensor) -> Tensor:
+        """Pixels of tiles among those that their lenses map a direction to. [K, P] -> [K, P]"""
+        found = []
+        for index, row, column, uniform in zip(
+            view.tolist(), top.tolist(), left.tolist(), inside, strict=True
+        ):
+            shown = self.views.intrinsics.has_ray(index)
+            if shown is None:
+                shown = torch.ones(self.views.size(index), dtype=torch.bool)
+            tile = _PixelPool(shown[row : row + TILE, column : column + TILE])
+            found.append(tile.pick(uniform)[:, 0])
+        return torch.stack(found)
+
+    @property
+    def _per_tile(self) -> int:
+        return max(1, min(PER_TILE, self.rays // LEAST_TILES))
+
+    def _prefetch(self, step: int) -> None:
+        """Let the system read the tiles of the next batches, as far as it was not told yet."""
+        assert isinstance(self.views.images, StoredImages)
+        if not step <= self._prefetched <= step + AHEAD:
+            self._prefetched = step
+        for later in range(self._prefetched + 1, step + AHEAD + 1):
+            generator = step_generator(self.seed, later, self.rank)
+            uniform = torch.rand(self.rays, 3, generator=generator, dtype=torch.float64)
+            _, place = self._choose(uniform[:: self._per_tile])
+            self.views.images.prefetch(*place.unbind(dim=1))
+        self._prefetched = step + AHEAD
+
     def _times(self, view: Tensor, far: Tensor, generator: torch.Generator) -> Tensor:
         """Times of rays, those far from silhouettes moved. int64 [R], bool [R] -> [R]"""
         times = self.views.times[view]
@@ -118,6 +201,70 @@ class RayBatches:
         return torch.where(far, (times + move).clamp(0, 1), times)
 
 
-def _pick(pool: Tensor, uniform: Tensor) -> Tensor:
-    """Entries of ``pool`` at places given by numbers from 0 to 1."""
-    return pool[(uniform * len(pool)).long().clamp_(max=len(pool) - 1)]
+class _PixelPool:
+    """Pixels to draw from.
+
+    Args:
+        chosen: Which pixels of some images or of a tile. bool, of any shape
+    """
+
+    def __init__(self, chosen: Tensor) -> None:
+        self.count = int(chosen.sum())
+        self.pixels = None
+        """Their numbers; None where all are chosen, which takes no memory."""
+        if self.count < chosen.numel():
+            kind = torch.int32 if chosen.numel() < 2**31 else torch.int64
+            self.pixels = chosen.flatten().nonzero()[:, 0].to(kind)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def pick(self, uniform: Tensor) -> Tensor:
+        """Pixels at places given by numbers from 0 to 1. [K] -> [K, 1]"""
+        place = (uniform * len(self)).long().clamp_(max=len(self) - 1)[:, None]
+        return place if self.pixels is None else self.pixels[place].long()
+
+
+class _TilePool:
+    """Tiles to draw from, each as often as it has pixels.
+
+    Args:
+        places: The view of each tile, and the tile's number in it. int32 [K, 2]
+        pixels: Its pixels without padding. int64 [K]
+    """
+
+    def __init__(self, places: Tensor, pixels: Tensor) -> None:
+        self.places, self.ends = places, pixels.cumsum(dim=0)
+
+    def __len__(self) -> int:
+        return int(self.ends[-1]) if len(self.ends) else 0
+
+    def pick(self, uniform: Tensor) -> Tensor:
+        """Views and tiles at places given by numbers from 0 to 1. [K] -> int64 [K, 2]"""
+        place = (uniform * len(self)).long().clamp_(max=len(self) - 1)
+        return self.places[torch.searchsorted(self.ends, place, right=True)].long()
+
+
+def _tile_pools(
+    views: Views, images: StoredImages, margins: list[int]
+) -> tuple[_TilePool, _TilePool]:
+    """Tiles within some pixels of the silhouettes, and all others."""
+    places, pixels, near = [], [], []
+    for index, margin in enumerate(margins):
+        lit = (images.flags(index) & LIT).float()[None]
+        reach = -(-margin // TILE)
+        near.append(F.max_pool2d(lit, 2 * reach + 1, stride=1, padding=reach).flatten() > 0)
+        height, width = (_lengths(side) for side in images.sizes[index].tolist())
+        shown = views.intrinsics.has_ray(index)
+        count = height[:, None] * width if shown is None else count_in_tiles(shown)
+        pixels.append(count.flatten())
+        number = torch.arange(len(pixels[-1]), dtype=torch.int32)
+        places.append(torch.stack([torch.full_like(number, index), number], dim=1))
+    place, counts, chosen = torch.cat(places), torch.cat(pixels), torch.cat(near)
+    first, second = (_TilePool(place[part], counts[part]) for part in (chosen, ~chosen))
+    return first, second
+
+
+def _lengths(side: int) -> Tensor:
+    """Rows, or columns, of the tiles along a side of an image."""
+    return (side - torch.arange(0, side, TILE)).clamp(max=TILE)

@@ -1,4 +1,4 @@
-"""Pinhole cameras in the convention of D-NeRF files.
+"""Cameras in the convention of D-NeRF files: rays of pixels, and pixels of points.
 
 Camera axes are OpenGL's: x right, y up, looking along -z. Pixel centres lie at +0.5.
 """
@@ -7,6 +7,8 @@ import math
 
 import torch
 from torch import Tensor
+
+from xplanes.scenes.lenses import Lenses
 
 
 def focal_length(angle_x: float, width: int) -> float:
@@ -41,8 +43,11 @@ def cast_rays(
     *,
     focal: Tensor | tuple[float, float],
     centre: Tensor | tuple[float, float],
+    lenses: Lenses | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Cast one ray through each named pixel.
+
+    Where a lens maps no direction to a pixel, the ray is the one nearest to it.
 
     Args:
         camera_to_world: Pose of the camera of each ray. [R, 4, 4] or [4, 4]
@@ -50,20 +55,121 @@ def cast_rays(
         columns: Pixel columns, from 0 at the left. [R]
         focal: Focal lengths along x and y in pixels. [R, 2] or [2]
         centre: Principal point, x from the left and y from the top, in pixels. [R, 2] or [2]
+        lenses: One for each ray, or one for all; pinholes when None.
 
     Returns:
-        Origins and unit directions in the world. [R, 3], [R, 3]
+        Origins and unit directions in the world, computed in double precision where lenses bend
+        them and returned in that of ``rows``. [R, 3], [R, 3]
     """
+    rotation = camera_to_world[..., :3, :3]
+    if lenses is not None:
+        x, y = image_plane(rows, columns, focal=focal, centre=centre, lenses=lenses)
+        local = lenses.directions(x, y)[0]
+        directions = (rotation.double() @ local[..., None])[..., 0].to(rows.dtype)
+        return camera_to_world[..., :3, 3].expand_as(directions), directions
     middle = columns + 0.5
-    focal_x, focal_y = focal.unbind(-1) if isinstance(focal, Tensor) else focal
-    centre_x, centre_y = centre.unbind(-1) if isinstance(centre, Tensor) else centre
+    focal_x, focal_y = _pair(focal)
+    centre_x, centre_y = _pair(centre)
     right = (middle - _like(middle, centre_x)) / _like(middle, focal_x)
     up = (_like(middle, centre_y - 0.5) - rows) / _like(middle, focal_y)
     local = torch.stack([right, up, -torch.ones_like(right)], dim=-1)
     local = local / local.norm(dim=-1, keepdim=True)
-    rotation = camera_to_world[..., :3, :3]
     directions = (rotation @ local[..., None])[..., 0]
     return camera_to_world[..., :3, 3].expand_as(directions), directions
+
+
+def image_plane(
+    rows: Tensor,
+    columns: Tensor,
+    *,
+    focal: Tensor | tuple[float, float],
+    centre: Tensor | tuple[float, float],
+    lenses: Lenses,
+) -> tuple[Tensor, Tensor]:
+    """Pixel centres in focal lengths, as `Lenses.directions` takes them; arguments of `cast_rays`.
+
+    Returns:
+        To the right of the principal point, and downwards. float64 [R], [R]
+    """
+    focal_x, focal_y = _pair(focal)
+    centre_x, centre_y = _pair(centre)
+    y = (rows.double() + 0.5 - centre_y) / focal_y
+    return (columns.double() + 0.5 - centre_x - lenses.skew * y) / focal_x, y
+
+
+def project(
+    camera_to_world: Tensor,
+    points: Tensor,
+    *,
+    focal: Tensor,
+    centre: Tensor,
+    lenses: Lenses | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Find the pixels at which a camera sees points; the inverse of `cast_rays`.
+
+    Args:
+        camera_to_world: Pose of the camera. [4, 4]
+        points: World points. [N, 3]
+        focal: Focal lengths along x and y in pixels. [2]
+        centre: Principal point in pixels. [2]
+        lenses: The camera's lens; a pinhole when None.
+
+    Returns:
+        Distances in pixels from the image's left and top edges, at +0.5 in the middle of a row or
+        column, [N] each, and whether the camera can see each point, however large its image may be,
+        bool [N]. The distances of other points mean nothing.
+    """
+    local = camera_axes(camera_to_world, points)
+    (focal_x, focal_y), (centre_x, centre_y) = focal.unbind(-1), centre.unbind(-1)
+    if lenses is None:
+        depth = -local[:, 2]
+        right, down = local[:, 0] / depth * focal_x, -local[:, 1] / depth * focal_y
+        return right + centre_x, down + centre_y, depth > 0
+    x, y, seen = lenses.image_points(local)
+    right, down = x * focal_x + y * lenses.skew + centre_x, y * focal_y + centre_y
+    return right.to(points.dtype), down.to(points.dtype), seen
+
+
+def ball_extent(
+    camera_to_world: Tensor,
+    points: Tensor,
+    radius: float,
+    *,
+    focal: Tensor,
+    lenses: Lenses | None = None,
+    stretch: float = 1.0,
+) -> Tensor:
+    """How far a ball around each point reaches from its centre in an image, on either axis.
+
+    Args:
+        camera_to_world: Pose of the camera. [4, 4]
+        points: Centres in the world. [N, 3]
+        radius: Of the balls, in world units.
+        focal: Focal lengths along x and y in pixels. [2]
+        lenses: The camera's lens; a pinhole when None.
+        stretch: Most by which the lens moves two points of the image apart (`Sight.stretch`).
+
+    Returns:
+        Upper bounds in pixels; infinity for balls that the camera touches. [N]
+    """
+    local = camera_axes(camera_to_world, points)
+    if lenses is not None:
+        across = torch.hypot(focal[0], lenses.skew)
+        pixels = stretch * torch.maximum(across, focal[1])
+        return (pixels * lenses.ball_extent(local, radius)).to(points.dtype)
+    depth = -local[:, 2]
+    slant = torch.hypot(depth, local[:, :2].abs().amax(dim=-1))
+    extent = focal.max() * radius * slant / (depth * (depth - radius))
+    return torch.where(depth > radius, extent, math.inf)
+
+
+def camera_axes(camera_to_world: Tensor, points: Tensor) -> Tensor:
+    """World points along a camera's axes. [N, 3]"""
+    return (points - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
+
+
+def _pair(value: Tensor | tuple[float, float]) -> tuple[Tensor | float, ...]:
+    return value.unbind(-1) if isinstance(value, Tensor) else value
 
 
 def _like(reference: Tensor, value: Tensor | float) -> Tensor | float:

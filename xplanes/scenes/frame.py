@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from xplanes.scenes.cameras import cast_rays
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.views import Views
 
@@ -102,6 +103,11 @@ def backwards(views: Views) -> Tensor:
     They are the cameras' z axes where principal points are centred.
     """
     focal, centre, size = views.intrinsics.focal, views.intrinsics.centre, views.intrinsics.size
+    if (lenses := views.intrinsics.lenses) is not None:
+        rows, columns = (0.5 * size.double() - 0.5).unbind(dim=1)
+        poses = views.camera_to_world.double()
+        looks = cast_rays(poses, rows, columns, focal=focal, centre=centre, lenses=lenses)[1]
+        return -looks.float()
     right, down = ((0.5 * size.flip(1) - centre) / focal).unbind(dim=1)
     local = torch.stack([-right, down, torch.ones_like(right)], dim=1)
     local = local / local.norm(dim=1, keepdim=True)
@@ -142,7 +148,7 @@ def scene_frame(views: Views, half_side: float | None = None) -> Frame:
         return cube_frame(half_side, centre)
     offset = views.camera_to_world[:, :3, 3] - centre
     depth = (offset * views.camera_to_world[:, :3, 2]).sum(dim=-1)
-    extent = (0.5 * views.intrinsics.size.flip(1) / views.intrinsics.focal).amax(dim=1)
+    extent = (0.5 * views.intrinsics.size.flip(1) / views.intrinsics.pinhole).amax(dim=1)
     half = float((depth.clamp_min(0) * extent.float()).max())
     if not math.isfinite(half) or half <= 0:
         raise SceneError(
@@ -184,8 +190,7 @@ def _reach(views: Views, centre: Tensor) -> float:
     """Largest distance from ``centre`` at which a ray through the foreground passes it."""
     largest = 0.0
     for index in range(len(views)):
-        seen = (views.image(index)[..., 3] > 0).flatten()
-        origins, directions = (ray[seen] for ray in views.image_rays(index))
+        origins, directions = views.foreground_rays(index)
         if len(origins):
             offset = centre - origins
             along = (offset * directions).sum(dim=-1, keepdim=True)

@@ -1,16 +1,15 @@
 """Image files decoded, multiplied by alpha and reduced to the working resolution."""
 
-import os
+import hashlib
 import struct
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 from torch import Tensor
 
+from xplanes.scenes import store
 from xplanes.scenes.errors import SceneError
 
 Size = tuple[int, int]
@@ -30,11 +29,11 @@ UNREADABLE = (
 
 
 def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
-    """Decode images of one size and reduce them to ``resolution`` pixels square.
+    """Decode images of one size and reduce them to a width.
 
     Args:
         paths: Image files, PNG or JPEG, at least one. [V]
-        resolution: Pixels per side; None keeps the size of the files.
+        resolution: Width in pixels; None keeps the size of the files.
 
     Returns:
         Colour, multiplied by alpha before it was averaged, and alpha. uint8 [V, H, W, 4]
@@ -43,61 +42,150 @@ def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
         SceneError: A file cannot be decoded, sizes differ, or the resolution cannot be met.
     """
     common_size(paths)
-    return read_images(paths, resolution)[0]
+    sizes = final_sizes(paths, native_sizes(paths), resolution)
+    return store.in_memory(sizes, _jobs(paths, sizes))
+
+
+def native_sizes(paths: Sequence[Path]) -> list[Size]:
+    """Heights and widths of image files, read from their headers alone.
+
+    Raises:
+        SceneError: If a file is no image.
+    """
+    return [read_header(path)[0] for path in paths]
+
+
+def final_sizes(
+    paths: Sequence[Path], native: Sequence[Size], resolution: int | None
+) -> list[Size]:
+    """Heights and widths of images that are reduced to one width, with their own aspect ratios.
+
+    Args:
+        paths: Image files. [V]
+        native: Their sizes. [V]
+        resolution: Width in pixels; None keeps the sizes.
+
+    Raises:
+        SceneError: If an image is narrower.
+    """
+    if resolution is None:
+        return list(native)
+    for path, (height, width) in zip(paths, native, strict=True):
+        check_resolution(path, width, height, resolution)
+    return [(max(1, round(height * resolution / width)), resolution) for height, width in native]
 
 
 def read_images(
-    paths: Sequence[Path], resolution: int | None
-) -> tuple[Tensor, list[Size], list[Size]]:
-    """Decode images of any sizes and reduce them to ``resolution`` pixels square.
+    paths: Sequence[Path],
+    sizes: Sequence[Size],
+    masks: Sequence[Path | None] = (),
+    has_ray: Sequence[Tensor | None] = (),
+    cache: Path | None = None,
+) -> Tensor | store.StoredImages:
+    """Decode images of any sizes and reduce them.
+
+    Images that take more than `store.IN_MEMORY` bytes are decoded once to a file of the cache.
 
     Args:
         paths: Image files, PNG or JPEG, at least one. [V]
-        resolution: Pixels per side; None keeps the sizes of the files.
+        sizes: Height and width of each image after that. [V]
+        masks: Files that alpha is multiplied by; none where it is empty. [V]
+        has_ray: Pixels of the reduced images that show anything, of each image bool [h, w], or None
+            for all; all of all images where it is empty. [V]
+        cache: Folder of decoded images; that of the user when None.
 
     Returns:
         Colour, multiplied by alpha before it was averaged, and alpha, smaller images padded with
-        zeros at the bottom and on the right: uint8 [V, H, W, 4]. Then the height and width of each
-        file, and those of each image without padding.
+        zeros at the bottom and on the right. uint8 [V, H, W, 4]
 
     Raises:
-        SceneError: A file cannot be decoded, or the resolution cannot be met.
+        SceneError: A file cannot be decoded, or a mask does not fit its image.
+        StorageError: The cache cannot be written.
     """
-    native = [(height, width) for width, height in map(_read_size, paths)]
-    sizes = native
-    if resolution is not None:
-        for path, (height, width) in zip(paths, native, strict=True):
-            check_resolution(path, width, height, resolution)
-        sizes = [(resolution, resolution)] * len(paths)
-    largest = max(height for height, _ in sizes), max(width for _, width in sizes)
-    same = len(set(sizes)) == 1
-    images = (torch.empty if same else torch.zeros)(len(paths), *largest, 4, dtype=torch.uint8)
+    jobs = _jobs(paths, sizes, masks, has_ray)
+    if not store.is_needed(sizes):
+        return store.in_memory(sizes, jobs)
+    cut = any(masks) or any(shown is not None for shown in has_ray)
+    channels = 4 if cut or any(read_header(path)[1] for path in paths) else 3
+    sources = [*paths, *(mask for mask in masks if mask is not None)]
+    recipe = ["images", [mask is not None for mask in masks], digests(has_ray)]
+    return store.decoded(sources, recipe, sizes, channels, jobs, cache)
 
-    def fill(index: int) -> None:
-        height, width = sizes[index]
-        pixels = shrink(load_premultiplied(paths[index]), width, height)
-        images[index, :height, :width] = torch.from_numpy(pixels)
 
-    # Pillow decodes and resamples without the interpreter lock, so threads are enough.
-    pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1, len(paths)))
+def _jobs(
+    paths: Sequence[Path],
+    sizes: Sequence[Size],
+    masks: Sequence[Path | None] = (),
+    has_ray: Sequence[Tensor | None] = (),
+) -> list[store.Job]:
+    """What decodes the images, one each."""
+
+    def job(index: int) -> store.Job:
+        def decode() -> Iterator[tuple[int, np.ndarray]]:
+            pixels = read_image(paths[index], sizes[index], masks[index] if masks else None)
+            yield index, cleared(pixels, has_ray[index] if has_ray else None)
+
+        return decode
+
+    return [job(index) for index in range(len(paths))]
+
+
+def cleared(pixels: np.ndarray, shown: Tensor | None) -> np.ndarray:
+    """Pixels with zeros where they show nothing. uint8 [h, w, C], bool [h, w]"""
+    if shown is not None:
+        pixels[~shown.numpy()] = 0
+    return pixels
+
+
+def digests(masks: Sequence[Tensor | None]) -> list[str]:
+    """Hashes of masks, most of which are one and the same tensor."""
+    known: dict[int, str] = {id(None): ""}
+    for mask in masks:
+        if mask is not None and id(mask) not in known:
+            known[id(mask)] = hashlib.sha256(mask.numpy().tobytes()).hexdigest()
+    return [known[id(mask)] for mask in masks]
+
+
+def read_image(path: Path, size: Size, mask: Path | None = None) -> np.ndarray:
+    """Decode one image, multiply it by its mask, and reduce it. uint8 [H, W, 4]"""
+    channels = load_premultiplied(path)
+    if mask is not None:
+        channels *= _read_mask(mask, path, channels.shape[1:])
+    height, width = size
+    return shrink(channels, width, height)
+
+
+def _read_mask(path: Path, image: Path, size: tuple[int, ...]) -> np.ndarray:
+    """A mask as factors from 0, where it is black, to 1. float32 [H, W]"""
     try:
-        list(pool.map(fill, range(len(paths))))
-    finally:
-        pool.shutdown(cancel_futures=True)
-    return images, native, sizes
+        with Image.open(path, formats=FORMATS) as picture:
+            if picture.mode in SIXTEEN_BIT_MODES:
+                values = np.asarray(picture, np.float32) / 257
+            else:
+                values = np.asarray(picture.convert("L"), np.float32)
+    except UNREADABLE as problem:
+        raise _unreadable(path, problem) from problem
+    if values.shape != size:
+        raise SceneError(
+            f"{path} has {values.shape[1]}x{values.shape[0]} pixels, but {image}, whose mask it "
+            f"is, has {size[1]}x{size[0]}. Export the mask at the size of the image."
+        )
+    # Zeros and ones are meant as black and white.
+    return values if values.max() == 1 else values / 255
 
 
 def common_size(paths: Sequence[Path]) -> tuple[int, int]:
     """Width and height that all files share, read from their headers alone."""
-    sizes = [_read_size(path) for path in paths]
-    for path, size in zip(paths, sizes, strict=True):
-        if size != sizes[0]:
+    sizes = [read_header(path)[0] for path in paths]
+    first_height, first_width = sizes[0]
+    for path, (height, width) in zip(paths, sizes, strict=True):
+        if (height, width) != sizes[0]:
             raise SceneError(
-                f"{path} has {size[0]}x{size[1]} pixels, but {paths[0]} has "
-                f"{sizes[0][0]}x{sizes[0][1]}. All images must have one size: "
+                f"{path} has {width}x{height} pixels, but {paths[0]} has "
+                f"{first_width}x{first_height}. All images must have one size: "
                 f"export or resize them alike."
             )
-    return sizes[0]
+    return first_width, first_height
 
 
 def check_resolution(path: Path, width: int, height: int, resolution: int) -> None:
@@ -107,16 +195,11 @@ def check_resolution(path: Path, width: int, height: int, resolution: int) -> No
             f"data.resolution={resolution} is not a size. Give 1 to {width} pixels, or null "
             f"to keep the {width}x{height} pixels of {path}."
         )
-    if width != height:
-        raise SceneError(
-            f"{path} has {width}x{height} pixels, and data.resolution={resolution} stands for a "
-            f"square. Set data.resolution=null to keep the images as they are; shrinking the files "
-            f"leaves camera_angle_x as it is, cropping them does not."
-        )
     if resolution > width:
         raise SceneError(
-            f"data.resolution={resolution} is more than the {width} pixels of {path}. Enlarged "
-            f"images hold no more detail: give at most {width}, or null for the native size."
+            f"data.resolution={resolution} is more than the {width} pixels that {path} is wide. "
+            f"Enlarged images hold no more detail: give at most {width}, or null for the native "
+            f"size."
         )
 
 
@@ -186,10 +269,12 @@ def _straight_channels(path: Path, picture: Image.Image) -> np.ndarray:
     return channels
 
 
-def _read_size(path: Path) -> tuple[int, int]:
+def read_header(path: Path) -> tuple[Size, bool]:
+    """Height and width of an image file, and whether it may have alpha."""
     try:
         with Image.open(path, formats=FORMATS) as picture:
-            return picture.size
+            alpha = "A" in picture.getbands() or "transparency" in picture.info
+            return (picture.height, picture.width), alpha
     except UNREADABLE as problem:
         raise _unreadable(path, problem) from problem
 

@@ -1,11 +1,13 @@
 """What the images' alpha rules out: space that some view shows to be empty."""
 
+import math
 from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from xplanes.scenes.cameras import ball_extent, project
 from xplanes.scenes.views import Views
 
 WINDOW = 0.06
@@ -47,24 +49,22 @@ def may_hold(views: Views, points: Tensor, *, radius: float) -> Tensor:
         Whether something may be there. bool [V, N]
     """
     inside = torch.ones(len(views), len(points), dtype=torch.bool)
+    intrinsics = views.intrinsics
     for index, pose in enumerate(views.camera_to_world):
-        (height, width), alpha = views.size(index), views.image(index)[..., 3]
-        focal_x, focal_y = views.intrinsics.focal[index].tolist()
-        centre_x, centre_y = views.intrinsics.centre[index].tolist()
-        local = (points - pose[:3, 3]) @ pose[:3, :3]
-        depth = -local[:, 2]
-        column = (local[:, 0] / depth * focal_x + centre_x).floor()
-        row = (-local[:, 1] / depth * focal_y + centre_y).floor()
-        seen = (depth > radius) & (column >= 0) & (column < width)
-        seen &= (row >= 0) & (row < height)
+        (height, width), (mask, cell) = views.size(index), views.silhouette(index)
+        focal, lens = intrinsics.focal[index], intrinsics.lens(index)
+        centre = intrinsics.centre[index]
+        column, row, seen = project(pose, points, focal=focal, centre=centre, lenses=lens)
+        column, row = column.floor(), row.floor()
+        seen = seen & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        stretch = 1.0 if intrinsics.sights is None else intrinsics.sights[index].stretch
+        margin = ball_extent(pose, points, radius, focal=focal, lenses=lens, stretch=stretch)
+        seen &= margin < math.inf
         if not seen.any():
             continue
-        # How far a ball of this radius reaches from the pixel of its centre, on either axis.
-        slant = torch.hypot(depth, local[:, :2].abs().amax(dim=-1))
-        focal = max(focal_x, focal_y)
-        margin = (focal * radius * slant / (depth * (depth - radius))).ceil()[seen]
-        steps = _steps_to_foreground(alpha > 0, int(margin.max()))
-        inside[index, seen] = steps[row[seen].long(), column[seen].long()] <= margin
+        margin = (margin[seen] / cell).ceil()
+        steps = _steps_to_foreground(mask, int(margin.max()))
+        inside[index, seen] = steps[row[seen].long() // cell, column[seen].long() // cell] <= margin
     return inside
 
 

@@ -19,10 +19,11 @@ SAME = 2
 
 def frames_are_equal(video: Views) -> bool:
     """Whether all frames of a fixed-camera video (two timesteps or more) are equal."""
-    first = video.images[0].to(torch.int16)
+    first = video.image(0).to(torch.int16)
     fixed = video.intrinsics.is_shared and not video.is_static
     return fixed and all(
-        int((frame.to(torch.int16) - first).abs().max()) <= SAME for frame in video.images[1:]
+        int((video.image(index).to(torch.int16) - first).abs().max()) <= SAME
+        for index in range(1, len(video))
     )
 
 
@@ -51,18 +52,24 @@ class SceneSettings(Settings, ABC):
     name: str  # Name of the format in run directories and tables.
     root: str  # Folder that holds the scenes.
     scene: str  # Folder of the scene, or name of the demo scene.
-    resolution: Count | None  # Pixels per side; null keeps the native size.
+    resolution: Count | None  # Width of the images in pixels; null keeps the native size.
     views: Count | None  # Training views, spread over time; null for all.
     train_on_video: bool  # Also train on the frames of the fixed camera.
     static: bool | None  # Static scene; null: if all frames of the fixed camera are equal.
     eval_split: Literal["test", "val"] | None  # Scored split; null: val in training, test after it.
     eval_views: Count | None  # Views of a scored split at most, spread over time; null for all.
     half_side: Positive | None  # Half the side of the scene's bounding cube; null estimates it.
+    cache: str | None = None  # Folder of images too large for memory; null: the user's cache.
 
     @property
     def folder(self) -> Path:
         """The scene's folder."""
         return Path(self.root) / self.scene
+
+    @property
+    def image_cache(self) -> Path | None:
+        """The folder of decoded images; None for that of the user."""
+        return None if self.cache is None else Path(self.cache)
 
     def prepare(self) -> None:
         """Download or render missing data; called in one process per machine.

@@ -1,13 +1,17 @@
-"""Posed, timed images of a scene, held in memory as bytes."""
+"""Posed, timed images of a scene, as bytes in memory or in a file of tiles."""
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from xplanes.scenes.cameras import cast_rays
+from xplanes.scenes.lenses import Lenses, Sight, sight
+from xplanes.scenes.store import LIT, SOLID, TILE, StoredImages, TileFile, count_in_tiles
 
 SAME_CAMERA = 1e-4
 """Share by which intrinsics of one camera differ at most."""
@@ -22,11 +26,13 @@ class Intrinsics:
         centre: Principal points, x from the left and y from the top; half of width and height where
             images are centred. float64 [V, 2]
         size: Height and width of each image. int64 [V, 2]
+        lenses: Lenses that distort the images; None where all cameras are pinholes.
     """
 
     focal: Tensor
     centre: Tensor
     size: Tensor
+    lenses: Lenses | None = None
 
     def __post_init__(self) -> None:
         for name in ("focal", "centre", "size"):
@@ -36,6 +42,14 @@ class Intrinsics:
             # Wider than rays, so that sizes and angles made of them are as exact as the files.
             kind = torch.int64 if name == "size" else torch.float64
             object.__setattr__(self, name, value.to(kind))
+        if self.lenses is not None:
+            if len(self.lenses) != len(self.size):
+                raise ValueError(
+                    f"intrinsics.lenses are {len(self.lenses)}, but there are {len(self.size)} "
+                    "images"
+                )
+            if self.lenses.are_pinholes:
+                object.__setattr__(self, "lenses", None)
 
     def __len__(self) -> int:
         return len(self.size)
@@ -51,7 +65,8 @@ class Intrinsics:
 
     def subset(self, indices: Tensor) -> "Intrinsics":
         """Those of the images at ``indices``, in that order. [K]"""
-        return Intrinsics(self.focal[indices], self.centre[indices], self.size[indices])
+        lenses = None if self.lenses is None else self.lenses.subset(indices)
+        return Intrinsics(self.focal[indices], self.centre[indices], self.size[indices], lenses)
 
     def joined(self, other: "Intrinsics") -> "Intrinsics":
         """These, then those of ``other``."""
@@ -59,6 +74,7 @@ class Intrinsics:
             torch.cat([self.focal, other.focal]),
             torch.cat([self.centre, other.centre]),
             torch.cat([self.size, other.size]),
+            _joined_lenses(self, other),
         )
 
     @property
@@ -69,17 +85,72 @@ class Intrinsics:
             bool((self.size == self.size[0]).all())
             and bool(((self.focal / self.focal[0] - 1).abs() <= SAME_CAMERA).all())
             and bool(((self.centre - self.centre[0]).abs() <= room).all())
+            and (self.lenses is None or self._lenses_are_equal(self.lenses, float(room)))
         )
+
+    def _lenses_are_equal(self, lenses: Lenses, room: float) -> bool:
+        return (
+            bool((lenses.model == lenses.model[0]).all())
+            and bool(((lenses.coefficients - lenses.coefficients[0]).abs() <= SAME_CAMERA).all())
+            and bool(((lenses.skew - lenses.skew[0]).abs() <= room).all())
+        )
+
+    def lens(self, index: int) -> Lenses | None:
+        """The lens of image ``index`` alone; None for a pinhole."""
+        return None if self.lenses is None else self.lenses.subset(slice(index, index + 1))
+
+    @cached_property
+    def sights(self) -> list[Sight] | None:
+        """What each image sees through its lens; None where all cameras are pinholes. [V]"""
+        if self.lenses is None:
+            return None
+        known: dict[tuple[float, ...], Sight] = {}
+        lenses, found = self.lenses, []
+        numbers = torch.cat(
+            [
+                *(self.focal, self.centre, self.size, lenses.model[:, None]),
+                *(lenses.coefficients, lenses.skew[:, None]),
+            ],
+            dim=1,
+        )
+        for index, key in enumerate(map(tuple, numbers.tolist())):
+            if key not in known:
+                height, width = self.size[index].tolist()
+                lens = lenses.subset(slice(index, index + 1))
+                known[key] = sight(lens, self.focal[index], self.centre[index], height, width)
+            found.append(known[key])
+        return found
+
+    def has_ray(self, index: int) -> Tensor | None:
+        """Which pixels of image ``index`` its lens maps a direction to; None for all. bool [h, w]
+
+        The corners of fisheye images show nothing.
+        """
+        return None if self.sights is None else self.sights[index].has_ray
+
+    @property
+    def pinhole(self) -> Tensor:
+        """Focal lengths of pinholes that see as much, where only a pinhole will do. [V, 2]"""
+        if self.sights is None:
+            return self.focal
+        return torch.tensor([each.pinhole for each in self.sights], dtype=torch.float64)
 
     @property
     def fov_y(self) -> float:
         """Vertical field of view of the median image, in radians."""
-        return 2 * math.atan(float((0.5 * self.size[:, 0] / self.focal[:, 1]).median()))
+        return 2 * math.atan(float((0.5 * self.size[:, 0] / self.pinhole[:, 1]).median()))
 
     def focal_at(self, size: int) -> float:
         """Focal length of a picture ``size`` pixels wide that shows as much as the median image."""
         longer = self.size.amax(dim=1)
-        return float((self.focal.mean(dim=1) * size / longer).median())
+        return float((self.pinhole.mean(dim=1) * size / longer).median())
+
+
+def _joined_lenses(first: Intrinsics, second: Intrinsics) -> Lenses | None:
+    if first.lenses is None and second.lenses is None:
+        return None
+    lenses = [each.lenses or Lenses.pinholes(len(each)) for each in (first, second)]
+    return lenses[0].joined(lenses[1])
 
 
 @dataclass(frozen=True)
@@ -90,7 +161,8 @@ class Views:
     which nothing may take for pixels. `image`, `composite` and `image_rays` leave the padding out.
 
     Attributes:
-        images: Colour, already multiplied by alpha, and alpha. uint8 [V, H, W, 4]
+        images: Colour, already multiplied by alpha, and alpha: a tensor, or what reads them from a
+            file of tiles. uint8 [V, H, W, 4]
         camera_to_world: Rigid camera poses. [V, 4, 4]
         times: Time of each image, from 0 to 1. [V]
         intrinsics: Focal lengths, principal points and sizes. A number stands for centred images
@@ -98,7 +170,7 @@ class Views:
         files: Name of each image, relative to the scene's folder.
     """
 
-    images: Tensor
+    images: Tensor | StoredImages
     camera_to_world: Tensor
     times: Tensor
     intrinsics: Intrinsics
@@ -141,9 +213,24 @@ class Views:
         return int(self.intrinsics.size.prod(dim=1).sum())
 
     @property
+    def is_cut(self) -> bool:
+        """Whether some pixels show nothing: padding, or corners that a fisheye lens leaves dark."""
+        sights = self.intrinsics.sights or []
+        return self.is_padded or any(each.has_ray is not None for each in sights)
+
+    @property
     def is_opaque(self) -> bool:
         """Whether no pixel lets the background through whole: alpha says nothing then."""
-        return all(bool((self.image(index)[..., 3] > 0).all()) for index in range(len(self)))
+        for index in range(len(self)):
+            has_ray = self.intrinsics.has_ray(index)
+            if isinstance(self.images, StoredImages):
+                shown = (self.images.flags(index) & SOLID) > 0
+                has_ray = None if has_ray is None else count_in_tiles(has_ray) == TILE**2
+            else:
+                shown = self.image(index)[..., 3] > 0
+            if not (shown if has_ray is None else shown[has_ray]).all():
+                return False
+        return True
 
     @property
     def outline(self) -> str:
@@ -156,9 +243,19 @@ class Views:
         return bool((self.times == self.times[0]).all())
 
     @property
+    def is_stored(self) -> bool:
+        """Whether the images are in a file of tiles, not in memory."""
+        return isinstance(self.images, StoredImages)
+
+    @property
     def nbytes(self) -> int:
-        """Bytes that the images take in memory."""
-        return self.images.numel()
+        """Bytes that the images take in memory, or on disk."""
+        return self.images.nbytes
+
+    @property
+    def identity(self) -> Any:
+        """What tells these images from others: their bytes, or what they were decoded from."""
+        return self.images if isinstance(self.images, Tensor) else self.images.identity
 
     def size(self, index: int) -> tuple[int, int]:
         """Height and width of image ``index``."""
@@ -166,22 +263,52 @@ class Views:
         return height, width
 
     def image(self, index: int) -> Tensor:
-        """Image ``index`` without padding, not copied. uint8 [h, w, 4]"""
+        """Image ``index`` without padding, for reading only. uint8 [h, w, 4]"""
+        if isinstance(self.images, StoredImages):
+            return self.images.image(index)
         height, width = self.size(index)
         return self.images[index, :height, :width]
 
+    def in_memory(self) -> Tensor:
+        """All images, with padding. uint8 [V, H, W, 4]"""
+        if isinstance(self.images, Tensor):
+            return self.images
+        whole = torch.zeros(self.images.shape, dtype=torch.uint8)
+        for index in range(len(self)):
+            height, width = self.size(index)
+            whole[index, :height, :width] = self.images.image(index)
+        return whole
+
+    def silhouette(self, index: int) -> tuple[Tensor, int]:
+        """Where image ``index`` has alpha above 0, in square cells.
+
+        Returns:
+            Whether any pixel of a cell has, and the cells' side in pixels: 1, but `TILE` for images
+            in a file of tiles, of which nothing is read. bool [rows, columns]
+        """
+        if isinstance(self.images, StoredImages):
+            return (self.images.flags(index) & LIT) > 0, TILE
+        return self.image(index)[..., 3] > 0, 1
+
     def valid(self) -> Tensor:
-        """Which pixels are no padding. bool [V, H, W]"""
+        """Which pixels show something: no padding, and a ray leads there. bool [V, H, W]"""
         height, width = self.intrinsics.size.unbind(dim=1)
         rows = torch.arange(self.height) < height[:, None]
         columns = torch.arange(self.width) < width[:, None]
-        return rows[:, :, None] & columns[:, None, :]
+        found = rows[:, :, None] & columns[:, None, :]
+        for index in range(len(self)):
+            if (has_ray := self.intrinsics.has_ray(index)) is not None:
+                found[index, : has_ray.shape[0], : has_ray.shape[1]] &= has_ray
+        return found
 
     def subset(self, indices: Tensor) -> "Views":
         """The views at ``indices``, in that order. [K]"""
         intrinsics = self.intrinsics.subset(indices)
-        images = self.images[indices]
-        if len(intrinsics) and self.is_padded:
+        if isinstance(self.images, StoredImages):
+            images = self.images.subset(indices)
+        else:
+            images = self.images[indices]
+        if isinstance(images, Tensor) and len(intrinsics) and self.is_padded:
             height, width = intrinsics.size.amax(dim=0).tolist()
             images = images[:, :height, :width].contiguous()
         return Views(
@@ -201,19 +328,69 @@ class Views:
         """Rays through every pixel of image ``index``, row by row. [h w, 3], [h w, 3]"""
         height, width = self.size(index)
         focal, centre = self.intrinsics.focal[index], self.intrinsics.centre[index]
-        return camera_rays(self.camera_to_world[index], focal, height, width, centre)
+        lens = self.intrinsics.lens(index)
+        return camera_rays(self.camera_to_world[index], focal, height, width, centre, lens)
+
+    def foreground_rays(self, index: int) -> tuple[Tensor, Tensor]:
+        """Rays through the pixels of image ``index`` with alpha above 0. [N, 3], [N, 3]
+
+        Of images in a file of tiles, rays through the corners of the tiles that hold such pixels.
+        """
+        mask, cell = self.silhouette(index)
+        if cell == 1:
+            origins, directions = self.image_rays(index)
+            return origins[mask.flatten()], directions[mask.flatten()]
+        first = mask.nonzero() * cell
+        last = torch.minimum(first + cell, self.intrinsics.size[index]) - 1
+        corners = torch.cat([first, last, torch.stack([first[:, 0], last[:, 1]], dim=1)])
+        rows, columns = torch.cat([corners, torch.stack([last[:, 0], first[:, 1]], dim=1)]).T
+        return self.pixel_rays(torch.full_like(rows, index), rows.float(), columns.float())
+
+    def pixel_rays(self, views: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """Rays through pixels of any images.
+
+        Args:
+            views: Number of the image of each ray. int64 [R]
+            rows: Pixel rows, from 0 at the top. [R]
+            columns: Pixel columns, from 0 at the left. [R]
+
+        Returns:
+            Origins and unit directions in the world. [R, 3], [R, 3]
+        """
+        intrinsics = self.intrinsics
+        return cast_rays(
+            self.camera_to_world[views],
+            rows,
+            columns,
+            focal=intrinsics.focal[views],
+            centre=intrinsics.centre[views],
+            lenses=None if intrinsics.lenses is None else intrinsics.lenses.subset(views),
+        )
 
 
 def joined(first: Views, second: Views) -> Views:
     """The views of both."""
-    height, width = max(first.height, second.height), max(first.width, second.width)
+    if isinstance(first.images, Tensor) and isinstance(second.images, Tensor):
+        height, width = max(first.height, second.height), max(first.width, second.width)
+        parts = [_padded(images, height, width) for images in (first.images, second.images)]
+        images = torch.cat(parts)
+    else:
+        images = _tiled(first).joined(_tiled(second))
     return Views(
-        torch.cat([_padded(views.images, height, width) for views in (first, second)]),
+        images,
         torch.cat([first.camera_to_world, second.camera_to_world]),
         torch.cat([first.times, second.times]),
         first.intrinsics.joined(second.intrinsics),
         first.files + second.files,
     )
+
+
+def _tiled(views: Views) -> StoredImages:
+    """The images in tiles."""
+    if isinstance(views.images, StoredImages):
+        return views.images
+    file = TileFile.of(views.image(index) for index in range(len(views)))
+    return StoredImages.all_of(file)
 
 
 def _padded(images: Tensor, height: int, width: int) -> Tensor:
@@ -247,6 +424,7 @@ def camera_rays(
     height: int,
     width: int,
     centre: Tensor | None = None,
+    lens: Lenses | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Rays through every pixel of one camera, row by row.
 
@@ -256,6 +434,7 @@ def camera_rays(
         height: Rows.
         width: Columns.
         centre: Principal point, x from the left and y from the top; the middle when None. [2]
+        lens: Its lens; a pinhole when None.
 
     Returns:
         Origins and unit directions in the world. [H W, 3], [H W, 3]
@@ -271,4 +450,5 @@ def camera_rays(
         columns.flatten(),
         focal=focal if isinstance(focal, Tensor) else (focal, focal),
         centre=(0.5 * width, 0.5 * height) if centre is None else centre,
+        lenses=lens,
     )

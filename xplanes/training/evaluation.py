@@ -96,7 +96,11 @@ def render_view(
     time = float(views.times[index])
     image = renderer.image(field, origins, directions, time, background.to(device))
     shape = views.size(index)
-    return {name: value.cpu().view(*shape, *value.shape[1:]) for name, value in image.items()}
+    found = {name: value.cpu().view(*shape, *value.shape[1:]) for name, value in image.items()}
+    if (has_ray := views.intrinsics.has_ray(index)) is not None:
+        for name, value in found.items():
+            value[~has_ray] = background.cpu() if name == "colour" else 0
+    return found
 
 
 def score_view(

@@ -298,6 +298,7 @@ class ProceduralSettings(SceneSettings, ABC):
                 splits=splits,
                 views=self.views,
                 eval_views=self.eval_views,
+                cache=self.image_cache,
             )
         except SceneError as problem:
             raise SceneError(

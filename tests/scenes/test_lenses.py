@@ -1,0 +1,346 @@
+"""Lenses against formulas written a second time, and the bounds that stand on them."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.lens_oracle import direction, pixel
+from tests.synthetic import ball_views, inside_ball, surrounding
+from xplanes.evaluation.render import lens as lens_of_picture
+from xplanes.preparation.fixed_view import check_camera
+from xplanes.scenes.batches import RayBatches
+from xplanes.scenes.cameras import ball_extent, cast_rays, look_at, project
+from xplanes.scenes.datamodule import UNIFORM
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.frame import backwards, cube_frame, scene_frame
+from xplanes.scenes.lenses import COEFFICIENTS, WIDEST, Lenses, LensModel
+from xplanes.scenes.silhouettes import may_hold
+from xplanes.scenes.views import Intrinsics, Views, camera_rays, joined
+
+HEIGHT, WIDTH = 30, 44
+FOCAL, CENTRE = (35.0, 37.0), (20.5, 16.25)
+
+LENSES = {
+    "barrel": ("perspective", {"k1": -0.2, "k2": 0.03}),
+    "pincushion": ("perspective", {"k1": 0.3, "k2": 0.1, "k3": 0.05}),
+    "tangential": ("perspective", {"k1": -0.1, "p1": 0.02, "p2": -0.015}),
+    "rational": (
+        "perspective",
+        {"k1": 0.9, "k2": 0.3, "k3": 0.02, "k4": 1.0, "k5": 0.3, "k6": 0.02},
+    ),
+    "prism": ("perspective", {"s1": 0.02, "s2": -0.01, "s3": -0.015, "s4": 0.01}),
+    "equidistant": ("fisheye", {}),
+    "fisheye": ("fisheye", {"k1": 0.05, "k2": -0.02, "k3": 0.004, "k4": -0.0005}),
+    "thin prism fisheye": ("fisheye", {"k1": 0.03, "p1": 0.004, "p2": -0.003, "s1": 0.005}),
+    "fov": ("fov", {"omega": 0.9}),
+}
+
+
+def lenses_of(*names, skew=0.0):
+    """Lenses of the table above."""
+    rows = [LENSES[name] for name in names]
+    first = [dict(k) | ({"k1": k["omega"]} if "omega" in k else {}) for _, k in rows]
+    return Lenses(
+        torch.tensor([LensModel[model.upper()] for model, _ in rows]),
+        torch.tensor(
+            [[k.get(name, 0.0) for name in COEFFICIENTS] for k in first], dtype=torch.float64
+        ),
+        torch.full((len(rows),), skew, dtype=torch.float64),
+    )
+
+
+def intrinsics_of(*names, focal=FOCAL, skew=0.0, height=HEIGHT, width=WIDTH, centre=CENTRE):
+    count = len(names)
+    return Intrinsics(
+        torch.tensor([focal] * count),
+        torch.tensor([centre] * count),
+        torch.tensor([[height, width]] * count),
+        lenses_of(*names, skew=skew),
+    )
+
+
+def grid():
+    rows, columns = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    return rows.flatten().double(), columns.flatten().double()
+
+
+def cast(name, rows, columns, pose=None, skew=0.0):
+    return cast_rays(
+        torch.eye(4, dtype=torch.float64) if pose is None else pose,
+        rows,
+        columns,
+        focal=torch.tensor(FOCAL, dtype=torch.float64),
+        centre=torch.tensor(CENTRE, dtype=torch.float64),
+        lenses=lenses_of(name, skew=skew),
+    )
+
+
+# Rays and pixels
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_rays_are_those_of_a_search(name):
+    model, k = LENSES[name]
+    generator = np.random.default_rng(0)
+    rows = torch.from_numpy(generator.uniform(-0.5, HEIGHT - 0.5, 12))
+    columns = torch.from_numpy(generator.uniform(-0.5, WIDTH - 0.5, 12))
+    for skew in (0.0, 1.5):
+        _, found = cast(name, rows, columns, skew=skew)
+        assert found.dtype == torch.float64
+        for ray, row, column in zip(found.tolist(), rows.tolist(), columns.tolist(), strict=True):
+            target = (column + 0.5, row + 0.5)
+            expected = direction(model, target, k, FOCAL, CENTRE, skew)
+            assert np.abs(np.subtract(ray, expected)).max() < 1e-9, (row, column)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_points_on_rays_are_seen_at_their_pixels(name):
+    model, k = LENSES[name]
+    pose = look_at(torch.tensor([[1.0, -3.0, 2.0]], dtype=torch.float64))[0]
+    rows, columns = grid()
+    origins, directions = cast(name, rows, columns, pose, skew=0.7)
+    options = {"focal": torch.tensor(FOCAL), "centre": torch.tensor(CENTRE)}
+    points = origins + torch.linspace(0.5, 9, len(rows))[:, None] * directions
+    x, y, seen = project(pose, points, lenses=lenses_of(name, skew=0.7), **options)
+    assert seen.all()
+    torch.testing.assert_close(x, columns + 0.5, atol=1e-9, rtol=0)
+    torch.testing.assert_close(y, rows + 0.5, atol=1e-9, rtol=0)
+    local = (points[7] - pose[:3, 3]) @ pose[:3, :3]
+    expected = pixel(model, local.tolist(), k, FOCAL, CENTRE, 0.7)
+    assert expected == pytest.approx((float(x[7]), float(y[7])), abs=1e-9)
+
+
+def test_single_precision_rays_are_as_exact_as_they_can_be():
+    rows, columns = grid()
+    pose = look_at(torch.tensor([[1.0, -3.0, 2.0]], dtype=torch.float64))[0]
+    for name in LENSES:
+        _, exact = cast(name, rows, columns, pose)
+        _, found = cast(name, rows.float(), columns.float(), pose.float())
+        assert found.dtype == torch.float32
+        assert float((found - exact).abs().max()) < 3e-7, name
+
+
+def test_lenses_of_one_batch_do_not_mix():
+    names = [name for name in LENSES for _ in range(3)]
+    lenses = lenses_of(*names)
+    rows = torch.rand(len(names), dtype=torch.float64) * HEIGHT
+    columns = torch.rand(len(names), dtype=torch.float64) * WIDTH
+    pose = torch.eye(4, dtype=torch.float64)
+    focal = torch.tensor([FOCAL] * len(names), dtype=torch.float64)
+    centre = torch.tensor([CENTRE] * len(names), dtype=torch.float64)
+    _, found = cast_rays(pose, rows, columns, focal=focal, centre=centre, lenses=lenses)
+    for index, name in enumerate(names):
+        alone = cast(name, rows[index : index + 1], columns[index : index + 1])[1][0]
+        torch.testing.assert_close(found[index], alone, atol=1e-12, rtol=0)
+
+
+def test_lenses_that_distort_nothing_cost_nothing():
+    square = ball_views(3, 0.5, size=20)
+    plain = replace(square.intrinsics, lenses=Lenses.pinholes(3))
+    assert plain.lenses is None
+    weak = intrinsics_of("barrel", "barrel")
+    weak = replace(weak, lenses=replace(weak.lenses, coefficients=weak.lenses.coefficients * 1e-12))
+    assert weak.lenses is not None
+    rays = [
+        camera_rays(torch.eye(4), weak.focal[0], HEIGHT, WIDTH, weak.centre[0], lens)[1]
+        for lens in (weak.lens(0), None)
+    ]
+    torch.testing.assert_close(rays[0], rays[1], atol=2e-7, rtol=0)
+    assert torch.tensor([weak.fov_y]) == pytest.approx(
+        2 * math.atan(0.5 * HEIGHT / FOCAL[1]), rel=0.01
+    )
+
+
+def test_intrinsics_keep_their_lenses():
+    both = intrinsics_of("barrel", "fisheye")
+    assert torch.equal(both.subset(torch.tensor([1])).lenses.model, torch.tensor([1]))
+    assert not both.is_shared
+    assert intrinsics_of("fov", "fov").is_shared
+    three = Intrinsics.shared(30.0, HEIGHT, WIDTH, 1).joined(both)
+    assert three.lenses.model.tolist() == [0, 0, 1]
+    assert three.subset(torch.tensor([0])).lenses is None
+    assert three.lenses.coefficients[1, 0] == -0.2
+    with pytest.raises(ValueError, match=r"lenses\.coefficients"):
+        Lenses(torch.zeros(2), torch.zeros(2, 8), torch.zeros(2))
+    with pytest.raises(ValueError, match="2 images"):
+        replace(both, lenses=lenses_of("fov"))
+
+
+# What no ray belongs to
+
+
+def test_limits_are_where_lenses_fold():
+    barrel = Lenses(
+        torch.zeros(1), torch.tensor([[-0.3] + [0.0] * 11], dtype=torch.float64), torch.zeros(1)
+    )
+    assert float(barrel.limit) == pytest.approx(math.sqrt(1 / 0.9), rel=1e-12)
+    edge = float(barrel.limit) * 2 / 3
+    x = torch.tensor([0.999 * edge, 1.001 * edge, 5.0])
+    local, found = barrel.directions(x.double(), torch.zeros(3, dtype=torch.float64))
+    assert found.tolist() == [True, False, False]
+    assert local.isfinite().all()
+    torch.testing.assert_close(local[1], local[2])  # the nearest there is
+    assert float(-local[2, 0] / local[2, 2]) == pytest.approx(float(barrel.limit), rel=1e-6)
+
+
+def test_fisheye_corners_have_no_rays_and_are_left_out():
+    """An equidistant lens whose circle of 180 degrees all around is smaller than the image."""
+    intrinsics = intrinsics_of("equidistant", "fov", focal=(6.0, 6.0), centre=(22.0, 15.0))
+    rows, columns = grid()
+    away = torch.hypot(columns + 0.5 - 22, rows + 0.5 - 15).view(HEIGHT, WIDTH) / 6
+    assert torch.equal(intrinsics.has_ray(0), away <= math.pi)
+    # Beyond pi / (2 omega) there is no direction; just before, it is aside by more than 89.9 deg.
+    assert torch.equal(intrinsics.has_ray(1), away < math.pi / 2 / 0.9)
+    images = torch.full((2, HEIGHT, WIDTH, 4), 255, dtype=torch.uint8)
+    for index in (0, 1):
+        images[index, ~intrinsics.has_ray(index)] = 0
+    views = Views(images, surrounding(2, 3.0), torch.zeros(2), intrinsics, ("a", "b"))
+    assert views.is_cut
+    assert views.is_opaque
+    assert torch.equal(views.valid()[0], intrinsics.has_ray(0))
+    _, directions = views.image_rays(0)
+    assert directions.isfinite().all()
+    assert directions.norm(dim=1).sub(1).abs().max() < 1e-5
+    batches = RayBatches(views, cube_frame(1.0, torch.zeros(3)), UNIFORM, seed=0)
+    assert len(batches.near) + len(batches.far) == int(views.valid().sum())
+    assert (batches.draw(0)["alpha"] == 1).all()
+
+
+def test_whole_fisheye_images_have_all_their_rays():
+    assert intrinsics_of("equidistant").has_ray(0) is None
+    assert intrinsics_of("fisheye", focal=(20.0, 20.0)).has_ray(0) is None
+
+
+# What assumed a pinhole
+
+
+def seen_ball(names, poses, radius, **options):
+    """Views of a ball through lenses, by their own rays."""
+    intrinsics = intrinsics_of(*names, **options)
+    height, width = intrinsics.size[0].tolist()
+    blank = torch.zeros(len(names), height, width, 4, dtype=torch.uint8)
+    files = tuple(f"{index}.png" for index in range(len(names)))
+    views = Views(blank, poses, torch.zeros(len(names)), intrinsics, files)
+    for index in range(len(names)):
+        origins, directions = (part.double() for part in views.image_rays(index))
+        along = -(origins * directions).sum(dim=1)
+        hit = (origins + along[:, None] * directions).norm(dim=1) < radius
+        views.images[index].view(-1, 4)[hit & (along > 0)] = 255
+    return views
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_balls_reach_no_farther_than_said(name):
+    intrinsics = intrinsics_of(name, skew=1.0, focal=(20.0, 22.0))
+    focal, centre, lens = intrinsics.focal[0], intrinsics.centre[0], intrinsics.lens(0)
+    sight = intrinsics.sights[0]
+    pose = torch.eye(4, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(1)
+    middle = 2 * torch.randn(400, 3, generator=generator, dtype=torch.float64)
+    middle[:40, :2] *= 0.05  # near the axis, before and behind the camera
+    for radius in (0.02, 0.4):
+        extent = ball_extent(pose, middle, radius, focal=focal, lenses=lens, stretch=sight.stretch)
+        x, y, seen = project(pose, middle, focal=focal, centre=centre, lenses=lens)
+        seen &= (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT) & extent.isfinite()
+        assert seen.sum() > 20
+        largest = torch.zeros(400, dtype=torch.float64)
+        for _ in range(200):
+            edge = torch.randn(400, 3, generator=generator, dtype=torch.float64)
+            edge = middle + radius * edge / edge.norm(dim=1, keepdim=True)
+            there_x, there_y, shown = project(pose, edge, focal=focal, centre=centre, lenses=lens)
+            shown &= (there_x >= 0) & (there_x < WIDTH) & (there_y >= 0) & (there_y < HEIGHT)
+            moved = torch.maximum((there_x - x).abs(), (there_y - y).abs())
+            largest = torch.where(shown, torch.maximum(largest, moved), largest)
+        assert (largest[seen] <= extent[seen]).all()
+        assert float((extent[seen] / largest[seen].clamp(min=1e-3)).median()) < 4
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_silhouettes_never_rule_out_what_is_there(name):
+    views = seen_ball([name] * 6, surrounding(6, 3.0), 0.5)
+    points = inside_ball(3000, 0.5)
+    assert may_hold(views, points, radius=0.01).all()
+    around = inside_ball(3000, 1.2, seed=1)
+    around = around[around.norm(dim=1) > 0.75]
+    assert may_hold(views, around, radius=0.01).all(dim=0).float().mean() < 0.01
+
+
+def test_fisheye_lenses_see_beside_and_behind_themselves():
+    """Cameras inside a scene, with the ball far from their axes."""
+    place = torch.tensor([[0.0, -2.0, 0.0]])
+    for target in ([2.0, -2.0, 0.0], [0.5, -5.0, 0.3]):  # 90 degrees aside; behind
+        pose = look_at(place, torch.tensor([target]))
+        views = seen_ball(
+            ["equidistant"], pose, 0.5, focal=(9.0, 9.0), height=60, width=60, centre=(30.0, 30.0)
+        )
+        assert (views.images[..., 3] > 0).any()
+        assert may_hold(views, inside_ball(2000, 0.5), radius=0.02).all()
+        empty = inside_ball(2000, 0.3) + torch.tensor([0.0, 0.0, 1.5])
+        assert not may_hold(views, empty, radius=0.02).any()
+
+
+def test_the_cube_holds_the_ball_through_any_lens():
+    for name in LENSES:
+        views = seen_ball([name] * 20, surrounding(20, 4.0), 0.5)
+        frame = scene_frame(views)
+        assert frame.points(inside_ball(2000, 0.5)).abs().max() <= 1, name
+        assert 1 / frame.scale < 0.95, name
+        # The principal point is not in the middle: the middle's ray is not the camera's axis.
+        middle = cast(name, torch.tensor([HEIGHT / 2 - 0.5]), torch.tensor([WIDTH / 2 - 0.5]))[1]
+        expected = views.camera_to_world[0, :3, :3] @ -middle[0].float()
+        torch.testing.assert_close(backwards(views)[0], expected, atol=1e-6, rtol=0)
+
+
+def test_pinholes_that_stand_for_lenses_see_as_wide():
+    for name, angle in (("barrel", None), ("equidistant", 44 / 35)):
+        intrinsics = intrinsics_of(name, focal=(35.0, 35.0), centre=(22.0, 15.0))
+        if angle is None:
+            ends = torch.tensor([-0.5, WIDTH - 0.5]), torch.full((2,), HEIGHT / 2 - 0.5)
+            _, (left, right) = cast_rays(
+                torch.eye(4),
+                ends[1],
+                ends[0],
+                focal=intrinsics.focal[0],
+                centre=intrinsics.centre[0],
+                lenses=intrinsics.lenses,
+            )
+            angle = math.acos(float(left @ right))
+        focal = float(intrinsics.pinhole[0, 0])
+        assert 2 * math.atan(22 / focal) == pytest.approx(angle, abs=1e-5), name
+    wide = intrinsics_of("equidistant", focal=(9.0, 9.0))
+    assert wide.fov_y == pytest.approx(WIDEST)
+
+
+def test_a_picture_from_a_view_has_its_lens():
+    views = seen_ball(["barrel", "fisheye"], surrounding(2, 4.0), 0.5, skew=0.5)
+    for index in (0, 1):
+        focal, centre, lens = lens_of_picture({"train": views}, f"view:{index}", 2 * WIDTH)
+        pose = views.camera_to_world[index]
+        _, found = camera_rays(pose, focal, 2 * WIDTH, 2 * WIDTH, centre, lens)
+        # The middle of four pixels is the centre of one of the view.
+        found = found.view(WIDTH, 2, WIDTH, 2, 3).mean(dim=(1, 3))
+        found = found[(WIDTH - HEIGHT) // 2 : (WIDTH + HEIGHT) // 2].reshape(-1, 3)
+        torch.testing.assert_close(found, views.image_rays(index)[1], atol=1e-3, rtol=0)
+
+
+def test_a_distorted_video_is_refused_where_pinholes_are_needed():
+    centre = (WIDTH / 2, HEIGHT / 2)
+    views = seen_ball(
+        ["barrel"] * 2, surrounding(1, 4.0).repeat(2, 1, 1), 0.5, centre=centre, focal=(35.0, 35.0)
+    )
+    with pytest.raises(SceneError, match=r"distorts.*preparation\.fixed_view=train"):
+        check_camera(views)
+    weak = replace(views.intrinsics.lenses, coefficients=views.intrinsics.lenses.coefficients / 50)
+    check_camera(replace(views, intrinsics=replace(views.intrinsics, lenses=weak)))
+
+
+def test_views_with_and_without_lenses_are_joined():
+    first = seen_ball(["fisheye"], surrounding(1, 4.0), 0.5)
+    second = ball_views(2, 0.5, size=20)
+    both = joined(first, second)
+    for index, (views, own) in enumerate([(first, 0), (second, 0), (second, 1)]):
+        for mine, theirs in zip(both.image_rays(index), views.image_rays(own), strict=True):
+            torch.testing.assert_close(mine, theirs, atol=2e-7, rtol=0)

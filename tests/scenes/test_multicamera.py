@@ -1,0 +1,319 @@
+"""Videos of several fixed cameras, written from rendered views and read back."""
+
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.synthetic import ball_views, surrounding, swinging
+from xplanes.components import build
+from xplanes.config import compose_plain
+from xplanes.errors import ConfigError
+from xplanes.lrm.canonical import OPENLRM_VIEW
+from xplanes.models.initialisation import Method, Place
+from xplanes.optional import MissingExtraError
+from xplanes.preparation.cache import StageCache
+from xplanes.preparation.fixed_view import fixed_view
+from xplanes.scenes import store
+from xplanes.scenes.errors import MissingSplitError, SceneError
+from xplanes.scenes.frame import scene_frame
+from xplanes.scenes.multicamera import read_cameras, read_multicamera
+from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.views import Views
+
+pytest.importorskip("av")
+imageio = pytest.importorskip("imageio.v2")
+
+CAMERAS, FRAMES, SIZE = 4, 6, 48
+
+
+def captured(cameras: int = CAMERAS, frames: int = FRAMES) -> Views:
+    """A swinging ball before grey, seen by fixed cameras: opaque, camera by camera."""
+    poses = surrounding(cameras, 4.0, 0).repeat_interleave(frames, dim=0)
+    times = torch.linspace(0, 1, frames).repeat(cameras)
+    views = ball_views(
+        len(poses), 0.6, centre=swinging(0.5, 0.3), size=SIZE, times=times, poses=poses
+    )
+    white = torch.tensor([0.4, 0.4, 0.4])
+    pixels = torch.stack([views.composite(i, white) for i in range(len(views))])
+    opaque = torch.full((*pixels.shape[:3], 4), 255, dtype=torch.uint8)
+    opaque[..., :3] = (pixels * 255).round().byte()
+    return replace(views, images=opaque)
+
+
+VIEWS = captured()
+
+
+def rgb(camera: int) -> np.ndarray:
+    """Frames of a camera. uint8 [T, H, W, 3]"""
+    return VIEWS.in_memory()[camera * FRAMES : (camera + 1) * FRAMES, ..., :3].numpy()
+
+
+def write_video(path: Path, frames: np.ndarray, rate: float = 30) -> None:
+    options = {"fps": rate, "codec": "libx264", "pixelformat": "yuv444p", "macro_block_size": 1}
+    with imageio.get_writer(path, output_params=["-crf", "5"], **options) as writer:
+        for frame in frames:
+            writer.append_data(frame)
+
+
+def write_images(folder: Path, frames: np.ndarray) -> None:
+    folder.mkdir(parents=True)
+    for number, frame in enumerate(frames):
+        Image.fromarray(frame).save(folder / f"{number + 5}.png")  # 10 comes after 9.
+
+
+def neural_3d_video(folder: Path, write: Callable, suffix: str) -> Path:
+    """The views in the layout of Neural 3D Video, with the calibration of twice their size."""
+    folder.mkdir(parents=True)
+    rows = []
+    for camera in range(CAMERAS):
+        write(folder / f"cam{camera:02d}{suffix}", rgb(camera))
+        pose = VIEWS.camera_to_world[camera * FRAMES].double().numpy()
+        right, up, back, centre = pose[:3].T
+        focal = 2 * float(VIEWS.intrinsics.focal[0, 0])
+        hwf = np.array([2 * SIZE, 2 * SIZE, focal])
+        matrix = np.stack([-up, right, back, centre, hwf], axis=1)
+        rows.append([*matrix.ravel(), 1.0, 9.0])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+    return folder
+
+
+def with_transforms(folder: Path, name: Callable[[int], str]) -> None:
+    frames = [
+        {
+            "file_path": name(camera),
+            "transform_matrix": VIEWS.camera_to_world[camera * FRAMES].tolist(),
+        }
+        for camera in range(CAMERAS)
+    ]
+    focal = float(VIEWS.intrinsics.focal[0, 0])
+    content = {"fl_x": focal, "w": SIZE, "h": SIZE, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return neural_3d_video(tmp_path_factory.mktemp("n3v") / "scene", write_video, ".mp4")
+
+
+def read(folder: Path, splits=("train", "test"), **options):
+    options = {"resolution": None, "test_cameras": ["cam00"]} | options
+    return read_multicamera(folder, splits=splits, **options)
+
+
+def require_rays_of(found: Views, indices: list[int]) -> None:
+    expected = VIEWS.subset(torch.tensor(indices))
+    assert len(found) == len(expected)
+    assert torch.allclose(found.times, expected.times)
+    for index in range(len(found)):
+        for one, other in zip(found.image_rays(index), expected.image_rays(index), strict=True):
+            assert (one - other).abs().max() < 1e-5
+
+
+def test_videos_of_neural_3d_video(videos: Path) -> None:
+    scene = read(videos)
+    require_rays_of(scene.splits["test"], list(range(FRAMES)))
+    require_rays_of(scene.splits["train"], list(range(FRAMES, CAMERAS * FRAMES)))
+    assert scene.splits["train"].files[:2] == ("cam01/000000", "cam01/000001")
+    assert scene.splits["train"].is_opaque
+    expected = VIEWS.in_memory()[FRAMES:].int()
+    apart = (scene.splits["train"].in_memory().int() - expected).abs().float()
+    assert apart.mean() < 2
+    # Each frame is nearer to its own image than to the others of its camera.
+    for number in range(FRAMES):
+        found = scene.splits["test"].image(number).int()
+        gaps = [(found - VIEWS.image(i).int()).abs().float().mean() for i in range(FRAMES)]
+        assert int(torch.stack(gaps).argmin()) == number
+
+
+def test_folders_of_images_keep_every_pixel(tmp_path: Path) -> None:
+    folder = neural_3d_video(tmp_path / "scene", write_images, "")
+    scene = read(folder)
+    assert torch.equal(scene.splits["test"].in_memory(), VIEWS.in_memory()[:FRAMES])
+    assert torch.equal(scene.splits["train"].in_memory(), VIEWS.in_memory()[FRAMES:])
+    (folder / "poses_bounds.npy").unlink()
+    for name in (
+        lambda camera: f"cam{camera:02d}",
+        lambda camera: f"./cam{camera:02d}/5.png",
+        lambda camera: f"cam{camera:02d}\\5",
+    ):
+        with_transforms(folder, name)
+        again = read(folder)
+        require_rays_of(again.splits["train"], list(range(FRAMES, CAMERAS * FRAMES)))
+        assert torch.equal(again.splits["train"].in_memory(), scene.splits["train"].in_memory())
+
+
+def test_transforms_may_name_videos(videos: Path, tmp_path: Path) -> None:
+    for video in videos.glob("*.mp4"):
+        (tmp_path / video.name).write_bytes(video.read_bytes())
+    with_transforms(tmp_path, lambda camera: f"cam{camera:02d}.mp4")
+    one, other = read(tmp_path), read(videos)
+    assert torch.equal(one.splits["train"].in_memory(), other.splits["train"].in_memory())
+
+
+def test_frames_by_range_and_stride(videos: Path) -> None:
+    scene = read(videos, frames=[1, 5, 2], resolution=24)
+    train = scene.splits["train"]
+    assert train.files[:3] == ("cam01/000001", "cam01/000003", "cam01/000005")
+    assert train.times[:4].tolist() == [0, 0.5, 1, 0]
+    assert train.size(0) == (24, 24)
+    expected = VIEWS.image(FRAMES + 3)[..., :3].float().view(24, 2, 24, 2, 3).mean(dim=(1, 3))
+    assert (train.image(1)[..., :3] - expected).abs().mean() < 2
+    assert read(videos, frames=[2, 2, 1]).splits["train"].is_static
+    few = read(videos, views=5, eval_views=2)
+    assert len(few.splits["train"]) == 5
+    assert few.splits["train"].times[[0, -1]].sum() == 1
+    assert len(few.splits["test"]) == 2
+
+
+def test_the_video_is_that_of_a_training_camera(videos: Path) -> None:
+    centres = VIEWS.camera_to_world[::FRAMES, :3, 3]
+    away = (centres - centres.mean(dim=0)).norm(dim=1)
+    central = 1 + int(away[1:].argmin())
+    video = read(videos).video
+    assert video.files == tuple(f"cam{central:02d}/{number:06d}" for number in range(FRAMES))
+    assert video.times.tolist() == pytest.approx(torch.linspace(0, 1, FRAMES).tolist())
+    assert read(videos, splits=("train",), video_camera="cam03").video.files[0][:5] == "cam03"
+    with pytest.raises(SceneError, match=r"video_camera=cam00.*must not see them"):
+        read(videos, video_camera="cam00")
+    with pytest.raises(SceneError, match=r"video_camera=cam9: there is no such.*cam01, cam02"):
+        read(videos, video_camera="cam9")
+
+
+def test_the_lrm_sees_that_video_as_it_is(videos: Path) -> None:
+    scene = read(videos, video_camera="cam02")
+    method = Method.read(compose_plain("train", ["lrm=tiny", "preparation.frames=3"]))
+    place = Place(scene, scene_frame(scene.splits["train"]), torch.device("cpu"))
+    made = fixed_view(method, place, OPENLRM_VIEW, 24, StageCache(None))
+    assert made.seconds == 0
+    assert [file[:5] for file in made.views.files] == ["cam02"] * 3
+    assert made.views.times.tolist() == pytest.approx([0, 0.4, 1])
+    assert torch.equal(made.views.image(2), scene.video.image(FRAMES - 1))
+
+
+def test_large_captures_are_kept_on_disk(videos: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    expected = read(videos)
+    before = sorted(videos.iterdir())
+    monkeypatch.setattr(store, "IN_MEMORY", 0)
+    scene = read(videos, cache=tmp_path / "cache")
+    assert f"{CAMERAS * FRAMES} images" in capsys.readouterr().out
+    for split in ("train", "test"):
+        assert scene.splits[split].is_stored
+        assert torch.equal(scene.splits[split].in_memory(), expected.splits[split].in_memory())
+    assert torch.equal(scene.video.in_memory(), expected.video.in_memory())
+    assert scene.splits["train"].images.files[0].channels == 3
+    # Another split, or fewer views, need nothing new.
+    read(videos, splits=("test",), cache=tmp_path / "cache", views=3)
+    assert not capsys.readouterr().out
+    assert sorted(videos.iterdir()) == before
+
+
+def test_settings_of_the_command_line(videos: Path) -> None:
+    plain = compose_plain(
+        "train",
+        [
+            "data=multicamera",
+            f"data.root={videos.parent}",
+            f"data.scene={videos.name}",
+            "data.resolution=null",
+            "data.frames=[0,2,1]",
+        ],
+    )
+    settings = build(plain["data"], SceneSettings, "data")
+    scene = settings.read()
+    assert set(scene.splits) == {"train", "test"}
+    assert len(scene.video) == 3
+    assert not scene.static_reason
+    with pytest.raises(SceneError, match=r"train_on_video=true.*already"):
+        replace(settings, train_on_video=True).read()
+    for frames in ([0, 1], [3, 2, 1], [-1, 2, 1], [0, 2, 0]):
+        with pytest.raises(ConfigError, match="frames="):
+            replace(settings, frames=frames)
+
+
+def test_cameras_of_different_lengths_and_rates(videos: Path, tmp_path: Path, caplog) -> None:
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    for path in videos.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    write_video(folder / "cam02.mp4", rgb(2)[:4])
+    with caplog.at_level(logging.WARNING):
+        scene = read(folder)
+    assert "camera cam02 has 4 frames, but cam00 6: the first 4 frames" in caplog.text
+    assert len(scene.splits["train"]) == 3 * 4
+    assert scene.splits["train"].times[:4].tolist() == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    with pytest.raises(SceneError, match=r"cam02\.mp4 has 4 frames.*data\.frames=\[0,3,1\]"):
+        read(folder, frames=[0, 5, 1])
+    write_video(folder / "cam02.mp4", rgb(2), rate=25)
+    with pytest.raises(SceneError, match=r"cam02\.mp4 has 25 frames per second.* 30: .*ffmpeg"):
+        read(folder)
+
+
+def test_damaged_files_are_named(videos: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    for path in videos.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    poses = np.load(folder / "poses_bounds.npy")
+
+    def refused(match: str, error: type[Exception] = SceneError, **options) -> None:
+        with pytest.raises(error, match=match):
+            read(folder, **options)
+
+    refused(r"has no split val: its splits are train, test", MissingSplitError, splits=("val",))
+    refused(r"has no split test", MissingSplitError, test_cameras=[])
+    refused(r"no camera cam7\. Its cameras are cam00, cam01", test_cameras=["cam7"])
+    refused(r"leaves no camera", test_cameras=[f"cam0{i}" for i in range(4)])
+    content = (folder / "cam01.mp4").read_bytes()
+    (folder / "cam01.mp4").write_bytes(content[: len(content) // 2])
+    refused(r"cam01\.mp4.*(truncated|damaged)")
+    (folder / "cam01.mp4").write_bytes(b"no video")
+    refused(r"cam01\.mp4 cannot be decoded as a video")
+    (folder / "cam01.mp4").unlink()
+    refused(r"has 4 cameras, but .* holds 3 .*: cam00\.mp4, cam02\.mp4")
+    (folder / "cam01.mp4").write_bytes(content)
+    for column, value, match in (
+        (4, 0.0, "row 2 .*height is 0"),
+        (14, np.nan, "focal length is nan"),
+        (0, 3.0, "row 2 .*orthonormal"),
+        (3, np.inf, "row 2 .*NaN or infinity"),
+    ):
+        spoilt = poses.copy()
+        spoilt[2, column] = value
+        np.save(folder / "poses_bounds.npy", spoilt)
+        refused(match)
+    np.save(folder / "poses_bounds.npy", poses[:, :16])
+    refused(r"not one row of 17 numbers")
+    np.save(folder / "poses_bounds.npy", np.array([{}]), allow_pickle=True)
+    refused(r"poses_bounds\.npy cannot be read")
+    (folder / "poses_bounds.npy").unlink()
+    refused(r"neither poses_bounds\.npy .* nor transforms\.json .*cam00\.mp4")
+    for name, match in (
+        ("cam05.mp4", "is no video"),
+        ("../other", "leaves the scene's folder"),
+        ("/cam00.mp4", "absolute"),
+        ("", "must be text"),
+        (".", "is the scene's folder"),
+    ):
+        with_transforms(folder, lambda camera, name=name: name)
+        refused(match)
+    (folder / "cam00").mkdir()
+    with_transforms(folder, lambda camera: f"cam0{camera}" if camera == 0 else f"cam0{camera}.mp4")
+    refused(r"cam00 holds no images")
+    with_transforms(folder, lambda camera: "cam01.mp4")
+    refused(r"another pose than .* data=nerfstudio")
+
+
+def test_cameras_of_images_need_no_pyav(tmp_path: Path, monkeypatch, videos: Path) -> None:
+    folder = neural_3d_video(tmp_path / "scene", write_images, "")
+    monkeypatch.setitem(__import__("sys").modules, "av", None)
+    assert len(read_cameras(folder)) == CAMERAS
+    assert len(read(folder).splits["train"]) == 3 * FRAMES
+    with pytest.raises(MissingExtraError, match=r'pip install "xplanes\[video\]"'):
+        read(videos)

@@ -1,0 +1,431 @@
+"""Images in a file of tiles: the same pixels as in memory, drawn evenly, whatever happens."""
+
+import copy
+import os
+import shutil
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.synthetic import ball_views
+from xplanes.files import StorageError
+from xplanes.scenes import store
+from xplanes.scenes.batches import AHEAD, RayBatches, RaySettings
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.frame import cube_frame, scene_frame
+from xplanes.scenes.images import final_sizes, native_sizes
+from xplanes.scenes.images import read_images as read_sized
+from xplanes.scenes.lenses import Lenses, LensModel
+from xplanes.scenes.silhouettes import may_hold
+from xplanes.scenes.store import TILE, StoredImages, TileFile
+from xplanes.scenes.views import Views, joined
+from xplanes.streams import step_generator
+
+FRAME = cube_frame(1.4, torch.zeros(3))
+RAYS = RaySettings(
+    per_batch=1000,
+    samples_per_batch=8192,
+    accumulate=1,
+    background="white",
+    skip_background=False,
+    background_share=0.1,
+    background_jitter=0.0,
+)
+
+
+def pictures(folder: Path, sizes, *, alpha: bool, seed=0) -> list[Path]:
+    """Noise as PNG files of some heights and widths."""
+    folder.mkdir(parents=True)
+    draw = np.random.default_rng(seed)
+    paths = []
+    for index, (height, width) in enumerate(sizes):
+        pixels = draw.integers(0, 256, (height, width, 4 if alpha else 3), dtype=np.uint8)
+        paths.append(folder / f"{index:03d}.png")
+        Image.fromarray(pixels).save(paths[-1])
+    return paths
+
+
+def read_images(paths: list[Path], resolution: int | None, cache: Path | None = None):
+    native = native_sizes(paths)
+    sizes = final_sizes(paths, native, resolution)
+    return read_sized(paths, sizes, cache=cache), native, sizes
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All images are too large for memory."""
+    monkeypatch.setattr(store, "IN_MEMORY", 0)
+
+
+def stored(views: Views) -> Views:
+    """The same views in tiles."""
+    file = TileFile.of(views.image(index) for index in range(len(views)))
+    return replace(views, images=StoredImages.all_of(file))
+
+
+SIZES = [(130, 70), (64, 64), (63, 129), (1, 1)]
+
+
+@pytest.mark.parametrize("alpha", [False, True])
+def test_a_file_holds_the_pixels_of_memory(tmp_path: Path, monkeypatch, alpha: bool) -> None:
+    paths = pictures(tmp_path / "scene", SIZES, alpha=alpha)
+    expected, native, sizes = read_images(paths, None)
+    monkeypatch.setattr(store, "IN_MEMORY", 4 * 4 * 130 * 129 - 1)
+    images, *rest = read_images(paths, None, tmp_path / "cache")
+    assert isinstance(images, StoredImages)
+    assert rest == [native, sizes] == [SIZES, SIZES]
+    assert images.shape == expected.shape
+    for index, (height, width) in enumerate(SIZES):
+        assert torch.equal(images.image(index), expected[index, :height, :width]), index
+    (file,) = images.files
+    assert file.channels == (4 if alpha else 3)
+    tiles = 3 * 2 + 1 + 1 * 3 + 1
+    assert images.nbytes == tiles * TILE**2 * file.channels
+    backwards = images.subset(torch.tensor([2, 0]))
+    assert torch.equal(backwards.image(0), images.image(2))
+    assert backwards.shape == (2, 130, 129, 4)
+    assert torch.equal(copy.deepcopy(backwards).image(1), images.image(0))
+    monkeypatch.setattr(store, "IN_MEMORY", 4 * 4 * 130 * 129)
+    assert isinstance(read_images(paths, None)[0], torch.Tensor)
+
+
+def test_reduced_images_are_the_same_too(tmp_path: Path, small) -> None:
+    paths = pictures(tmp_path / "scene", [(70, 70)] * 2, alpha=True)
+    images, _, sizes = read_images(paths, 66, tmp_path / "cache")
+    assert sizes == [(66, 66)] * 2
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store, "IN_MEMORY", 2**20)
+        expected = read_images(paths, 66)[0]
+    assert torch.equal(images.image(1), expected[1])
+
+
+def test_flags_say_what_the_alpha_of_a_tile_shows() -> None:
+    image = torch.zeros(70, 130, 4, dtype=torch.uint8)
+    image[:, 64:, 3] = 255
+    image[0, 64, 3] = 0
+    (found,) = (StoredImages.all_of(TileFile.of([image])).flags(0),)
+    # The padding of the tiles at the edges is neither lit nor transparent.
+    assert found.tolist() == [[0, 1, 3], [0, 3, 3]]
+
+
+def test_views_in_tiles_tell_the_same_as_views_in_memory() -> None:
+    views = ball_views(6, 0.6, size=150)
+    tiled = stored(views)
+    assert tiled.is_stored
+    assert not tiled.is_opaque
+    assert (tiled.height, tiled.width, tiled.pixels) == (150, 150, views.pixels)
+    white = torch.ones(3)
+    for index in range(len(views)):
+        assert torch.equal(tiled.composite(index, white), views.composite(index, white))
+    assert torch.equal(tiled.in_memory(), views.images)
+    full = replace(views, images=torch.full_like(views.images, 255))
+    assert stored(full).is_opaque
+    both = joined(views, tiled.subset(torch.tensor([1])))
+    assert both.is_stored
+    assert torch.equal(both.image(6), views.image(1))
+    assert torch.equal(both.image(5), views.image(5))
+    again = joined(tiled, both)
+    assert len(again) == 13
+    assert torch.equal(again.image(12), views.image(1))
+    assert tiled.identity != both.identity
+
+
+def test_tiles_never_rule_out_what_pixels_leave_open() -> None:
+    views = ball_views(4, 0.3, size=300)
+    tiled = stored(views)
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) * 3 - 1.5
+    exact, coarse = (may_hold(those, points, radius=0.02) for those in (views, tiled))
+    assert not (exact & ~coarse).any()
+    assert (~coarse).float().mean() > 0.1
+    near, far = scene_frame(views).scale, scene_frame(tiled).scale
+    assert far <= near * (1 + 1e-6)
+    opaque = replace(views, images=torch.full_like(views.images, 255))
+    assert scene_frame(stored(opaque)).scale == pytest.approx(scene_frame(opaque).scale, rel=1e-6)
+
+
+def numbered(sizes) -> Views:
+    """Opaque views whose pixels hold their view, row and column."""
+    images = []
+    for index, (height, width) in enumerate(sizes):
+        image = torch.full((height, width, 4), 255, dtype=torch.uint8)
+        image[..., 0] = index
+        image[..., 1] = torch.arange(height)[:, None]
+        image[..., 2] = torch.arange(width)
+        images.append(image)
+    views = ball_views(len(sizes), 0.5, size=8)
+    size = torch.tensor(sizes)
+    focal, centre = torch.full((len(sizes), 2), 90.0), 0.5 * size.flip(1).double()
+    intrinsics = views.intrinsics.__class__(focal, centre, size)
+    return replace(views, images=StoredImages.all_of(TileFile.of(images)), intrinsics=intrinsics)
+
+
+def test_every_pixel_is_drawn_as_often_as_any_other() -> None:
+    sizes = [(70, 130), (33, 64), (64, 5)]
+    views = numbered(sizes)
+    batches = RayBatches(views, FRAME, replace(RAYS, per_batch=3000), seed=0)
+    counts = torch.zeros(3, 256, 256)
+    for step in range(120):
+        batch = batches.draw(step)
+        view, row, column = (batch["target"] * 255).round().long().T
+        counts.index_put_((view, row, column), torch.ones(3000), accumulate=True)
+        if step == 0:
+            # Rays, times and colours are those of one pixel.
+            for index, (height, width) in enumerate(sizes):
+                own = view == index
+                assert (row[own] < height).all()
+                assert (column[own] < width).all()
+                _, expected = views.image_rays(index)
+                found = batch["directions"][own]
+                assert torch.allclose(found, expected[row[own] * width + column[own]], atol=1e-6)
+                assert (batch["times"][own] == views.times[index]).all()
+    drawn = torch.cat([counts[i, :h, :w].flatten() for i, (h, w) in enumerate(sizes)])
+    assert drawn.sum() == counts.sum() == 120 * 3000
+    assert drawn.min() > 0
+    expected = 120 * 3000 / views.pixels
+    # Pixels of one tile are drawn together, which does not change how often, but spreads counts
+    # of whole tiles.
+    assert abs(float(drawn.mean()) - expected) < 1e-3
+    tile = counts[0, :64, :64].sum() / 4096, counts[1, :33].sum() / 2112, counts[2].sum() / 320
+    for mean in tile:
+        assert float(mean) == pytest.approx(expected, rel=0.15)
+    within = counts[0, :64, :64].flatten()
+    chi_squared = float(((within - within.mean()) ** 2 / within.mean()).sum())
+    assert abs(chi_squared - 4095) < 5 * (2 * 4095) ** 0.5
+
+
+def test_no_pixel_is_drawn_that_a_fisheye_lens_leaves_dark() -> None:
+    views = numbered([(150, 150)] * 2)
+    lenses = replace(Lenses.pinholes(2), model=torch.full((2,), int(LensModel.FISHEYE)), limit=None)
+    intrinsics = replace(views.intrinsics, focal=torch.full((2, 2), 30.0), lenses=lenses)
+    shown = intrinsics.has_ray(0)
+    assert shown is not None
+    assert 0.5 < shown.float().mean() < 0.99
+    images = [views.image(index).clone() for index in range(2)]
+    for image in images:
+        image[~shown] = 0
+    tiles = StoredImages.all_of(TileFile.of(images))
+    views = replace(views, images=tiles, intrinsics=intrinsics)
+    assert views.is_opaque
+    batches = RayBatches(views, FRAME, replace(RAYS, per_batch=4000), seed=0)
+    assert len(batches.near) + len(batches.far) == 2 * int(shown.sum())
+    drawn = torch.zeros(150, 150)
+    for step in range(60):
+        batch = batches.draw(step)
+        assert (batch["alpha"] == 1).all()
+        row, column = (batch["target"][:, 1:] * 255).round().long().T
+        drawn.index_put_((row, column), torch.ones(4000), accumulate=True)
+        _, expected = views.image_rays(0)
+        own = (batch["target"][:, 0] * 255).round() == 0
+        place = row[own] * 150 + column[own]
+        assert torch.allclose(batch["directions"][own], expected[place], atol=1e-5)
+    assert not drawn[~shown].any()
+    assert drawn[shown].min() > 0
+
+
+def test_tiles_far_from_silhouettes_get_the_asked_share() -> None:
+    views = stored(ball_views(3, 0.15, size=400))
+    for share in (0.0, 0.2):
+        settings = replace(
+            RAYS, skip_background=True, background_share=share, background_jitter=0.2
+        )
+        batches = RayBatches(views, FRAME, settings, seed=0)
+        assert len(batches.near) + len(batches.far) == views.pixels
+        natural = len(batches.far) / views.pixels
+        assert batches.skipped == pytest.approx(natural - share)
+        moved = lit = 0.0
+        for step in range(30):
+            batch = batches.draw(step)
+            # Of three views, those at the ends of time stay for half of the moves.
+            other = ~torch.isin(batch["times"], views.times)
+            moved += float(other.float().mean()) / 30
+            lit += float((batch["alpha"] > 0).float().mean()) / 30
+            assert not batch["alpha"][other].any()
+        assert moved == pytest.approx(share * 2 / 3, abs=0.05)
+        shown = float((views.in_memory()[..., 3] > 0).float().mean())
+        assert lit == pytest.approx((1 - share) * shown / (1 - natural), rel=0.25)
+
+
+def test_a_batch_of_tiles_depends_on_seed_step_and_rank_alone(tmp_path: Path, small) -> None:
+    paths = pictures(tmp_path / "scene", [(200, 200)] * 4, alpha=False)
+    images, *_ = read_images(paths, None, tmp_path / "cache")
+    views = replace(ball_views(4, 0.5, size=200), images=images)
+    settings = replace(RAYS, background="random")
+    used = RayBatches(views, FRAME, settings, seed=3)
+    for step in (0, 1, 2, 70, 5):
+        used.draw(step)
+    for step in (0, 1, AHEAD, 10**9):
+        fresh = RayBatches(views, FRAME, settings, seed=3)
+        one, other = fresh.draw(step), used.draw(step)
+        assert all(torch.equal(one[name], other[name]) for name in one), step
+    for seed, rank in ((4, 0), (3, 1)):
+        other = RayBatches(views, FRAME, settings, seed=seed, rank=rank).draw(0)
+        assert not torch.equal(other["directions"], used.draw(0)["directions"])
+    # Few rays come from as many tiles as they can.
+    few = RayBatches(views, FRAME, replace(RAYS, per_batch=7), seed=0).draw(0)
+    assert len(few["times"]) == 7
+
+
+def test_tiles_of_coming_steps_are_announced_once(monkeypatch) -> None:
+    views = numbered([(200, 200)] * 3)
+    told: list[tuple[int, int]] = []
+    read: list[tuple[int, int]] = []
+    tiles = StoredImages.pixels
+    monkeypatch.setattr(
+        StoredImages,
+        "prefetch",
+        lambda self, view, tile: told.extend(zip(view.tolist(), tile.tolist(), strict=True)),
+    )
+
+    def pixels(self, view, tile, inside):
+        read.extend(zip(view.tolist(), tile.tolist(), strict=True))
+        return tiles(self, view, tile, inside)
+
+    monkeypatch.setattr(StoredImages, "pixels", pixels)
+    batches = RayBatches(views, FRAME, RAYS, seed=0)
+    for step in range(5, 9):
+        batches.draw(step)
+    per_step = len(read) // 4
+    assert len(told) == (3 + AHEAD) * per_step
+    assert told[: 3 * per_step] == read[per_step:]
+
+
+def test_draws_from_memory_are_those_of_scattered_pixels() -> None:
+    views = ball_views(5, 0.5, size=40)
+    for skip in (False, True):
+        batches = RayBatches(views, FRAME, replace(RAYS, skip_background=skip), seed=7, rank=2)
+        batch = batches.draw(11)
+        uniform = torch.rand(
+            1000, 3, generator=step_generator(7, 11, 2), dtype=torch.float64
+        ).numpy()
+        far, near = batches.far.pixels.numpy(), batches.near.pixels.numpy()
+        pixel = np.where(
+            uniform[:, 0] < batches.far_share,
+            far[(uniform[:, 1] * len(far)).astype(int)],
+            near[(uniform[:, 1] * len(near)).astype(int)],
+        )
+        colour = views.images.numpy().reshape(-1, 4)[pixel].astype(np.float32) / 255
+        assert np.array_equal(batch["target"], colour[:, :3] + (1 - colour[:, 3:])), skip
+        assert np.array_equal(batch["jitter"], uniform[:, 2].astype(np.float32)), skip
+        assert np.array_equal(batch["times"], views.times.numpy()[pixel // 1600]), skip
+
+
+def private_bytes() -> int:
+    """Memory of this process alone."""
+    lines = Path("/proc/self/smaps_rollup").read_text().splitlines()
+    return 1024 * sum(int(line.split()[1]) for line in lines if line.startswith("Private_"))
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps_rollup").is_file(), reason="needs Linux's /proc")
+def test_drawing_takes_no_memory_of_the_images(tmp_path: Path, small, capsys) -> None:
+    size, count = (1024, 1024), 20
+
+    def job(index):
+        return lambda: [(index, np.full((*size, 3), index, np.uint8))]
+
+    source = tmp_path / "source"
+    source.write_bytes(b"")
+    whole = 3 * count * size[0] * size[1]  # 63 MB
+    before = private_bytes()
+    images = store.decoded(
+        [source], "test", [size] * count, 3, [job(i) for i in range(count)], tmp_path / "cache"
+    )
+    poses = ball_views(count, 0.5, size=4)
+    batches = RayBatches(
+        Views(images, poses.camera_to_world, poses.times, 1000.0, poses.files), FRAME, RAYS, seed=0
+    )
+    for step in range(100):
+        batches.draw(step)
+    assert images.nbytes == whole
+    assert private_bytes() - before < whole / 3
+    said = capsys.readouterr().out
+    assert "20 images of up to 1024x1024 px" in said
+    assert "0.1 GB" in said
+    assert str(tmp_path / "cache") in said
+
+
+def test_the_cache_is_used_again_until_a_source_changes(tmp_path: Path, small, capsys) -> None:
+    paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=False)
+    cache = tmp_path / "cache"
+    first = read_images(paths, None, cache)[0]
+    assert "decoding" in capsys.readouterr().out
+    again = read_images(paths, None, cache)[0]
+    assert not capsys.readouterr().out
+    assert again.identity == first.identity
+    other = Image.fromarray(np.full((65, 65, 3), 9, np.uint8))
+    other.save(paths[1])
+    changed = read_images(paths, None, cache)[0]
+    assert (changed.image(1)[..., :3] == 9).all()
+    assert torch.equal(changed.image(0), first.image(0))
+    # One second later with the same content is another file, too.
+    os.utime(paths[2], ns=(0, 10**9))
+    assert read_images(paths, None, cache)[0].identity != changed.identity
+    assert sorted(path.suffix for path in cache.iterdir()).count(".tiles") == 3
+    assert not [path for path in (tmp_path / "scene").iterdir() if path.suffix != ".png"]
+
+
+def test_a_file_that_was_cut_off_is_made_anew(tmp_path: Path, small) -> None:
+    paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=True)
+    images = read_images(paths, None, tmp_path / "cache")[0]
+    (path,) = (tmp_path / "cache").glob("*.tiles")
+    expected = images.image(2)
+    os.truncate(path, 1000)
+    with pytest.raises(StorageError, match=r"ends too early.*Delete it"):
+        images.image(2)
+    again = read_images(paths, None, tmp_path / "cache")[0]
+    assert torch.equal(again.image(2), expected)
+
+
+def test_a_damaged_image_leaves_nothing_behind(tmp_path: Path, small) -> None:
+    paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=False)
+    content = paths[1].read_bytes()
+    paths[1].write_bytes(content[: len(content) // 2])
+    with pytest.raises(SceneError, match=r"001\.png cannot be decoded"):
+        read_images(paths, None, tmp_path / "cache")
+    assert not [p for p in (tmp_path / "cache").iterdir() if p.suffix != ".lock"]
+    paths[1].write_bytes(content)
+    assert len(read_images(paths, None, tmp_path / "cache")[0]) == 3
+
+
+def test_a_disk_without_space_is_refused_first(tmp_path: Path, small, monkeypatch) -> None:
+    paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=False)
+    usage = shutil.disk_usage(tmp_path)._replace(free=2**28 + 100)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
+    with pytest.raises(StorageError, match=r"0\.3 GB free.*data\.cache"):
+        read_images(paths, None, tmp_path / "cache")
+    assert not list((tmp_path / "cache").glob("*.tiles"))
+
+
+def test_the_cache_is_the_users_if_none_is_named(tmp_path: Path, small, monkeypatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("sys.platform", "linux")
+    paths = pictures(tmp_path / "scene", [(65, 65)], alpha=False)
+    read_images(paths, None)
+    assert len(list((tmp_path / "home" / "xplanes" / "images").glob("*.tiles"))) == 1
+
+
+def test_an_interrupted_decoder_stops_soon(tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    source.write_bytes(b"")
+    begun = threading.Event()
+
+    def slow():
+        for index in range(100):
+            begun.set()
+            time.sleep(0.02)
+            yield index, np.zeros((4, 4, 3), np.uint8)
+
+    def broken():
+        begun.wait()
+        raise SceneError("camera 7 is damaged")
+        yield
+
+    began = time.monotonic()
+    with pytest.raises(SceneError, match="camera 7"):
+        store.decoded([source], "", [(4, 4)] * 101, 3, [slow, broken], tmp_path / "cache")
+    assert time.monotonic() - began < 1.5

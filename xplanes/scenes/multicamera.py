@@ -1,0 +1,531 @@
+"""Videos of several fixed cameras: Neural 3D Video, or a folder with a calibration.
+
+Neural 3D Video keeps the calibration in poses_bounds.npy and the cameras as cam00.mp4, cam01.mp4,
+... in the same order. In other folders a transforms.json names each camera's video, its folder of
+images, or one of these images.
+"""
+
+import logging
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PureWindowsPath
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from xplanes.errors import ConfigError
+from xplanes.scenes import store, videos
+from xplanes.scenes.errors import MissingSplitError, SceneError
+from xplanes.scenes.images import (
+    Size,
+    cleared,
+    digests,
+    final_sizes,
+    native_sizes,
+    read_header,
+    read_image,
+    shrink,
+)
+from xplanes.scenes.listing import (
+    SUFFIXES,
+    Calibration,
+    Listing,
+    checked_pose,
+    final_intrinsics,
+    is_positive,
+    require_rays,
+    short,
+    thinned,
+)
+from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.transforms import read_calibration, read_frames
+from xplanes.scenes.views import Scene, Views
+
+logger = logging.getLogger(__name__)
+
+POSES = "poses_bounds.npy"
+TRANSFORMS = "transforms.json"
+
+SAME_RATE = 1e-3
+"""Share by which frame rates of synchronised cameras differ at most."""
+
+SAME_POSE = 1e-4
+"""Largest difference between poses of a fixed camera."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MultiCameraSettings(SceneSettings):
+    """Synchronised videos of several fixed cameras."""
+
+    frames: list[int] | None  # First frame, last frame and stride; null for all frames.
+    test_cameras: list[str]  # Names of the cameras that are scored and not trained on.
+    video_camera: str | None  # Camera whose video the LRM sees; null: the most central one.
+
+    def check(self) -> None:
+        if self.frames is None:
+            return
+        if len(self.frames) != 3:
+            raise ConfigError(
+                f"frames={self.frames}: must be [first, last, stride], such as [0,299,1], or null"
+            )
+        first, last, stride = self.frames
+        if not 0 <= first <= last or stride < 1:
+            raise ConfigError(
+                f"frames={self.frames}: the first frame must be 0 or later, the last not before "
+                "it, and the stride at least 1"
+            )
+
+    def load(self, splits: Sequence[str]) -> Scene:
+        if self.train_on_video:
+            raise SceneError(
+                "data.train_on_video=true: the video's camera is one of the training cameras "
+                "already; set it to false"
+            )
+        return read_multicamera(
+            self.folder,
+            resolution=self.resolution,
+            splits=splits,
+            frames=self.frames,
+            test_cameras=self.test_cameras,
+            video_camera=self.video_camera,
+            views=self.views,
+            eval_views=self.eval_views,
+            cache=self.image_cache,
+        )
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A fixed camera and what it recorded.
+
+    Attributes:
+        name: Name of its video, or of its folder of images.
+        source: The video or the folder.
+        pose: Camera-to-world matrix with OpenGL's axes. float64 [4, 4]
+        calibration: Its focal length, principal point and lens.
+        label: Where the calibration tells of it, for messages.
+    """
+
+    name: str
+    source: Path
+    pose: np.ndarray
+    calibration: Calibration
+    label: str
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The frames of a camera.
+
+    Attributes:
+        camera: The camera.
+        size: Height and width of the frames.
+        count: Number of frames.
+        rate: Frames per second; None for images and where the video does not tell.
+        images: The image files in the order of time; empty for a video. [count]
+    """
+
+    camera: Camera
+    size: Size
+    count: int
+    rate: float | None
+    images: tuple[Path, ...] = ()
+
+
+def read_multicamera(
+    folder: Path,
+    *,
+    resolution: int | None,
+    splits: Sequence[str],
+    frames: Sequence[int] | None = None,
+    test_cameras: Sequence[str] = (),
+    video_camera: str | None = None,
+    views: int | None = None,
+    eval_views: int | None = None,
+    cache: Path | None = None,
+) -> Scene:
+    """Read the videos of fixed cameras and their calibration, and check all of it.
+
+    Args:
+        folder: Folder of the calibration and the videos or images.
+        resolution: Width of the images in pixels; None keeps the native sizes.
+        splits: Names of the splits to read: train, test.
+        frames: First frame, last frame and stride; None for all that every camera has. They get
+            times from 0 to 1.
+        test_cameras: Names of the cameras that make up the test split; all others are trained on.
+        video_camera: Camera whose frames are ``Scene.video``; the most central training camera when
+            None.
+        views: Number of views to keep of the train split, spread evenly over time; None keeps all.
+        eval_views: The same for the test split, at most.
+        cache: Folder of images that are too large for memory; that of the user when None.
+
+    Raises:
+        MissingSplitError: If there is no split of a name.
+        SceneError: Anything else is missing, damaged or inconsistent.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise SceneError(
+            f"The scene folder {folder.absolute()} does not exist. Set data.root and data.scene to "
+            f"a folder with {POSES} or {TRANSFORMS} and the cameras' videos."
+        )
+    cameras = read_cameras(folder)
+    parts = _split_cameras(folder, cameras, test_cameras)
+    for split in splits:
+        if split not in parts:
+            raise MissingSplitError(
+                f"{folder} has no split {split}: its splits are {', '.join(parts)}. Name cameras "
+                "to score with data.test_cameras=[NAME], or leave data.eval_split out."
+            )
+    watched = _video_camera(cameras, parts, video_camera)
+    recordings = [_recording(camera) for camera in cameras]
+    _require_one_rate(recordings)
+    numbers = _frame_numbers(folder, recordings, frames)
+    whole = _read_views(recordings, numbers, resolution, cache)
+    count = len(numbers)
+    places = {file: place for place, file in enumerate(whole.files)}
+    listing = _listing(recordings, whole, count)
+    wanted = {split: _of_cameras(parts[split], count) for split in dict.fromkeys(splits)}
+    chosen = {split: listing.subset(part) for split, part in wanted.items()}
+    chosen = thinned(chosen, views, eval_views, folder)
+    return Scene(
+        folder.resolve().name,
+        {
+            split: whole.subset(torch.tensor([places[file] for file in part.files]))
+            for split, part in chosen.items()
+        },
+        video=whole.subset(torch.tensor(_of_cameras([watched], count))),
+    )
+
+
+def read_cameras(folder: Path) -> list[Camera]:
+    """The calibrated cameras of a folder, in the order of its calibration.
+
+    Raises:
+        SceneError: If it has no calibration, or one that does not fit its videos and images.
+    """
+    if (folder / POSES).is_file():
+        cameras = _from_poses_bounds(folder)
+    elif (folder / TRANSFORMS).is_file():
+        cameras = _from_transforms(folder)
+    else:
+        found = ", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "nothing"
+        raise SceneError(
+            f"{folder} holds neither {POSES} (Neural 3D Video) nor {TRANSFORMS} (a frame for each "
+            f"camera), but {found}. Add the calibration of the cameras."
+        )
+    twice = [
+        name for name, count in Counter(camera.name for camera in cameras).items() if count > 1
+    ]
+    if twice:
+        raise SceneError(
+            f"{folder}: several cameras are called {twice[0]}. Name their videos or folders apart."
+        )
+    return cameras
+
+
+def _from_poses_bounds(folder: Path) -> list[Camera]:
+    """Cameras of poses_bounds.npy, whose rows belong to the videos or folders cam* by name."""
+    path = folder / POSES
+    try:
+        rows = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as problem:
+        raise SceneError(
+            f"{path} cannot be read as an array ({problem}). Export or download it again."
+        ) from problem
+    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
+        raise SceneError(
+            f"{path} holds {rows.dtype} {list(rows.shape)}, not one row of 17 numbers for each "
+            "camera: a pose of 3 rows and 5 columns, then the nearest and the farthest depth."
+        )
+    sources = sorted(
+        source
+        for source in folder.glob("cam*")
+        if source.is_dir() or source.suffix.lower() in videos.SUFFIXES
+    )
+    # A video may lie beside a folder of images made of it.
+    sources = list({source.stem: source for source in sources}.values())
+    if len(sources) != len(rows):
+        names = ", ".join(source.name for source in sources) or "none"
+        raise SceneError(
+            f"{path} has {len(rows)} cameras, but {folder} holds {len(sources)} of the name cam*: "
+            f"{names}. Add the videos that are missing, or take the others' rows out."
+        )
+    cameras = []
+    for index, (source, row) in enumerate(zip(sources, rows, strict=True)):
+        label = f"{path}: row {index} ({source.name})"
+        matrix = row[:15].astype(np.float64).reshape(3, 5)
+        down, right, back, centre, (height, width, focal) = matrix.T
+        for key, value in (("height", height), ("width", width), ("focal length", focal)):
+            if not is_positive(float(value)):
+                raise SceneError(f"{label}: {key} is {value:g}; it must be above 0. Export again.")
+        pose = np.eye(4)
+        pose[:3] = np.stack([right, -down, back, centre], axis=1)
+        pose = checked_pose(label, pose, "the pose")
+        calibration = Calibration(fl_x=float(focal), w=float(width), h=float(height))
+        cameras.append(Camera(source.stem, source, pose, calibration, label))
+    return cameras
+
+
+def _from_transforms(folder: Path) -> list[Camera]:
+    """Cameras of transforms.json: a frame for each, or several with one pose."""
+    path = folder / TRANSFORMS
+    content = read_frames(path)
+    cameras: dict[Path, Camera] = {}
+    for index, frame in enumerate(content["frames"]):
+        label = f"{path}: frame {index} ({frame['file_path']})"
+        source = _source(label, folder.resolve(), frame["file_path"])
+        pose = checked_pose(label, frame["transform_matrix"])
+        if (other := cameras.get(source)) is not None:
+            if np.abs(other.pose - pose).max() > SAME_POSE:
+                raise SceneError(
+                    f"{label} has another pose than {other.label}, but both lead to {source}, "
+                    "and cameras must not move. Read a moving camera with data=nerfstudio."
+                )
+            continue
+        calibration = read_calibration(str(path), content, label, frame)
+        cameras[source] = Camera(source.stem, source, pose, calibration, label)
+    return list(cameras.values())
+
+
+def _source(label: str, folder: Path, name: Any) -> Path:
+    """The video or the folder of images that a frame names."""
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise SceneError(f"{label}: file_path is {short(name)}; it must be text such as cam00.mp4.")
+    relative = Path(name.replace("\\", "/"))
+    if relative.is_absolute() or PureWindowsPath(name).anchor:
+        raise SceneError(
+            f"{label}: file_path is absolute. Write it relative to {folder}, as in cam00.mp4."
+        )
+    for suffix in SUFFIXES:
+        source = (folder / f"{relative}{suffix}").resolve()
+        if not source.is_relative_to(folder):
+            raise SceneError(
+                f"{label}: file_path leaves the scene's folder {folder} (it leads to {source}). "
+                "Put the camera's files inside the folder and correct file_path."
+            )
+        if source.is_dir() or (source.is_file() and source.suffix.lower() in videos.SUFFIXES):
+            break
+        if source.is_file() and source.parent != folder:
+            return source.parent
+    else:
+        raise SceneError(
+            f"{label}: {folder / relative} is no video ({', '.join(videos.SUFFIXES)}), no folder "
+            "of images and no image in a folder of the camera's own. Add it, or take the frame "
+            "out of the list."
+        )
+    if source == folder:
+        raise SceneError(f"{label}: file_path is the scene's folder, not that of one camera.")
+    return source
+
+
+def _split_cameras(
+    folder: Path, cameras: Sequence[Camera], test_cameras: Sequence[str]
+) -> dict[str, list[int]]:
+    """Numbers of the cameras of each split."""
+    names = [camera.name for camera in cameras]
+    for name in test_cameras:
+        if name not in names:
+            raise SceneError(
+                f"data.test_cameras: {folder} has no camera {name}. Its cameras are "
+                f"{', '.join(names)}."
+            )
+    test = [index for index, name in enumerate(names) if name in test_cameras]
+    train = [index for index, name in enumerate(names) if name not in test_cameras]
+    if not train:
+        raise SceneError(
+            f"data.test_cameras={list(test_cameras)} leaves no camera of {folder} to train on. "
+            f"Its cameras are {', '.join(names)}: take one out of the list."
+        )
+    return {"train": train} | ({"test": test} if test else {})
+
+
+def _video_camera(cameras: Sequence[Camera], parts: dict[str, list[int]], name: str | None) -> int:
+    """Number of the camera whose video the LRM sees."""
+    train = parts["train"]
+    if name is None:
+        centres = np.stack([camera.pose[:3, 3] for camera in cameras])
+        away = np.linalg.norm(centres - centres.mean(axis=0), axis=1)
+        return min(train, key=lambda index: away[index])
+    found = [index for index, camera in enumerate(cameras) if camera.name == name]
+    if not found:
+        raise SceneError(
+            f"data.video_camera={name}: there is no such camera. Name one of "
+            f"{', '.join(cameras[index].name for index in train)}, or null for the most central."
+        )
+    if found[0] not in train:
+        raise SceneError(
+            f"data.video_camera={name} is one of data.test_cameras, whose frames are scored: the "
+            "LRM must not see them. Name a training camera, or take it out of the test cameras."
+        )
+    return found[0]
+
+
+def _recording(camera: Camera) -> Recording:
+    """What a camera recorded, from headers alone."""
+    if camera.source.is_file():
+        video = videos.read_header(camera.source)
+        rate = None if video.rate is None else float(video.rate)
+        return Recording(camera, video.size, video.count, rate)
+    images = sorted(
+        (
+            path
+            for path in camera.source.iterdir()
+            if path.suffix.lower() in SUFFIXES[1:] and not path.name.startswith(".")
+        ),
+        key=lambda path: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", path.name)],
+    )
+    if not images:
+        raise SceneError(
+            f"{camera.source} holds no images ({', '.join(SUFFIXES[1:])}). Add the frames of the "
+            f"camera, or take it out of the calibration ({camera.label})."
+        )
+    sizes = native_sizes(images)
+    for path, size in zip(images, sizes, strict=True):
+        if size != sizes[0]:
+            raise SceneError(
+                f"{path} has {size[1]}x{size[0]} pixels, but {images[0]} of the same camera has "
+                f"{sizes[0][1]}x{sizes[0][0]}. Export its frames alike."
+            )
+    return Recording(camera, sizes[0], len(images), None, tuple(images))
+
+
+def _require_one_rate(recordings: Sequence[Recording]) -> None:
+    """Refuse videos of different rates, whose frame numbers stand for different times."""
+    timed = [(recording.camera, recording.rate) for recording in recordings if recording.rate]
+    for camera, rate in timed:
+        if abs(rate / timed[0][1] - 1) > SAME_RATE:
+            raise SceneError(
+                f"{camera.source} has {rate:g} frames per second, but {timed[0][0].source} "
+                f"{timed[0][1]:g}: frames of one number are not of one time. Encode all videos at "
+                f"one rate: ffmpeg -i {camera.source.name} -r {timed[0][1]:g} NEW.mp4"
+            )
+
+
+def _frame_numbers(
+    folder: Path, recordings: Sequence[Recording], frames: Sequence[int] | None
+) -> range:
+    """Numbers of the frames to read, which every camera has."""
+    shortest = min(recordings, key=lambda recording: recording.count)
+    longest = max(recordings, key=lambda recording: recording.count)
+    if frames is not None:
+        first, last, stride = frames
+        if last >= shortest.count:
+            raise SceneError(
+                f"data.frames={list(frames)}, but {shortest.camera.source} has "
+                f"{shortest.count} frames, the last of number {shortest.count - 1}. Set "
+                f"data.frames=[{min(first, shortest.count - 1)},{shortest.count - 1},{stride}], or "
+                "null."
+            )
+        return range(first, last + 1, stride)
+    if shortest.count < longest.count:
+        logger.warning(
+            "%s: camera %s has %d frames, but %s %d: the first %d frames of every camera are used",
+            folder,
+            shortest.camera.name,
+            shortest.count,
+            longest.camera.name,
+            longest.count,
+            shortest.count,
+        )
+    return range(shortest.count)
+
+
+def _of_cameras(cameras: Sequence[int], count: int) -> list[int]:
+    """Numbers of the views of some cameras, of ``count`` frames each."""
+    return [camera * count + frame for camera in cameras for frame in range(count)]
+
+
+def _read_views(
+    recordings: Sequence[Recording], numbers: range, resolution: int | None, cache: Path | None
+) -> Views:
+    """All frames of all cameras, camera by camera."""
+    count = len(numbers)
+    native = [recording.size for recording in recordings]
+    sources = [recording.camera.source for recording in recordings]
+    sizes = final_sizes(sources, native, resolution)
+    calibrations = [recording.camera.calibration for recording in recordings]
+    intrinsics = final_intrinsics(calibrations, native, sizes)
+    has_ray = [intrinsics.has_ray(index) for index in range(len(recordings))]
+    for recording, shown in zip(recordings, has_ray, strict=True):
+        if shown is not None:
+            require_rays(recording.camera.label, recording.camera.calibration, shown)
+    jobs = [
+        _job(recording, numbers, sizes[index], has_ray[index], index * count)
+        for index, recording in enumerate(recordings)
+    ]
+    all_sizes = [size for size in sizes for _ in numbers]
+    if store.is_needed(all_sizes):
+        images = [
+            recording.images[number]
+            for recording in recordings
+            if recording.images
+            for number in numbers
+        ]
+        files = [source for source in sources if source.is_file()] + images
+        cut = any(shown is not None for shown in has_ray)
+        channels = 4 if cut or any(read_header(path)[1] for path in images) else 3
+        names = [[recording.camera.name, bool(recording.images)] for recording in recordings]
+        span = [numbers.start, numbers.stop, numbers.step]
+        recipe = ["multicamera", names, span, digests(has_ray)]
+        pixels = store.decoded(files, recipe, all_sizes, channels, jobs, cache)
+    else:
+        pixels = store.in_memory(all_sizes, jobs)
+    poses = torch.from_numpy(np.stack([recording.camera.pose for recording in recordings])).float()
+    camera = torch.arange(len(recordings)).repeat_interleave(count)
+    times = torch.linspace(0, 1, count) if count > 1 else torch.zeros(1)
+    return Views(
+        pixels,
+        poses[camera],
+        times.repeat(len(recordings)),
+        intrinsics.subset(camera),
+        tuple(
+            f"{recording.camera.name}/{number:06d}"
+            for recording in recordings
+            for number in numbers
+        ),
+    )
+
+
+def _job(
+    recording: Recording, numbers: range, size: Size, shown: Tensor | None, place: int
+) -> store.Job:
+    """What decodes the frames of a camera, the first of which is image number ``place``."""
+
+    def decode() -> Iterator[tuple[int, np.ndarray]]:
+        if recording.images:
+            pictures = (read_image(recording.images[number], size) for number in numbers)
+        else:
+            pictures = (
+                _reduced(frame, size) for frame in videos.frames(recording.camera.source, numbers)
+            )
+        for offset, pixels in enumerate(pictures):
+            yield place + offset, cleared(pixels, shown)
+
+    return decode
+
+
+def _reduced(frame: np.ndarray, size: Size) -> np.ndarray:
+    """A video's frame in its final size. uint8 [h, w, 3] -> [H, W, 3 or 4]"""
+    if frame.shape[:2] == size:
+        return frame
+    channels = np.full((4, *frame.shape[:2]), 255, np.float32)
+    channels[:3] = frame.transpose(2, 0, 1)
+    return shrink(channels, size[1], size[0])
+
+
+def _listing(recordings: Sequence[Recording], views: Views, count: int) -> Listing:
+    """The views as a list from which some can be chosen."""
+    return Listing(
+        paths=tuple(r.camera.source for r in recordings for _ in range(count)),
+        files=views.files,
+        camera_to_world=views.camera_to_world,
+        times=views.times,
+        calibrations=tuple(r.camera.calibration for r in recordings for _ in range(count)),
+        timed=True,
+        cameras=tuple(r.camera.name for r in recordings for _ in range(count)),
+    )

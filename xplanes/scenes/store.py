@@ -1,0 +1,464 @@
+"""Decoded images that need not fit in memory: files of tiles, written once and read in pieces.
+
+A file holds the tiles of all images one after the other, each image's row by row, then one byte a
+tile that says what its alpha shows (`LIT`, `SOLID`); images without alpha have three channels and
+no such bytes. Its name is a hash of the sources and of how they were decoded, so it needs no
+header: a file of that name and of the right length is the right one.
+
+Tiles are read, not mapped: pages of a mapping count as the process's own memory, those that reading
+leaves in the system's cache do not.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import sys
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from xplanes.files import MARK, StorageError, existing, replacing, require_writable
+from xplanes.locks import in_turn
+
+IN_MEMORY = 2**30
+"""Bytes up to which the decoded images of a split are held in memory."""
+
+TILE = 64
+"""Rows and columns of a tile: 12 kB without alpha, 16 kB with it, whole pages either way."""
+
+VERSION = 1
+"""Version of the files; increase it whenever images are decoded to other bytes."""
+
+SPARE = 2**28
+"""Bytes of the disk that are left free."""
+
+LIT, SOLID = 1, 2
+"""What a tile's byte says: some pixel has alpha above 0; all pixels have."""
+
+Job = Callable[[], Iterable[tuple[int, np.ndarray]]]
+"""Decodes some of the images: gives their numbers and pixels, uint8 [h, w, 3 or 4]."""
+
+
+class StoredImages:
+    """The images of some views, in files of tiles. Read-only.
+
+    Args:
+        files: Where the tiles are.
+        places: Number of the file, and of the image in it, for each view. int64 [V, 2]
+    """
+
+    def __init__(self, files: Sequence["TileFile"], places: Tensor) -> None:
+        self.files, self.places = tuple(files), places
+        self._of_view = places.tolist()
+        sizes = [self.files[file].sizes[image] for file, image in self._of_view]
+        self.sizes = torch.tensor(sizes, dtype=torch.int64).view(-1, 2)
+        """Height and width of each image. int64 [V, 2]"""
+
+    @classmethod
+    def all_of(cls, file: "TileFile") -> "StoredImages":
+        """All images of a file, in its order."""
+        return cls([file], torch.tensor([[0, image] for image in range(len(file.sizes))]))
+
+    def __len__(self) -> int:
+        return len(self._of_view)
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """That of the images as one tensor: their number, largest height and width, 4."""
+        height, width = self.sizes.amax(dim=0).tolist() if len(self) else (0, 0)
+        return len(self), height, width, 4
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the images take on disk."""
+        tiles = (-(-self.sizes // TILE)).prod(dim=1)
+        channels = torch.tensor([self.files[file].channels for file, _ in self._of_view])
+        return int((tiles * channels).sum()) * TILE**2
+
+    @property
+    def identity(self) -> list[Any]:
+        """What tells these images from others, as builtins."""
+        return [[file.key for file in self.files], self._of_view]
+
+    def image(self, index: int) -> Tensor:
+        """Premultiplied colour and alpha of a view. uint8 [h, w, 4]"""
+        file, image = self._of_view[index]
+        return self.files[file].image(image)
+
+    def flags(self, index: int) -> Tensor:
+        """`LIT` and `SOLID` of a view's tiles. uint8 [rows, columns]"""
+        file, image = self._of_view[index]
+        return self.files[file].flags(image)
+
+    def pixels(self, views: Tensor, tiles: Tensor, inside: Tensor) -> Tensor:
+        """Pixels of some tiles.
+
+        Args:
+            views: The view of each tile. int64 [K]
+            tiles: Numbers of the tiles in their images, row by row. int64 [K]
+            inside: Numbers of the pixels in their tiles, row by row. int64 [K, P]
+
+        Returns:
+            Premultiplied colour and alpha. uint8 [K, P, 4]
+        """
+        wanted = inside.numpy()
+        found = np.full((*wanted.shape, 4), 255, np.uint8)
+        for row, (view, tile) in enumerate(zip(views.tolist(), tiles.tolist(), strict=True)):
+            number, image = self._of_view[view]
+            file = self.files[number]
+            found[row, :, : file.channels] = file.tiles(image, tile, 1)[wanted[row]]
+        return torch.from_numpy(found)
+
+    def prefetch(self, views: Tensor, tiles: Tensor) -> None:
+        """Let the system begin to read some tiles. int64 [K], int64 [K]"""
+        for view, tile in zip(views.tolist(), tiles.tolist(), strict=True):
+            file, image = self._of_view[view]
+            self.files[file].prefetch(image, tile)
+
+    def subset(self, indices: Tensor) -> "StoredImages":
+        """The images at ``indices``, in that order. [K]"""
+        return StoredImages(self.files, self.places[indices])
+
+    def joined(self, other: "StoredImages") -> "StoredImages":
+        """These, then the others."""
+        shift = torch.tensor([len(self.files), 0])
+        return StoredImages(
+            self.files + other.files, torch.cat([self.places, other.places + shift])
+        )
+
+
+class TileFile:
+    """A file of tiles, or the same in memory.
+
+    Args:
+        source: The file, or the tiles of all images. uint8 [tiles, TILE**2, C]
+        key: Hash of what the images come from.
+        sizes: Height and width of each image.
+        channels: 3 for images without alpha, else 4.
+        flags: What the tiles' alpha shows; None for images without. uint8 [tiles]
+    """
+
+    def __init__(
+        self,
+        source: Path | np.ndarray,
+        key: str,
+        sizes: Sequence[tuple[int, int]],
+        channels: int,
+        flags: np.ndarray | None = None,
+    ) -> None:
+        self.source, self.key, self.sizes, self.channels = source, key, tuple(sizes), channels
+        self.first = _firsts(sizes)
+        self._file = source.open("rb", buffering=0) if isinstance(source, Path) else None
+        if channels == 4 and flags is None:
+            assert isinstance(source, Path)
+            total = self.first[-1]
+            flags = np.fromfile(source, np.uint8, total, offset=total * TILE**2 * channels)
+        self._flags = flags
+
+    def __reduce__(self) -> Any:
+        return TileFile, (self.source, self.key, self.sizes, self.channels, self._flags)
+
+    @classmethod
+    def of(cls, images: Iterable[Tensor]) -> "TileFile":
+        """The same in memory, of images with alpha. uint8 [h, w, 4] each"""
+        images = list(images)
+        tiles = np.concatenate([to_tiles(image.numpy()) for image in images])
+        flags = np.concatenate([_alpha_flags(image.numpy()) for image in images])
+        sizes = [(image.shape[0], image.shape[1]) for image in images]
+        return cls(tiles, hashlib.sha256(tiles.data).hexdigest(), sizes, 4, flags)
+
+    def image(self, index: int) -> Tensor:
+        """Premultiplied colour and alpha of an image. uint8 [h, w, 4]"""
+        (height, width), channels = self.sizes[index], self.channels
+        rows, columns = _grid(height, width)
+        tiles = self.tiles(index, 0, rows * columns).reshape(rows, columns, TILE, TILE, channels)
+        whole = np.full((rows * TILE, columns * TILE, 4), 255, np.uint8)
+        whole.reshape(rows, TILE, columns, TILE, 4)[..., :channels] = tiles.swapaxes(1, 2)
+        return torch.from_numpy(whole)[:height, :width]
+
+    def flags(self, index: int) -> Tensor:
+        """`LIT` and `SOLID` of an image's tiles. uint8 [rows, columns]"""
+        grid = _grid(*self.sizes[index])
+        if self._flags is None:
+            return torch.full(grid, LIT | SOLID, dtype=torch.uint8)
+        part = self._flags[self.first[index] : self.first[index + 1]]
+        return torch.from_numpy(part.reshape(grid))
+
+    def tiles(self, index: int, tile: int, count: int) -> np.ndarray:
+        """Tiles of an image, ``tile`` the first. uint8 [count, TILE**2, C]; of 1 [TILE**2, C]"""
+        number = self.first[index] + tile
+        shape = (TILE**2, self.channels) if count == 1 else (count, TILE**2, self.channels)
+        if isinstance(self.source, np.ndarray):
+            return self.source[number : number + count].reshape(shape)
+        length = TILE**2 * self.channels
+        content = self._read(number * length, count * length)
+        return np.frombuffer(content, np.uint8).reshape(shape)
+
+    def _read(self, offset: int, length: int) -> bytes:
+        assert self._file is not None
+        if hasattr(os, "pread"):
+            content = os.pread(self._file.fileno(), length, offset)
+        else:
+            # Windows has no such call, and a position shared by threads would not do.
+            assert isinstance(self.source, Path)
+            with self.source.open("rb", buffering=0) as file:
+                file.seek(offset)
+                content = file.read(length)
+        if len(content) < length:
+            raise StorageError(
+                f"{self.source} ends too early: it was cut off while in use. Delete it and start "
+                "again; it is decoded anew"
+            )
+        return content
+
+    def prefetch(self, index: int, tile: int) -> None:
+        """Let the system begin to read a tile, where it can be told."""
+        if self._file is not None and hasattr(os, "posix_fadvise"):
+            length = TILE**2 * self.channels
+            offset = (self.first[index] + tile) * length
+            os.posix_fadvise(self._file.fileno(), offset, length, os.POSIX_FADV_WILLNEED)
+
+
+def default_cache() -> Path:
+    """The folder of decoded images in the user's cache directory."""
+    home = Path.home()
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local"
+    elif sys.platform == "darwin":
+        base = home / "Library" / "Caches"
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or home / ".cache"
+    return Path(base) / "xplanes" / "images"
+
+
+def is_needed(sizes: Sequence[tuple[int, int]]) -> bool:
+    """Whether images of these heights and widths are too much for memory."""
+    height, width = _largest(sizes)
+    return 4 * len(sizes) * height * width > IN_MEMORY
+
+
+def in_memory(sizes: Sequence[tuple[int, int]], jobs: Sequence[Job]) -> Tensor:
+    """Decode images to one tensor, padded with zeros at the bottom and on the right.
+
+    Args:
+        sizes: Height and width of each image. [V]
+        jobs: Decode the images, each some of them. They run in threads.
+
+    Returns:
+        Premultiplied colour and alpha. uint8 [V, H, W, 4]
+    """
+    empty = torch.empty if len(set(sizes)) == 1 else torch.zeros
+    images = empty(len(sizes), *_largest(sizes), 4, dtype=torch.uint8)
+
+    def keep(index: int, pixels: np.ndarray) -> None:
+        height, width = sizes[index]
+        images[index, :height, :width] = torch.from_numpy(_with_channels(pixels, 4))
+
+    _run(jobs, keep)
+    return images
+
+
+def decoded(
+    sources: Sequence[Path],
+    recipe: Any,
+    sizes: Sequence[tuple[int, int]],
+    channels: int,
+    jobs: Sequence[Job],
+    folder: Path | None,
+) -> StoredImages:
+    """Decode images to a file of the cache, unless it is there already.
+
+    Of processes that want the same images one decodes, the others wait. What a process that was
+    killed left behind is removed by the next one.
+
+    Args:
+        sources: Files that the images come from; the result belongs to their sizes and times.
+        recipe: Builtins that say how they are decoded.
+        sizes: Height and width of each image.
+        channels: 3 if no image has alpha, else 4.
+        jobs: Decode the images, each some of them. They run in threads.
+        folder: The cache; that of the user when None.
+
+    Raises:
+        StorageError: If the disk lacks the space, or cannot be written.
+    """
+    folder = default_cache() if folder is None else folder
+    states = [(str(path.resolve()), path.stat()) for path in sources]
+    files = [[name, state.st_size, state.st_mtime_ns] for name, state in states]
+    content = json.dumps([VERSION, TILE, channels, list(sizes), recipe, files])
+    key = hashlib.sha256(content.encode()).hexdigest()
+    path = folder / f"{key[:32]}.tiles"
+    total = _firsts(sizes)[-1]
+    length = total * (TILE**2 * channels + (channels == 4))
+
+    def found() -> StoredImages | None:
+        if not path.is_file() or path.stat().st_size != length:
+            return None
+        return StoredImages.all_of(TileFile(path, key, sizes, channels))
+
+    if (ready := found()) is not None:
+        return ready
+    require_writable(folder)
+    with in_turn(path.with_suffix(".lock")):
+        if (ready := found()) is not None:
+            return ready
+        # Whoever holds the lock owns what others left unfinished under this name.
+        for leftover in folder.glob(f".{path.name}{MARK}*"):
+            leftover.unlink(missing_ok=True)
+        _require_space(folder, length)
+        height, width = _largest(sizes)
+        print(
+            f"{len(sizes)} images of up to {width}x{height} px take {length / 2**30:.1f} GB "
+            f"decoded, too much for memory: decoding them once to {path} (it can be deleted when "
+            "no run needs it)",
+            flush=True,
+        )
+        with replacing(path) as temporary:
+            _write(temporary, sizes, channels, jobs, length)
+    ready = found()
+    assert ready is not None
+    return ready
+
+
+def _require_space(folder: Path, length: int) -> None:
+    free = shutil.disk_usage(existing(folder)).free
+    if free < length + SPARE:
+        raise StorageError(
+            f"{folder} has {free / 2**30:.1f} GB free, but the decoded images take "
+            f"{length / 2**30:.1f} GB. Free some space, set data.cache to a folder on another "
+            "disk, or take fewer or smaller images"
+        )
+
+
+def _write(
+    path: Path, sizes: Sequence[tuple[int, int]], channels: int, jobs: Sequence[Job], length: int
+) -> None:
+    """Decode all images to a file. In memory is one image a thread."""
+    from tqdm import tqdm
+
+    first = _firsts(sizes)
+    flags = np.zeros(first[-1], np.uint8)
+    written = np.zeros(len(sizes), bool)
+    turn = threading.Lock()
+    with path.open("r+b", buffering=0) as file:
+        file.truncate(length)
+        bar = tqdm(
+            total=len(sizes),
+            desc="decoding",
+            unit="image",
+            leave=False,
+            disable=not sys.stderr.isatty(),
+        )
+
+        def keep(index: int, pixels: np.ndarray) -> None:
+            pixels = _with_channels(pixels, channels)
+            assert pixels.shape == (*sizes[index], channels)
+            if channels == 4:
+                flags[first[index] : first[index + 1]] = _alpha_flags(pixels)
+            content = to_tiles(pixels).data.cast("B")
+            with turn:
+                file.seek(first[index] * TILE**2 * channels)
+                # A write may take less than it is given, at most 2 GB on Linux.
+                while len(content):
+                    content = content[file.write(content) :]
+                bar.update()
+            written[index] = True
+
+        try:
+            _run(jobs, keep)
+        finally:
+            bar.close()
+        assert written.all()
+        if channels == 4:
+            file.seek(first[-1] * TILE**2 * channels)
+            file.write(flags.tobytes())
+
+
+def _run(jobs: Sequence[Job], keep: Callable[[int, np.ndarray], None]) -> None:
+    """Run jobs in threads, until one fails; each image is handed on as it is decoded."""
+    stop = threading.Event()
+
+    def run(job: Job) -> None:
+        try:
+            for index, pixels in job():
+                if stop.is_set():
+                    return
+                keep(index, pixels)
+        except BaseException:
+            stop.set()  # Other jobs may be long.
+            raise
+
+    # Decoders work without the interpreter lock, so threads are enough.
+    pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1, len(jobs)))
+    try:
+        list(pool.map(run, jobs))
+    finally:
+        stop.set()
+        pool.shutdown(cancel_futures=True)
+
+
+def _with_channels(pixels: np.ndarray, channels: int) -> np.ndarray:
+    """Pixels with so many channels: alpha is cut off, or 255. uint8 [h, w, C]"""
+    if pixels.shape[-1] >= channels:
+        return pixels[..., :channels]
+    whole = np.full((*pixels.shape[:2], channels), 255, np.uint8)
+    whole[..., : pixels.shape[-1]] = pixels
+    return whole
+
+
+def to_tiles(pixels: np.ndarray) -> np.ndarray:
+    """An image cut into tiles, row by row, zeros beyond its edges.
+
+    Args:
+        pixels: The image. uint8 [h, w, C]
+
+    Returns:
+        Its tiles. uint8 [tiles, TILE**2, C]
+    """
+    height, width, channels = pixels.shape
+    rows, columns = _grid(height, width)
+    whole = np.zeros((rows * TILE, columns * TILE, channels), np.uint8)
+    whole[:height, :width] = pixels
+    tiles = whole.reshape(rows, TILE, columns, TILE, channels).swapaxes(1, 2)
+    return tiles.reshape(rows * columns, TILE**2, channels)
+
+
+def count_in_tiles(mask: Tensor) -> Tensor:
+    """How many pixels of each tile a mask holds. bool [h, w] -> int64 [rows, columns]"""
+    height, width = mask.shape
+    rows, columns = _grid(height, width)
+    padded = F.pad(mask, (0, columns * TILE - width, 0, rows * TILE - height))
+    return padded.view(rows, TILE, columns, TILE).sum(dim=(1, 3))
+
+
+def _alpha_flags(pixels: np.ndarray) -> np.ndarray:
+    """`LIT` and `SOLID` of an image's tiles. uint8 [h, w, 4] -> uint8 [tiles]"""
+    seen = torch.from_numpy(np.ascontiguousarray(pixels[..., 3] > 0)).float()[None]
+    # At the edges the pool takes the pixels that there are: padding is neither lit nor bare.
+    lit = F.max_pool2d(seen, TILE, ceil_mode=True)
+    bare = F.max_pool2d(1 - seen, TILE, ceil_mode=True)
+    return (LIT * (lit > 0) + SOLID * (bare == 0)).flatten().byte().numpy()
+
+
+def _largest(sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """Largest height and largest width."""
+    return max(height for height, _ in sizes), max(width for _, width in sizes)
+
+
+def _grid(height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of tiles of an image."""
+    return -(-height // TILE), -(-width // TILE)
+
+
+def _firsts(sizes: Sequence[tuple[int, int]]) -> list[int]:
+    """Number of the first tile of each image, and that of all tiles."""
+    counts = [rows * columns for rows, columns in (_grid(*size) for size in sizes)]
+    return [0, *np.cumsum(counts).tolist()]

@@ -1,0 +1,103 @@
+"""Frames of video files, decoded with PyAV (extra `video`)."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from xplanes.optional import require
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.images import Size
+
+SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+"""Suffixes of files that are taken for videos."""
+
+
+@dataclass(frozen=True)
+class Video:
+    """What a video file says about itself.
+
+    Attributes:
+        path: The file.
+        size: Height and width of its frames.
+        count: Number of its frames.
+        rate: Frames per second; None where the file does not tell.
+    """
+
+    path: Path
+    size: Size
+    count: int
+    rate: Fraction | None
+
+
+def read_header(path: Path) -> Video:
+    """Size, number and rate of a video's frames. Nothing is decoded.
+
+    Raises:
+        SceneError: If the file is no video.
+        MissingExtraError: If PyAV is not installed.
+    """
+    av = require("av", extra="video")
+    try:
+        with av.open(str(path)) as container:
+            stream = _stream(path, container)
+            # Not every container tells; counting packets decodes none.
+            count = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
+            size = (stream.codec_context.height, stream.codec_context.width)
+            return Video(path, size, count, stream.average_rate)
+    except av.FFmpegError as problem:
+        raise _unreadable(path, problem) from problem
+
+
+def frames(path: Path, numbers: range) -> Iterator[np.ndarray]:
+    """Decode some frames of a video.
+
+    Args:
+        path: The file.
+        numbers: Numbers of the frames, from 0 on, ascending.
+
+    Returns:
+        Colours of each frame. uint8 [h, w, 3]
+
+    Raises:
+        SceneError: If the file is damaged, ends before the last of them, or shows rotated frames.
+    """
+    av = require("av", extra="video")
+    number = -1
+    try:
+        with av.open(str(path)) as container:
+            stream = _stream(path, container)
+            stream.codec_context.thread_count = 1  # Other videos are decoded at the same time.
+            for number, frame in enumerate(container.decode(stream)):
+                if frame.rotation:
+                    raise SceneError(
+                        f"{path} is to be shown rotated by {frame.rotation} degrees, so that its "
+                        "pixels are not those of its calibration. Encode it upright: ffmpeg -i "
+                        f"{path.name} upright{path.suffix}"
+                    )
+                if number in numbers:
+                    yield frame.to_ndarray(format="rgb24")
+                if number == numbers[-1]:
+                    return
+    except av.FFmpegError as problem:
+        raise _unreadable(path, problem) from problem
+    raise SceneError(
+        f"{path} ends after frame {number}, but frame {numbers[-1]} is wanted: it is probably "
+        f"truncated. Download it again, or set data.frames=[{numbers[0]},{number},{numbers.step}]."
+    )
+
+
+def _stream(path: Path, container: Any) -> Any:
+    if not container.streams.video:
+        raise SceneError(f"{path} holds no video stream. Put the camera's video in its place.")
+    return container.streams.video[0]
+
+
+def _unreadable(path: Path, problem: Exception) -> SceneError:
+    return SceneError(
+        f"{path} cannot be decoded as a video ({problem}). It is probably truncated or damaged: "
+        "export or download it again."
+    )

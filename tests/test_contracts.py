@@ -79,8 +79,8 @@ COMPOSITIONS = [
     ["data=blender", "model=kplanes"],
     ["data=nerfstudio", "model=tineuvox_s", "model/sampler=fixed_step"],
     ["data=multicamera", "model=tensor4d", "model/sampler=neus"],
-    ["model=tensor4d_density"],
-    ["model=kplanes_explicit"],
+    ["data=colmap", "model=tensor4d_density"],
+    ["data=nerfies", "model=kplanes_explicit"],
     ["model=tineuvox_b"],
     *(
         [f"{group}={name}" for group, name in both if name is not None]

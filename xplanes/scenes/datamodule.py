@@ -284,6 +284,7 @@ class _GivenScene(SceneSettings):
             eval_split=None,
             eval_views=None,
             half_side=None,
+            cache=None,
         )
 
     def load(self, splits: Sequence[str]) -> Scene:

@@ -1,8 +1,9 @@
 """What every reader makes of its files: a list of posed, timed images; how these become views."""
 
+import json
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -11,13 +12,29 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xplanes.scenes.errors import SceneError
+from xplanes.scenes.cameras import upright
+from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.images import Size, final_sizes, native_sizes, read_images
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.views import Intrinsics, Views
 
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 RIGID_TOLERANCE = 1e-3
+
+FARTHEST = 1e15
+"""Largest coordinate of a camera; squares of it still fit single precision."""
+
+ROUNDING = 1e-4
+"""Largest rounding error of camera positions in single precision, as a share of their extent."""
+
+SHORTEST, LONGEST = 1e-3, 1e5
+"""Smallest and largest focal length, in sizes of the image."""
+
+FARTHEST_ASIDE, STRONGEST = 1e3, 1e6
+"""Largest distance of a principal point, in sizes of the image, and largest coefficient."""
+
+SHAPE_TOLERANCE = 0.02
+"""By how much the aspect ratio of an image may differ from that of its camera."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +167,44 @@ class Listing:
         return self.subset(sorted(by_time[rank] for rank in ranks))
 
 
+def held_out(listing: Listing, every: int) -> dict[str, list[int]]:
+    """Places of the images to train on, and of those held out as val.
+
+    One image in ``every`` is held out, by time, then file name; not the first and the last.
+    """
+    times = listing.times.tolist()
+    order = sorted(range(len(listing)), key=lambda index: (times[index], listing.files[index]))
+    chosen = set(order[max(1, every // 2) : -1 : every])
+    return {
+        "train": [index for index in range(len(listing)) if index not in chosen],
+        "val": sorted(chosen),
+    }
+
+
+def picked(
+    parts: Mapping[str, Listing], splits: Sequence[str], source: Path, way_out: str
+) -> dict[str, Listing]:
+    """The splits asked for.
+
+    Args:
+        parts: Images by split name.
+        splits: Names of splits.
+        source: What the splits were made from, for messages.
+        way_out: What makes another split, for messages.
+
+    Raises:
+        MissingSplitError: If one has no images.
+    """
+    for split in splits:
+        if not parts.get(split):
+            names = ", ".join(name for name, part in parts.items() if part)
+            raise MissingSplitError(
+                f"{source} has no {split} split. Splits of this capture: {names or 'none'}. "
+                f"{way_out}"
+            )
+    return {split: parts[split] for split in splits}
+
+
 def thinned(
     listings: dict[str, Listing], views: int | None, eval_views: int | None, source: Path
 ) -> dict[str, Listing]:
@@ -192,31 +247,66 @@ def read_views(listing: Listing, resolution: int | None, cache: Path | None = No
     """
     native = native_sizes(listing.paths)
     sizes = final_sizes(listing.paths, native, resolution)
-    intrinsics = final_intrinsics(listing.calibrations, native, sizes)
+    labels = [str(path) for path in listing.paths]
+    intrinsics = final_intrinsics(labels, listing.calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(listing))]
     for index, shown in enumerate(has_ray):
         if shown is not None:
-            require_rays(str(listing.paths[index]), listing.calibrations[index], shown)
+            require_rays(labels[index], listing.calibrations[index], shown)
     images = read_images(listing.paths, sizes, listing.masks, has_ray, cache)
     views = Views(images, listing.camera_to_world, listing.times, intrinsics, listing.files)
     _warn_of_empty(views, listing)
     return views
 
 
+def require_shapes(listing: Listing) -> None:
+    """Refuse images that cannot be those that their cameras were calibrated for.
+
+    Args:
+        listing: Images whose calibrations tell width and height.
+
+    Raises:
+        SceneError: If an aspect ratio is another.
+    """
+    sizes = native_sizes(listing.paths)
+    for path, (height, width), camera in zip(
+        listing.paths, sizes, listing.calibrations, strict=True
+    ):
+        assert camera.w is not None
+        assert camera.h is not None
+        # Images that were made smaller have rounded sizes.
+        off = abs(width * camera.h - height * camera.w)
+        if off > max(1.5 * max(camera.w, camera.h), SHAPE_TOLERANCE * width * camera.h):
+            raise SceneError(
+                f"{path} has {width}x{height} pixels, but its camera was calibrated for images of "
+                f"{camera.w:g}x{camera.h:g}, of another aspect ratio. Perhaps the image was turned "
+                "or cut: take the one that the camera was calibrated with."
+            )
+
+
 def final_intrinsics(
-    calibrations: Sequence[Calibration], native: Sequence[Size], sizes: Sequence[Size]
+    labels: Sequence[str],
+    calibrations: Sequence[Calibration],
+    native: Sequence[Size],
+    sizes: Sequence[Size],
 ) -> Intrinsics:
     """Intrinsics of images in their final sizes.
 
     Args:
+        labels: The images, for messages. [V]
         calibrations: What is told about their cameras. [V]
         native: Heights and widths of the files. [V]
         sizes: Those after the images were resized. [V]
+
+    Raises:
+        SceneError: If a camera is too extreme.
     """
     known = [
         calibration.scaled(file, size)
         for calibration, file, size in zip(calibrations, native, sizes, strict=True)
     ]
+    for label, size, camera, numbers in zip(labels, sizes, calibrations, known, strict=True):
+        _require_real(label, size, camera, *numbers)
     focal, centre, skew = (
         torch.tensor(values, dtype=torch.float64) for values in zip(*known, strict=True)
     )
@@ -225,6 +315,37 @@ def final_intrinsics(
     model = torch.tensor([int(calibration.model) for calibration in calibrations])
     lenses = Lenses(model, torch.tensor(rows, dtype=torch.float64), skew)
     return Intrinsics(focal, centre, torch.tensor(sizes), lenses)
+
+
+def _require_real(
+    label: str,
+    size: Size,
+    camera: Calibration,
+    focal: tuple[float, float],
+    centre: tuple[float, float],
+    skew: float,
+) -> None:
+    """Refuse cameras so extreme that their rays cannot be told apart, or overflow."""
+    for axis, along, middle, pixels in zip("xy", focal, centre, reversed(size), strict=True):
+        for name, value, low, high in (
+            ("focal length", along / pixels, SHORTEST, LONGEST),
+            ("principal point", middle / pixels, -FARTHEST_ASIDE, FARTHEST_ASIDE),
+        ):
+            if not low <= value <= high:
+                raise SceneError(
+                    f"{label}: the {name} along {axis} is {value:.3g} image sizes; it must lie "
+                    f"between {low:g} and {high:g}. Correct the camera, or calibrate again."
+                )
+    if not abs(skew) <= focal[0]:
+        raise SceneError(
+            f"{label}: the skew is {skew:.3g} pixels, more than the focal length of "
+            f"{focal[0]:.3g}. Correct the camera, or calibrate again."
+        )
+    if any(not abs(value) <= STRONGEST for value in camera.distortion):
+        raise SceneError(
+            f"{label}: its {camera.words}, of which none may be beyond {STRONGEST:g}. Correct the "
+            "camera, or calibrate again."
+        )
 
 
 def require_rays(label: str, lens: Calibration, shown: Tensor) -> None:
@@ -254,8 +375,7 @@ def _warn_of_empty(views: Views, listing: Listing) -> None:
     if empty:
         warnings.warn(
             f"{len(empty)} of {len(views)} images show nothing (alpha is 0 everywhere): "
-            f"{', '.join(empty[:5])}{', ...' if len(empty) > 5 else ''} in "
-            f"{listing.paths[0].parent}.",
+            f"{some(empty)} in {listing.paths[0].parent}.",
             stacklevel=4,
         )
 
@@ -293,6 +413,65 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         f"{label}: no image {folder / relative}, nor with {', '.join(SUFFIXES[1:])} added. "
         f"Add the file or take the frame out of the list."
     )
+
+
+def mask_files(
+    folder: Path, names: Sequence[Sequence[str]], key: str = "data.masks"
+) -> tuple[Path | None, ...]:
+    """The mask of each image; None for images without, of which a warning tells.
+
+    Args:
+        folder: Folder of masks.
+        names: Names that the mask of each image may have in it, in the order of preference. [V]
+        key: The setting that names the folder.
+
+    Raises:
+        SceneError: If no image has a mask.
+    """
+    masks = tuple(
+        next((path for name in each if (path := folder / name).is_file()), None) for each in names
+    )
+    bare = [each[0] for each, mask in zip(names, masks, strict=True) if mask is None]
+    if len(bare) == len(masks):
+        raise SceneError(
+            f"{key}: {folder} {'holds' if folder.is_dir() else 'does not exist, so there is'} no "
+            f"mask of any image, such as {bare[0]}. Put the masks there, or set {key}=null."
+        )
+    if bare:
+        warnings.warn(
+            f"{folder} has no mask of {len(bare)} of {len(masks)} images, which are shown whole: "
+            f"{some(bare)}.",
+            stacklevel=4,
+        )
+    return masks
+
+
+def unit_times(times: Sequence[float]) -> list[float]:
+    """Times in any unit, mapped to [0, 1]; all 0 where they are equal."""
+    # Integers stay as they are until the first was subtracted: clocks count nanoseconds.
+    first, last = min(times), max(times)
+    return [(time - first) / (last - first) if last > first else 0.0 for time in times]
+
+
+def read_object(path: Path, content: str) -> dict[str, Any]:
+    """A JSON object from a file.
+
+    Args:
+        path: The file.
+        content: What the object must have, for messages.
+
+    Raises:
+        SceneError: If it cannot be read, or is none.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as problem:
+        raise SceneError(
+            f"{path} cannot be read as JSON ({problem}). Export or download it again."
+        ) from problem
+    if not isinstance(found, dict):
+        raise SceneError(f"{path} must hold a JSON object with {content}, not {short(found)}.")
+    return found
 
 
 def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.ndarray:
@@ -337,6 +516,49 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
     return pose
 
 
+def oriented(poses: np.ndarray, points: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """A capture whose world is turned so that the cameras' mean up vector is its z axis.
+
+    It stays as it is, and a warning says so, where the cameras agree on no up vector.
+
+    Args:
+        poses: Cameras. float64 [V, 4, 4]
+        points: Points in the same world. float64 [N, 3]
+    """
+    rotation = upright(torch.from_numpy(poses))
+    if rotation is None:
+        warnings.warn(
+            "The up vectors of the cameras cancel out, so the world keeps the axes that the files "
+            "give it. data.orient=false says that it should.",
+            stacklevel=4,
+        )
+        return poses, points
+    turned, turn = poses.copy(), rotation.numpy()
+    turned[:, :3] = turn @ poses[:, :3]
+    return turned, None if points is None else points @ turn.T
+
+
+def require_precision(source: Path, positions: np.ndarray) -> None:
+    """Refuse cameras so far from the world's origin that single precision moves them.
+
+    Args:
+        source: Where they were read, for messages.
+        positions: Of all cameras of a capture. float64 [V, 3]
+
+    Raises:
+        SceneError: If they lie too far away.
+    """
+    extent = float(np.ptp(positions, axis=0).max())
+    largest = float(np.abs(positions).max())
+    room = ROUNDING * extent / float(np.finfo(np.float32).eps) if extent > 0 else FARTHEST
+    if not largest <= min(room, FARTHEST):
+        raise SceneError(
+            f"{source}: the cameras lie up to {largest:.3g} world units from the origin and "
+            f"{extent:.3g} apart, which single precision cannot hold. Move the capture to the "
+            "origin first, as with colmap model_transformer, or correct the cameras."
+        )
+
+
 def refuse_repeats(
     labels: Sequence[str], paths: Sequence[Path], poses: np.ndarray, times: Sequence[float]
 ) -> None:
@@ -370,8 +592,13 @@ def refuse_repeats(
 
 def is_number(value: Any) -> bool:
     """Whether a value read from a file is a finite number."""
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number and math.isfinite(value)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        # JSON holds integers that no float can.
+        return False
 
 
 def is_positive(value: Any) -> bool:
@@ -383,3 +610,8 @@ def short(value: Any) -> str:
     """A value read from a file, for messages."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def some(names: Sequence[str]) -> str:
+    """The first of many names, for messages."""
+    return f"{', '.join(names[:5])}{', ...' if len(names) > 5 else ''}"

@@ -449,7 +449,8 @@ def _read_views(
     sources = [recording.camera.source for recording in recordings]
     sizes = final_sizes(sources, native, resolution)
     calibrations = [recording.camera.calibration for recording in recordings]
-    intrinsics = final_intrinsics(calibrations, native, sizes)
+    labels = [recording.camera.label for recording in recordings]
+    intrinsics = final_intrinsics(labels, calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(recordings))]
     for recording, shown in zip(recordings, has_ray, strict=True):
         if shown is not None:

@@ -59,7 +59,7 @@ class SceneSettings(Settings, ABC):
     eval_split: Literal["test", "val"] | None  # Scored split; null: val in training, test after it.
     eval_views: Count | None  # Views of a scored split at most, spread over time; null for all.
     half_side: Positive | None  # Half the side of the scene's bounding cube; null estimates it.
-    cache: str | None = None  # Folder of images too large for memory; null: the user's cache.
+    cache: str | None  # Folder of images too large for memory; null: the user's cache.
 
     @property
     def folder(self) -> Path:

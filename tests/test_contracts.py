@@ -76,8 +76,8 @@ COMPOSITIONS = [
     ["lrm=xlarge", "model/sampler=kplanes", "logger=wandb"],
     ["lrm=file", "model/sampler=kplanes_explicit"],
     # A model brings its sampler along; here some are named.
-    ["model=kplanes"],
-    ["model=tineuvox_s", "model/sampler=fixed_step"],
+    ["data=blender", "model=kplanes"],
+    ["data=nerfstudio", "model=tineuvox_s", "model/sampler=fixed_step"],
     ["model=tensor4d", "model/sampler=neus"],
     ["model=tensor4d_density"],
     ["model=kplanes_explicit"],

@@ -1,6 +1,7 @@
 import json
 import math
 import warnings
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from tests.refusals import assert_refused
 from xplanes.scenes.cameras import focal_length, look_at
 from xplanes.scenes.dnerf import SceneError, read_scene
 from xplanes.scenes.images import load_images, load_premultiplied, shrink
+from xplanes.scenes.lenses import COEFFICIENTS
+from xplanes.scenes.transforms import read_transforms
 
 LEGO = Path(__file__).parents[3] / "shared" / "scenes" / "lego"
 ANGLE = 0.7
@@ -237,15 +240,25 @@ def test_video_is_read_when_there_is_one(scene):
     assert video.times.tolist() == [0, 0.5, 1]
 
 
-def test_images_need_not_be_square_at_their_own_size(scene):
+def test_a_resolution_is_a_width(scene):
     for i in range(5):
-        Image.fromarray(picture(i)[:6]).save(scene.path / "train" / f"r_{i}.png")
+        Image.fromarray(picture(i)[: 6 if i < 4 else 9]).save(scene.path / "train" / f"r_{i}.png")
+    scene.contents["train"] |= {"fl_x": 30.0, "fl_y": 24.0, "cx": 5.0, "cy": 2.0}
+    scene.write()
     views = scene.read().splits["train"]
-    assert (views.height, views.width) == (6, 12)
-    message = scene.error(resolution=6)
-    assert "12x6" in message
-    assert "data.resolution=6" in message
-    assert "data.resolution=null" in message
+    assert views.intrinsics.size.tolist() == [[6, 12]] * 4 + [[9, 12]]
+    views = scene.read(resolution=4).splits["train"]
+    assert views.intrinsics.size.tolist() == [[2, 4]] * 4 + [[3, 4]]
+    for i in range(5):
+        expected = box_average(picture(i)[: 6 if i < 4 else 9], 3)
+        assert np.abs(views.image(i).numpy() - expected).max() <= 1
+    # 5 of 12 columns, but 2 of 6 rows and 4 of 9: each axis has its own ratio.
+    views = scene.read(resolution=5).splits["train"]
+    assert views.intrinsics.size.tolist() == [[2, 5]] * 4 + [[4, 5]]
+    expected = torch.tensor([[12.5, 8.0]] * 4 + [[12.5, 24 * 4 / 9]], dtype=torch.float64)
+    torch.testing.assert_close(views.intrinsics.focal, expected)
+    expected = torch.tensor([[25 / 12, 2 / 3]] * 4 + [[25 / 12, 8 / 9]], dtype=torch.float64)
+    torch.testing.assert_close(views.intrinsics.centre, expected)
 
 
 def test_an_empty_image_is_only_a_warning(scene):
@@ -388,12 +401,9 @@ def test_damaged_or_missing_image(scene):
     assert ".png" in message
 
 
-def test_images_of_different_sizes(scene):
+def test_an_image_narrower_than_the_resolution(scene):
     Image.fromarray(picture(0, 8)[:6]).save(scene.path / "train" / "r_3.png")
-    message = scene.error(resolution=4)
-    assert "r_3.png has 8x6" in message
-    assert "data.resolution=null" in message
-    Image.fromarray(picture(0, 8)).save(scene.path / "train" / "r_3.png")
+    assert scene.read(resolution=4).splits["train"].size(3) == (3, 4)
     message = scene.error(resolution=9)
     assert "data.resolution=9 is more than the 8 pixels" in message
     assert "r_3.png" in message
@@ -530,25 +540,129 @@ def test_field_of_view_missing(scene):
 
 def test_lenses_that_are_not_read(scene):
     whole, frame = scene.contents["train"], dict(scene.frame(1))
-    for other, word in (
-        ({"k1": 0.1}, "k1=0.1"),
-        ({"k4": -1e-3}, "k4"),
-        ({"p2": "a"}, "p2"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model=OPENCV_FISHEYE"),
-        ({"is_fisheye": True}, "is_fisheye"),
+    for other, words in (
+        ({"p2": "a"}, "p2 is 'a'; a distortion coefficient must be a number"),
+        ({"k4": -1e-3}, "k4=-0.001 may mean.*FULL_OPENCV"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model=EQUIRECTANGULAR.*undistort"),
+        ({"camera_model": "FISHEYE624", "fl_x": 9}, "camera_model=FISHEYE624"),
+        ({"latlong": True}, "latlong=True"),
+        ({"camera_model": "OPENCV_FISHEYE"}, 'fisheye lens needs "fl_x"'),
+        ({"camera_model": "FOV", "fl_x": 9}, 'FOV needs "omega"'),
+        ({"camera_model": "FOV", "fl_x": 9, "omega": 4}, "not 4"),
     ):
         scene.contents["train"] = whole | other
         scene.write()
-        message = scene.error(other)
-        assert word in message
-        assert "undistort" in message, word
+        assert_refused(SceneError, words, scene.read, other)
         scene.contents["train"] = whole
         scene.frame(1).update(other)
         scene.write()
-        message = scene.error(other)
-        assert "frame 1" in message, word
-        assert word in message
+        message = assert_refused(SceneError, words, scene.read, other)
+        assert "frame 1" in message, words
         scene.contents["train"]["frames"][1] = dict(frame)
+
+
+def test_lenses_are_read_from_the_file_and_its_frames(scene):
+    scene.contents["train"] |= {"fl_x": 30, "k1": -0.1, "p1": 0.01, "camera_model": "OPENCV"}
+    scene.frame(1).update({"k1": 0.05})
+    scene.frame(2).update({"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k4": 0.001, "p1": 0})
+    scene.frame(3).update({"is_fisheye": True, "sx1": 0.003, "sy1": 0.004})
+    scene.frame(4).update({"camera_model": "FOV", "omega": 0.8})
+    scene.write()
+    lenses = scene.read(resolution=6).splits["train"].intrinsics.lenses
+    assert lenses.model.tolist() == [0, 0, 1, 1, 2]
+    named = [
+        {name: value for name, value in zip(COEFFICIENTS, row, strict=True) if value}
+        for row in lenses.coefficients.tolist()
+    ]
+    assert named == [
+        {"k1": -0.1, "p1": 0.01},
+        {"k1": 0.05, "p1": 0.01},
+        {"k1": 0.02, "k4": 0.001},
+        {"k1": -0.1, "p1": 0.01, "s1": 0.003, "s3": 0.004},
+        {"k1": 0.8},
+    ]
+    scene.contents["train"] |= {"camera_model": "FULL_OPENCV", "k4": 0.3}
+    scene.write()
+    assert scene.read().splits["train"].intrinsics.lenses.coefficients[0, 3] == 0.3
+
+
+def test_a_lens_that_folds_inside_its_images(scene):
+    scene.contents["train"] |= {"fl_x": 6, "k1": -0.4}
+    scene.write()
+    message = scene.error()
+    for words in ("r_0.png", "perspective lens with k1=-0.4", "row 0", "undistort"):
+        assert words in message
+    # Barely outside the corners it does no harm; half a fisheye's circle is dark, which it may be.
+    scene.contents["train"] |= {"fl_x": 16}
+    scene.write()
+    scene.read()
+    scene.contents["train"] |= {"fl_x": 1.5, "k1": 0, "is_fisheye": True}
+    scene.write()
+    views = scene.read().splits["train"]
+    corner = views.image(0)[:2, :2]
+    assert not corner.any()
+    assert views.image(4)[8, 5:7, 3].min() == 255
+    assert not views.valid()[0, 0, 0]
+
+
+# Masks
+
+
+def test_masks_become_alpha(scene):
+    (scene.path / "masks").mkdir()
+    mask = np.zeros((12, 12), np.uint8)
+    mask[:, 3:] = 255
+    mask[:, 6:9] = 51
+    straight = picture(0)
+    straight[..., 3] = 255
+    for name, values in (("grey", mask), ("ones", mask // 255), ("rgb", mask[..., None] + [0] * 3)):
+        Image.fromarray(values.astype(np.uint8)).save(scene.path / "masks" / f"{name}.png")
+    Image.fromarray(straight).save(scene.path / "train" / "r_1.png")
+    for name in ("grey", "rgb", "ones"):
+        scene.frame(1)["mask_path"] = f"masks/{name}.png"
+        scene.write()
+        views = scene.read().splits["train"]
+        share = (mask if name != "ones" else mask // 255 * 255)[..., None] / 255
+        assert np.abs(views.image(1).numpy() - straight * share).max() <= 0.5 + 1e-4, name
+        assert torch.equal(views.image(0), scene.read().splits["train"].image(0))
+    # A mask is averaged with its image.
+    scene.frame(1)["mask_path"] = "masks/grey.png"
+    scene.write()
+    masked = straight * (mask[..., None] / 255)
+    masked[..., 3] = mask
+    whole = np.concatenate([masked[..., :3], masked[..., 3:]], axis=2)
+    expected = whole.reshape(4, 3, 4, 3, 4).mean(axis=(1, 3))
+    found = scene.read(resolution=4).splits["train"].image(1).numpy()
+    assert np.abs(found - expected).max() <= 0.5 + 1e-3
+
+
+def test_a_listing_keeps_what_belongs_to_an_image(scene):
+    listing = read_transforms(scene.path / "transforms_train.json")
+    named = replace(
+        listing,
+        masks=(None, *(path.with_suffix(".mask") for path in listing.paths[1:])),
+        cameras=tuple("abcde"),
+    )
+    part = named.subset([3, 0])
+    assert part.files == ("train/r_3.png", "train/r_0.png")
+    assert part.masks == (listing.paths[3].with_suffix(".mask"), None)
+    assert part.cameras == ("d", "a")
+    assert part.times.tolist() == [0.75, 0]
+    assert torch.equal(part.camera_to_world[0], listing.camera_to_world[3])
+    assert listing.subset([1]).masks == listing.subset([1]).cameras == ()
+
+
+def test_masks_that_do_not_fit(scene):
+    Image.new("L", (12, 9), 255).save(scene.path / "low.png")
+    for name, words in (
+        ("low.png", "12x9 pixels.*r_1.png, whose mask it is, has 12x12"),
+        ("none.png", "frame 1.*no image"),
+        ("../low.png", "mask_path leaves the scene's folder"),
+        (3, "mask_path must be text"),
+    ):
+        scene.frame(1)["mask_path"] = name
+        scene.write()
+        assert_refused(SceneError, words, scene.read, name)
 
 
 def test_lenses_that_are_no_numbers(scene):

@@ -1,18 +1,14 @@
 """Scenes on disk in the format of D-NeRF and Blender: transforms_train.json and its images."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
 from xplanes.scenes.errors import MissingSplitError, SceneError
-from xplanes.scenes.images import read_images
+from xplanes.scenes.listing import Listing, read_views, thinned
 from xplanes.scenes.source import SceneSettings
-from xplanes.scenes.transforms import Transforms, read_transforms
-from xplanes.scenes.views import Intrinsics, Scene, Views
+from xplanes.scenes.transforms import read_transforms
+from xplanes.scenes.views import Scene
 
 __all__ = ["SceneError", "read_scene"]
 
@@ -52,7 +48,7 @@ def read_scene(
 
     Args:
         folder: Folder of transforms_train.json and the images.
-        resolution: Pixels per side of the (square) images; None keeps the native sizes.
+        resolution: Width of the images in pixels; None keeps the native sizes.
         splits: Names of the splits to read, such as train, val, test.
         views: Number of views to keep of the train split, spread evenly over time;
             None keeps all.
@@ -68,32 +64,23 @@ def read_scene(
     _check_folder(folder)
     paths = {split: _transforms_path(folder, split) for split in dict.fromkeys(splits)}
     listed = {split: read_transforms(path) for split, path in paths.items()}
-    for split, transforms in listed.items():
-        key, count = ("views", views) if split == "train" else ("eval_views", eval_views)
-        if count is not None and split != "train":
-            count = min(count, len(transforms.files))
-        if count is not None:
-            listed[split] = _spread(
-                transforms, count, f"data.{key}", f"the {split} split of {folder}"
-            )
+    listed = thinned(listed, views, eval_views, folder)
     video = _list_video(folder)
     others = listed if video is None else {**listed, "video": video}
     _require_times(folder, listed.get("train"), others)
     return Scene(
         folder.resolve().name,
-        {split: _load(transforms, resolution) for split, transforms in listed.items()},
-        video=None if video is None else _load(video, resolution),
+        {split: read_views(listing, resolution) for split, listing in listed.items()},
+        video=None if video is None else read_views(video, resolution),
     )
 
 
-def _require_times(
-    folder: Path, train: Transforms | None, others: Mapping[str, Transforms]
-) -> None:
+def _require_times(folder: Path, train: Listing | None, others: Mapping[str, Listing]) -> None:
     """Refuse frames of a moving scene that do not tell their times."""
     if train is None or len(train.times.unique()) == 1:
         return
-    for split, transforms in others.items():
-        if not transforms.timed:
+    for split, listing in others.items():
+        if not listing.timed:
             raise SceneError(
                 f'No frame of {folder / f"transforms_{split}.json"} has a "time", but those of '
                 "transforms_train.json have several. Give every frame its time."
@@ -136,60 +123,15 @@ def _scenes_in(folder: Path) -> list[str]:
     return sorted(path.parent.name for path in folder.glob("*/transforms_train.json"))
 
 
-def _spread(transforms: Transforms, count: int, key: str, split: str) -> Transforms:
-    """Keep ``count`` frames at even ranks in time, the first and the last among them."""
-    total = len(transforms.files)
-    if not 1 <= count <= total:
-        raise SceneError(
-            f"{key}={count}, but {split} has {total} views. Give a number from 1 to "
-            f"{total}, or null for all."
-        )
-    by_time = transforms.times.argsort(stable=True).tolist()
-    ranks = [round(i * (total - 1) / max(count - 1, 1)) for i in range(count)]
-    return transforms.subset(sorted(by_time[rank] for rank in ranks))
-
-
-def _list_video(folder: Path) -> Transforms | None:
+def _list_video(folder: Path) -> Listing | None:
     path = folder / "transforms_video.json"
     if not path.is_file():
         return None
-    transforms = read_transforms(path)
-    poses = transforms.camera_to_world
+    listing = read_transforms(path)
+    poses = listing.camera_to_world
     if not poses.allclose(poses[:1].expand_as(poses), atol=1e-4):
         raise SceneError(
             f"{path} holds a camera that moves. It must hold the frames of one fixed camera: "
             f"correct it, or rename the file and it is not read."
         )
-    return transforms
-
-
-def _load(transforms: Transforms, resolution: int | None) -> Views:
-    images, native, sizes = read_images(transforms.paths, resolution)
-    _warn_of_empty(images, transforms)
-    known = [
-        lens.scaled(file, size)
-        for lens, file, size in zip(transforms.lenses, native, sizes, strict=True)
-    ]
-    focal, centre = torch.tensor(known, dtype=torch.float64).unbind(dim=1)
-    return Views(
-        images=images,
-        camera_to_world=transforms.camera_to_world,
-        times=transforms.times,
-        intrinsics=Intrinsics(focal, centre, torch.tensor(sizes)),
-        files=transforms.files,
-    )
-
-
-def _warn_of_empty(images: Tensor, transforms: Transforms) -> None:
-    empty = [
-        file
-        for file, image in zip(transforms.files, images, strict=True)
-        if not image[..., 3].any()
-    ]
-    if empty:
-        warnings.warn(
-            f"{len(empty)} of {len(images)} images show nothing (alpha is 0 everywhere): "
-            f"{', '.join(empty[:5])}{', ...' if len(empty) > 5 else ''} in "
-            f"{transforms.paths[0].parent}.",
-            stacklevel=4,
-        )
+    return listing

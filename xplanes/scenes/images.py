@@ -30,11 +30,11 @@ UNREADABLE = (
 
 
 def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
-    """Decode images of one size and reduce them to ``resolution`` pixels square.
+    """Decode images of one size and reduce them to a width.
 
     Args:
         paths: Image files, PNG or JPEG, at least one. [V]
-        resolution: Pixels per side; None keeps the size of the files.
+        resolution: Width in pixels; None keeps the size of the files.
 
     Returns:
         Colour, multiplied by alpha before it was averaged, and alpha. uint8 [V, H, W, 4]
@@ -43,40 +43,70 @@ def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
         SceneError: A file cannot be decoded, sizes differ, or the resolution cannot be met.
     """
     common_size(paths)
-    return read_images(paths, resolution)[0]
+    return read_images(paths, final_sizes(paths, native_sizes(paths), resolution))
+
+
+def native_sizes(paths: Sequence[Path]) -> list[Size]:
+    """Heights and widths of image files, read from their headers alone.
+
+    Raises:
+        SceneError: If a file is no image.
+    """
+    return [(height, width) for width, height in map(_read_size, paths)]
+
+
+def final_sizes(
+    paths: Sequence[Path], native: Sequence[Size], resolution: int | None
+) -> list[Size]:
+    """Heights and widths of images that are reduced to one width, with their own aspect ratios.
+
+    Args:
+        paths: Image files. [V]
+        native: Their sizes. [V]
+        resolution: Width in pixels; None keeps the sizes.
+
+    Raises:
+        SceneError: If an image is narrower.
+    """
+    if resolution is None:
+        return list(native)
+    for path, (height, width) in zip(paths, native, strict=True):
+        check_resolution(path, width, height, resolution)
+    return [(max(1, round(height * resolution / width)), resolution) for height, width in native]
 
 
 def read_images(
-    paths: Sequence[Path], resolution: int | None
-) -> tuple[Tensor, list[Size], list[Size]]:
-    """Decode images of any sizes and reduce them to ``resolution`` pixels square.
+    paths: Sequence[Path],
+    sizes: Sequence[Size],
+    masks: Sequence[Path | None] = (),
+    has_ray: Sequence[Tensor | None] = (),
+) -> Tensor:
+    """Decode images of any sizes and reduce them.
 
     Args:
         paths: Image files, PNG or JPEG, at least one. [V]
-        resolution: Pixels per side; None keeps the sizes of the files.
+        sizes: Height and width of each image after that. [V]
+        masks: Files that alpha is multiplied by; none where it is empty. [V]
+        has_ray: Pixels of the reduced images that show anything, of each image bool [h, w], or None
+            for all; all of all images where it is empty. [V]
 
     Returns:
         Colour, multiplied by alpha before it was averaged, and alpha, smaller images padded with
-        zeros at the bottom and on the right: uint8 [V, H, W, 4]. Then the height and width of each
-        file, and those of each image without padding.
+        zeros at the bottom and on the right. uint8 [V, H, W, 4]
 
     Raises:
-        SceneError: A file cannot be decoded, or the resolution cannot be met.
+        SceneError: A file cannot be decoded, or a mask does not fit its image.
     """
-    native = [(height, width) for width, height in map(_read_size, paths)]
-    sizes = native
-    if resolution is not None:
-        for path, (height, width) in zip(paths, native, strict=True):
-            check_resolution(path, width, height, resolution)
-        sizes = [(resolution, resolution)] * len(paths)
     largest = max(height for height, _ in sizes), max(width for _, width in sizes)
     same = len(set(sizes)) == 1
     images = (torch.empty if same else torch.zeros)(len(paths), *largest, 4, dtype=torch.uint8)
 
     def fill(index: int) -> None:
         height, width = sizes[index]
-        pixels = shrink(load_premultiplied(paths[index]), width, height)
+        pixels = read_image(paths[index], sizes[index], masks[index] if masks else None)
         images[index, :height, :width] = torch.from_numpy(pixels)
+        if has_ray and (shown := has_ray[index]) is not None:
+            images[index, :height, :width][~shown] = 0
 
     # Pillow decodes and resamples without the interpreter lock, so threads are enough.
     pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1, len(paths)))
@@ -84,7 +114,35 @@ def read_images(
         list(pool.map(fill, range(len(paths))))
     finally:
         pool.shutdown(cancel_futures=True)
-    return images, native, sizes
+    return images
+
+
+def read_image(path: Path, size: Size, mask: Path | None = None) -> np.ndarray:
+    """Decode one image, multiply it by its mask, and reduce it. uint8 [H, W, 4]"""
+    channels = load_premultiplied(path)
+    if mask is not None:
+        channels *= _read_mask(mask, path, channels.shape[1:])
+    height, width = size
+    return shrink(channels, width, height)
+
+
+def _read_mask(path: Path, image: Path, size: tuple[int, ...]) -> np.ndarray:
+    """A mask as factors from 0, where it is black, to 1. float32 [H, W]"""
+    try:
+        with Image.open(path, formats=FORMATS) as picture:
+            if picture.mode in SIXTEEN_BIT_MODES:
+                values = np.asarray(picture, np.float32) / 257
+            else:
+                values = np.asarray(picture.convert("L"), np.float32)
+    except UNREADABLE as problem:
+        raise _unreadable(path, problem) from problem
+    if values.shape != size:
+        raise SceneError(
+            f"{path} has {values.shape[1]}x{values.shape[0]} pixels, but {image}, whose mask it "
+            f"is, has {size[1]}x{size[0]}. Export the mask at the size of the image."
+        )
+    # Zeros and ones are meant as black and white.
+    return values if values.max() == 1 else values / 255
 
 
 def common_size(paths: Sequence[Path]) -> tuple[int, int]:
@@ -107,16 +165,11 @@ def check_resolution(path: Path, width: int, height: int, resolution: int) -> No
             f"data.resolution={resolution} is not a size. Give 1 to {width} pixels, or null "
             f"to keep the {width}x{height} pixels of {path}."
         )
-    if width != height:
-        raise SceneError(
-            f"{path} has {width}x{height} pixels, and data.resolution={resolution} stands for a "
-            f"square. Set data.resolution=null to keep the images as they are; shrinking the files "
-            f"leaves camera_angle_x as it is, cropping them does not."
-        )
     if resolution > width:
         raise SceneError(
-            f"data.resolution={resolution} is more than the {width} pixels of {path}. Enlarged "
-            f"images hold no more detail: give at most {width}, or null for the native size."
+            f"data.resolution={resolution} is more than the {width} pixels that {path} is wide. "
+            f"Enlarged images hold no more detail: give at most {width}, or null for the native "
+            f"size."
         )
 
 

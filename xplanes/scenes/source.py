@@ -51,7 +51,7 @@ class SceneSettings(Settings, ABC):
     name: str  # Name of the format in run directories and tables.
     root: str  # Folder that holds the scenes.
     scene: str  # Folder of the scene, or name of the demo scene.
-    resolution: Count | None  # Pixels per side; null keeps the native size.
+    resolution: Count | None  # Width of the images in pixels; null keeps the native size.
     views: Count | None  # Training views, spread over time; null for all.
     train_on_video: bool  # Also train on the frames of the fixed camera.
     static: bool | None  # Static scene; null: if all frames of the fixed camera are equal.

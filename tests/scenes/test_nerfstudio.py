@@ -1,0 +1,276 @@
+"""Captures as nerfstudio and instant-ngp write them."""
+
+import json
+import logging
+import math
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.lens_oracle import direction
+from tests.refusals import assert_refused
+from tests.synthetic import ball_views, surrounding
+from xplanes.config import compose_plain
+from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.errors import MissingSplitError, SceneError
+from xplanes.scenes.nerfstudio import read_capture
+
+SIZE, ANGLE = 24, 0.7
+FOCAL = 0.5 * SIZE / math.tan(0.5 * ANGLE)
+PINHOLE = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 12.0, "cy": 12.0, "w": SIZE, "h": SIZE}
+
+
+class Capture:
+    """A capture on disk: the images of a ball, and keys of the file and of its frames."""
+
+    def __init__(self, path, count=10, **shared):
+        self.path = path
+        self.views = ball_views(count, 0.6, size=SIZE, angle=ANGLE)
+        (path / "images").mkdir(parents=True)
+        self.content = {**PINHOLE, "aabb_scale": 16, **shared, "frames": []}
+        for index, pose in enumerate(self.views.camera_to_world.double().tolist()):
+            name = f"images/frame_{index:05d}.png"
+            # Alpha is 0 or 255: multiplied by it or not, colour is the same.
+            Image.fromarray(self.views.image(index).numpy()).save(path / name)
+            self.content["frames"].append({"file_path": name, "transform_matrix": pose})
+
+    @property
+    def frames(self):
+        return self.content["frames"]
+
+    def timed(self, times, key="time"):
+        for frame, time in zip(self.frames, times, strict=True):
+            frame[key] = time
+        return self
+
+    def read(self, splits=("train",), resolution=None, **options):
+        (self.path / "transforms.json").write_text(json.dumps(self.content))
+        return read_capture(self.path, resolution=resolution, splits=splits, **options)
+
+    def refused(self, words, case=None, error=SceneError, **options):
+        return assert_refused(error, words, partial(self.read, **options), case)
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return Capture(tmp_path / "ball")
+
+
+def numbers(views):
+    return [int(file[-9:-4]) for file in views.files]
+
+
+def test_a_capture_equals_what_it_was_written_from(capture):
+    capture.timed([i / 9 for i in range(10)])
+    scene = capture.read(("train", "val"))
+    assert scene.name == "ball"
+    parts = scene.splits
+    assert sorted(numbers(parts["train"]) + numbers(parts["val"])) == list(range(10))
+    for views in parts.values():
+        for index, number in enumerate(numbers(views)):
+            assert torch.equal(views.image(index), capture.views.image(number))
+            assert views.times[index] == pytest.approx(number / 9)
+            for mine, theirs in zip(
+                views.image_rays(index), capture.views.image_rays(number), strict=True
+            ):
+                torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("keys", "model"),
+    [
+        ({"camera_model": "OPENCV", "k1": -0.2, "k2": 0.05, "p1": 0.01, "p2": -0.02}, None),
+        ({"camera_model": "SIMPLE_RADIAL", "k1": 0.15}, None),
+        ({"camera_model": "FULL_OPENCV", "k1": 0.3, "k4": 0.2, "k5": 0.02}, None),
+        ({"camera_model": "OPENCV_FISHEYE", "k1": 0.03, "k2": 0.005, "k4": 1e-4}, "fisheye"),
+        ({"is_fisheye": True, "k1": 0.03}, "fisheye"),
+    ],
+)
+def test_a_distorted_lens_gives_its_rays(tmp_path, keys, model):
+    shared = {"fl_x": 20.0, "fl_y": 21.0, "cx": 11.0, "cy": 12.5, **keys}
+    capture = Capture(tmp_path, 4, **shared)
+    # One frame tells a lens of its own.
+    capture.frames[2] |= {"fl_x": 25.0, "k1": 0.02}
+    numbers_of = {key: value for key, value in keys.items() if key[0] in "kp"}
+    for resolution, scale in ((None, 1), (8, 1 / 3)):
+        views = capture.read(resolution=resolution, eval_every=10).splits["train"]
+        side = views.width
+        for index, number in enumerate(numbers(views)):
+            own = numbers_of | ({"k1": 0.02} if number == 2 else {})
+            focal = (scale * (25 if number == 2 else 20), scale * 21)
+            origins, found = views.image_rays(index)
+            pose = capture.views.camera_to_world[number].double().numpy()
+            for row, column in ((0, 0), (side // 2, side // 3), (side - 1, 1), (1, side - 1)):
+                target, centre = (column + 0.5, row + 0.5), (11 * scale, 12.5 * scale)
+                local = direction(model or "perspective", target, own, focal, centre, widest=1.4)
+                expected = pose[:3, :3] @ np.array(local)
+                ray = found[row * side + column].numpy()
+                assert np.abs(ray - expected).max() < 1e-5, (number, row, column)
+            assert np.abs(origins.numpy() - pose[:3, 3]).max() < 1e-6
+
+
+def test_frames_are_held_out_at_even_ranks_of_time(capture):
+    """Neither the first nor the last, whatever the order of the file."""
+    capture.timed([(7 * i % 10) / 10 for i in range(10)])
+    for every, expected in ((8, [0.4]), (4, [0.2, 0.6]), (3, [0.1, 0.4, 0.7]), (100, [])):
+        parts = capture.read(eval_every=every).splits
+        found = sorted(capture.frames[i]["time"] for i in numbers(parts["train"]))
+        assert found == [i / 10 for i in range(10) if i / 10 not in expected], every
+        if expected:
+            val = capture.read(("val",), eval_every=every).splits["val"]
+            assert sorted(round(time, 5) for time in val.times.tolist()) == expected
+    capture.refused(
+        r"no val split.*eval_every below 100",
+        error=MissingSplitError,
+        splits=("val",),
+        eval_every=100,
+    )
+    capture.refused(
+        r"no test split.*Splits of this capture: train, val.*data\.eval_split",
+        error=MissingSplitError,
+        splits=("test",),
+    )
+    # Without times, the names of the files decide.
+    for frame in capture.frames:
+        del frame["time"]
+    capture.frames.reverse()
+    assert numbers(capture.read(("val",), eval_every=4).splits["val"]) == [6, 2]
+    assert capture.read().splits["train"].is_static
+
+
+def test_lists_of_file_names_are_the_splits(capture):
+    names = [frame["file_path"] for frame in capture.frames]
+    capture.content |= {"train_filenames": names[3:], "test_filenames": [f"./{names[1]}"]}
+    parts = capture.read(("train", "test")).splits
+    assert numbers(parts["train"]) == list(range(3, 10))
+    assert numbers(parts["test"]) == [1]
+    capture.refused("no val split", error=MissingSplitError, splits=("val",))
+    assert len(capture.read(views=3, splits=("train",)).splits["train"]) == 3
+    whole = dict(capture.content)
+    for change, words in (
+        ({"val_filenames": "a"}, "val_filenames is 'a', not a list"),
+        ({"val_filenames": ["images/none.png"]}, "no image"),
+        ({"val_filenames": [names[3]]}, "frame_00003.png is in train_filenames and in val_fil"),
+        ({"val_filenames": ["../x.png"]}, "val_filenames leaves the scene's folder"),
+        ({"train_filenames": []}, "no frames to train on"),
+    ):
+        capture.content = whole | change
+        capture.refused(words, change)
+    capture.content = whole
+    capture.frames.pop(5)
+    capture.refused("train_filenames names images/frame_00005.png, which no frame shows")
+
+
+@pytest.mark.parametrize("key", ["time", "timestamp"])
+def test_times_in_any_unit_are_mapped_over_all_frames(capture, key, caplog):
+    # Nanoseconds since 1970, which single precision cannot tell apart.
+    capture.timed([1_700_000_000_000_000_000 + 33_000_000 * i for i in range(10)], key)
+    with caplog.at_level(logging.INFO, logger="xplanes"):
+        parts = capture.read(("train", "val")).splits
+    assert f"{key} from 1700000000000000000 to 1700000000297000000" in caplog.text
+    for views in parts.values():
+        expected = [number / 9 for number in numbers(views)]
+        assert views.times.tolist() == pytest.approx(expected, abs=1e-6)
+
+
+def test_times_from_0_to_1_stay(capture, caplog):
+    capture.timed([0.1 + i / 20 for i in range(10)])
+    with caplog.at_level(logging.INFO, logger="xplanes"):
+        views = capture.read().splits["train"]
+    assert float(views.times.min()) == pytest.approx(0.1)
+    assert "mapped" not in caplog.text
+    del capture.frames[4]["time"]
+    capture.refused('frame 4.*has no "time", but 9 of 10')
+    capture.frames[4]["time"] = "soon"
+    capture.refused("time is 'soon'; it must be a number in any unit")
+
+
+def test_images_of_several_sizes_and_widths(capture):
+    for index in (1, 4):
+        path = capture.path / capture.frames[index]["file_path"]
+        with Image.open(path) as picture:
+            picture.resize((48, 36)).save(path)
+    views = capture.read(resolution=12, eval_every=100).splits["train"]
+    assert [views.size(index) for index in range(3)] == [(12, 12), (9, 12), (12, 12)]
+    # The file tells of images of 24 x 24: each axis has its own ratio.
+    assert views.intrinsics.focal[1].tolist() == pytest.approx([FOCAL / 2, FOCAL * 9 / 24])
+
+
+def test_masks_bound_the_scene(capture):
+    mask = Image.fromarray(np.tri(SIZE, dtype=np.uint8) * 255)
+    mask.save(capture.path / "mask.png")
+    for frame in capture.frames:
+        frame["mask_path"] = "mask.png"
+    views = capture.read(eval_every=100).splits["train"]
+    for index in range(10):
+        expected = capture.views.image(index) * torch.ones(SIZE, SIZE).tril()[..., None]
+        assert torch.equal(views.image(index), expected.byte())
+
+
+def test_keys_of_other_programs_change_nothing(capture):
+    plain = capture.read().splits["train"]
+    capture.content |= {
+        "applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]],
+        "applied_scale": 3.0,
+        "scale": 0.33,
+        "offset": [0.5, 0.5, 0.5],
+        "ply_file_path": "sparse.ply",
+        "orientation_override": "none",
+        "k3": 0,
+        "camera_angle_x": "?",
+        "rolling_shutter": [0, 0, 0, 0],
+    }
+    for frame in capture.frames:
+        frame |= {"colmap_im_id": 3, "sharpness": 10.0, "mask_path": None, "depth_file_path": "x"}
+    found = capture.read().splits["train"]
+    assert torch.equal(found.camera_to_world, plain.camera_to_world)
+    assert torch.equal(found.images, plain.images)
+    assert torch.equal(found.intrinsics.focal, plain.intrinsics.focal)
+    capture.content["from_na"] = True
+    capture.refused("from_na=True stands for poses with other axes")
+
+
+def test_what_is_no_capture(tmp_path):
+    (tmp_path / "blender").mkdir()
+    (tmp_path / "blender" / "transforms_train.json").write_text("{}")
+    Capture(tmp_path / "other").read()
+    for name, words in (
+        ("blender", "data=blender"),
+        ("none", "none does not exist. Captures in .*: other"),
+        ("other/images", r"holds no transforms\.json"),
+    ):
+        read = partial(read_capture, tmp_path / name, resolution=None, splits=("train",))
+        assert_refused(SceneError, words, read, name)
+
+
+def test_the_command_lines_settings_read_a_capture(capture):
+    capture.timed([0.1 * i for i in range(10)]).read()
+    options = (f"data.root={capture.path.parent}", "data.scene=ball", "data.resolution=12")
+    data = SceneDataModule.compose("data=nerfstudio", *options, "data.eval_every=4")
+    assert {name: len(views) for name, views in data.scene.splits.items()} == {"train": 8, "val": 2}
+    assert data.test_split == "val"
+    assert data.scene.splits["train"].outline == "12x12 px"
+
+
+def test_blender_is_the_reader_of_dnerf():
+    dnerf, blender = (
+        compose_plain("train", [f"data={name}"])["data"] for name in ("dnerf", "blender")
+    )
+    assert {key for key in dnerf if dnerf[key] != blender[key]} == {"name", "root"}
+
+
+def test_lenses_and_poses_of_many_cameras_stay_with_their_images(capture):
+    """Views taken out, spread and held out keep the lens of their own frame."""
+    for index, frame in enumerate(capture.frames):
+        frame |= {"fl_x": 20.0 + index, "k1": 0.01 * (index + 1), "time": (3 * index % 10) / 10}
+    parts = capture.read(("train", "val"), eval_every=3, views=4).splits
+    for views in parts.values():
+        for index, number in enumerate(numbers(views)):
+            assert views.intrinsics.focal[index, 0] == 20 + number
+            lens = views.intrinsics.lens(index)
+            assert float(lens.coefficients[0, 0]) == pytest.approx(0.01 * (number + 1))
+            expected = surrounding(10, 4.0)[number]
+            torch.testing.assert_close(views.camera_to_world[index], expected)

@@ -1,0 +1,367 @@
+"""What every reader makes of its files: a list of posed, timed images; how these become views."""
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PureWindowsPath
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.images import Size, final_sizes, native_sizes, read_images
+from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
+from xplanes.scenes.views import Intrinsics, Views
+
+SUFFIXES = ("", ".png", ".jpg", ".jpeg")
+RIGID_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a file tells about the camera of one image.
+
+    Attributes:
+        per_width: Focal length in image widths; None where ``fl_x`` tells it.
+        fl_x: Focal length along x in pixels of an image of ``w`` x ``h``.
+        fl_y: The same along y; None for square pixels.
+        cx: Principal point, from the left; None for the middle.
+        cy: Principal point, from the top; None for the middle.
+        w: Width of the image that these numbers speak of; None for that of the image file.
+        h: Its height.
+        model: Kind of lens.
+        distortion: Its coefficients, in the order of `COEFFICIENTS`; none for a lens without.
+        skew: Pixels to the right for each focal length down.
+    """
+
+    per_width: float | None = None
+    fl_x: float | None = None
+    fl_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    w: float | None = None
+    h: float | None = None
+    model: LensModel = LensModel.PERSPECTIVE
+    distortion: tuple[float, ...] = ()
+    skew: float = 0.0
+
+    def scaled(
+        self, native: Size, size: Size
+    ) -> tuple[tuple[float, float], tuple[float, float], float]:
+        """Focal lengths, principal point and skew of the image in its final size.
+
+        Args:
+            native: Height and width of the image file.
+            size: Those after it was resized.
+        """
+        (rows, columns), (height, width) = native, size
+        # Of an image of another size only one side may be told.
+        wide = self.w or (columns if self.h is None else columns * self.h / rows)
+        high = self.h or (rows if self.w is None else rows * self.w / columns)
+        per_width = self.per_width if self.fl_x is None else self.fl_x / wide
+        assert per_width is not None
+        focal_x = per_width * width
+        if self.fl_y is not None:
+            focal_y = self.fl_y / high * height
+        else:
+            focal_y = focal_x * ((height / rows) / (width / columns))
+        centre_x = 0.5 * width if self.cx is None else self.cx / wide * width
+        centre_y = 0.5 * height if self.cy is None else self.cy / high * height
+        return (focal_x, focal_y), (centre_x, centre_y), self.skew / wide * width
+
+    @property
+    def words(self) -> str:
+        """The lens in words."""
+        named = [
+            f"{'omega' if self.model == LensModel.FOV else name}={value:g}"
+            for name, value in zip(COEFFICIENTS, self.distortion, strict=False)
+            if value
+        ]
+        return f"{self.model.name.lower()} lens with {', '.join(named) or 'no distortion'}"
+
+
+@dataclass(frozen=True)
+class Listing:
+    """The images of one split, or of a whole capture, before they are read.
+
+    Attributes:
+        paths: Image files. [V]
+        files: Their names in tables and messages, relative to the scene's folder. [V]
+        camera_to_world: Rigid camera poses with OpenGL's axes. [V, 4, 4]
+        times: Time of each image, from 0 to 1; all 0 for a static scene. [V]
+        calibrations: Focal length, principal point and lens of each image. [V]
+        timed: Whether the source tells the times.
+        masks: A mask file for each image, white where it shows the scene and black elsewhere, or
+            None for an image without; empty where there are none. [V]
+        cameras: Name of the physical camera that took each image; empty where that is not
+            known. [V]
+    """
+
+    paths: tuple[Path, ...]
+    files: tuple[str, ...]
+    camera_to_world: Tensor
+    times: Tensor
+    calibrations: tuple[Calibration, ...]
+    timed: bool
+    masks: tuple[Path | None, ...] = ()
+    cameras: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def subset(self, indices: Sequence[int]) -> "Listing":
+        """The images at ``indices``, in that order. [K]"""
+        chosen = list(indices)
+        return Listing(
+            tuple(self.paths[i] for i in chosen),
+            tuple(self.files[i] for i in chosen),
+            self.camera_to_world[chosen],
+            self.times[chosen],
+            tuple(self.calibrations[i] for i in chosen),
+            self.timed,
+            tuple(self.masks[i] for i in chosen) if self.masks else (),
+            tuple(self.cameras[i] for i in chosen) if self.cameras else (),
+        )
+
+    def spread(self, count: int | None, key: str, split: str) -> "Listing":
+        """``count`` images at even ranks in time, the first and the last among them.
+
+        Args:
+            count: How many to keep; None keeps all.
+            key: The setting that says so, for messages.
+            split: What they are taken from, for messages.
+
+        Raises:
+            SceneError: If there are not so many.
+        """
+        if count is None:
+            return self
+        total = len(self)
+        if not 1 <= count <= total:
+            raise SceneError(
+                f"{key}={count}, but {split} has {total} views. Give a number from 1 to "
+                f"{total}, or null for all."
+            )
+        by_time = self.times.argsort(stable=True).tolist()
+        ranks = [round(i * (total - 1) / max(count - 1, 1)) for i in range(count)]
+        return self.subset(sorted(by_time[rank] for rank in ranks))
+
+
+def thinned(
+    listings: dict[str, Listing], views: int | None, eval_views: int | None, source: Path
+) -> dict[str, Listing]:
+    """Splits with as many images as data.views and data.eval_views ask for.
+
+    Args:
+        listings: Images by split name.
+        views: Images to keep of the train split; None keeps all.
+        eval_views: The same for every other split, at most.
+        source: Folder of the scene, for messages.
+
+    Raises:
+        SceneError: If the train split has not so many.
+    """
+    found = {}
+    for split, listing in listings.items():
+        where = f"the {split} split of {source}"
+        if split == "train":
+            found[split] = listing.spread(views, "data.views", where)
+        else:
+            most = eval_views if eval_views is None else min(eval_views, len(listing))
+            found[split] = listing.spread(most, "data.eval_views", where)
+    return found
+
+
+def read_views(listing: Listing, resolution: int | None) -> Views:
+    """Read the images of a listing, with their masks, and reduce them to a width.
+
+    Pixels to which a fisheye or FOV lens maps no direction, as outside of a fisheye's circle, get
+    alpha 0, and no rays are drawn from them.
+
+    Args:
+        listing: At least one image.
+        resolution: Width in pixels; None keeps the sizes of the files.
+
+    Raises:
+        SceneError: If a file cannot be decoded, the resolution cannot be met, or a perspective
+            lens maps no direction to a pixel.
+    """
+    native = native_sizes(listing.paths)
+    sizes = final_sizes(listing.paths, native, resolution)
+    intrinsics = _intrinsics(listing, native, sizes)
+    has_ray = [intrinsics.has_ray(index) for index in range(len(listing))]
+    for index, shown in enumerate(has_ray):
+        if shown is not None:
+            _require_rays(listing, index, shown)
+    images = read_images(listing.paths, sizes, listing.masks, has_ray)
+    _warn_of_empty(images, listing)
+    return Views(images, listing.camera_to_world, listing.times, intrinsics, listing.files)
+
+
+def _intrinsics(listing: Listing, native: list[Size], sizes: list[Size]) -> Intrinsics:
+    known = [
+        calibration.scaled(file, size)
+        for calibration, file, size in zip(listing.calibrations, native, sizes, strict=True)
+    ]
+    focal, centre, skew = (
+        torch.tensor(values, dtype=torch.float64) for values in zip(*known, strict=True)
+    )
+    pad = (0.0,) * len(COEFFICIENTS)
+    rows = [(c.distortion + pad)[: len(COEFFICIENTS)] for c in listing.calibrations]
+    model = torch.tensor([int(calibration.model) for calibration in listing.calibrations])
+    lenses = Lenses(model, torch.tensor(rows, dtype=torch.float64), skew)
+    return Intrinsics(focal, centre, torch.tensor(sizes), lenses)
+
+
+def _require_rays(listing: Listing, index: int, shown: Tensor) -> None:
+    """Refuse images whose lens folds back inside them, or that show nothing at all."""
+    lens, share = listing.calibrations[index], float((~shown).float().mean())
+    if lens.model != LensModel.PERSPECTIVE and share < 1:
+        return
+    row, column = (~shown).nonzero()[0].tolist()
+    raise SceneError(
+        f"{listing.paths[index]}: its {lens.words} folds back inside the image: no direction "
+        f"belongs to {share:.1%} of the pixels, such as that in row {row}, column {column}. "
+        "Calibrate again with fewer coefficients, correct them, or undistort the images."
+    )
+
+
+def _warn_of_empty(images: Tensor, listing: Listing) -> None:
+    empty = [
+        file for file, image in zip(listing.files, images, strict=True) if not image[..., 3].any()
+    ]
+    if empty:
+        warnings.warn(
+            f"{len(empty)} of {len(images)} images show nothing (alpha is 0 everywhere): "
+            f"{', '.join(empty[:5])}{', ...' if len(empty) > 5 else ''} in "
+            f"{listing.paths[0].parent}.",
+            stacklevel=4,
+        )
+
+
+def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> Path:
+    """The file that ``name`` stands for, with or without its suffix, inside ``folder``.
+
+    Args:
+        label: The file and frame that name it, for messages.
+        folder: The scene's folder, with its links resolved.
+        name: Name relative to ``folder``.
+        key: The key that holds the name.
+
+    Raises:
+        SceneError: If it is no name, leaves the folder, or there is no such file.
+    """
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise SceneError(f"{label}: {key} must be text such as ./train/r_000.")
+    # Blender on Windows writes backslashes.
+    relative = Path(name.replace("\\", "/"))
+    if relative.is_absolute() or PureWindowsPath(name).anchor:
+        raise SceneError(
+            f"{label}: {key} is absolute. Write it relative to {folder}, as in ./train/r_000."
+        )
+    for suffix in SUFFIXES:
+        image = (folder / f"{relative}{suffix}").resolve()
+        if not image.is_relative_to(folder):
+            raise SceneError(
+                f"{label}: {key} leaves the scene's folder {folder} (it leads to {image}). "
+                f"Put the image inside the folder and correct {key}."
+            )
+        if image.is_file():
+            return image
+    raise SceneError(
+        f"{label}: no image {folder / relative}, nor with {', '.join(SUFFIXES[1:])} added. "
+        f"Add the file or take the frame out of the list."
+    )
+
+
+def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.ndarray:
+    """A camera-to-world matrix: finite, rigid, right-handed.
+
+    Args:
+        label: The file and frame that hold it, for messages.
+        matrix: 4 rows of 4 numbers.
+        key: What it is called there.
+
+    Returns:
+        The matrix. float64 [4, 4]
+
+    Raises:
+        SceneError: If it is no such matrix.
+    """
+    try:
+        pose = np.asarray(matrix, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pose = np.empty(0)
+    if pose.shape != (4, 4):
+        raise SceneError(f"{label}: {key} must be 4 rows of 4 numbers, not {short(matrix)}.")
+    if not np.isfinite(pose).all():
+        raise SceneError(f"{label}: {key} holds NaN or infinity. Export it again.")
+    if np.abs(pose[3] - [0, 0, 0, 1]).max() > RIGID_TOLERANCE:
+        raise SceneError(
+            f"{label}: the last row of {key} is {pose[3].tolist()}, not [0, 0, 0, 1]. "
+            f"Poses are camera-to-world, written row by row (perhaps this one is transposed)."
+        )
+    rotation = pose[:3, :3]
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if error > RIGID_TOLERANCE:
+        raise SceneError(
+            f"{label}: the rotation in {key} is not orthonormal (off by {error:.2g}, "
+            f"allowed {RIGID_TOLERANCE:g}). Set the camera's scale to 1 and export again."
+        )
+    if np.linalg.det(rotation) < 0:
+        raise SceneError(
+            f"{label}: the rotation in {key} mirrors (determinant -1, must be +1). "
+            f"Axes are OpenGL's: x right, y up, z backward; negate one column."
+        )
+    return pose
+
+
+def refuse_repeats(
+    labels: Sequence[str], paths: Sequence[Path], poses: np.ndarray, times: Sequence[float]
+) -> None:
+    """Refuse images that are listed twice.
+
+    Args:
+        labels: The file and frame of each image, for messages. [V]
+        paths: Image files. [V]
+        poses: Their cameras. [V, 4, 4]
+        times: Their times; empty for a static scene, whose cameras may repeat. [V]
+
+    Raises:
+        SceneError: If a file, or a camera and time, comes twice.
+    """
+    files: dict[Path, str] = {}
+    seen: dict[tuple[bytes, float], str] = {}
+    for index, label in enumerate(labels):
+        other = files.setdefault(paths[index], label)
+        if other is not label:
+            raise SceneError(f"{label} shows the same file as {other}. Remove one of the two.")
+        # Paths around a static object may pass the same place twice, so only times convict.
+        if not times:
+            continue
+        other = seen.setdefault((poses[index].tobytes(), times[index]), label)
+        if other is not label:
+            raise SceneError(
+                f"{label} has the same camera and time as {other}. Remove one of the two, or "
+                f"correct its time."
+            )
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value read from a file is a finite number."""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and math.isfinite(value)
+
+
+def is_positive(value: Any) -> bool:
+    """Whether a value read from a file is a finite number above 0."""
+    return is_number(value) and value > 0
+
+
+def short(value: Any) -> str:
+    """A value read from a file, for messages."""
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -13,11 +13,11 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / 
 """The configuration files: inside an installed package, beside it in a checkout."""
 
 
-def compose_plain(name: str, overrides: Sequence[str], conf: Path = CONF) -> dict[str, Any]:
+def compose_plain(name: str | None, overrides: Sequence[str], conf: Path = CONF) -> dict[str, Any]:
     """A configuration with some settings changed, resolved to builtins.
 
     Args:
-        name: Its file in ``conf``, without ending.
+        name: Its file in ``conf``, without ending; None for nothing but what ``overrides`` add.
         overrides: ``key=value`` each.
         conf: The configuration folder.
 

@@ -36,6 +36,9 @@ from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
 
+CONSEQUENCES = {"scale": ("cut", "texels"), "astray": ("cut",)}
+"""Findings that say no more than another one does."""
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -141,7 +144,7 @@ def _recognised(folder: Path, changed: Sequence[str]) -> str:
     known: dict[type[SceneSettings], str] = {}
     with plugins(modules):
         for option in group_options("data", search):
-            node = compose_plain(f"data/{option}", [*_place(folder), *search])["data"]
+            node = compose_plain(None, [f"+data={option}", *_place(folder), *search])["data"]
             known.setdefault(type(build(node, SceneSettings, "data")), option)
     found = [option for cls, option in known.items() if cls.recognises(folder)]
     if len(found) == 1:
@@ -186,6 +189,8 @@ def inspect(choice: Choice) -> Capture:
     findings = [*camera_findings(scene, frame), *image_findings(scene, looks)]
     if frame is not None and texels is not None:
         findings += texel_findings(pixels_per_texel(train, frame, texels), train, texels)
+    follows = {kind for each in findings for kind in CONSEQUENCES.get(each.kind, ())}
+    findings = [each for each in findings if each.kind not in follows]
     return Capture(choice, scene, frame, problem, looks, tuple(findings), texels)
 
 
@@ -310,9 +315,7 @@ def facts(capture: Capture) -> dict[str, Any]:
     if frame is not None:
         away = (train.camera_to_world[:, :3, 3] - frame.centre).norm(dim=-1)
         content["cube"] = {
-            "centre": [
-                round(float(value) * frame.scale, 6) / frame.scale for value in frame.centre
-            ],
+            "centre": [_rounded(float(value), frame) for value in frame.centre],
             "side": 2 / frame.scale,
             "source": _cube_source(capture),
             "camera_distance": [float(away.min()), float(away.median()), float(away.max())],

@@ -203,6 +203,39 @@ def look_at(position: Tensor, target: Tensor | None = None) -> Tensor:
     return pose
 
 
+def upright(camera_to_world: Tensor) -> Tensor | None:
+    """A rotation of the world after which the cameras' mean up vector is its z axis.
+
+    Args:
+        camera_to_world: Poses of all cameras. [V, 4, 4]
+
+    Returns:
+        The rotation, in double precision, [3, 3]; None where the cameras agree on no up vector, as
+        where they look down on the scene from all headings.
+    """
+    up = camera_to_world[:, :3, 1].double().mean(dim=0)
+    length = up.norm()
+    if length < 0.1:
+        return None
+    x, y, z = (up / length).tolist()
+    if z < 0:
+        # Half a turn about x comes first: close to half a turn, the smallest rotation is ill-posed.
+        flip = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+        return _upward(x, -y, -z) @ flip
+    return _upward(x, y, z)
+
+
+def _upward(x: float, y: float, z: float) -> Tensor:
+    """The smallest rotation that takes a unit vector with z >= 0 to the z axis. [3, 3]"""
+    share = 1 / (1 + z)
+    rows = [
+        [1 - x * x * share, -x * y * share, -x],
+        [-x * y * share, 1 - y * y * share, -y],
+        [x, y, z],
+    ]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
 def camera_around(
     azimuth: float, elevation: float, distance: float, target: Tensor | None = None
 ) -> Tensor:

@@ -1,8 +1,9 @@
 """What every reader makes of its files: a list of posed, timed images; how these become views."""
 
+import json
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -11,13 +12,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xplanes.scenes.errors import SceneError
+from xplanes.scenes.cameras import upright
+from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.images import Size, final_sizes, native_sizes, read_images
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.views import Intrinsics, Views
 
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 RIGID_TOLERANCE = 1e-3
+
+SHAPE_TOLERANCE = 0.02
+"""By how much the aspect ratio of an image may differ from that of its camera."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +155,44 @@ class Listing:
         return self.subset(sorted(by_time[rank] for rank in ranks))
 
 
+def held_out(listing: Listing, every: int) -> dict[str, list[int]]:
+    """Places of the images to train on, and of those held out as val.
+
+    One image in ``every`` is held out, by time, then file name; not the first and the last.
+    """
+    times = listing.times.tolist()
+    order = sorted(range(len(listing)), key=lambda index: (times[index], listing.files[index]))
+    chosen = set(order[max(1, every // 2) : -1 : every])
+    return {
+        "train": [index for index in range(len(listing)) if index not in chosen],
+        "val": sorted(chosen),
+    }
+
+
+def picked(
+    parts: Mapping[str, Listing], splits: Sequence[str], source: Path, way_out: str
+) -> dict[str, Listing]:
+    """The splits asked for.
+
+    Args:
+        parts: Images by split name.
+        splits: Names of splits.
+        source: What the splits were made from, for messages.
+        way_out: What makes another split, for messages.
+
+    Raises:
+        MissingSplitError: If one has no images.
+    """
+    for split in splits:
+        if not parts.get(split):
+            names = ", ".join(name for name, part in parts.items() if part)
+            raise MissingSplitError(
+                f"{source} has no {split} split. Splits of this capture: {names or 'none'}. "
+                f"{way_out}"
+            )
+    return {split: parts[split] for split in splits}
+
+
 def thinned(
     listings: dict[str, Listing], views: int | None, eval_views: int | None, source: Path
 ) -> dict[str, Listing]:
@@ -201,6 +244,31 @@ def read_views(listing: Listing, resolution: int | None) -> Views:
     return Views(images, listing.camera_to_world, listing.times, intrinsics, listing.files)
 
 
+def require_shapes(listing: Listing) -> None:
+    """Refuse images that cannot be those that their cameras were calibrated for.
+
+    Args:
+        listing: Images whose calibrations tell width and height.
+
+    Raises:
+        SceneError: If an aspect ratio is another.
+    """
+    sizes = native_sizes(listing.paths)
+    for path, (height, width), camera in zip(
+        listing.paths, sizes, listing.calibrations, strict=True
+    ):
+        assert camera.w is not None
+        assert camera.h is not None
+        # Images that were made smaller have rounded sizes.
+        off = abs(width * camera.h - height * camera.w)
+        if off > max(1.5 * max(camera.w, camera.h), SHAPE_TOLERANCE * width * camera.h):
+            raise SceneError(
+                f"{path} has {width}x{height} pixels, but its camera was calibrated for images of "
+                f"{camera.w:g}x{camera.h:g}, of another aspect ratio. Perhaps the image was turned "
+                "or cut: take the one that the camera was calibrated with."
+            )
+
+
 def _intrinsics(listing: Listing, native: list[Size], sizes: list[Size]) -> Intrinsics:
     known = [
         calibration.scaled(file, size)
@@ -236,8 +304,7 @@ def _warn_of_empty(images: Tensor, listing: Listing) -> None:
     if empty:
         warnings.warn(
             f"{len(empty)} of {len(images)} images show nothing (alpha is 0 everywhere): "
-            f"{', '.join(empty[:5])}{', ...' if len(empty) > 5 else ''} in "
-            f"{listing.paths[0].parent}.",
+            f"{some(empty)} in {listing.paths[0].parent}.",
             stacklevel=4,
         )
 
@@ -275,6 +342,65 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         f"{label}: no image {folder / relative}, nor with {', '.join(SUFFIXES[1:])} added. "
         f"Add the file or take the frame out of the list."
     )
+
+
+def mask_files(
+    folder: Path, names: Sequence[Sequence[str]], key: str = "data.masks"
+) -> tuple[Path | None, ...]:
+    """The mask of each image; None for images without, of which a warning tells.
+
+    Args:
+        folder: Folder of masks.
+        names: Names that the mask of each image may have in it, in the order of preference. [V]
+        key: The setting that names the folder.
+
+    Raises:
+        SceneError: If no image has a mask.
+    """
+    masks = tuple(
+        next((path for name in each if (path := folder / name).is_file()), None) for each in names
+    )
+    bare = [each[0] for each, mask in zip(names, masks, strict=True) if mask is None]
+    if len(bare) == len(masks):
+        raise SceneError(
+            f"{key}: {folder} {'holds' if folder.is_dir() else 'does not exist, so there is'} no "
+            f"mask of any image, such as {bare[0]}. Put the masks there, or set {key}=null."
+        )
+    if bare:
+        warnings.warn(
+            f"{folder} has no mask of {len(bare)} of {len(masks)} images, which are shown whole: "
+            f"{some(bare)}.",
+            stacklevel=4,
+        )
+    return masks
+
+
+def unit_times(times: Sequence[float]) -> list[float]:
+    """Times in any unit, mapped to [0, 1]; all 0 where they are equal."""
+    # Integers stay as they are until the first was subtracted: clocks count nanoseconds.
+    first, last = min(times), max(times)
+    return [(time - first) / (last - first) if last > first else 0.0 for time in times]
+
+
+def read_object(path: Path, content: str) -> dict[str, Any]:
+    """A JSON object from a file.
+
+    Args:
+        path: The file.
+        content: What the object must have, for messages.
+
+    Raises:
+        SceneError: If it cannot be read, or is none.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as problem:
+        raise SceneError(
+            f"{path} cannot be read as JSON ({problem}). Export or download it again."
+        ) from problem
+    if not isinstance(found, dict):
+        raise SceneError(f"{path} must hold a JSON object with {content}, not {short(found)}.")
+    return found
 
 
 def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.ndarray:
@@ -319,6 +445,28 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
     return pose
 
 
+def oriented(poses: np.ndarray, points: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """A capture whose world is turned so that the cameras' mean up vector is its z axis.
+
+    It stays as it is, and a warning says so, where the cameras agree on no up vector.
+
+    Args:
+        poses: Cameras. float64 [V, 4, 4]
+        points: Points in the same world. float64 [N, 3]
+    """
+    rotation = upright(torch.from_numpy(poses))
+    if rotation is None:
+        warnings.warn(
+            "The up vectors of the cameras cancel out, so the world keeps the axes that the files "
+            "give it. data.orient=false says that it should.",
+            stacklevel=4,
+        )
+        return poses, points
+    turned, turn = poses.copy(), rotation.numpy()
+    turned[:, :3] = turn @ poses[:, :3]
+    return turned, None if points is None else points @ turn.T
+
+
 def refuse_repeats(
     labels: Sequence[str], paths: Sequence[Path], poses: np.ndarray, times: Sequence[float]
 ) -> None:
@@ -352,8 +500,13 @@ def refuse_repeats(
 
 def is_number(value: Any) -> bool:
     """Whether a value read from a file is a finite number."""
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number and math.isfinite(value)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        # JSON holds integers that no float can.
+        return False
 
 
 def is_positive(value: Any) -> bool:
@@ -365,3 +518,8 @@ def short(value: Any) -> str:
     """A value read from a file, for messages."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def some(names: Sequence[str]) -> str:
+    """The first of many names, for messages."""
+    return f"{', '.join(names[:5])}{', ...' if len(names) > 5 else ''}"

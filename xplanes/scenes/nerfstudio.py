@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from xplanes.scenes.errors import MissingSplitError, SceneError
-from xplanes.scenes.listing import Listing, image_path, read_views, short, thinned
+from xplanes.scenes.listing import Listing, held_out, image_path, read_views, short, thinned
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.transforms import listing_of, read_frames
 from xplanes.scenes.views import Scene
@@ -82,7 +82,7 @@ def read_capture(
                 "out."
             )
     listing = listing_of(path, content, any_unit=True)
-    parts = _listed_splits(path, content, listing) or _held_out(listing, eval_every)
+    parts = _listed_splits(path, content, listing) or held_out(listing, eval_every)
     chosen = {}
     for split in dict.fromkeys(splits):
         if not parts.get(split):
@@ -125,17 +125,6 @@ def _listed_splits(
                 )
             found.setdefault(split, []).append(places[image])
     return {split: sorted(set(chosen)) for split, chosen in found.items()}
-
-
-def _held_out(listing: Listing, every: int) -> dict[str, list[int]]:
-    """Places of the frames for training, and of those held out at even ranks."""
-    times = listing.times.tolist()
-    order = sorted(range(len(listing)), key=lambda index: (times[index], listing.files[index]))
-    held_out = set(order[max(1, every // 2) : -1 : every])
-    return {
-        "train": [index for index in range(len(listing)) if index not in held_out],
-        "val": sorted(held_out),
-    }
 
 
 def _no_split(

@@ -1,6 +1,5 @@
 """Files of cameras and times (transforms_train.json and its kin), read and checked."""
 
-import json
 import logging
 import math
 from collections.abc import Mapping
@@ -21,8 +20,10 @@ from xplanes.scenes.listing import (
     image_path,
     is_number,
     is_positive,
+    read_object,
     refuse_repeats,
     short,
+    unit_times,
 )
 
 logger = logging.getLogger(__name__)
@@ -93,7 +94,7 @@ def read_frames(path: Path) -> dict[str, Any]:
     Raises:
         SceneError: If it is not such a file.
     """
-    content = _read_json(path)
+    content = read_object(path, '"frames"')
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise SceneError(f'{path} lists no frames. Its key "frames" must hold at least one.')
@@ -106,18 +107,6 @@ def read_frames(path: Path) -> dict[str, Any]:
                     f'{path}: frame {index} has no "{key}". Every frame needs file_path and '
                     f"transform_matrix, and time in a dynamic scene."
                 )
-    return content
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as problem:
-        raise SceneError(
-            f"{path} cannot be read as JSON ({problem}). Export or download it again."
-        ) from problem
-    if not isinstance(content, dict):
-        raise SceneError(f'{path} must hold a JSON object with "frames", not {short(content)}.')
     return content
 
 
@@ -142,13 +131,12 @@ def _times(path: Path, named: list[tuple[str, dict[str, Any]]], any_unit: bool) 
                 f"{label}: {key} is {short(time)}; it must be a number {kind}"
                 f"{'' if any_unit else '. Divide frame numbers by the last one'}."
             )
-    # Integers stay as they are until the first was subtracted: clocks count nanoseconds.
     times = [frame[key] for _, frame in named]
     first, last = min(times), max(times)
     if not any_unit or (not stamped and first >= 0 and last <= 1):
         return [float(time) for time in times]
     logger.info("%s: %s from %s to %s is mapped to times from 0 to 1", path, key, first, last)
-    return [(time - first) / (last - first) if last > first else 0.0 for time in times]
+    return unit_times(times)
 
 
 def _calibration(

@@ -316,6 +316,8 @@ class Scene:
         video: Frames of a fixed camera, where the scene has one.
         background: What lies behind the scene in scores and pictures. [3]
         static_reason: Why the scene is known to be static; empty if it may move.
+        points: Points on surfaces, as structure from motion finds them, in the world; None where
+            there are none. float32 [N, 3]
     """
 
     name: str
@@ -323,6 +325,7 @@ class Scene:
     video: Views | None = None
     background: Tensor = field(default_factory=lambda: torch.ones(3))
     static_reason: str = ""
+    points: Tensor | None = None
 
 
 def camera_rays(

@@ -1,0 +1,492 @@
+"""The reader of COLMAP's captures.
+
+tests/data/colmap holds a model that pycolmap 4.2.1 wrote, and rays that it cast, one image for each
+camera model.
+"""
+
+import json
+import logging
+import math
+import shutil
+import struct
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.captures import HEIGHT, WIDTH, picture, poses, save, settings, write_colmap
+from tests.lens_oracle import direction
+from tests.refusals import assert_refused
+from xplanes.errors import ConfigError
+from xplanes.scenes.cameras import cast_rays
+from xplanes.scenes.colmap import ColmapSettings
+from xplanes.scenes.colmap_model import LENSES, read_model
+from xplanes.scenes.errors import MissingSplitError, SceneError
+from xplanes.scenes.lenses import COEFFICIENTS, Lenses
+
+PYCOLMAP = Path(__file__).parents[1] / "data" / "colmap"
+OPENCV = (36.0, 34.0, 20.5, 14.25, -0.11, 0.03, 0.004, -0.003)
+CAMERA = {1: ("OPENCV", WIDTH, HEIGHT, OPENCV)}
+POINTS = [[0.1, 0.2, 0.3], [-0.4, 0.5, 0.6]]
+
+
+class Capture:
+    """A capture of eight images that can be changed before it is read."""
+
+    def __init__(self, path, names=None):
+        self.path = path
+        self.names = names or [f"frame_{i:03d}.png" for i in range(8)]
+        self.poses = poses(len(self.names))
+        for index, name in enumerate(self.names):
+            save(path / "images" / name, picture(index))
+        self.write()
+
+    def write(self, cameras=CAMERA, camera=1, keep=None, text=False):
+        images = [
+            (name, pose, camera, index % 3)
+            for index, (name, pose) in enumerate(zip(self.names, self.poses, strict=True))
+            if keep is None or index in keep
+        ]
+        write_colmap(self.path / "sparse" / "0", cameras, images, POINTS, text=text)
+
+    def settings(self, **changes):
+        return settings(ColmapSettings, "colmap", self.path, **{"orient": False, **changes})
+
+    def read(self, *splits, **changes):
+        return self.settings(**changes).load(splits or ("train", "val"))
+
+    def views(self, **changes):
+        """All views as one split, in the order of their names."""
+        return self.read("train", eval_every=100, **changes).splits["train"]
+
+    def refused(self, words, **changes):
+        call = partial(self.read, "train", **changes)
+        return assert_refused(SceneError, words, call, (words, changes))
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return Capture(tmp_path / "room")
+
+
+# Models
+
+
+def rays(model, index, rows, columns):
+    """Rays of an image of a model, in double precision."""
+    camera = model.calibrations[index]
+    size = (int(camera.h), int(camera.w))
+    focal, centre, skew = camera.scaled(size, size)
+    row = torch.zeros(1, len(COEFFICIENTS), dtype=torch.float64)
+    row[0, : len(camera.distortion)] = torch.tensor(camera.distortion, dtype=torch.float64)
+    lens = Lenses(torch.tensor([int(camera.model)]), row, torch.tensor([skew]))
+    return cast_rays(
+        torch.from_numpy(model.camera_to_world[index]),
+        torch.tensor(rows, dtype=torch.float64),
+        torch.tensor(columns, dtype=torch.float64),
+        focal=focal,
+        centre=centre,
+        lenses=lens,
+    )
+
+
+def test_pycolmaps_rays_through_every_camera_model():
+    model = read_model(PYCOLMAP)
+    expected = json.loads((PYCOLMAP / "expected.json").read_text())
+    assert model.names == tuple(expected["images"])
+    assert {image["model"] for image in expected["images"].values()} == set(LENSES)
+    assert model.points is not None
+    assert np.abs(model.points - expected["points"]).max() == 0
+    for index, image in enumerate(expected["images"].values()):
+        rows, columns, *wanted = np.array(image["rays"]).T
+        origins, directions = rays(model, index, rows, columns)
+        assert np.abs(origins.numpy() - image["origin"]).max() < 1e-12, image["model"]
+        assert np.abs(directions.numpy() - np.stack(wanted, axis=1)).max() < 1e-8, image["model"]
+
+
+def test_models_written_by_pycolmap(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    whole = pycolmap.Reconstruction()
+    whole.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=OPENCV, camera_id=3)
+    )
+    turns = np.random.default_rng(1).normal(size=(4, 4))
+    for index, turn in enumerate(turns / np.linalg.norm(turns, axis=1, keepdims=True)):
+        image = pycolmap.Image(name=f"a {index}.png", camera_id=3, image_id=index + 1)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(np.ones(2))] * index)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.arange(3.0) + index)
+        whole.add_image_with_trivial_frame(image, pose)
+    whole.add_point3D(np.array([1.0, 2.0, 3.0]), pycolmap.Track())
+    for write in ("write_binary", "write_text"):
+        folder = tmp_path / write
+        folder.mkdir()
+        getattr(whole, write)(folder)
+        model = read_model(folder)
+        assert model.names == tuple(f"a {index}.png" for index in range(4))
+        for index, found in enumerate(model.camera_to_world):
+            world = np.linalg.inv(
+                np.vstack([whole.images[index + 1].cam_from_world().matrix(), [0, 0, 0, 1]])
+            )
+            assert np.abs(found - world @ np.diag([1, -1, -1, 1])).max() < 1e-12
+        assert model.points.tolist() == [[1, 2, 3]]
+
+
+def test_text_and_binary_models_are_the_same(tmp_path):
+    names = ["b c/ d.png", "a.png", "é.png"]
+    cameras = {4: CAMERA[1], 9: ("FOV", 20, 10, (9.0, 8.0, 7.0, 6.0, 0.5))}
+    images = [
+        (name, pose, 4 + 5 * (i % 2), i)
+        for i, (name, pose) in enumerate(zip(names, poses(3), strict=True))
+    ]
+    found = []
+    for text in (False, True):
+        write_colmap(tmp_path / str(text), cameras, images, POINTS, text=text)
+        found.append(read_model(tmp_path / str(text)))
+    for model in found:
+        assert model.names == ("a.png", "b c/ d.png", "é.png")
+        assert np.abs(model.camera_to_world - poses(3)[[1, 0, 2]]).max() < 1e-14
+        assert [camera.w for camera in model.calibrations] == [20, 40, 40]
+        assert model.points.tolist() == POINTS
+    assert found[0].calibrations == found[1].calibrations
+
+
+# Views
+
+
+def test_rays_pixels_and_points(capture):
+    views = capture.views()
+    assert views.files == tuple(f"images/{name}" for name in capture.names)
+    names = ("k1", "k2", "p1", "p2")
+    for index in (0, 5):
+        assert np.array_equal(views.image(index)[..., :3].numpy(), picture(index))
+        origins, directions = (ray.numpy() for ray in views.image_rays(index))
+        for row, column in ((0, 0), (29, 39), (12, 30)):
+            local = direction(
+                *("perspective", (column + 0.5, row + 0.5)),
+                *(dict(zip(names, OPENCV[4:], strict=True)), OPENCV[:2], OPENCV[2:4]),
+            )
+            expected = capture.poses[index][:3, :3] @ local
+            place = row * WIDTH + column
+            assert np.abs(directions[place] - expected).max() < 1e-5
+            assert np.abs(origins[place] - capture.poses[index][:3, 3]).max() < 1e-6
+    half = capture.views(resolution=WIDTH // 2)
+    assert half.images.shape[1:3] == (HEIGHT // 2, WIDTH // 2)
+    torch.testing.assert_close(half.intrinsics.focal, views.intrinsics.focal / 2)
+    torch.testing.assert_close(half.intrinsics.centre, views.intrinsics.centre / 2)
+    points = capture.read("train").points
+    assert points.tolist() == torch.tensor(POINTS).tolist()
+    (capture.path / "sparse/0/points3D.bin").unlink()
+    assert capture.read("train").points is None
+
+
+def test_the_world_is_turned_upright_as_a_whole(capture):
+    tilt = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    tilt *= np.linalg.det(tilt)
+    for turn in (tilt, np.diag([1.0, -1.0, -1.0]), np.eye(3)[[0, 2, 1]] * [1, 1, -1]):
+        capture.poses = poses(8)
+        capture.poses[:, :3] = turn @ capture.poses[:, :3]
+        capture.write()
+        scene = capture.read("train", orient=True, eval_every=100)
+        found = scene.splits["train"].camera_to_world.double().numpy()
+        up = found[:, :3, 1].mean(axis=0)
+        assert np.abs(up[:2]).max() < 1e-6
+        assert up[2] > 0.5
+        # Poses in one another's axes, and points in those of cameras, are the same.
+        before = np.linalg.inv(capture.poses[0]) @ capture.poses
+        assert np.abs(np.linalg.inv(found[0]) @ found - before).max() < 1e-5
+        points = np.hstack([scene.points.double().numpy(), np.ones((2, 1))])
+        places = np.linalg.inv(capture.poses[2]) @ np.hstack([POINTS, np.ones((2, 1))]).T
+        assert np.abs(np.linalg.inv(found[2]) @ points.T - places).max() < 1e-5
+    upright = poses(8)
+    capture.poses = upright
+    capture.write()
+    assert (
+        np.abs(
+            capture.views(orient=True).camera_to_world[:, :3, 1].numpy() - upright[:, :3, 1]
+        ).max()
+        < 0.2
+    )
+
+
+def test_cameras_that_agree_on_no_way_up(capture):
+    capture.poses = np.tile(np.eye(4), (8, 1, 1))
+    for index, pose in enumerate(capture.poses):
+        angle = index * math.pi / 4
+        pose[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+        pose[0, 3] = index
+    capture.write()
+    with pytest.warns(UserWarning, match="up vectors of the cameras cancel out"):
+        views = capture.views(orient=True)
+    assert np.abs(views.camera_to_world.numpy() - capture.poses).max() < 1e-6
+
+
+def test_masks_are_used_when_they_are_named(capture):
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, :10] = 0
+    for index, name in enumerate(capture.names[:-1]):
+        # COLMAP adds the suffix to the image's name; others keep the name, or change the suffix.
+        save(capture.path / "masks" / (name if index % 2 else f"{name}.png"), mask)
+    assert capture.views().image(0)[..., 3].min() == 255
+    with pytest.warns(UserWarning, match=r"no mask of 1 of 8 images.*frame_007\.png"):
+        views = capture.views(masks="masks")
+    for index in range(7):
+        assert not views.image(index)[:, :10].any()
+        assert np.array_equal(views.image(index)[:, 10:, :3], picture(index)[:, 10:])
+    assert views.image(7)[..., 3].min() == 255
+    capture.refused(
+        r"data\.masks: .*none does not exist.*frame_000\.png.*data\.masks=null", masks="none"
+    )
+    (capture.path / "none").mkdir()
+    capture.refused(r"none holds no mask of any image", masks="none")
+
+
+def test_where_the_model_is(capture):
+    for place in ("sparse", "colmap/sparse/0", "mine"):
+        other = capture.path.parent / place.replace("/", "_")
+        save(other / "images" / "frame_000.png", picture(0))
+        save(other / "images" / "frame_001.png", picture(1))
+        images = [(f"frame_00{i}.png", capture.poses[i], 1, 0) for i in range(2)]
+        write_colmap(other / place, CAMERA, images)
+        model = {"model": "mine"} if place == "mine" else {}
+        read = settings(ColmapSettings, "colmap", other, **model).load(["train"])
+        assert len(read.splits["train"]) == 2
+    capture.refused(r"no cameras\.bin or cameras\.txt in other\. Set data\.model", model="other")
+    capture.refused(r"does not exist\. Set data\.root", root="nowhere")
+    capture.refused(r"pictures is not a folder\. Set data\.images", images="pictures")
+
+
+def test_further_models_are_told_of(capture, caplog):
+    (capture.path / "sparse/1").mkdir()
+    capture.read("train")
+    assert "holds 2 models" in caplog.text
+
+
+def test_missing_and_unregistered_images(capture, caplog):
+    capture.write(keep=range(5))
+    capture.read("train")
+    assert "3 of 8 images in" in caplog.text
+    assert "frame_005.png, frame_006.png, frame_007.png" in caplog.text
+    (capture.path / "images/frame_002.png").unlink()
+    capture.refused(r"1 of 5 images that .*images\.bin lists are not in .*: frame_002\.png")
+
+
+def test_images_of_another_shape(capture):
+    save(capture.path / "images/frame_003.png", picture(3, WIDTH, HEIGHT))
+    capture.refused(r"frame_003\.png has 30x40 pixels.*calibrated for images of 40x30")
+    save(capture.path / "images/frame_003.png", picture(3, 15, 21))
+    assert capture.views(resolution=20).images.shape[2] == 20
+
+
+# Times
+
+
+def test_times_are_the_last_numbers_in_names(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    capture = Capture(tmp_path / "room", ["c2_010.png", "c1_020.png", "c1_060.png"])
+    assert capture.views().times.tolist() == pytest.approx([0.2, 1, 0])
+    assert "the numbers in their names, from 10 to 60" in caplog.text
+    assert capture.views(time_pattern=r"c(\d)").times.tolist() == [0, 0, 1]
+    capture.refused(
+        r"c1_020\.png has no number where data\.time_pattern=f\(", time_pattern=r"f(\d+)"
+    )
+    bare = Capture(tmp_path / "bare", ["a.png", "b.png"])
+    bare.refused(r"a\.png has no number\. Set data\.time_pattern.*data\.times.*data\.static=true")
+    assert bare.views(static=True).times.tolist() == [0, 0]
+    same = Capture(tmp_path / "same", ["a_1_4k.png", "a_2_4k.png"])
+    same.refused("names of all 2 images, such as a_1_4k.png, give the number 4")
+    assert same.views(time_pattern=r"_(\d+)_").times.tolist() == [0, 1]
+
+
+def test_times_from_a_table(capture):
+    table = capture.path / "times.csv"
+    # Nanoseconds of a clock are subtracted before they become floats.
+    lines = [f"{name},{1_600_000_000_000_000_000 + i * i}" for i, name in enumerate(capture.names)]
+    table.write_text("\ufefffile,time\n" + "\n".join([*lines, "unknown.png,3"]), encoding="utf-8")
+    found = capture.views(times="times.csv").times
+    assert found.tolist() == pytest.approx([i * i / 49 for i in range(8)])
+    for text, words in (
+        (
+            "file,time\n" + "\n".join(lines[:6]),
+            r"no time for 2 of 8 images: frame_006\.png, frame_0",
+        ),
+        ("name,time\na,1", r"times\.csv: line 2 has no file\. The first line"),
+        ("file,time\na.png", r"line 2 has no time"),
+        ("file,time\na.png,soon", r"line 2 gives a\.png the time 'soon'; it must be a number"),
+        ("file,time\na.png,nan", r"line 2 gives a\.png the time 'nan'; it must be a number"),
+        ("file,time\na.png,1\na.png,2", r"line 3 gives a\.png the time 2, an earlier one 1"),
+        ("", r"no time for 8 of 8 images"),
+    ):
+        table.write_text(text)
+        capture.refused(words, times="times.csv")
+    table.write_bytes(b"file,time\n\xff\xfe")
+    capture.refused(r"times\.csv cannot be read as CSV", times="times.csv")
+    capture.refused(r"data\.times=.*none\.csv cannot be read as CSV", times="none.csv")
+
+
+def test_times_by_rank_count_what_was_not_registered(tmp_path, caplog):
+    numbers = (2, 9, 10, 11, 100)
+    capture = Capture(tmp_path / "rig", [f"cam{c}/{c}_{i}.png" for c in (1, 2) for i in numbers])
+
+    def times():
+        views = capture.views(times="rank")
+        return dict(zip(views.files, views.times.tolist(), strict=True))
+
+    expected = {
+        f"images/cam{c}/{c}_{number}.png": rank / 4
+        for c in (1, 2)
+        for rank, number in enumerate(numbers)
+    }
+    assert times() == expected
+    capture.write(keep=[0, 2, 3, 4, 5, 6, 7, 8, 9])
+    expected.pop("images/cam1/1_9.png")
+    assert times() == expected
+    assert "folders hold" not in caplog.text
+    (capture.path / "images/cam1/1_9.png").unlink()
+    times()
+    assert "folders hold 4 to 5 images" in caplog.text
+
+
+def test_one_camera_and_time_twice(capture):
+    capture.poses[3] = capture.poses[2]
+    capture.write()
+    assert len(capture.views()) == 8
+    rows = [f"{name},{max(index, 3)}" for index, name in enumerate(capture.names)]
+    (capture.path / "times.csv").write_text("\n".join(["file,time", *rows]))
+    capture.refused("frame_003.png has the same camera and time as .*002", times="times.csv")
+
+
+# Splits
+
+
+def test_views_are_held_out_by_time_and_by_camera(tmp_path):
+    capture = Capture(tmp_path / "rig", [f"cam{c}/{i}.png" for c in (1, 2, 11) for i in range(9)])
+    splits = capture.read("train", "val", eval_every=4).splits
+    assert [len(splits[name]) for name in ("train", "val")] == [21, 6]
+    assert not set(splits["train"].files) & set(splits["val"].files)
+    assert {0.0, 1.0} <= set(splits["train"].times.tolist())
+    scene = capture.read("train", "val", "test", test_cameras=["cam1/"], views=5, eval_views=3)
+    assert {file[:11] for file in scene.splits["test"].files} == {"images/cam1"}
+    assert not any(
+        "cam1/" in file for name in ("train", "val") for file in scene.splits[name].files
+    )
+    assert [len(scene.splits[name]) for name in ("train", "val", "test")] == [5, 2, 3]
+    capture.refused(
+        r"data\.test_cameras=cam3: .*no such folder.*cam1, cam11, cam2", test_cameras=["cam3"]
+    )
+    with pytest.raises(
+        MissingSplitError, match=r"has no test split.*train, val.*data\.test_cameras"
+    ):
+        capture.read("test")
+    with pytest.raises(MissingSplitError, match="has no train split"):
+        capture.read("train", test_cameras=["cam1", "cam2", "cam11"])
+
+
+def test_captures_without_folders_have_no_cameras(capture):
+    capture.refused(r"has no folders, one for each camera", test_cameras=["cam3"])
+
+
+def test_settings_that_cannot_work(capture):
+    for words, changes in (
+        (r"time_pattern=\(: is no regular expression", {"time_pattern": "("}),
+        (r"must have one group.*it has 0", {"time_pattern": "frame"}),
+        (r"must have one group.*it has 2", {"time_pattern": r"(\d)(\d)"}),
+        (r"file names tell no times where times=rank", {"time_pattern": r"(\d)", "times": "rank"}),
+        ("eval_every=0", {"eval_every": 0}),
+    ):
+        assert_refused(ConfigError, words, partial(capture.settings, **changes), changes)
+
+
+# Damaged files
+
+
+def test_truncated_binary_files(tmp_path):
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        folder = tmp_path / name
+        shutil.copytree(PYCOLMAP, folder)
+        whole = (PYCOLMAP / name).read_bytes()
+        for length in [*range(0, len(whole), 11), len(whole) - 1]:
+            (folder / name).write_bytes(whole[:length])
+            assert_refused(
+                SceneError,
+                rf"{name} is truncated or damaged: its {length} bytes end within .*model_converter",
+                partial(read_model, folder),
+                length,
+            )
+        for count in (1, 2**62):
+            (folder / name).write_bytes(struct.pack("<Q", count) + whole[8:])
+            words = "bytes follow the 1" if count == 1 else f"of {count}"
+            message = assert_refused(SceneError, words, partial(read_model, folder), count)
+            assert str(folder / name) in message
+
+
+def test_damaged_text_files(tmp_path):
+    folder = tmp_path / "room"
+
+    def refused(file, change, words):
+        write_colmap(folder, CAMERA, [("a.png", poses(1)[0], 1, 2)], POINTS, text=True)
+        path = folder / file
+        path.write_text(change(path.read_text()))
+        message = assert_refused(SceneError, words, partial(read_model, folder), (file, words))
+        assert file in message
+
+    refused("cameras.txt", lambda t: "", "camera 1, which cameras.txt does not list")
+    refused("cameras.txt", lambda t: t.replace("0.03", "x"), "line 2 is .* must be CAMERA_ID MODEL")
+    refused("cameras.txt", lambda t: t.replace(" -0.003", ""), "has 7 parameters.*OPENCV.*has 8")
+    refused("cameras.txt", lambda t: t + "1 PINHOLE 9 9 1 1 1 1", "camera 1.*is listed twice")
+    refused("cameras.txt", lambda t: t.replace("OPENCV", "EUCM"), "camera model EUCM.*undistorter")
+    refused("cameras.txt", lambda t: t.replace("36.0", "-36.0"), "fx=-36.0; it must be .*above 0")
+    refused("cameras.txt", lambda t: t.replace("20.5", "nan"), "cx=nan; it must be a finite")
+    refused("cameras.txt", lambda t: t.replace(" 40 ", " 0 "), "width=0; it must be .*above 0")
+    refused("cameras.txt", lambda t: t.replace("0.004", "1e999"), "p1=inf; it must be a finite")
+    refused("images.txt", lambda t: "# nothing\n\n", "lists no images")
+    refused("images.txt", lambda t: t.replace(" a.png", ""), "must be IMAGE_ID QW QX")
+    refused("images.txt", lambda t: "\n".join(t.split("\n")[:3]), "sees.*but the file ends")
+    refused("images.txt", lambda t: t.replace(" 1.5", ""), "line 4 must hold the points that a.png")
+    refused("images.txt", lambda t: "\n".join(t.split("\n")[2:] * 2), "lists a.png twice")
+    refused("points3D.txt", lambda t: t.replace("0.5", "?"), "must be POINT3D_ID X Y Z")
+    refused("points3D.txt", lambda t: t.replace("-0.4", "nan"), "point 2 of 2 lies at .nan")
+    write_colmap(folder, CAMERA, [("a.png", poses(1)[0], 1, 2)], text=True)
+    (folder / "images.txt").write_bytes(b"\xff\xfe\x00")
+    assert_refused(SceneError, "cannot be read as text", partial(read_model, folder), "bytes")
+    (folder / "images.txt").unlink()
+    assert_refused(SceneError, "neither images.bin nor images", partial(read_model, folder), "none")
+
+
+def test_models_that_lie(capture):
+    whole = capture.poses
+    capture.write(camera=5)
+    capture.refused("frame_000.png was taken by camera 5, which cameras.bin does not list")
+    capture.write(cameras={1: (11, 4, 3, (1.0,) * 16)})
+    capture.refused(
+        r"cameras\.bin: camera 1 has the camera model number 11.*These are: SIMPLE_PINH"
+    )
+    capture.write(cameras={1: ("FOV", 40, 30, (9.0, 9.0, 1.0, 1.0, 4.0))})
+    capture.refused("omega=4.0; it must lie between 0 and pi")
+    for value in (math.nan, math.inf):
+        capture.poses = whole.copy()
+        capture.poses[4, 0, 3] = value
+        capture.write()
+        capture.refused(r"frame_004\.png: the pose is .*must be a unit quaternion")
+    capture.poses = whole
+    capture.poses[:, :3, 3] += 4e6
+    capture.write()
+    capture.refused("cameras lie up to 4e.06 world units .*single precision.*model_transformer")
+    path = capture.path / "sparse/0/images.bin"
+    data = bytearray(path.read_bytes())
+    data[12:20] = struct.pack("<d", 7.0)
+    path.write_bytes(data)
+    capture.refused(r"frame_000\.png: the pose is \[7\.0,.*must be a unit quaternion")
+
+
+def test_names_that_leave_the_folder(capture):
+    save(capture.path.parent / "secret.png", picture(0))
+    for name in ("../../secret.png", str(capture.path.parent / "secret.png")):
+        write_colmap(capture.path / "sparse/0", CAMERA, [(name, capture.poses[0], 1, 0)])
+        capture.refused(r"images\.bin: .*secret\.png: NAME (leaves the scene's|is absolute)")
+
+
+def test_lenses_that_fold_back_inside_images(capture):
+    capture.write(cameras={1: ("SIMPLE_RADIAL", WIDTH, HEIGHT, (20.0, 20.0, 15.0, -0.9))})
+    capture.refused(r"frame_000\.png: its perspective lens with k1=-0\.9 folds back")

@@ -1,0 +1,262 @@
+"""The reader of captures of Nerfies, HyperNeRF and DyCheck."""
+
+import json
+import shutil
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from tests.captures import HEIGHT, WIDTH, NerfiesFolder, picture, save, settings
+from tests.lens_oracle import direction
+from tests.refusals import assert_refused
+from xplanes.scenes.errors import MissingSplitError, SceneError
+from xplanes.scenes.nerfies import NerfiesSettings
+
+CENTRE, SCALE = np.array([0.5, -1, 2]), 0.25
+
+
+def read(capture, *splits, **changes):
+    made = settings(NerfiesSettings, "nerfies", capture.path, **{"orient": False, **changes})
+    return made.load(splits or ("train", "val"))
+
+
+def refused(capture, words, **changes):
+    return assert_refused(SceneError, words, partial(read, capture, **changes), (words, changes))
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return NerfiesFolder(tmp_path / "broom")
+
+
+def oracle(capture, index, row, column):
+    """Direction of a pixel of a full image, by the formulas of the format, in the world."""
+    lens = capture.lens
+    names = dict(
+        zip(
+            ("k1", "k2", "k3", "p1", "p2"),
+            (*lens["radial_distortion"], *lens["tangential"]),
+            strict=True,
+        )
+    )
+    focal = lens["focal_length"]
+    local = direction(
+        *("perspective", (column + 0.5, row + 0.5), names),
+        *((focal, focal * lens["pixel_aspect_ratio"]), lens["principal_point"], lens["skew"]),
+    )
+    return capture.poses[index][:3, :3] @ local
+
+
+def test_rays_pixels_times_and_cameras(capture):
+    scene = read(capture)
+    for name, first in (("train", 0), ("val", 1)):
+        views = scene.splits[name]
+        assert views.files == tuple(f"rgb/1x/00000{i}.png" for i in range(first, 6, 2))
+        assert views.times.tolist() == pytest.approx([i / 5 for i in range(first, 6, 2)])
+        for place, index in enumerate(range(first, 6, 2)):
+            assert np.array_equal(views.image(place)[..., :3].numpy(), picture(index))
+            origins, directions = (ray.numpy() for ray in views.image_rays(place))
+            position = (capture.poses[index][:3, 3] - CENTRE) * SCALE
+            assert np.abs(origins - position).max() < 1e-6
+            for row, column in ((0, 0), (29, 39), (12, 30)):
+                expected = oracle(capture, index, row, column)
+                assert np.abs(directions[row * WIDTH + column] - expected).max() < 1e-5
+
+
+def test_the_smallest_images_that_are_large_enough(capture):
+    for resolution, folder in ((None, "1x"), (40, "1x"), (21, "1x"), (20, "2x"), (10, "2x")):
+        views = read(capture, "train", resolution=resolution).splits["train"]
+        assert views.files[0] == f"rgb/{folder}/000000.png", resolution
+        assert views.width == (resolution or WIDTH)
+    full, half = (read(capture, "train", resolution=n).splits["train"] for n in (None, 20))
+    for name in ("focal", "centre"):
+        torch.testing.assert_close(
+            getattr(half.intrinsics, name), getattr(full.intrinsics, name) / 2
+        )
+    torch.testing.assert_close(half.intrinsics.lenses.skew, full.intrinsics.lenses.skew / 2)
+    # Rays through the corners of four pixels are those through the middle of one.
+    corners = full.image_rays(0)[1].view(HEIGHT, WIDTH, 3)
+    middle = corners.view(15, 2, 20, 2, 3).mean(dim=(1, 3))
+    found = half.image_rays(0)[1].view(15, 20, 3)
+    assert (middle / middle.norm(dim=-1, keepdim=True) - found).abs().max() < 2e-4
+    refused(capture, "41", resolution=41)
+    shutil.rmtree(capture.path / "rgb/1x")
+    refused(capture, "resolution", resolution=40)
+
+
+def test_the_world_is_turned_upright(capture):
+    np.save(capture.path / "points.npy", np.array([[1.0, 2.0, 3.0]]))
+    plain, turned = read(capture, "train"), read(capture, "train", orient=True)
+    assert plain.points.numpy() == pytest.approx((np.array([[1, 2, 3]]) - CENTRE) * SCALE)
+    before, after = (scene.splits["train"].camera_to_world for scene in (plain, turned))
+    torch.testing.assert_close(
+        before[0].inverse() @ before, after[0].inverse() @ after, atol=1e-5, rtol=0
+    )
+    seen = [
+        (scene.points[0] - poses[0, :3, 3]) @ poses[0, :3, :3]
+        for scene, poses in ((plain, before), (turned, after))
+    ]
+    torch.testing.assert_close(*seen, atol=1e-5, rtol=0)
+    whole = read(capture, "train", "val", orient=True).splits
+    up = torch.cat([whole[name].camera_to_world[:, :3, 1] for name in whole]).mean(dim=0)
+    assert up[:2].abs().max() < 1e-6
+
+
+def test_both_names_of_tangential_distortion(capture):
+    first = read(capture, "train").splits["train"].image_rays(0)[1]
+    for name in capture.ids:
+        shift = capture.lens["tangential"]
+        capture.change(f"camera/{name}.json", tangential=..., tangential_distortion=shift)
+    assert torch.equal(read(capture, "train").splits["train"].image_rays(0)[1], first)
+    for name in capture.ids:
+        capture.change(f"camera/{name}.json", tangential_distortion=...)
+    assert not torch.equal(read(capture, "train").splits["train"].image_rays(0)[1], first)
+
+
+def test_which_key_counts_time(capture):
+    def times():
+        return read(capture, "train").splits["train"].times.tolist()
+
+    warped = times()
+    for place, entry in enumerate(capture.metadata.values()):
+        entry["time_id"] = place**2
+    capture.write("metadata.json", capture.metadata)
+    assert times() == pytest.approx([0, 4 / 25, 16 / 25])
+    capture.metadata["000003"].pop("time_id")
+    capture.write("metadata.json", capture.metadata)
+    assert times() == warped
+    capture.metadata["000003"].pop("warp_id")
+    capture.write("metadata.json", capture.metadata)
+    assert times() == pytest.approx([0, 0.4, 0.8])
+    capture.metadata["000003"].pop("appearance_id")
+    capture.write("metadata.json", capture.metadata)
+    refused(capture, r"metadata\.json: 000003 has no warp_id.*data\.static=true")
+    assert read(capture, static=True).splits["train"].times.tolist() == [0, 0, 0]
+    (capture.path / "metadata.json").unlink()
+    refused(capture, r"metadata\.json cannot be read as JSON")
+    assert read(capture, static=True).splits["train"].times.tolist() == [0, 0, 0]
+
+
+def test_splits(capture):
+    ids = capture.ids
+    for kind, train, val in (("mono", ids[:3], ids[3:]), ("intl", ids[1:3], ids[:1])):
+        capture.write(f"splits/train_{kind}.json", {"frame_names": train})
+        capture.write(f"splits/val_{kind}.json", {"frame_names": val})
+        splits = read(capture, protocol=kind).splits
+        for name, names in (("train", train), ("val", val)):
+            assert splits[name].files == tuple(f"rgb/1x/{each}.png" for each in names)
+    refused(capture, r"data\.protocol=all: .*train_all\.json.*intl or mono", protocol="all")
+    assert len(read(capture, "train").splits["train"]) == 3
+    capture.write("splits/train.json", {"frame_names": ids[:4]})
+    capture.write("splits/val.json", {"frame_names": ids[4:]})
+    assert len(read(capture, "train").splits["train"]) == 4
+    shutil.rmtree(capture.path / "splits")
+    capture.change("dataset.json", train_ids=...)
+    assert read(capture).splits["train"].files[1] == "rgb/1x/000002.png"
+    capture.change("dataset.json", val_ids=[])
+    splits = read(capture, eval_every=3).splits
+    assert [len(splits[name]) for name in ("train", "val")] == [4, 2]
+    with pytest.raises(MissingSplitError, match=r"has no test split.*train, val"):
+        read(capture, "test")
+
+
+def test_masks_are_used_when_they_are_named(capture):
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, :10] = 0
+    for name in capture.ids:
+        save(capture.path / "masks" / "1x" / f"{name}.png", mask)
+    assert read(capture).splits["train"].image(0)[..., 3].min() == 255
+    image = read(capture, masks="masks").splits["val"].image(1)
+    assert not image[:, :10].any()
+    assert np.array_equal(image[:, 10:, :3], picture(3)[:, 10:])
+    refused(capture, r"data\.masks: .*other does not exist", masks="other")
+
+
+def test_captures_that_are_not_whole(capture):
+    (capture.path / "rgb/1x/000004.png").unlink()
+    refused(capture, r"1 of 6 files are not in .*rgb/1x: 000004")
+    assert len(read(capture, resolution=20).splits["train"]) == 3
+    (capture.path / "camera/000005.json").unlink()
+    refused(capture, r"1 of 6 files are not in .*camera: 000005 \(\.json\)")
+    shutil.rmtree(capture.path / "rgb")
+    (capture.path / "camera/000005.json").write_text(
+        (capture.path / "camera/000004.json").read_text()
+    )
+    refused(capture, r"rgb has no folder, such as 1x or 4x, with an image of 000000")
+    (capture.path / "dataset.json").unlink()
+    refused(capture, r"broom holds no dataset\.json\. Set data\.root")
+    refused(capture, r"nowhere/broom does not exist", root="nowhere")
+
+
+def test_cameras_that_cannot_be(capture):
+    whole = json.loads((capture.path / "camera/000002.json").read_text())
+    rows = np.array(whole["orientation"])
+    for change, words in (
+        (
+            {"orientation": (rows * [1, 1, -1]).tolist()},
+            "orientation mirrors .*right, down, forward",
+        ),
+        ({"orientation": (2 * rows).tolist()}, "rotation in orientation is not orthonormal"),
+        ({"orientation": rows[:2].tolist()}, "orientation is .*must be 3 rows"),
+        ({"orientation": [[1, 0, 0], [0, 1], [0, 0, 1]]}, r"row 1 of orientation is \[0, 1\]"),
+        ({"position": [0, None, 1]}, r"position is \[0, None, 1\]; it must be 3 numbers"),
+        ({"position": ...}, "position is None; it must be 3 numbers"),
+        ({"focal_length": 0}, "focal_length is 0; it must be a number above 0"),
+        ({"focal_length": ...}, "focal_length is None"),
+        ({"pixel_aspect_ratio": -1}, "pixel_aspect_ratio is -1; it must be a number above 0"),
+        ({"skew": "no"}, "skew is 'no'; it must be a number"),
+        ({"principal_point": [10**400, 1]}, "principal_point is .*; it must be 2 numbers"),
+        ({"image_size": [0, 30]}, "image_size is 0 x 30"),
+        ({"image_size": [30, 40]}, "calibrated for images of 30x40"),
+        ({"radial_distortion": [1, 2]}, r"radial_distortion is \[1, 2\]; it must be 3 numbers"),
+        ({"tangential": 1}, "tangential is 1; it must be 2 numbers"),
+        ({"radial_distortion": [-3, 0, 0]}, "folds back inside the image"),
+    ):
+        capture.change("camera/000002.json", **(whole | change))
+        message = refused(capture, words)
+        assert "000002" in message, words
+    for text in ("", "[1", "[1, 2]", '{"orientation": '):
+        capture.write("camera/000002.json", text)
+        refused(capture, r"000002\.json (cannot be read as JSON|must hold a JSON object)")
+
+
+def test_other_files_that_cannot_be(capture):
+    def wrong(file, words, **changes):
+        before = (capture.path / file).read_text()
+        capture.change(file, **changes)
+        assert file in refused(capture, words)
+        capture.write(file, before)
+
+    wrong("scene.json", "scale is 0; it must be a number above 0", scale=0)
+    wrong("scene.json", r"center is \[1, 2\]; it must be 3 numbers", center=[1, 2])
+    wrong("dataset.json", "train_ids is 'all'; it must be a list", train_ids="all")
+    wrong("dataset.json", "train_ids lists 000001 twice", train_ids=["000001"] * 2)
+    wrong("dataset.json", "1 images are to be trained on and to be scored", val_ids=["000000"])
+    wrong("dataset.json", "ids is None; it must be a list", ids=..., train_ids=..., val_ids=...)
+    wrong("metadata.json", "has no object for 000003", **{"000003": 7})
+    wrong("metadata.json", "warp_id of 000003 is 'x'; it must be", **{"000003": {"warp_id": "x"}})
+    save(capture.path.parent / "secret.png", picture(0))
+    capture.write("../secret.json", (capture.path / "camera/000000.json").read_text())
+    capture.change("dataset.json", train_ids=["../../secret"])
+    refused(capture, "ids leaves the scene's folder")
+
+
+def test_points_that_cannot_be(capture):
+    path = capture.path / "points.npy"
+    np.save(path, np.zeros((4, 3)))
+    whole = path.read_bytes()
+    for data, words in (
+        (whole[:-8], r"points\.npy cannot be read"),
+        (whole[:20], r"points\.npy cannot be read"),
+        (b"", r"points\.npy cannot be read"),
+        (whole.replace(b"(4, 3)", b"(3, 4)"), r"array \[3, 4\]; it must be .*\[N, 3\]"),
+        (whole.replace(b"(4, 3)", b"(9**9, 3)"), "points.npy cannot be read"),
+    ):
+        path.write_bytes(data)
+        refused(capture, words)
+    np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    refused(capture, r"points\.npy cannot be read")
+    np.save(path, np.full((2, 3), np.nan))
+    refused(capture, r"points\.npy holds an array \[2, 3\]; it must be finite")

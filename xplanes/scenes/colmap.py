@@ -1,0 +1,364 @@
+"""Captures that COLMAP has registered: a sparse model and its images."""
+
+import csv
+import logging
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+
+from xplanes.errors import ConfigError
+from xplanes.scenes.colmap_model import SparseModel, read_model
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.listing import (
+    Listing,
+    held_out,
+    image_path,
+    is_number,
+    mask_files,
+    oriented,
+    picked,
+    read_views,
+    refuse_repeats,
+    require_shapes,
+    short,
+    some,
+    thinned,
+    unit_times,
+)
+from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.views import Scene
+from xplanes.settings import Count
+
+logger = logging.getLogger(__name__)
+
+MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
+"""Where sparse models are looked for."""
+
+KINDS = (".png", ".jpg", ".jpeg")
+
+ROUNDING = 1e-4
+"""Largest rounding error of camera positions in single precision, as a share of their extent."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapSettings(SceneSettings):
+    """A capture that COLMAP has registered."""
+
+    model: str | None  # Folder of the model; null for sparse/0, sparse or colmap/sparse/0.
+    images: str  # Folder of the images that COLMAP was run on.
+    # Folder of masks: NAME.png for each image NAME, black where nothing is to be shown. Null for
+    # none: masks that hid moving things from COLMAP would hide them here, too.
+    masks: str | None
+    # Times of the images: a CSV file with the columns file and time, or rank, for the order in each
+    # camera's folder. Null for the numbers in the file names.
+    times: str | None
+    # Regular expression whose group is the number in a file name, such as frame_(\d+); null for the
+    # last number.
+    time_pattern: str | None
+    # Folders within that of the images whose images are the test split.
+    test_cameras: list[str]
+    # One image in so many is held out as val, by time, then file name; not the first and the last.
+    eval_every: Count
+    orient: bool  # Turn the world so that the cameras' mean up vector becomes its z axis.
+
+    def check(self) -> None:
+        if self.time_pattern is None:
+            return
+        if self.times is not None:
+            raise ConfigError(
+                f"time_pattern={self.time_pattern}: file names tell no times where "
+                f"times={self.times}; set one of both to null"
+            )
+        try:
+            groups = re.compile(self.time_pattern).groups
+        except re.error as problem:
+            raise ConfigError(
+                f"time_pattern={self.time_pattern}: is no regular expression ({problem}); write "
+                r"one such as frame_(\d+)"
+            ) from problem
+        if groups != 1:
+            raise ConfigError(
+                f"time_pattern={self.time_pattern}: must have one group in brackets, the number, "
+                rf"as in frame_(\d+); it has {groups}"
+            )
+
+    def load(self, splits: Sequence[str]) -> Scene:
+        model = read_model(_model_folder(self.folder, self.model))
+        listing, points = self._listing(model)
+        chosen = picked(
+            self._parts(listing),
+            splits,
+            model.source,
+            "Name the folders of some cameras in data.test_cameras, lower data.eval_every="
+            f"{self.eval_every}, or choose another data.eval_split.",
+        )
+        chosen = thinned(chosen, self.views, self.eval_views, self.folder)
+        return Scene(
+            self.folder.resolve().name,
+            {split: read_views(part, self.resolution) for split, part in chosen.items()},
+            points=points,
+        )
+
+    def _listing(self, model: SparseModel) -> tuple[Listing, torch.Tensor | None]:
+        """All images of the capture, and the model's points."""
+        images = self.folder / self.images
+        if not images.is_dir():
+            raise SceneError(
+                f"{images} is not a folder. Set data.images to the folder, relative to that of the "
+                "scene, that COLMAP was run on."
+            )
+        root = images.resolve()
+        _require_files(model, images)
+        labels = [f"{model.source}: {name}" for name in model.names]
+        paths = [
+            image_path(label, root, name, "NAME")
+            for label, name in zip(labels, model.names, strict=True)
+        ]
+        present = {
+            path.relative_to(root).as_posix()
+            for path in root.rglob("*")
+            if path.suffix.lower() in KINDS and path.is_file()
+        }
+        _warn_of_unregistered(sorted(present - set(model.names)), len(present), images)
+        times = self._times(model.names, labels, present)
+        poses, points = model.camera_to_world, model.points
+        if self.orient:
+            poses, points = oriented(poses, points)
+        _require_precision(model.source, poses[:, :3, 3])
+        refuse_repeats(labels, paths, poses, times)
+        folders = [_camera(name) for name in model.names]
+        listing = Listing(
+            paths=tuple(paths),
+            files=tuple((PurePosixPath(self.images) / name).as_posix() for name in model.names),
+            camera_to_world=torch.from_numpy(poses).float(),
+            times=torch.tensor(times or [0.0] * len(paths), dtype=torch.float32),
+            calibrations=model.calibrations,
+            timed=bool(times),
+            masks=() if self.masks is None else self._masks(model.names, self.masks),
+            cameras=tuple(folders) if any(folders) else (),
+        )
+        require_shapes(listing)
+        return listing, None if points is None else torch.from_numpy(points).float()
+
+    def _masks(self, names: Sequence[str], masks: str) -> tuple[Path | None, ...]:
+        kinds = [
+            (f"{name}.png", name, PurePosixPath(name).with_suffix(".png").as_posix())
+            for name in names
+        ]
+        return mask_files(self.folder / masks, kinds)
+
+    def _times(self, names: Sequence[str], labels: Sequence[str], present: set[str]) -> list[float]:
+        """Times from 0 to 1; none where the scene is said to be static."""
+        if self.static:
+            return []
+        if self.times is None:
+            found = _numbers(names, labels, self.time_pattern)
+            origin = "the numbers in their names"
+        elif self.times == "rank":
+            found = _ranks(names, present)
+            origin = "their order in their folders"
+        else:
+            path = self.folder / self.times
+            found = _listed_times(path, names)
+            origin = str(path)
+        logger.info(
+            "The times of %d images, from 0 to 1, are %s, from %s to %s",
+            *(len(names), origin, min(found), max(found)),
+        )
+        return unit_times(found)
+
+    def _parts(self, listing: Listing) -> dict[str, Listing]:
+        """The capture by splits."""
+        tested: set[int] = set()
+        for camera in self.test_cameras:
+            chosen = {
+                place
+                for place, name in enumerate(listing.cameras)
+                if f"{name}/".startswith(f"{camera.strip('/')}/")
+            }
+            if not chosen:
+                names = sorted(set(listing.cameras))
+                raise SceneError(
+                    f"data.test_cameras={camera}: {self.folder / self.images} has "
+                    + (
+                        f"no such folder. Folders with images: {some(names)}."
+                        if names
+                        else "no folders, one for each camera. Set data.test_cameras=[]."
+                    )
+                )
+            tested |= chosen
+        rest = listing.subset([place for place in range(len(listing)) if place not in tested])
+        parts = {name: rest.subset(part) for name, part in held_out(rest, self.eval_every).items()}
+        return parts | {"test": listing.subset(sorted(tested))}
+
+
+def _model_folder(folder: Path, name: str | None) -> Path:
+    """The folder of the sparse model."""
+    names = MODELS if name is None else (name,)
+    for each in names:
+        path = folder / each
+        if any((path / f"cameras.{end}").is_file() for end in ("bin", "txt")):
+            others = [
+                other.name
+                for other in path.parent.iterdir()
+                if other != path and other.name.isdigit() and other.is_dir()
+            ]
+            if name is None and path.name == "0" and others:
+                logger.warning(
+                    "%s holds %d models, because COLMAP could not join them all: %s is read. "
+                    "Choose another with data.model",
+                    *(path.parent, len(others) + 1, path),
+                )
+            return path
+    if not folder.is_dir():
+        raise SceneError(
+            f"The folder {folder.absolute()} does not exist. Set data.root and data.scene to a "
+            "folder that holds a COLMAP model and its images."
+        )
+    raise SceneError(
+        f"{folder} holds no COLMAP model: there is no cameras.bin or cameras.txt in "
+        f"{', '.join(names)}. Set data.model to the model's folder, relative to {folder}."
+    )
+
+
+def _camera(name: str) -> str:
+    """The folder of an image, which holds those of one camera; empty where there is none."""
+    folder = PurePosixPath(name).parent.as_posix()
+    return "" if folder == "." else folder
+
+
+def _require_files(model: SparseModel, images: Path) -> None:
+    missing = [name for name in model.names if not (images / name).is_file()]
+    if missing:
+        raise SceneError(
+            f"{len(missing)} of {len(model.names)} images that {model.source} lists are not in "
+            f"{images}: {some(missing)}. Put them there, or set data.images to the folder that "
+            "COLMAP was run on."
+        )
+
+
+def _warn_of_unregistered(names: Sequence[str], count: int, images: Path) -> None:
+    if names:
+        logger.warning(
+            "%d of %d images in %s are not used, because COLMAP did not register them: %s",
+            *(len(names), count, images, some(names)),
+        )
+
+
+def _number(text: str) -> float | None:
+    """A finite number, whole where it is written so."""
+    for kind in (int, float):
+        try:
+            number = kind(text)
+        except ValueError:
+            continue
+        return number if is_number(number) else None
+    return None
+
+
+def _numbers(names: Sequence[str], labels: Sequence[str], pattern: str | None) -> list[float]:
+    """The number in each name."""
+    found: list[float] = []
+    for name, label in zip(names, labels, strict=True):
+        if pattern is None:
+            text = (re.findall(r"\d+", PurePosixPath(name).stem) or [None])[-1]
+            wanted = "no number"
+        else:
+            match = re.search(pattern, name)
+            text = None if match is None else match[1]
+            wanted = f"no number where data.time_pattern={pattern} has its group"
+        number = None if text is None else _number(text)
+        if number is None:
+            raise SceneError(f"{label} has {wanted}. {_OTHER_TIMES}")
+        found.append(number)
+    if len(names) > 1 and len(set(found)) == 1:
+        raise SceneError(
+            f"The names of all {len(names)} images, such as {names[0]}, give the number {found[0]} "
+            f"for their time. {_OTHER_TIMES}"
+        )
+    return found
+
+
+_OTHER_TIMES = (
+    r"Set data.time_pattern to a regular expression for the names, such as frame_(\d+), data.times "
+    "to a CSV file with the columns file and time, or, for a static scene, data.static=true."
+)
+
+
+def _ranks(names: Sequence[str], present: set[str]) -> list[float]:
+    """The place of each image in its folder, images that COLMAP did not register included."""
+    folders: dict[str, list[str]] = defaultdict(list)
+    for name in present | set(names):
+        folders[_camera(name)].append(name)
+    places: dict[str, float] = {}
+    for inside in folders.values():
+        # frame_10 comes after frame_9.
+        inside.sort(key=_natural)
+        places |= {name: place for place, name in enumerate(inside)}
+    counts = {len(folders[_camera(name)]) for name in names}
+    if len(counts) > 1:
+        logger.warning(
+            "The cameras' folders hold %d to %d images. Those of one rank are taken to show one "
+            "time: if frames are missing, set data.times to a CSV file",
+            *(min(counts), max(counts)),
+        )
+    return [places[name] for name in names]
+
+
+def _natural(name: str) -> list[str | int]:
+    """A name as text and numbers in turns."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+
+
+def _listed_times(path: Path, names: Sequence[str]) -> list[float]:
+    """The time of each image from a CSV file."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as problem:
+        raise SceneError(
+            f"data.times={path} cannot be read as CSV ({problem}). Write one line for each image, "
+            "with the columns file and time, or set data.times=null."
+        ) from problem
+    known: dict[str, float] = {}
+    for line, row in enumerate(rows, start=2):
+        file, time = row.get("file"), row.get("time")
+        if file is None or time is None:
+            raise SceneError(
+                f"{path}: line {line} has no {'file' if file is None else 'time'}. The first line "
+                "must name the columns file and time; each further line must fill both."
+            )
+        number = _number(time)
+        if number is None:
+            raise SceneError(
+                f"{path}: line {line} gives {file} the time {short(time)}; it must be a number, in "
+                "any unit."
+            )
+        if known.setdefault(file, number) != number:
+            raise SceneError(
+                f"{path}: line {line} gives {file} the time {time}, an earlier one {known[file]}. "
+                "Remove one of them."
+            )
+    if bare := [name for name in names if name not in known]:
+        raise SceneError(
+            f"{path} has no time for {len(bare)} of {len(names)} images: {some(bare)}. Add a line "
+            "for each, with the name that COLMAP has for it."
+        )
+    return [known[name] for name in names]
+
+
+def _require_precision(source: Path, positions: np.ndarray) -> None:
+    """Refuse cameras so far from the world's origin that single precision moves them."""
+    extent = float(np.ptp(positions, axis=0).max())
+    largest = float(np.abs(positions).max())
+    if extent > 0 and largest * np.finfo(np.float32).eps > ROUNDING * extent:
+        raise SceneError(
+            f"{source}: the cameras lie up to {largest:.6g} world units from the origin, but only "
+            f"{extent:.3g} apart, which single precision cannot tell exactly. Move the model to "
+            "the origin first, as with colmap model_transformer."
+        )

@@ -1,0 +1,397 @@
+"""COLMAP's sparse models: cameras, images and points, from binary and text files.
+
+The files are read here, not by pycolmap: given a truncated file, that library hangs, takes all
+memory or returns wrong cameras, and no error of it names the file and the entry.
+"""
+
+import math
+import mmap
+import os
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.lenses import COEFFICIENTS, LensModel
+from xplanes.scenes.listing import Calibration, short
+
+LENSES: dict[str, tuple[int, LensModel, str]] = {
+    "SIMPLE_PINHOLE": (0, LensModel.PERSPECTIVE, "f cx cy"),
+    "PINHOLE": (1, LensModel.PERSPECTIVE, "fx fy cx cy"),
+    "SIMPLE_RADIAL": (2, LensModel.PERSPECTIVE, "f cx cy k1"),
+    "RADIAL": (3, LensModel.PERSPECTIVE, "f cx cy k1 k2"),
+    "OPENCV": (4, LensModel.PERSPECTIVE, "fx fy cx cy k1 k2 p1 p2"),
+    "OPENCV_FISHEYE": (5, LensModel.FISHEYE, "fx fy cx cy k1 k2 k3 k4"),
+    "FULL_OPENCV": (6, LensModel.PERSPECTIVE, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+    "FOV": (7, LensModel.FOV, "fx fy cx cy omega"),
+    "SIMPLE_RADIAL_FISHEYE": (8, LensModel.FISHEYE, "f cx cy k1"),
+    "RADIAL_FISHEYE": (9, LensModel.FISHEYE, "f cx cy k1 k2"),
+    "THIN_PRISM_FISHEYE": (10, LensModel.FISHEYE, "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s3"),
+    "SIMPLE_FISHEYE": (14, LensModel.FISHEYE, "f cx cy"),
+    "FISHEYE": (15, LensModel.FISHEYE, "fx fy cx cy"),
+}
+"""COLMAP's camera models: their numbers in binary files, and their parameters in order."""
+
+UNIT_TOLERANCE = 1e-2
+"""By how much the length of a quaternion may differ from 1."""
+
+CAMERA = struct.Struct("<IiQQ")
+IMAGE = struct.Struct("<I7dI")
+COUNT = struct.Struct("<Q")
+POINT = struct.Struct("<Q3d3BdQ")
+POINT_IN_IMAGE, TRACK_ENTRY = 24, 8
+"""Bytes of a point seen in an image, and of an image that sees a point."""
+
+Parsed = TypeVar("Parsed")
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """What COLMAP found out about the images that it registered, in the order of their names.
+
+    Attributes:
+        source: The file that lists the images.
+        names: Image files, relative to the folder that COLMAP was run on. [V]
+        camera_to_world: Poses with OpenGL's axes, in COLMAP's world. float64 [V, 4, 4]
+        calibrations: Cameras and lenses. [V]
+        points: Triangulated points; None where there is no file of them. float64 [N, 3]
+    """
+
+    source: Path
+    names: tuple[str, ...]
+    camera_to_world: np.ndarray
+    calibrations: tuple[Calibration, ...]
+    points: np.ndarray | None
+
+
+def read_model(folder: Path) -> SparseModel:
+    """Read and check a sparse model, from binary files where there are both kinds.
+
+    Args:
+        folder: Folder of cameras, images and points3D, each .bin or .txt.
+
+    Raises:
+        SceneError: If a file is missing, damaged, or tells of a lens that is not read.
+    """
+    cameras_path, images_path = _part(folder, "cameras"), _part(folder, "images")
+    cameras = (_binary_cameras if cameras_path.suffix == ".bin" else _text_cameras)(cameras_path)
+    images = (_binary_images if images_path.suffix == ".bin" else _text_images)(images_path)
+    if not images:
+        raise SceneError(
+            f"{images_path} lists no images: COLMAP has registered none. Run its mapper again, or "
+            "choose another model with data.model."
+        )
+    images.sort(key=lambda image: image[0])
+    for (name, *_), (after, *_) in pairwise(images):
+        if name == after:
+            raise SceneError(f"{images_path} lists {name} twice. Remove one of the two.")
+    for name, _, camera in images:
+        if camera not in cameras:
+            raise SceneError(
+                f"{images_path}: {name} was taken by camera {camera}, which {cameras_path.name} "
+                f"does not list. Both files must be of one model: copy or export them again."
+            )
+    names, poses, numbers = zip(*images, strict=True)
+    points_path = next(
+        (path for end in ("bin", "txt") if (path := folder / f"points3D.{end}").is_file()), None
+    )
+    points = None
+    if points_path is not None:
+        binary = points_path.suffix == ".bin"
+        points = (_binary_points if binary else _text_points)(points_path)
+    return SparseModel(
+        images_path,
+        names,
+        np.stack(poses),
+        tuple(cameras[camera] for camera in numbers),
+        points,
+    )
+
+
+def _part(folder: Path, name: str) -> Path:
+    for end in ("bin", "txt"):
+        if (path := folder / f"{name}.{end}").is_file():
+            return path
+    raise SceneError(
+        f"{folder} holds neither {name}.bin nor {name}.txt. Export the model again, or set "
+        "data.model to the folder that holds it, relative to the scene's folder."
+    )
+
+
+class _Binary:
+    """A binary file, read from its front."""
+
+    def __init__(self, path: Path, data: bytes | mmap.mmap) -> None:
+        self.path, self.data, self.at = path, data, 0
+
+    def take(self, kind: struct.Struct, what: str) -> tuple:
+        """The next values, which are those of ``what``."""
+        start = self.at
+        self.skip(kind.size, what)
+        return kind.unpack_from(self.data, start)
+
+    def text(self, what: str) -> str:
+        """The next text, up to a byte of 0."""
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            raise self._truncated(what)
+        start, self.at = self.at, end + 1
+        return os.fsdecode(self.data[start:end])
+
+    def skip(self, count: int, what: str) -> None:
+        """Pass over bytes of ``what``."""
+        if count > len(self.data) - self.at:
+            raise self._truncated(what)
+        self.at += count
+
+    def entries(self, kind: str) -> Iterator[str]:
+        """Labels of as many entries as the file says that it holds; all of it must be read then."""
+        (count,) = self.take(COUNT, f"the number of {kind}s")
+        for index in range(count):
+            yield f"{kind} {index + 1} of {count}"
+        if self.at < len(self.data):
+            raise SceneError(
+                f"{self.path} is damaged: {len(self.data) - self.at} bytes follow the {count} "
+                f"{kind}s that it says it holds. {_AGAIN}"
+            )
+
+    def _truncated(self, what: str) -> SceneError:
+        return SceneError(
+            f"{self.path} is truncated or damaged: its {len(self.data)} bytes end within {what}. "
+            f"{_AGAIN}"
+        )
+
+
+_AGAIN = "Copy it again, or export the model again with colmap model_converter."
+
+
+def _read_binary(path: Path, parse: Callable[[_Binary], Parsed]) -> Parsed:
+    try:
+        with path.open("rb") as file:
+            if not os.fstat(file.fileno()).st_size:
+                return parse(_Binary(path, b""))
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                return parse(_Binary(path, data))
+    except OSError as problem:
+        raise SceneError(f"{path} cannot be read ({problem}).") from problem
+
+
+def _binary_cameras(path: Path) -> dict[int, Calibration]:
+    lenses = {number: (name, kind) for name, (number, _, kind) in LENSES.items()}
+
+    def parse(file: _Binary) -> dict[int, Calibration]:
+        cameras: dict[int, Calibration] = {}
+        for what in file.entries("camera"):
+            camera, number, width, height = file.take(CAMERA, what)
+            label = f"{path}: camera {camera}"
+            if number not in lenses:
+                raise _other_lens(label, f"number {number}")
+            name, kind = lenses[number]
+            values = file.take(struct.Struct(f"<{len(kind.split())}d"), what)
+            _add_camera(cameras, label, camera, _calibration(label, name, width, height, values))
+        return cameras
+
+    return _read_binary(path, parse)
+
+
+def _binary_images(path: Path) -> list[tuple[str, np.ndarray, int]]:
+    def parse(file: _Binary) -> list[tuple[str, np.ndarray, int]]:
+        images = []
+        for what in file.entries("image"):
+            _, *motion, camera = file.take(IMAGE, what)
+            name = file.text(what)
+            (count,) = file.take(COUNT, what)
+            file.skip(POINT_IN_IMAGE * count, f"{what} ({name})")
+            images.append((name, _pose(f"{path}: {name}", motion), camera))
+        return images
+
+    return _read_binary(path, parse)
+
+
+def _binary_points(path: Path) -> np.ndarray:
+    def parse(file: _Binary) -> np.ndarray:
+        points = []
+        for what in file.entries("point"):
+            _, x, y, z, *_, seen_by = file.take(POINT, what)
+            file.skip(TRACK_ENTRY * seen_by, what)
+            points.append((x, y, z))
+        return _positions(path, points)
+
+    return _read_binary(path, parse)
+
+
+def _text_lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Lines that are no comments, each with its label."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as problem:
+        raise SceneError(f"{path} cannot be read as text ({problem}). {_AGAIN}") from problem
+    for number, line in enumerate(text.split("\n"), start=1):
+        if not line.startswith("#"):
+            yield f"{path}: line {number}", line.strip()
+
+
+def _parsed(
+    label: str, line: str, kind: str, parse: Callable[[list[str]], Parsed], most: int = -1
+) -> Parsed:
+    """What ``parse`` makes of a line's words, of which the last holds all after ``most``."""
+    try:
+        return parse(line.split(maxsplit=most))
+    except (ValueError, IndexError, OverflowError) as problem:
+        raise SceneError(
+            f"{label} is {short(line)}, but must be {kind}. The file is truncated or damaged: "
+            "export the model again."
+        ) from problem
+
+
+def _text_cameras(path: Path) -> dict[int, Calibration]:
+    def parse(words: list[str]) -> tuple[int, str, int, int, list[float]]:
+        camera, model, width, height, *values = words
+        return int(camera), model, int(width), int(height), [float(value) for value in values]
+
+    cameras: dict[int, Calibration] = {}
+    for label, line in _text_lines(path):
+        if not line:
+            continue
+        camera, model, width, height, values = _parsed(
+            label, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", parse
+        )
+        label = f"{label} (camera {camera})"
+        if model not in LENSES:
+            raise _other_lens(label, model)
+        _add_camera(cameras, label, camera, _calibration(label, model, width, height, values))
+    return cameras
+
+
+def _text_images(path: Path) -> list[tuple[str, np.ndarray, int]]:
+    def parse(words: list[str]) -> tuple[list[float], int, str]:
+        return [float(word) for word in words[1:8]], int(words[8]), words[9]
+
+    images = []
+    lines = _text_lines(path)
+    for label, line in lines:
+        if not line:
+            continue
+        # Names may contain spaces.
+        motion, camera, name = _parsed(
+            label, line, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", parse, most=9
+        )
+        # A second line, empty where no points are seen, holds three values for each point.
+        below, points = next(lines, (label, None))
+        if points is None or len(points.split()) % 3:
+            raise SceneError(
+                f"{below} must hold the points that {name} sees, three values for each, or be "
+                f"empty, but {'the file ends' if points is None else f'is {short(points)}'}. The "
+                "file is truncated or damaged: export the model again."
+            )
+        images.append((name, _pose(f"{label} ({name})", motion), camera))
+    return images
+
+
+def _text_points(path: Path) -> np.ndarray:
+    def parse(words: list[str]) -> tuple[float, float, float]:
+        return float(words[1]), float(words[2]), float(words[3])
+
+    points = [
+        _parsed(label, line, "POINT3D_ID X Y Z ...", parse, most=4)
+        for label, line in _text_lines(path)
+        if line
+    ]
+    return _positions(path, points)
+
+
+def _positions(path: Path, points: list[tuple[float, float, float]]) -> np.ndarray:
+    positions = np.array(points, dtype=np.float64).reshape(-1, 3)
+    bad = ~np.isfinite(positions).all(axis=1)
+    if bad.any():
+        raise SceneError(
+            f"{path}: point {int(bad.argmax()) + 1} of {len(points)} lies at "
+            f"{positions[bad][0].tolist()}. Remove it, or export the model again."
+        )
+    return positions
+
+
+def _add_camera(
+    cameras: dict[int, Calibration], label: str, number: int, calibration: Calibration
+) -> None:
+    if number in cameras:
+        raise SceneError(f"{label} is listed twice. Remove one of the two.")
+    cameras[number] = calibration
+
+
+def _calibration(
+    label: str, model: str, width: int, height: int, values: Sequence[float]
+) -> Calibration:
+    """The lens that COLMAP's parameters stand for."""
+    _, lens, kind = LENSES[model]
+    names = kind.split()
+    if len(values) != len(names):
+        raise SceneError(
+            f"{label} has {len(values)} parameters, but a {model} camera has {len(names)}: {kind}. "
+            "Export the model again."
+        )
+    known = dict(zip(names, values, strict=True))
+    sizes = {"width": width, "height": height} | {
+        key: known[key] for key in ("f", "fx", "fy") if key in known
+    }
+    for key, value in {**known, **sizes}.items():
+        if not math.isfinite(value) or (key in sizes and value <= 0):
+            raise SceneError(
+                f"{label} has {key}={value}; it must be a finite number"
+                f"{' above 0' if key in sizes else ''}. Export the model again, or calibrate again."
+            )
+    distortion = tuple(known.get(name, 0.0) for name in COEFFICIENTS)
+    if lens == LensModel.FOV:
+        distortion = (known["omega"],)
+        if not 0 <= known["omega"] < math.pi:
+            raise SceneError(
+                f"{label} has omega={known['omega']}; it must lie between 0 and pi radians. "
+                "Calibrate again, or with another camera model."
+            )
+    return Calibration(
+        fl_x=known.get("f", known.get("fx")),
+        fl_y=known.get("f", known.get("fy")),
+        cx=known["cx"],
+        cy=known["cy"],
+        w=width,
+        h=height,
+        model=lens,
+        distortion=distortion if any(distortion) else (),
+    )
+
+
+def _other_lens(label: str, model: str) -> SceneError:
+    return SceneError(
+        f"{label} has the camera model {model}, which is not read. These are: "
+        f"{', '.join(LENSES)}. Undistort the images with colmap image_undistorter, or calibrate "
+        "with one of these."
+    )
+
+
+def _pose(label: str, motion: Sequence[float]) -> np.ndarray:
+    """A camera-to-world matrix from a world-to-camera quaternion, real part first, and shift."""
+    values = np.array(motion, dtype=np.float64)
+    length = np.linalg.norm(values[:4])
+    if not np.isfinite(values).all() or abs(length - 1) > UNIT_TOLERANCE:
+        raise SceneError(
+            f"{label}: the pose is {values.tolist()}; it must be a unit quaternion QW QX QY QZ and "
+            "a finite translation TX TY TZ. The file is damaged: export the model again."
+        )
+    w, x, y, z = values[:4] / length
+    world_to_camera = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    pose = np.eye(4)
+    # COLMAP's cameras have y down and look along +z.
+    pose[:3, :3] = world_to_camera.T * [1, -1, -1]
+    pose[:3, 3] = -world_to_camera.T @ values[4:]
+    return pose

@@ -1,0 +1,358 @@
+"""Captures in the format of Nerfies, HyperNeRF and DyCheck: a camera file for each image."""
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.images import native_sizes
+from xplanes.scenes.listing import (
+    Calibration,
+    Listing,
+    checked_pose,
+    held_out,
+    image_path,
+    is_number,
+    is_positive,
+    mask_files,
+    oriented,
+    picked,
+    read_object,
+    read_views,
+    refuse_repeats,
+    require_shapes,
+    short,
+    some,
+    thinned,
+    unit_times,
+)
+from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.views import Scene
+from xplanes.settings import Count
+
+logger = logging.getLogger(__name__)
+
+TIMES = ("time_id", "warp_id", "appearance_id")
+"""Keys of metadata.json that count timesteps; the first that all images have is taken."""
+
+IMAGES = (".png", ".jpg", ".jpeg")
+
+DOWNLOAD = "Download or unpack the capture again."
+
+
+@dataclass(frozen=True, kw_only=True)
+class NerfiesSettings(SceneSettings):
+    """A capture in the format of Nerfies, HyperNeRF or DyCheck."""
+
+    # DyCheck's splits of this name, such as mono or intl. Null for those in splits/train.json,
+    # where there is one, or dataset.json.
+    protocol: str | None
+    # Folder of masks, with the folders and names of rgb, black where nothing is to be shown; null
+    # for none. DyCheck's co-visibility masks say what views share, not what is there.
+    masks: str | None
+    # One image in so many is held out as val, by time, then name, where the capture lists none.
+    eval_every: Count
+    orient: bool  # Turn the world so that the cameras' mean up vector becomes its z axis.
+
+    def load(self, splits: Sequence[str]) -> Scene:
+        folder = self.folder
+        if not (folder / "dataset.json").is_file():
+            raise _no_capture(folder)
+        chosen, source = _splits(folder, self.protocol)
+        names = list(dict.fromkeys(name for part in chosen.values() for name in part))
+        listing, points = self._listing(names)
+        places = {name: place for place, name in enumerate(names)}
+        if chosen.get("val"):
+            found = {split: [places[name] for name in part] for split, part in chosen.items()}
+        else:
+            found = held_out(listing, self.eval_every)
+        parts = picked(
+            {split: listing.subset(part) for split, part in found.items()},
+            splits,
+            source,
+            "Leave data.eval_split out, or set it to val.",
+        )
+        parts = thinned(parts, self.views, self.eval_views, folder)
+        return Scene(
+            folder.resolve().name,
+            {split: read_views(part, self.resolution) for split, part in parts.items()},
+            points=points,
+        )
+
+    def _listing(self, names: Sequence[str]) -> tuple[Listing, torch.Tensor | None]:
+        """The images of these names, and the points of the capture."""
+        folder = self.folder
+        root = folder.resolve()
+        scale, centre = _scene(folder / "scene.json")
+        _require_files(folder / "camera", names, (".json",))
+        cameras = [
+            _camera(image_path(str(folder / "dataset.json"), root, f"camera/{name}.json", "ids"))
+            for name in names
+        ]
+        poses = np.stack([pose for pose, _ in cameras])
+        poses[:, :3, 3] = (poses[:, :3, 3] - centre) * scale
+        points = _points(folder / "points.npy")
+        if points is not None:
+            points = (points - centre) * scale
+        if self.orient:
+            poses, points = oriented(poses, points)
+        pictures = _picture_folder(folder, names, self.resolution)
+        labels = [f"{folder / 'dataset.json'}: {name}" for name in names]
+        paths = [
+            image_path(label, root, f"rgb/{pictures}/{name}", "ids")
+            for label, name in zip(labels, names, strict=True)
+        ]
+        times, takers = self._metadata(names)
+        refuse_repeats(labels, paths, poses, times)
+        masks = ()
+        if self.masks is not None:
+            kinds = [(f"{pictures}/{name}.png", f"{name}.png") for name in names]
+            masks = mask_files(folder / self.masks, kinds)
+        listing = Listing(
+            paths=tuple(paths),
+            files=tuple(path.relative_to(root).as_posix() for path in paths),
+            camera_to_world=torch.from_numpy(poses).float(),
+            times=torch.tensor(times or [0.0] * len(paths), dtype=torch.float32),
+            calibrations=tuple(calibration for _, calibration in cameras),
+            timed=bool(times),
+            masks=masks,
+            cameras=takers,
+        )
+        require_shapes(listing)
+        return listing, None if points is None else torch.from_numpy(points).float()
+
+    def _metadata(self, names: Sequence[str]) -> tuple[list[float], tuple[str, ...]]:
+        """Times from 0 to 1, none where the scene is said to be static, and names of cameras."""
+        path = self.folder / "metadata.json"
+        if self.static and not path.is_file():
+            return [], ()
+        content = read_object(path, "the timestep of each image")
+        entries = []
+        for name in names:
+            entry = content.get(name)
+            if not isinstance(entry, dict):
+                raise SceneError(
+                    f'{path} has no object for {name}. Add one such as {{"warp_id": 0, '
+                    '"camera_id": 0}, or take the name out of dataset.json.'
+                )
+            entries.append(entry)
+        taken = [str(entry["camera_id"]) for entry in entries if "camera_id" in entry]
+        cameras = tuple(taken) if len(taken) == len(names) else ()
+        if self.static:
+            return [], cameras
+        key = next((key for key in TIMES if all(key in entry for entry in entries)), None)
+        if key is None:
+            bare = next(
+                name for name, entry in zip(names, entries, strict=True) if TIMES[1] not in entry
+            )
+            raise SceneError(
+                f"{path}: {bare} has no warp_id, and not all images have one of "
+                f"{', '.join(TIMES)}. Add the number of the timestep to each image, or set "
+                "data.static=true."
+            )
+        for name, entry in zip(names, entries, strict=True):
+            if not is_number(entry[key]):
+                raise SceneError(
+                    f"{path}: {key} of {name} is {short(entry[key])}; it must be a number."
+                )
+        times = [entry[key] for entry in entries]
+        logger.info(
+            "%s: %s from %s to %s is mapped to times from 0 to 1",
+            *(path, key, min(times), max(times)),
+        )
+        return unit_times(times), cameras
+
+
+def _no_capture(folder: Path) -> SceneError:
+    there = "holds no dataset.json" if folder.is_dir() else "does not exist"
+    return SceneError(
+        f"The folder {folder.absolute()} {there}. Set data.root and data.scene to a folder with "
+        "dataset.json, metadata.json, scene.json, camera/ and rgb/."
+    )
+
+
+def _splits(folder: Path, protocol: str | None) -> tuple[dict[str, list[str]], Path]:
+    """Names of the images to train on and of those to score, and the file that lists them.
+
+    Where none are listed to score, all images are to train on.
+    """
+    ending = "" if protocol is None else f"_{protocol}"
+    path = folder / "splits" / f"train{ending}.json"
+    found: dict[str, list[str]] = {}
+    if protocol is not None and not path.is_file():
+        names = sorted(
+            other.stem.removeprefix("train_") for other in path.parent.glob("train_*.json")
+        )
+        raise SceneError(
+            f"data.protocol={protocol}: {path} does not exist. "
+            + (f"Set it to {' or '.join(names)}." if names else "Set it to null.")
+        )
+    if path.is_file():
+        for split in ("train", "val"):
+            listed = path.with_name(f"{split}{ending}.json")
+            if listed.is_file():
+                content = read_object(listed, '"frame_names"')
+                found[split] = _names(listed, content, "frame_names")
+    else:
+        path = folder / "dataset.json"
+        content = read_object(path, '"ids"')
+        for split in ("train", "val"):
+            if content.get(f"{split}_ids"):
+                found[split] = _names(path, content, f"{split}_ids")
+        if "train" not in found:
+            scored = set(found.get("val", ()))
+            names = [name for name in _names(path, content, "ids") if name not in scored]
+            found = {"train": names} | found
+    shared = sorted(set(found["train"]) & set(found.get("val", ())))
+    if shared:
+        raise SceneError(
+            f"{path}: {len(shared)} images are to be trained on and to be scored: {some(shared)}. "
+            "Take them out of one of the two lists."
+        )
+    return found, path
+
+
+def _names(path: Path, content: Mapping[str, Any], key: str) -> list[str]:
+    names = content.get(key)
+    good = isinstance(names, list) and names and all(isinstance(name, str | int) for name in names)
+    if not good:
+        raise SceneError(
+            f"{path}: {key} is {short(names)}; it must be a list of one or more names of images."
+        )
+    assert isinstance(names, list)
+    texts = [str(name) for name in names]
+    if len(set(texts)) < len(texts):
+        twice = next(name for name in texts if texts.count(name) > 1)
+        raise SceneError(f"{path}: {key} lists {twice} twice. Remove one of the two.")
+    return texts
+
+
+def _scene(path: Path) -> tuple[float, np.ndarray]:
+    """How positions become those of the scene: ``(position - centre) * scale``."""
+    content = read_object(path, "scale and center")
+    scale = content.get("scale")
+    if not is_positive(scale):
+        raise SceneError(f"{path}: scale is {short(scale)}; it must be a number above 0.")
+    return float(content["scale"]), _numbers(path, content, "center", 3)
+
+
+def _numbers(path: Path, content: Mapping[str, Any], key: str, count: int) -> np.ndarray:
+    """A list of finite numbers. float64 [count]"""
+    values = content.get(key)
+    if (
+        not isinstance(values, list)
+        or len(values) != count
+        or not all(is_number(value) for value in values)
+    ):
+        raise SceneError(
+            f"{path}: {key} is {short(values)}; it must be {count} numbers. {DOWNLOAD}"
+        )
+    return np.array(values, dtype=np.float64)
+
+
+def _camera(path: Path) -> tuple[np.ndarray, Calibration]:
+    """The pose of a camera file, before it is centred and scaled, and its lens."""
+    content = read_object(path, "orientation, position and focal_length")
+    rows = content.get("orientation")
+    if not isinstance(rows, list) or len(rows) != 3:
+        raise SceneError(f"{path}: orientation is {short(rows)}; it must be 3 rows of 3 numbers.")
+    table = {f"row {index} of orientation": row for index, row in enumerate(rows)}
+    orientation = np.stack([_numbers(path, table, key, 3) for key in table])
+    if np.linalg.det(orientation) < 0:
+        raise SceneError(
+            f"{path}: orientation mirrors (determinant -1, must be +1). Its rows are the camera's "
+            "axes in the world: right, down, forward. Negate one of them."
+        )
+    pose = np.eye(4)
+    # OpenGL's cameras have y up and look along -z.
+    pose[:3, :3] = orientation.T * [1, -1, -1]
+    pose[:3, 3] = _numbers(path, content, "position", 3)
+    checked_pose(str(path), pose, "orientation")
+    for key, default in (("focal_length", None), ("pixel_aspect_ratio", 1)):
+        if not is_positive(content.get(key, default)):
+            raise SceneError(
+                f"{path}: {key} is {short(content.get(key))}; it must be a number above 0."
+            )
+    skew = content.get("skew", 0)
+    if not is_number(skew):
+        raise SceneError(f"{path}: skew is {short(skew)}; it must be a number.")
+    width, height = _numbers(path, content, "image_size", 2)
+    if width < 1 or height < 1:
+        raise SceneError(
+            f"{path}: image_size is {width:g} x {height:g}; it must be at least one pixel. "
+            f"{DOWNLOAD}"
+        )
+    centre_x, centre_y = _numbers(path, content, "principal_point", 2)
+    # The first captures were written with another name.
+    tangential = "tangential" if "tangential" in content else "tangential_distortion"
+    none = {"radial_distortion": [0, 0, 0], tangential: [0, 0]}
+    k1, k2, k3 = _numbers(path, none | content, "radial_distortion", 3)
+    p1, p2 = _numbers(path, none | content, tangential, 2)
+    distortion = (k1, k2, k3, 0.0, 0.0, 0.0, p1, p2)
+    calibration = Calibration(
+        fl_x=float(content["focal_length"]),
+        fl_y=content["focal_length"] * content.get("pixel_aspect_ratio", 1.0),
+        cx=float(centre_x),
+        cy=float(centre_y),
+        w=float(width),
+        h=float(height),
+        distortion=tuple(map(float, distortion)) if any(distortion) else (),
+        skew=float(skew),
+    )
+    return pose, calibration
+
+
+def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) -> str:
+    """The folder in rgb of the smallest images that are at least as wide as asked for.
+
+    The largest images, where none are, or none were asked for.
+    """
+    widths = {}
+    for path in (folder / "rgb").glob("*x"):
+        first = [path / f"{names[0]}{end}" for end in IMAGES]
+        if path.name[:-1].isdecimal() and any(file.is_file() for file in first):
+            widths[path.name] = native_sizes([file for file in first if file.is_file()])[0][1]
+    if not widths:
+        raise SceneError(
+            f"{folder / 'rgb'} has no folder, such as 1x or 4x, with an image of {names[0]}. "
+            f"{DOWNLOAD}"
+        )
+    enough = {name: width for name, width in widths.items() if width >= (resolution or math.inf)}
+    chosen = min(enough, key=enough.__getitem__) if enough else max(widths, key=widths.__getitem__)
+    _require_files(folder / "rgb" / chosen, names, IMAGES)
+    return chosen
+
+
+def _require_files(folder: Path, names: Sequence[str], ends: Sequence[str]) -> None:
+    missing = [
+        name for name in names if not any((folder / f"{name}{end}").is_file() for end in ends)
+    ]
+    if missing:
+        raise SceneError(
+            f"{len(missing)} of {len(names)} files are not in {folder}: {some(missing)} "
+            f"({' or '.join(ends)}). {DOWNLOAD}"
+        )
+
+
+def _points(path: Path) -> np.ndarray | None:
+    """Points of the background, before they are centred and scaled. float64 [N, 3]"""
+    if not path.is_file():
+        return None
+    try:
+        points = np.array(np.load(path, mmap_mode="r", allow_pickle=False), dtype=np.float64)
+    except (OSError, ValueError, EOFError) as problem:
+        raise SceneError(
+            f"{path} cannot be read ({problem}). {DOWNLOAD} Or remove it: it is not needed."
+        ) from problem
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise SceneError(
+            f"{path} holds an array {list(points.shape)}; it must be finite positions [N, 3]. "
+            f"{DOWNLOAD} Or remove it: it is not needed."
+        )
+    return points

@@ -48,7 +48,7 @@ def draw(capture: Capture) -> Image.Image:
     top, side = 76, 520
     for number, (title, axes) in enumerate((("from above", "xy"), ("from the side", "xz"))):
         left = MARGIN + number * (side + MARGIN)
-        _cameras(sheet, (left, top, left + side, top + side), title, axes, capture)
+        sheet.paste(_cameras(side, title, axes, capture), (left, top))
     left, right = MARGIN + 2 * (side + MARGIN), WIDTH - MARGIN
     _times(sheet, (left, top, right, top + 300), capture)
     _coverage(sheet, (left, top + 324, right, top + side), capture)
@@ -149,15 +149,17 @@ class _Plan:
         return [(self.x + x, self.y - y) for x, y in flat.tolist()]
 
 
-def _cameras(sheet: _Sheet, box: Box, title: str, axes: str, capture: Capture) -> None:
-    """Cameras with their frusta, the cube, and rays through the corners of some images."""
-    left, top, right, bottom = box
-    sheet.box(box, fill=PANEL)
+def _cameras(side: int, title: str, axes: str, capture: Capture) -> Image.Image:
+    """Cameras with their frusta, the cube, and rays through the corners of some images.
+
+    They are drawn by themselves, since rays leave the panel.
+    """
+    sheet = _Sheet(side, side)
+    sheet.box((0, 0, side, side), fill=PANEL)
     frame, splits = capture.frame, capture.scene.splits
     places = torch.cat([views.camera_to_world[:, :3, 3] for views in splits.values()])
     points = places if frame is None else torch.cat([places, _cube_edges(frame).flatten(0, 1)])
-    inner = (left + 12, top + 30, right - 12, bottom - 30)
-    plan = _Plan(inner, axes, points)
+    plan = _Plan((12, 30, side - 12, side - 30), axes, points)
     length = 0.07 * plan.span
     train = splits["train"]
     count = min(MOST_RAYS, len(train))
@@ -186,12 +188,13 @@ def _cameras(sheet: _Sheet, box: Box, title: str, axes: str, capture: Capture) -
                 sheet.line(plan(outline), colour, 1.0)
                 for tip in tips:
                     sheet.line(plan(torch.stack([place, tip])), colour, 0.8)
-    sheet.text((left + 12, top + 8), f"{title}: {axes[0]} to the right, {axes[1]} up", size=15)
+    sheet.text((12, 8), f"{title}: {axes[0]} to the right, {axes[1]} up", size=15)
     step = 10.0 ** math.floor(math.log10(0.4 * plan.span))
     wide = step * plan.per_unit
-    sheet.line([(left + 14, bottom - 14), (left + 14 + wide, bottom - 14)], INK, 2)
+    sheet.line([(14, side - 14), (14 + wide, side - 14)], INK, 2)
     words = f"{step:g} world unit{'' if step == 1 else 's'}"
-    sheet.text((left + 22 + wide, bottom - 14), words, anchor="lm", size=13)
+    sheet.text((22 + wide, side - 14), words, anchor="lm", size=13)
+    return sheet.image
 
 
 def _spread(total: int, most: int) -> list[int]:

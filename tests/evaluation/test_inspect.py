@@ -63,19 +63,10 @@ def model():
 @pytest.fixture
 def inspected(model):
     def read(scene, half_side=None, texels=16):
-        settings = Given(
-            name="given",
-            root="nowhere",
-            scene="ball",
-            resolution=None,
-            views=None,
-            train_on_video=False,
-            static=None,
-            eval_split=None,
-            eval_views=None,
-            half_side=half_side,
-            content=scene,
-        )
+        usual = compose_plain(None, ["+data=blender"])["data"]
+        given = {**usual, "name": "given", "scene": "ball", "resolution": None}
+        given |= {"half_side": half_side, "content": scene}
+        settings = Given(**{key: value for key, value in given.items() if key != "_target_"})
         return inspect(Choice((), settings, replace(model, resolution=texels)))
 
     return read

@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ def commands(program: str) -> list[list[str]]:
     return [shlex.split(line) for line in lines]
 
 
-def ball(count: int, **options: object) -> Views:
+def ball(count: int, **options: Any) -> Views:
     return ball_views(count, 0.6, centre=swinging(0.3, 1), size=SIZE, **options)
 
 

@@ -20,6 +20,7 @@ from xplanes.cli import main
 from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
+from xplanes.evaluation.findings import camera_findings
 from xplanes.evaluation.inspect import (
     Choice,
     cameras_of,
@@ -309,6 +310,18 @@ def test_each_warning_is_given_where_it_is_deserved_and_no_other(inspected, name
     assert re.search(words, finding.text), finding.text
     assert finding.text in table(capture)
     assert {"kind": kind, "text": finding.text} in facts(capture)["warnings"]
+
+
+def test_cameras_that_look_at_no_one_thing_are_told_of():
+    generator = torch.Generator().manual_seed(0)
+    places = torch.randn(40, 3, generator=generator) * torch.tensor([0.3, 0.3, 0.05])
+    targets = places + torch.tensor([0.0, 0.0, 5.0])
+    targets += torch.randn(40, 3, generator=generator) * 0.3
+    views = replace(ball_views(40, 0.6, size=8), camera_to_world=look_at(places, targets))
+    for poses, expected in ((views.camera_to_world, ["astray"]), (surrounding(40, 3.0), [])):
+        scene = Scene("hall", {"train": replace(views, camera_to_world=poses)})
+        found = camera_findings(scene, scene_frame(scene.splits["train"]))
+        assert [each.kind for each in found] == expected
 
 
 def test_axes_that_diverge_leave_a_table_and_a_picture_and_end_in_an_error(inspected):

@@ -78,8 +78,8 @@ COMPOSITIONS = [
     # A model brings its sampler along; here some are named.
     ["data=blender", "model=kplanes"],
     ["data=nerfstudio", "model=tineuvox_s", "model/sampler=fixed_step"],
-    ["model=tensor4d", "model/sampler=neus"],
-    ["model=tensor4d_density"],
+    ["data=colmap", "model=tensor4d", "model/sampler=neus"],
+    ["data=nerfies", "model=tensor4d_density"],
     ["model=kplanes_explicit"],
     ["model=tineuvox_b"],
     *(

@@ -33,6 +33,12 @@ class Tally:
                 assert torch.as_tensor(tensor).isfinite().all(), tensor
         self.content["finite"] += 1
 
+    def diagnosed(self, message: str, name: str) -> None:
+        """Count a case that was refused; the message must hold the name of the culprit."""
+        self.content["cases"] += 1
+        assert name in message
+        self.content["diagnosed"] += 1
+
     def error(self, value: float, most: float) -> None:
         """Note an error, which must be ``most`` at most."""
         assert value <= most, f"error {value:.2g}, allowed {most:.2g}"

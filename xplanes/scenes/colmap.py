@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-import numpy as np
 import torch
 
 from xplanes.errors import ConfigError
@@ -24,6 +23,7 @@ from xplanes.scenes.listing import (
     picked,
     read_views,
     refuse_repeats,
+    require_precision,
     require_shapes,
     short,
     some,
@@ -40,9 +40,6 @@ MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
 """Where sparse models are looked for."""
 
 KINDS = (".png", ".jpg", ".jpeg")
-
-ROUNDING = 1e-4
-"""Largest rounding error of camera positions in single precision, as a share of their extent."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +134,7 @@ class ColmapSettings(SceneSettings):
         poses, points = model.camera_to_world, model.points
         if self.orient:
             poses, points = oriented(poses, points)
-        _require_precision(model.source, poses[:, :3, 3])
+        require_precision(model.source, poses[:, :3, 3])
         refuse_repeats(labels, paths, poses, times)
         folders = [_camera(name) for name in model.names]
         listing = Listing(
@@ -358,15 +355,3 @@ def _listed_times(path: Path, names: Sequence[str]) -> list[float]:
             "for each, with the name that COLMAP has for it."
         )
     return [known[name] for name in names]
-
-
-def _require_precision(source: Path, positions: np.ndarray) -> None:
-    """Refuse cameras so far from the world's origin that single precision moves them."""
-    extent = float(np.ptp(positions, axis=0).max())
-    largest = float(np.abs(positions).max())
-    if extent > 0 and largest * np.finfo(np.float32).eps > ROUNDING * extent:
-        raise SceneError(
-            f"{source}: the cameras lie up to {largest:.6g} world units from the origin, but only "
-            f"{extent:.3g} apart, which single precision cannot tell exactly. Move the model to "
-            "the origin first, as with colmap model_transformer."
-        )

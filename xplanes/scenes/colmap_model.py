@@ -1,7 +1,7 @@
 """COLMAP's sparse models: cameras, images and points, from binary and text files.
 
-The files are read here, not by pycolmap: given a truncated file, that library hangs, takes all
-memory or returns wrong cameras, and no error of it names the file and the entry.
+The files are read here, not by pycolmap: given a truncated file, its version 4.2 hangs, takes all
+memory or returns wrong cameras, and its errors do not name the file.
 """
 
 import math
@@ -376,7 +376,7 @@ def _other_lens(label: str, model: str) -> SceneError:
 def _pose(label: str, motion: Sequence[float]) -> np.ndarray:
     """A camera-to-world matrix from a world-to-camera quaternion, real part first, and shift."""
     values = np.array(motion, dtype=np.float64)
-    length = np.linalg.norm(values[:4])
+    length = math.hypot(*values[:4])
     if not np.isfinite(values).all() or abs(length - 1) > UNIT_TOLERANCE:
         raise SceneError(
             f"{label}: the pose is {values.tolist()}; it must be a unit quaternion QW QX QY QZ and "

@@ -21,6 +21,18 @@ from xplanes.scenes.views import Intrinsics, Views
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 RIGID_TOLERANCE = 1e-3
 
+FARTHEST = 1e15
+"""Largest coordinate of a camera; squares of it still fit single precision."""
+
+ROUNDING = 1e-4
+"""Largest rounding error of camera positions in single precision, as a share of their extent."""
+
+SHORTEST, LONGEST = 1e-3, 1e5
+"""Smallest and largest focal length, in sizes of the image."""
+
+FARTHEST_ASIDE, STRONGEST = 1e3, 1e6
+"""Largest distance of a principal point, in sizes of the image, and largest coefficient."""
+
 SHAPE_TOLERANCE = 0.02
 """By how much the aspect ratio of an image may differ from that of its camera."""
 
@@ -274,6 +286,10 @@ def _intrinsics(listing: Listing, native: list[Size], sizes: list[Size]) -> Intr
         calibration.scaled(file, size)
         for calibration, file, size in zip(listing.calibrations, native, sizes, strict=True)
     ]
+    for path, size, camera, numbers in zip(
+        listing.paths, sizes, listing.calibrations, known, strict=True
+    ):
+        _require_real(path, size, camera, *numbers)
     focal, centre, skew = (
         torch.tensor(values, dtype=torch.float64) for values in zip(*known, strict=True)
     )
@@ -282,6 +298,37 @@ def _intrinsics(listing: Listing, native: list[Size], sizes: list[Size]) -> Intr
     model = torch.tensor([int(calibration.model) for calibration in listing.calibrations])
     lenses = Lenses(model, torch.tensor(rows, dtype=torch.float64), skew)
     return Intrinsics(focal, centre, torch.tensor(sizes), lenses)
+
+
+def _require_real(
+    path: Path,
+    size: Size,
+    camera: Calibration,
+    focal: tuple[float, float],
+    centre: tuple[float, float],
+    skew: float,
+) -> None:
+    """Refuse cameras so extreme that their rays cannot be told apart, or overflow."""
+    for axis, along, middle, pixels in zip("xy", focal, centre, reversed(size), strict=True):
+        for name, value, low, high in (
+            ("focal length", along / pixels, SHORTEST, LONGEST),
+            ("principal point", middle / pixels, -FARTHEST_ASIDE, FARTHEST_ASIDE),
+        ):
+            if not low <= value <= high:
+                raise SceneError(
+                    f"{path}: the {name} along {axis} is {value:.3g} image sizes; it must lie "
+                    f"between {low:g} and {high:g}. Correct the camera, or calibrate again."
+                )
+    if not abs(skew) <= focal[0]:
+        raise SceneError(
+            f"{path}: the skew is {skew:.3g} pixels, more than the focal length of {focal[0]:.3g}. "
+            "Correct the camera, or calibrate again."
+        )
+    if any(not abs(value) <= STRONGEST for value in camera.distortion):
+        raise SceneError(
+            f"{path}: its {camera.words}, of which none may be beyond {STRONGEST:g}. Correct the "
+            "camera, or calibrate again."
+        )
 
 
 def _require_rays(listing: Listing, index: int, shown: Tensor) -> None:
@@ -465,6 +512,27 @@ def oriented(poses: np.ndarray, points: np.ndarray | None) -> tuple[np.ndarray, 
     turned, turn = poses.copy(), rotation.numpy()
     turned[:, :3] = turn @ poses[:, :3]
     return turned, None if points is None else points @ turn.T
+
+
+def require_precision(source: Path, positions: np.ndarray) -> None:
+    """Refuse cameras so far from the world's origin that single precision moves them.
+
+    Args:
+        source: Where they were read, for messages.
+        positions: Of all cameras of a capture. float64 [V, 3]
+
+    Raises:
+        SceneError: If they lie too far away.
+    """
+    extent = float(np.ptp(positions, axis=0).max())
+    largest = float(np.abs(positions).max())
+    room = ROUNDING * extent / float(np.finfo(np.float32).eps) if extent > 0 else FARTHEST
+    if not largest <= min(room, FARTHEST):
+        raise SceneError(
+            f"{source}: the cameras lie up to {largest:.3g} world units from the origin and "
+            f"{extent:.3g} apart, which single precision cannot hold. Move the capture to the "
+            "origin first, as with colmap model_transformer, or correct the cameras."
+        )
 
 
 def refuse_repeats(

@@ -26,6 +26,7 @@ from xplanes.scenes.listing import (
     read_object,
     read_views,
     refuse_repeats,
+    require_precision,
     require_shapes,
     short,
     some,
@@ -113,6 +114,7 @@ class NerfiesSettings(SceneSettings):
             for label, name in zip(labels, names, strict=True)
         ]
         times, takers = self._metadata(names)
+        require_precision(folder, poses[:, :3, 3])
         refuse_repeats(labels, paths, poses, times)
         masks = ()
         if self.masks is not None:

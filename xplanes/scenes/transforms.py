@@ -22,6 +22,7 @@ from xplanes.scenes.listing import (
     is_positive,
     read_object,
     refuse_repeats,
+    require_precision,
     short,
     unit_times,
 )
@@ -76,6 +77,7 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
         for label, frame in named
     )
     times = _times(path, named, any_unit)
+    require_precision(path, poses[:, :3, 3])
     refuse_repeats(labels, paths, poses, times)
     return Listing(
         paths=tuple(paths),

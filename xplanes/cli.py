@@ -73,8 +73,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"xplanes {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     commands.add_parser("train", help="train a field: key=value ..., and the options of Hydra")
-    verbs = (_add_download, _add_triplanes, _add_evaluate, _add_render, _add_view, _add_table)
-    for add in (*verbs, _add_pretrain, _add_score):
+    verbs = (_add_download, _add_inspect, _add_triplanes, _add_evaluate, _add_render, _add_view)
+    for add in (*verbs, _add_table, _add_pretrain, _add_score):
         add(commands)
     return parser
 
@@ -93,6 +93,48 @@ def _download(options: argparse.Namespace) -> None:
 
     root = download_dnerf(options.root)
     print(f"train with: {train_command()} data=dnerf data.root={root} data.scene=lego")
+
+
+def _add_inspect(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser(
+        "inspect", help="say and draw what is read of a capture, and warn of what may be wrong"
+    )
+    parser.add_argument(
+        "arguments",
+        nargs="+",
+        metavar="FOLDER data.KEY=VALUE",
+        help="the folder of a scene, settings of train.py, or both",
+    )
+    parser.add_argument(
+        "--out", type=Path, help="the picture, a PNG; default: inspect_SCENE.png, here"
+    )
+    parser.add_argument("--json", action="store_true", help="print the facts as JSON")
+    parser.set_defaults(command=_inspect)
+
+
+def _inspect(options: argparse.Namespace) -> None:
+    import contextlib
+    import json
+
+    from xplanes.evaluation.inspect import check_out, choose, facts, inspect, next_command, table
+    from xplanes.evaluation.inspect_picture import write_picture
+    from xplanes.scenes.errors import SceneError
+
+    choice = choose(options.arguments)
+    out = options.out or Path(f"inspect_{Path(choice.scene.scene).name}.png")
+    check_out(out, choice.scene)
+    # Readers may say what they do; standard output is for JSON alone.
+    with contextlib.redirect_stdout(sys.stderr) if options.json else contextlib.nullcontext():
+        capture = inspect(choice)
+    write_picture(out, capture)
+    if options.json:
+        print(json.dumps({**facts(capture), "picture": str(out)}, indent=2))
+    else:
+        _say(f"{table(capture)}\n\nwrote   {out}")
+    if capture.problem:
+        raise SceneError(capture.problem)
+    if not options.json:
+        _say(f"train   {next_command(capture)}")
 
 
 def _add_triplanes(commands: "argparse._SubParsersAction") -> None:

@@ -1,7 +1,8 @@
 """The configuration files and what Hydra makes of them. Must stay quick: it imports no torch."""
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +13,48 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / 
 """The configuration files: inside an installed package, beside it in a checkout."""
 
 
-def compose_plain(name: str, overrides: Sequence[str], conf: Path = CONF) -> dict[str, Any]:
+def compose_plain(name: str | None, overrides: Sequence[str], conf: Path = CONF) -> dict[str, Any]:
     """A configuration with some settings changed, resolved to builtins.
 
     Args:
-        name: Its file in ``conf``, without ending.
+        name: Its file in ``conf``, without ending; None for nothing but what ``overrides`` add.
         overrides: ``key=value`` each.
         conf: The configuration folder.
 
     Raises:
         ConfigError: For a key or option that does not exist.
     """
-    from hydra import compose, initialize_config_dir
+    from hydra import compose
+
+    with _hydra(conf):
+        return to_plain(compose(name, list(overrides)))
+
+
+def group_options(
+    group: str, overrides: Sequence[str] = (), name: str = "train", conf: Path = CONF
+) -> list[str]:
+    """Names of a group's options, those of the folders in ``hydra.searchpath`` included.
+
+    Args:
+        group: The group, such as ``data``.
+        overrides: ``key=value`` each.
+        name: File of the configuration in ``conf``, without ending.
+        conf: The configuration folder.
+
+    Raises:
+        ConfigError: For overrides that Hydra cannot read.
+    """
+    from hydra.core.global_hydra import GlobalHydra
+
+    with _hydra(conf):
+        loader = GlobalHydra.instance().config_loader()
+        return loader.get_group_options(group, config_name=name, overrides=list(overrides))
+
+
+@contextmanager
+def _hydra(conf: Path) -> Iterator[None]:
+    """A Hydra of our own, whose errors say what is nearest to an unknown name."""
+    from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.singleton import Singleton
     from hydra.errors import HydraException
@@ -33,7 +64,7 @@ def compose_plain(name: str, overrides: Sequence[str], conf: Path = CONF) -> dic
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(conf), version_base="1.3"):
-            return to_plain(compose(name, list(overrides)))
+            yield
     except HydraException as error:
         raise ConfigError(f"{error}{near_names(str(error), conf)}") from error
     finally:

@@ -16,6 +16,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from xplanes.backend import warm_up
 from xplanes.errors import ConfigError
+from xplanes.evaluation.findings import camera_findings
 from xplanes.evaluation.render import orbit_poses, render_path, video_times, write_video
 from xplanes.evaluation.report import closing, header, log_hparams, summary, write_pictures
 from xplanes.evaluation.runs import read_config
@@ -188,6 +189,8 @@ def train(
     if resume and record is not None and _has_checkpoint(folder):
         require_same_views(folder, record.content, views)
     frame = method.model.frame(views, settings.half_side)
+    for finding in camera_findings(scene, frame) if record is not None else ():
+        logger.warning("%s", finding.text)
     loaded = time.monotonic() - started
     found = Initialisation(method.model, frame)
     if source is not None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 
@@ -18,6 +19,10 @@ class DiscSettings(SceneSettings):
     """A red disc before cameras on a circle."""
 
     count: Count
+
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        return (folder / "discs.txt").is_file()
 
     def load(self, splits: Sequence[str]) -> Scene:
         return Scene("disc", {name: self._views(index) for index, name in enumerate(splits)})

@@ -63,6 +63,14 @@ class ColmapSettings(SceneSettings):
     eval_every: Count
     orient: bool  # Turn the world so that the cameras' mean up vector becomes its z axis.
 
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        # The model in colmap/ is what transforms.json beside it was made of.
+        places = [folder / name for name in MODELS if not name.startswith("colmap/")]
+        return any(
+            (place / f"cameras.{end}").is_file() for place in places for end in ("bin", "txt")
+        )
+
     def check(self) -> None:
         if self.time_pattern is None:
             return

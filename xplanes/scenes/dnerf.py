@@ -22,6 +22,10 @@ GET_DATA = (
 class BlenderSettings(SceneSettings):
     """A scene on disk in the format of D-NeRF or Blender."""
 
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        return (folder / "transforms_train.json").is_file()
+
     def load(self, splits: Sequence[str]) -> Scene:
         return read_scene(
             self.folder,

@@ -1,6 +1,5 @@
 """The field's frame: the cube [-1, 1]^3 and how the world maps into it."""
 
-import logging
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -11,8 +10,6 @@ from torch import Tensor
 from xplanes.scenes.cameras import cast_rays
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.views import Views
-
-logger = logging.getLogger(__name__)
 
 MARGIN = 1.03
 """Room around the farthest thing that any view shows."""
@@ -152,24 +149,14 @@ def scene_frame(views: Views, half_side: float | None = None) -> Frame:
     half = float((depth.clamp_min(0) * extent.float()).max())
     if not math.isfinite(half) or half <= 0:
         raise SceneError(
-            "the cameras look away from one another, so the scene's bounds cannot be found: set "
-            "data.half_side, in world units"
+            "the cameras look away from one another, so the scene's bounds cannot be found. Axes "
+            "are OpenGL's: where those of the file are OpenCV's (y down, z forward), negate the "
+            "second and third column of every pose. If the poses are right, set data.half_side, in "
+            "world units"
         )
     spread = _spread(views)
     reach = MARGIN * _reach(views, centre) / spread if spread > 0 else math.inf
     half = min(half, reach)
-    back = backwards(views)
-    distance = (offset * back).sum(dim=-1)
-    aside = (offset - distance[:, None] * back).norm(dim=-1)
-    astray = int(((distance <= half) | (aside > half)).sum())
-    if 4 * astray > len(views):
-        logger.warning(
-            "%d of %d cameras do not look at the scene's cube, %.3g world units wide: all must "
-            "look at one thing, from around it",
-            astray,
-            len(views),
-            2 * half,
-        )
     return cube_frame(half, centre)
 
 

@@ -79,6 +79,10 @@ class MultiCameraSettings(SceneSettings):
                 "it, and the stride at least 1"
             )
 
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        return (folder / POSES).is_file() and any(folder.glob("cam*"))
+
     def load(self, splits: Sequence[str]) -> Scene:
         if self.train_on_video:
             raise SceneError(

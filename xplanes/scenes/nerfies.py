@@ -61,6 +61,10 @@ class NerfiesSettings(SceneSettings):
     eval_every: Count
     orient: bool  # Turn the world so that the cameras' mean up vector becomes its z axis.
 
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        return (folder / "dataset.json").is_file() and (folder / "camera").is_dir()
+
     def load(self, splits: Sequence[str]) -> Scene:
         folder = self.folder
         if not (folder / "dataset.json").is_file():

@@ -26,6 +26,10 @@ class NerfstudioSettings(SceneSettings):
     # Captures that list their splits (train_filenames, ...) keep them.
     eval_every: Count
 
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        return (folder / "transforms.json").is_file()
+
     def load(self, splits: Sequence[str]) -> Scene:
         return read_capture(
             self.folder,

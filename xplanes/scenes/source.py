@@ -71,6 +71,14 @@ class SceneSettings(Settings, ABC):
         """The folder of decoded images; None for that of the user."""
         return None if self.cache is None else Path(self.cache)
 
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        """Whether a folder looks like a scene of this format, by the names of what is in it.
+
+        Formats whose scenes are no folders of the user's recognise none.
+        """
+        return False
+
     def prepare(self) -> None:
         """Download or render missing data; called in one process per machine.
 

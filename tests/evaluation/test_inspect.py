@@ -1,0 +1,532 @@
+"""`xplanes inspect`: what it says of captures in order, and of those with one thing wrong."""
+
+import json
+import math
+import re
+import shlex
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.lens_oracle import direction, pixel
+from tests.refusals import assert_refused
+from tests.synthetic import ball_views, surrounding, swinging
+from xplanes.cli import main
+from xplanes.components import build
+from xplanes.config import compose_plain
+from xplanes.errors import ConfigError
+from xplanes.evaluation.findings import camera_findings
+from xplanes.evaluation.inspect import (
+    Choice,
+    cameras_of,
+    choose,
+    distortion,
+    facts,
+    inspect,
+    lens_words,
+    table,
+)
+from xplanes.evaluation.inspect_picture import CUBE, HEIGHT, SCALE, WIDTH, _sample, draw
+from xplanes.models.base import ModelSettings
+from xplanes.scenes.cameras import look_at
+from xplanes.scenes.errors import MissingSplitError, SceneError
+from xplanes.scenes.frame import scene_frame
+from xplanes.scenes.lenses import Lenses, LensModel
+from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.views import Intrinsics, Scene, Views
+
+SIZE, COUNT, HELD = 32, 16, 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Given(SceneSettings):
+    """A scene that is there already."""
+
+    content: Any
+
+    def load(self, splits):
+        missing = [split for split in splits if split not in self.content.splits]
+        if missing:
+            raise MissingSplitError(f"no {missing}")
+        return replace(self.content, splits={split: self.content.splits[split] for split in splits})
+
+
+@pytest.fixture(scope="module")
+def model():
+    return build(compose_plain("train", [])["model"], ModelSettings, "model")
+
+
+@pytest.fixture
+def inspected(model):
+    def read(scene, half_side=None, texels=16):
+        usual = compose_plain(None, ["+data=blender"])["data"]
+        given = {**usual, "name": "given", "scene": "ball", "resolution": None}
+        given |= {"half_side": half_side, "content": scene}
+        settings = Given(**{key: value for key, value in given.items() if key != "_target_"})
+        return inspect(Choice((), settings, replace(model, resolution=texels)))
+
+    return read
+
+
+def ball(*, moving=True, **train):
+    """A ball that swings, or lies beside the centre, in order."""
+    centre = swinging(0.3, 1) if moving else lambda _: torch.tensor([0.3, 0.1, 0.0])
+    held = torch.linspace(0.1, 0.9, HELD)
+    options = {"centre": centre, "size": SIZE}
+    parts = {
+        "train": ball_views(COUNT, 0.6, **options, **train),
+        "test": ball_views(HELD, 0.6, **options, seed=1, times=held),
+    }
+    named = {
+        split: replace(views, files=tuple(f"{split}/{name}" for name in views.files))
+        for split, views in parts.items()
+    }
+    return Scene("ball", named)
+
+
+def at_once(scene):
+    parts = {split: replace(v, times=v.times * 0) for split, v in scene.splits.items()}
+    return replace(scene, splits=parts)
+
+
+def with_train(scene, **changes):
+    train = replace(scene.splits["train"], **changes)
+    return replace(scene, splits={**scene.splits, "train": train})
+
+
+def painted(scene, paint):
+    """The scene with other images: ``paint`` takes those of a split. uint8 [V, H, W, 4]"""
+    parts = {
+        split: replace(views, images=paint(views.images.clone()))
+        for split, views in scene.splits.items()
+    }
+    return replace(scene, splits=parts)
+
+
+def textured(images):
+    """Opaque images: the ball before a wall of noise."""
+    noise = torch.randint(30, 200, images.shape, dtype=torch.uint8)
+    noise[..., 3] = 255
+    return torch.where(images[..., 3:] > 0, images, noise)
+
+
+def turned(poses):
+    """OpenCV's axes."""
+    return poses @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+
+
+def kinds(capture):
+    return {each.kind for each in capture.findings}
+
+
+def rig(count=4):
+    """Fixed cameras that take turns in pairs of images."""
+    return surrounding(count, 4.0).repeat(COUNT // count, 1, 1)
+
+
+def fisheye(scene):
+    def bent(views):
+        lenses = Lenses(
+            torch.full((len(views),), int(LensModel.FISHEYE)),
+            torch.tensor([[0.05, -0.01, *[0.0] * 10]]).repeat(len(views), 1),
+            torch.zeros(len(views)),
+        )
+        return replace(views, intrinsics=replace(views.intrinsics, lenses=lenses))
+
+    return replace(scene, splits={name: bent(views) for name, views in scene.splits.items()})
+
+
+IN_ORDER = {
+    "moving camera": ball,
+    "fixed cameras": lambda: ball(poses=rig()),
+    "one time": lambda: at_once(ball(moving=False)),
+    "fixed cameras, one time": lambda: at_once(ball(moving=False, poses=rig())),
+    "opaque": lambda: painted(ball(), textured),
+    "fisheye": lambda: fisheye(ball()),
+    "random times": lambda: ball(
+        times=torch.rand(COUNT, generator=torch.Generator().manual_seed(3))
+    ),
+}
+
+
+@pytest.mark.parametrize("name", IN_ORDER)
+def test_a_capture_in_order_gets_no_warning(inspected, name):
+    capture = inspected(IN_ORDER[name]())
+    assert capture.findings == ()
+    assert capture.problem == ""
+    assert "no warnings" in table(capture)
+
+
+def test_a_demo_scene_is_in_order_by_its_name_and_as_a_folder(tmp_path):
+    small = ["data.resolution=24", "data.train_views=12", "data.val_views=3", "data.test_views=3"]
+    capture = inspect(choose(["data=demo", f"data.root={tmp_path}", "data.scene=balls", *small]))
+    assert capture.findings == ()
+    again = inspect(choose([str(next(tmp_path.glob("balls_*")))]))  # As a folder.
+    assert again.choice.scene.name == "blender"
+    assert facts(again)["splits"] == facts(capture)["splits"]
+
+
+def gap():
+    return with_train(
+        ball(), times=torch.cat([torch.linspace(0, 0.25, 8), torch.linspace(0.75, 1, 8)])
+    )
+
+
+def short():
+    scene = ball()
+    parts = {k: replace(v, times=v.times * 0.01) for k, v in scene.splits.items()}
+    return replace(scene, splits=parts)
+
+
+def astray():
+    scene = ball()
+    poses = scene.splits["train"].camera_to_world.clone()
+    place = poses[::5, :3, 3]
+    poses[::5] = look_at(place, place.flip(1) * 3 + 1)
+    images = scene.splits["train"].images.clone()
+    images[::5, SIZE // 4 :] = 0  # What they show passes the cube's centre no farther away.
+    return with_train(scene, camera_to_world=poses)
+
+
+def same_file():
+    scene = ball()
+    train, test = scene.splits["train"], scene.splits["test"]
+    images = test.images.clone()
+    images[0] = train.images[3]
+    files = (train.files[3], *test.files[1:])
+    changed = replace(test, images=images, files=files)
+    return replace(scene, splits={"train": train, "test": changed})
+
+
+def same_camera():
+    scene = ball()
+    train, test = scene.splits["train"], scene.splits["test"]
+    poses, times = test.camera_to_world.clone(), test.times.clone()
+    poses[2], times[2] = train.camera_to_world[5], train.times[5]
+    changed = replace(test, camera_to_world=poses, times=times)
+    return replace(scene, splits={"train": train, "test": changed})
+
+
+def same_pixels():
+    scene = ball()
+    train, test = scene.splits["train"], scene.splits["test"]
+    images = test.images.clone()
+    images[1] = train.images[7]
+    return replace(scene, splits={"train": train, "test": replace(test, images=images)})
+
+
+def white(images):
+    images[images[..., 3] > 0] = 255
+    return images
+
+
+def on_white(images):
+    images[images[..., 3] == 0] = 255
+    return images
+
+
+def emptied(images):
+    images[::3] = 0
+    return images
+
+
+def some_full(images):
+    images[-1] = textured(images[-1:])[0]
+    return images
+
+
+def hardly_masked(images):
+    images = textured(images)
+    images[:, :2, :2] = 0
+    return images
+
+
+def inverted(images):
+    shown = images[..., 3] > 0
+    images = textured(images)
+    images[shown] = 0
+    return images
+
+
+def two_sizes():
+    scene = ball()
+    train = scene.splits["train"]
+    size = train.intrinsics.size.clone()
+    focal, centre = train.intrinsics.focal.clone(), train.intrinsics.centre.clone()
+    images = train.images.clone()
+    half = images[::2, ::2, ::2].clone()
+    images[::2] = 0
+    images[::2, : SIZE // 2, : SIZE // 2] = half
+    for value in (focal, centre):
+        value[::2] *= 0.5
+    size[::2] //= 2
+    return with_train(scene, images=images, intrinsics=Intrinsics(focal, centre, size))
+
+
+WRONG = {
+    "a gap in the times": (gap, {}, "times", "between 0.25 and 0.75, 14 times"),
+    "times in other units": (short, {}, "times", "run from 0 to 0.01, 1% of"),
+    "no times": (
+        lambda: at_once(ball(poses=rig())),
+        {},
+        "one_time",
+        "train/000.png and train/004.png have one camera",
+    ),
+    "other axes": (
+        lambda: with_train(ball(), camera_to_world=turned(ball().splits["train"].camera_to_world)),
+        {},
+        "axes",
+        "16 of 16 cameras look away",
+    ),
+    "cameras astray": (astray, {}, "astray", "4 of 16 cameras do not see"),
+    "a small cube": (ball, {"half_side": 0.05}, "scale", "too small"),
+    "a large cube": (ball, {"half_side": 20.0}, "scale", "too large"),
+    "a cut scene": (ball, {"half_side": 0.5}, "cut", "cuts off .*% of the foreground"),
+    "a shared file": (same_file, {}, "shared", r"1 of 4 test.*\(train/003.png is train/003"),
+    "a shared camera": (same_camera, {}, "shared", r"1 of 4 test.*\(test/002.png is train/005"),
+    "shared pixels": (same_pixels, {}, "shared", r"the same pixels \(test/001.png is train/007"),
+    "white on white": (lambda: painted(ball(), white), {}, "white", "100% of the silhouettes"),
+    "opaque white": (lambda: painted(ball(), on_white), {}, "white", "20 of 20 images are opaque"),
+    "empty images": (lambda: painted(ball(), emptied), {}, "empty", "8 of 20 images show"),
+    "a mask is missing": (lambda: painted(ball(), some_full), {}, "opaque", "2 of 20 images"),
+    "useless masks": (lambda: painted(ball(), hardly_masked), {}, "opaque", "20 of 20 .* less tha"),
+    "inverted masks": (lambda: painted(ball(), inverted), {}, "inverted", "of 20 images are opaqu"),
+    "two sizes": (two_sizes, {}, "sizes", r"8 of 16x16 px, 12 of 32x32 px"),
+    "coarse planes": (ball, {"texels": 2}, "texels", r"planes with 2 texels.*data\.resolution="),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_each_warning_is_given_where_it_is_deserved_and_no_other(inspected, name):
+    make, options, kind, words = WRONG[name]
+    capture = inspected(make(), **options)
+    assert kinds(capture) == {kind}
+    (finding,) = capture.findings
+    assert re.search(words, finding.text), finding.text
+    assert finding.text in table(capture)
+    assert {"kind": kind, "text": finding.text} in facts(capture)["warnings"]
+
+
+def test_cameras_that_look_at_no_one_thing_are_told_of():
+    generator = torch.Generator().manual_seed(0)
+    places = torch.randn(40, 3, generator=generator) * torch.tensor([0.3, 0.3, 0.05])
+    targets = places + torch.tensor([0.0, 0.0, 5.0])
+    targets += torch.randn(40, 3, generator=generator) * 0.3
+    views = replace(ball_views(40, 0.6, size=8), camera_to_world=look_at(places, targets))
+    for poses, expected in ((views.camera_to_world, ["astray"]), (surrounding(40, 3.0), [])):
+        scene = Scene("hall", {"train": replace(views, camera_to_world=poses)})
+        found = camera_findings(scene, scene_frame(scene.splits["train"]))
+        assert [each.kind for each in found] == expected
+
+
+def test_axes_that_diverge_leave_a_table_and_a_picture_and_end_in_an_error(inspected):
+    make, *_ = WRONG["other axes"]
+    capture = inspected(make())
+    assert capture.frame is None
+    assert "negate the second and third column" in capture.problem
+    assert facts(capture)["cube"] is None
+    assert draw(capture).size == (WIDTH, HEIGHT)
+
+
+def test_facts_are_those_of_the_scene(inspected):
+    capture = inspected(ball())
+    known = json.loads(json.dumps(facts(capture)))
+    train = known["splits"]["train"]
+    assert (train["views"], train["sizes"]) == (COUNT, [[SIZE, SIZE]])
+    assert (train["timesteps"], train["times"]) == (COUNT, [0, 1])
+    assert train["largest_gap"] == pytest.approx(1 / (COUNT - 1))
+    assert train["field_of_view"] == pytest.approx([math.degrees(0.7)] * 2)
+    assert (train["lens"], train["distortion_pixels"]) == ("pinhole", 0)
+    shown = (capture.scene.splits["train"].images[..., 3] > 0).float().mean(dim=(1, 2))
+    assert train["opaque"][0] == pytest.approx(float(shown.min()))
+    assert train["opaque"][2] == pytest.approx(float(shown.max()))
+    assert known["cube"]["source"] == "cameras and silhouettes"
+    assert known["cube"]["camera_distance"] == pytest.approx([4, 4, 4], abs=0.1)
+    # A texel is side / 16 wide, a pixel 4 / focal.
+    focal = 0.5 * SIZE / math.tan(0.35)
+    expected = known["cube"]["side"] / 16 / (4 / focal)
+    assert known["pixels_per_texel"] == pytest.approx(expected, rel=0.02)
+    given = facts(inspected(ball(), half_side=1.0))["cube"]
+    assert (given["source"], given["side"]) == ("data.half_side", 2.0)
+
+
+def test_cameras_are_told_apart_by_poses_or_lenses(inspected):
+    fixed = cameras_of(ball(poses=rig(4)).splits["train"])
+    assert [group.indices for group in fixed] == [list(range(k, COUNT, 4)) for k in range(4)]
+    assert all(group.fixed for group in fixed)
+    views = ball().splits["train"]
+    assert [(group.fixed, len(group.indices)) for group in cameras_of(views)] == [(False, COUNT)]
+    files = tuple(f"cam{i % 2:02d}/{i}.png" for i in range(COUNT))
+    focal = views.intrinsics.focal.clone()
+    focal[1::2] *= 1.5
+    two = replace(views, files=files, intrinsics=replace(views.intrinsics, focal=focal))
+    assert [group.name for group in cameras_of(two)] == ["cam00", "cam01"]
+
+
+def test_distortion_is_how_far_the_oracle_moves_a_corner():
+    views = ball().splits["train"]
+    k = {"k1": -0.2, "k2": 0.03, "p1": 0.01}
+    row = torch.zeros(1, 12, dtype=torch.float64)
+    row[0, 0], row[0, 1], row[0, 6] = k["k1"], k["k2"], k["p1"]
+    lenses = Lenses(torch.zeros(COUNT), row.repeat(COUNT, 1), torch.zeros(COUNT))
+    bent = replace(views, intrinsics=replace(views.intrinsics, lenses=lenses))
+    assert lens_words(bent) == "perspective k1 k2 p1"
+    focal, centre = [0.5 * SIZE / math.tan(0.35)] * 2, [SIZE / 2] * 2
+    moved = []
+    for corner in [(0, 0), (SIZE, 0), (0, SIZE), (SIZE, SIZE)]:
+        ray = direction("perspective", corner, k, focal, centre)
+        straight = pixel("perspective", ray, {}, focal, centre)
+        moved.append(math.dist(corner, straight))
+    assert distortion(bent) == pytest.approx(max(moved), rel=1e-6)
+    assert "fisheye k1 k2" in lens_words(fisheye(ball()).splits["train"])
+
+
+def test_the_picture_shows_the_cameras(inspected):
+    capture = inspected(ball())
+    picture = np.asarray(draw(capture))
+    assert picture.shape == (HEIGHT, WIDTH, 3)
+    assert 0.2 < (picture == 255).all(axis=-1).mean() < 0.9
+    again = np.asarray(draw(inspected(ball())))
+    assert np.array_equal(picture, again)
+    others = np.asarray(draw(inspected(ball(poses=surrounding(COUNT, 4.0, seed=9)))))
+    plans = np.s_[100:580, 24:1088]
+    assert (picture[plans] != others[plans]).any(axis=-1).mean() > 0.01
+    # The strips of time are the same: no camera stands still.
+    strips = np.s_[80:370, 1120:1570]
+    assert np.array_equal(picture[strips], others[strips])
+
+
+def test_the_edges_of_the_cube_are_where_the_lens_shows_them():
+    views = fisheye(ball()).splits["train"]
+    frame = scene_frame(views)
+    index, side = 5, 256
+    image = np.asarray(_sample(views, index, (side, side), frame)).astype(int)
+    ink = [int(CUBE[i : i + 2], 16) for i in (1, 3, 5)]
+    drawn = np.abs(image - ink).max(axis=-1) < 40
+    assert 0.005 < drawn.mean() < 0.1
+    world_to_camera = views.camera_to_world[index].double().inverse()
+    k, focal = {"k1": 0.05, "k2": -0.01}, views.intrinsics.focal[index].tolist()
+    found = 0
+    for corner in torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3):
+        for axis in range(3):
+            place = corner.clone()
+            place[axis] *= 0.5  # A quarter of the way along an edge.
+            world = frame.to_world(place).double()
+            local = world_to_camera[:3, :3] @ world + world_to_camera[:3, 3]
+            x, y = pixel("fisheye", local.tolist(), k, focal, [SIZE / 2] * 2)
+            column, row = (round(value * SCALE * side / SIZE) for value in (x, y))
+            if 3 <= column < SCALE * side - 3 and 3 <= row < SCALE * side - 3:
+                assert drawn[row - 2 : row + 3, column - 2 : column + 3].any()
+                found += 1
+    assert found > 6
+
+
+def write_nerfstudio(folder: Path, views: Views, **more):
+    (folder / "images").mkdir(parents=True)
+    focal = float(views.intrinsics.focal[0, 0])
+    frames = []
+    for index, pose in enumerate(views.camera_to_world.tolist()):
+        name = f"images/{index:03d}.png"
+        Image.fromarray(views.image(index).numpy()).save(folder / name)
+        frames.append(
+            {"file_path": name, "transform_matrix": pose, "time": float(views.times[index])}
+        )
+    content = {"fl_x": focal, "w": SIZE, "h": SIZE, "frames": frames, **more}
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def test_a_folder_is_recognised_read_and_drawn(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "my captures" / "a ball's"
+    write_nerfstudio(folder, ball().splits["train"], k1=-0.1, camera_model="OPENCV")
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    assert main(["inspect", str(folder)]) == 0
+    printed = capsys.readouterr().out
+    assert "as nerfstudio" in printed
+    assert "perspective k1" in printed
+    assert "no warnings" in printed
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+    with Image.open("inspect_a ball's.png") as picture:
+        assert picture.size == (WIDTH, HEIGHT)
+    command = printed.splitlines()[-1].partition("train data=")[2]
+    assert command.startswith("nerfstudio ")
+    again = choose(shlex.split(f"data={command}"))
+    assert again.scene.folder == folder
+    assert main(["inspect", str(folder), "data.half_side=0.1", "--json", "--out", "a.png"]) == 0
+    known = json.loads(capsys.readouterr().out)
+    assert known["cube"]["side"] == pytest.approx(0.2)
+    assert [each["kind"] for each in known["warnings"]] == ["scale"]
+    assert Path(known["picture"]).is_file()
+
+
+def test_errors_are_one_line_and_leave_1(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    views = ball().splits["train"]
+    write_nerfstudio(tmp_path / "ball", views)
+    write_nerfstudio(
+        tmp_path / "away", replace(views, camera_to_world=turned(views.camera_to_world))
+    )
+    cases = [
+        (["missing"], "missing is not a folder"),
+        (["."], r"no scene of a known format. Scenes inside it: away, ball"),
+        (["ball", "ball"], "give one folder"),
+        (["ball", "--out", "ball/a.png"], "the scene's own folder"),
+        (["ball", "--out", "a.jpg"], "must end in .png"),
+        (["ball", "data.resolutoin=3"], "data.resolution"),
+        (["ball", "data.resolution=64"], "data.resolution=64"),
+        (["ball", "data=blender"], "transforms_train"),
+        (["away"], "negate the second and third column"),
+    ]
+    for arguments, words in cases:
+        assert main(["inspect", *arguments]) == 1, arguments
+        error = capsys.readouterr().err
+        assert re.search(words, error), (arguments, error)
+        assert "Traceback" not in error
+    (tmp_path / "ball" / "transforms_train.json").write_text("{}")
+    assert_refused(
+        ConfigError, "several formats.*choose one with data=", lambda: choose(["ball"]), "both"
+    )
+
+
+def test_a_format_of_ones_own_joins(tmp_path, monkeypatch):
+    conf = tmp_path / "conf" / "data"
+    conf.mkdir(parents=True)
+    base = compose_plain("train", [])["data"]
+    dropped = ("seed", "train_views", "test_views", "val_views", "_target_")
+    node = {name: value for name, value in base.items() if name not in dropped}
+    node |= {"_target_": "tests.plugins.shell_format.DiscSettings", "name": "disc", "count": 6}
+    (conf / "disc.yaml").write_text(json.dumps(node))
+    folder = tmp_path / "shells"
+    folder.mkdir()
+    (folder / "discs.txt").write_text("six")
+    plugin = ["plugins=[tests.plugins]", f"hydra.searchpath=[file://{tmp_path}/conf]"]
+    assert_refused(SceneError, "no scene of a known", lambda: choose([str(folder)]), "unknown")
+    assert choose([str(folder), *plugin]).scene.name == "disc"
+
+
+def test_a_run_says_what_cameras_and_times_tell(tmp_path, caplog, monkeypatch):
+    from tests.training.runs import small_config
+    from xplanes import pipeline
+
+    views = gap().splits["train"]
+    write_nerfstudio(tmp_path / "ball", views)
+    config = small_config(tmp_path)
+    config["data"] = compose_plain(
+        "train", ["data=nerfstudio", f"data.root={tmp_path}", "data.scene=ball"]
+    )["data"] | {"resolution": None}
+
+    def stop(*_: object) -> None:
+        raise SceneError("far enough")
+
+    monkeypatch.setattr(pipeline, "Initialisation", stop)
+    with pytest.raises(SceneError, match="far enough"):
+        pipeline.run(config, tmp_path / "run", [], resume=False)
+    said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert (
+        sum("no training view shows the times between 0.25 and 0.75" in text for text in said) == 1
+    )

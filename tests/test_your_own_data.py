@@ -1,0 +1,161 @@
+"""Every command of docs/your_own_data.md that needs no other program is run, in order."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.captures import NerfiesFolder, write_colmap
+from tests.synthetic import ball_views, swinging
+from tests.training.runs import SMALL
+from xplanes.cli import main
+from xplanes.config import compose_plain
+from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.demo.write import ensure_demo_scene
+from xplanes.scenes.views import Views
+
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "your_own_data.md"
+SIZE = 40
+CAMERAS, FRAMES = 4, 4
+
+
+def commands(program: str) -> list[list[str]]:
+    """Arguments of the page's commands of a program."""
+    lines = re.findall(rf"^    {program} (.*)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    return [shlex.split(line) for line in lines]
+
+
+def ball(count: int, **options: Any) -> Views:
+    return ball_views(count, 0.6, centre=swinging(0.3, 1), size=SIZE, **options)
+
+
+def save(path: Path, image: torch.Tensor) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(image.numpy()).save(path)
+
+
+def opaque(image: torch.Tensor) -> torch.Tensor:
+    """An image before a wall of grey noise. uint8 [h, w, 3]"""
+    noise = torch.randint(40, 200, image.shape, dtype=torch.uint8)
+    return torch.where(image[..., 3:] > 0, image, noise)[..., :3].contiguous()
+
+
+def write_dancer(folder: Path) -> None:
+    """A COLMAP model with masks and times."""
+    views = ball(16)
+    names = [f"frame_{number:04d}.jpg" for number in range(16)]
+    for index, name in enumerate(names):
+        save(folder / "images" / name, opaque(views.image(index)))
+        save(folder / "masks" / f"{name}.png", views.image(index)[..., 3].contiguous())
+    focal = float(views.intrinsics.focal[0, 0])
+    camera = {1: ("OPENCV", SIZE, SIZE, (focal, focal, SIZE / 2, SIZE / 2, -0.02, 0.0, 0.0, 0.0))}
+    poses = views.camera_to_world.double().numpy()
+    images = [(name, pose, 1, 2) for name, pose in zip(names, poses, strict=True)]
+    write_colmap(folder / "sparse" / "0", camera, images, [[0.1, 0.2, 0.3]])
+    rows = [f"{name},{index / 10}" for index, name in enumerate(names)]
+    (folder / "times.csv").write_text("\n".join(["file,time", *rows]) + "\n")
+
+
+def write_statue(folder: Path) -> None:
+    """nerfstudio's transforms.json."""
+    views = ball(16)
+    focal = float(views.intrinsics.focal[0, 0])
+    frames = []
+    for index, pose in enumerate(views.camera_to_world.tolist()):
+        name = f"images/frame_{index:05d}.png"
+        save(folder / name, opaque(views.image(index)))
+        frames.append({"file_path": name, "transform_matrix": pose, "time": index / 30})
+    content = {"camera_model": "OPENCV", "fl_x": focal, "w": SIZE, "h": SIZE, "k1": 0.01}
+    (folder / "transforms.json").write_text(json.dumps({**content, "frames": frames}))
+
+
+def write_kitchen(folder: Path) -> None:
+    """Neural 3D Video's calibration, with folders of images."""
+    poses = ball(CAMERAS).camera_to_world
+    times = torch.linspace(0, 1, FRAMES)
+    rows = []
+    for camera, pose in enumerate(poses):
+        views = ball(FRAMES, poses=pose.repeat(FRAMES, 1, 1), times=times)
+        for index in range(FRAMES):
+            save(folder / f"cam{camera:02d}" / f"{index:04d}.png", opaque(views.image(index)))
+        right, up, back, place = pose[:3].double().numpy().T
+        size = np.array([SIZE, SIZE, float(views.intrinsics.focal[0, 0])])
+        matrix = np.stack([-up, right, back, place, size], axis=1)
+        rows.append([*matrix.ravel(), 1.0, 9.0])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the page's reader works."""
+    root = tmp_path_factory.mktemp("work")
+    captures = root / "captures"
+    write_dancer(captures / "dancer")
+    write_statue(captures / "statue")
+    write_kitchen(captures / "kitchen")
+    NerfiesFolder(captures / "broom", 10)
+    counts = {"train_views": 10, "val_views": 2, "test_views": 3}
+    demo = ensure_demo_scene(
+        root / "demo", "balls", resolution=24, **counts, announce=lambda _: None
+    )
+    demo.rename(captures / "excavator")
+    return root
+
+
+def test_the_page_has_a_section_for_each_format() -> None:
+    named = {
+        text.partition("=")[2]
+        for words in commands(r"python train\.py")
+        for text in words
+        if text.startswith("data=")
+    }
+    assert named == {"colmap", "nerfstudio", "blender", "nerfies", "multicamera"}
+
+
+@pytest.mark.parametrize("words", commands("xplanes inspect"), ids=" ".join)
+def test_inspect_as_the_page_says(words: list[str], place: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(place)
+    before = {path: path.stat().st_mtime_ns for path in (place / "captures").rglob("*")}
+    assert main(["inspect", *words]) == 0, capsys.readouterr().err
+    printed = capsys.readouterr().out
+    if "--json" in words:
+        picture = json.loads(printed)["picture"]
+    else:
+        picture = printed.partition("\nwrote   ")[2].splitlines()[0]
+    assert (place / picture).is_file()
+    after = {path: path.stat().st_mtime_ns for path in (place / "captures").rglob("*")}
+    assert after == before
+
+
+def small(words: list[str]) -> list[str]:
+    """A command's settings, with what makes a run last a moment."""
+    kept = [text for text in SMALL if not text.startswith(("data.", "lrm="))]
+    sizes = ["data.resolution=24" if text == "data.resolution=400" else text for text in words]
+    return [*sizes, *kept, "lrm=none", "trainer.max_steps=2", "callbacks.evaluation.at=[0]"]
+
+
+@pytest.mark.parametrize("words", commands(r"python train\.py"), ids=" ".join)
+def test_training_reads_what_the_page_says(words: list[str], place: Path, monkeypatch) -> None:
+    monkeypatch.chdir(place)
+    settings = [text for text in small(words) if not text.startswith("hydra.")]
+    scene = SceneDataModule(compose_plain("train", settings)["data"]).scene
+    assert {"train"} < set(scene.splits)
+    assert len(scene.splits["train"]) > 4
+
+
+@pytest.mark.slow
+def test_training_and_rendering_as_the_page_says(place: Path, monkeypatch) -> None:
+    from xplanes.launch import train
+
+    monkeypatch.chdir(place)
+    for words in commands(r"python train\.py"):
+        train(small(words), ["train"])
+    for words in commands("xplanes render"):
+        assert main(["render", *words, "--frames", "2", "--size", "16"]) == 0
+        assert Path(words[-1]).is_file()

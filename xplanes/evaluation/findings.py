@@ -1,0 +1,512 @@
+"""What may be wrong with a capture: each finding in words, with its numbers and the way out."""
+
+import hashlib
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from xplanes.rendering.box import ray_box
+from xplanes.scenes.cameras import cast_rays, project
+from xplanes.scenes.frame import Frame, backwards, optical_centre
+from xplanes.scenes.views import Scene, Views
+
+GAP_SPACINGS, GAP_SPAN = 12.0, 0.05
+"""A stretch without times is a gap from so many median spacings on that are so much of the span."""
+
+SHORT_SPAN = 0.2
+"""Share of [0, 1] that times cover at least, unless they were scaled wrongly."""
+
+CONVERGENCE = 0.02
+"""Least eigenvalue at which optical axes, which are not parallel then, meet in a point."""
+
+ASTRAY = 0.1
+"""Share of the cameras that may look past the centre of the cube."""
+
+SMALL, LARGE = 0.03, 3.0
+"""Bounds of half the cube's side, in median distances of the cameras."""
+
+COARSE = 8.0
+"""Image pixels on a texel from which on planes resolve far less than the images show."""
+
+CUT = 0.02
+"""Share of the foreground that may lie outside of the cube."""
+
+PALE_STEPS, PALE = 16, 0.15
+"""Opaque pixels at most so far from the background look like it; share that may, at silhouettes."""
+
+EMPTY = 1e-3
+"""Share of opaque pixels below which an image shows next to nothing."""
+
+FULL = 0.98
+"""Share of opaque pixels from which on a mask is none."""
+
+MOST_VIEWS = 300
+"""Views of a split whose pixels are looked at, spread evenly."""
+
+MOST_RAYS = 4096
+"""Foreground pixels of an image whose rays are held against the cube."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that may be wrong.
+
+    Attributes:
+        kind: Name of what it is about, for programs.
+        text: What it is, with numbers, and what to do.
+    """
+
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the pixels of one image tell.
+
+    Attributes:
+        coverage: Share of the pixels that are opaque.
+        border: The same along the image's edges.
+        middle: The same in the middle, a tenth as wide and high as the image.
+        pale_edge: Share of the opaque pixels next to transparent ones that look like the
+            background; None where there are too few to say.
+        pale_border: Share of the pixels along the image's edges that do and are opaque.
+        cut: Share of the foreground whose rays miss the cube.
+        digest: Hash of the pixels; None where all are alike.
+    """
+
+    coverage: float
+    border: float
+    middle: float
+    pale_edge: float | None
+    pale_border: float
+    cut: float
+    digest: bytes | None
+
+
+def looked_at(views: Views) -> list[int]:
+    """Numbers of the views whose pixels are looked at."""
+    count = min(len(views), MOST_VIEWS)
+    return [round(i * (len(views) - 1) / max(count - 1, 1)) for i in range(count)]
+
+
+def look(views: Views, index: int, background: Tensor, frame: Frame | None) -> Look:
+    """Look at the pixels of one image.
+
+    Args:
+        views: The images.
+        index: Which of them.
+        background: What lies behind the scene, from 0 to 1. [3]
+        frame: The field's frame; None where none was found.
+    """
+    image = views.image(index)
+    alpha = image[..., 3]
+    height, width = alpha.shape
+    has_ray = views.intrinsics.has_ray(index)
+    valid = torch.ones_like(alpha, dtype=torch.bool) if has_ray is None else has_ray
+    opaque, clear = alpha > 127, (alpha <= 5) & valid
+    pale = (image[..., :3].short() - (255 * background).short()).abs().amax(dim=-1) < PALE_STEPS
+    pale &= alpha >= 250
+    ring = valid.clone()
+    rim = max(1, round(0.02 * min(height, width)))
+    ring[rim : height - rim, rim : width - rim] = False
+    rows, columns = (slice(round(0.45 * n), round(0.55 * n) + 1) for n in (height, width))
+    # Half-transparent pixels lie between, so that the opaque ones are two pixels away.
+    near_clear = F.max_pool2d(clear.float()[None], 5, stride=1, padding=2)[0] > 0
+    edge = near_clear & (alpha >= 250)
+    plain = bool((image == image[0, 0]).all())
+    return Look(
+        coverage=_share(opaque, valid),
+        border=_share(opaque, ring),
+        middle=_share(opaque[rows, columns], valid[rows, columns]),
+        pale_edge=_share(pale, edge) if int(edge.sum()) >= 0.1 * (height + width) else None,
+        pale_border=_share(pale, ring),
+        cut=0.0 if frame is None else _cut(views, index, opaque, frame),
+        digest=None if plain else hashlib.sha256(image.contiguous().numpy().data).digest(),
+    )
+
+
+def _share(what: Tensor, among: Tensor) -> float:
+    return float(what[among].float().mean()) if among.any() else 0.0
+
+
+def _cut(views: Views, index: int, opaque: Tensor, frame: Frame) -> float:
+    """Share of an image's foreground whose rays miss the cube."""
+    pixels = opaque.nonzero()
+    if not len(pixels):
+        return 0.0
+    rows, columns = pixels[:: -(-len(pixels) // MOST_RAYS)].float().T
+    intrinsics = views.intrinsics
+    rays = cast_rays(
+        views.camera_to_world[index],
+        rows,
+        columns,
+        focal=intrinsics.focal[index],
+        centre=intrinsics.centre[index],
+        lenses=intrinsics.lens(index),
+    )
+    far = ray_box(*frame.rays(*rays))[1]
+    return float((far <= 0).float().mean())
+
+
+def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
+    """What cameras and times alone tell, and images that different times should tell apart.
+
+    Args:
+        scene: The scene; its training views and those that are scored.
+        frame: The field's frame; None where none was found.
+    """
+    train = scene.splits["train"]
+    yield from _times(scene, train)
+    yield from _shared(scene)
+    yield from _sizes(scene)
+    if (away := _outward(train)) is not None:
+        yield away
+    elif frame is not None:
+        yield from _astray(train, frame)
+        yield from _scale(train, frame)
+
+
+def image_findings(scene: Scene, looks: Mapping[str, list[Look]]) -> Iterator[Finding]:
+    """What the images' pixels tell.
+
+    Args:
+        scene: The scene.
+        looks: Looks at the images of each split, of those that `looked_at` names.
+    """
+    masks = list(_masks(scene, looks))
+    yield from masks
+    yield from _shared_images(scene, looks)
+    if masks:
+        return  # What silhouettes tell means little then.
+    seen = [each for split in looks.values() for each in split]
+    transparent = [each for each in seen if each.coverage < FULL]
+    if 2 * len(transparent) > len(seen):
+        yield from _white_edges(transparent)
+        share = _mean([each.cut for each in transparent])
+        if share > CUT:
+            yield Finding(
+                "cut",
+                f"the cube cuts off {share:.0%} of the foreground: nothing is shown outside of it. "
+                "Raise data.half_side, or mask what does not belong to the scene",
+            )
+        return
+    bordered = [each for each in seen if each.pale_border > 0.9]
+    if 2 * len(bordered) > len(seen):
+        yield Finding(
+            "white",
+            f"{len(bordered)} of {len(seen)} images are opaque and end in the background's colour: "
+            "a field that is empty there and one that is filled look the same. Write RGBA images "
+            "or masks",
+        )
+
+
+def texel_findings(per_texel: float, views: Views, resolution: int) -> Iterator[Finding]:
+    """Whether the images show far more than planes resolve.
+
+    Args:
+        per_texel: Image pixels that a texel of the planes covers, see `pixels_per_texel`.
+        views: Training views.
+        resolution: Texels along an axis of the planes.
+    """
+    if per_texel > COARSE:
+        width = max(1, round(views.width * 0.5 * COARSE / per_texel))
+        finer = 2 ** round(math.log2(resolution * per_texel / (0.5 * COARSE)))
+        yield Finding(
+            "texels",
+            f"a texel of planes with {resolution} texels a side covers {per_texel:.0f} pixels of "
+            f"images {views.width} pixels wide. Set data.resolution={width}, which costs nothing "
+            f"that the planes could show, or model.resolution={finer}",
+        )
+
+
+def pixels_per_texel(views: Views, frame: Frame, resolution: int) -> float:
+    """Image pixels, along a side, that a texel covers at the centre of the cube; the median view.
+
+    Args:
+        views: Training views.
+        frame: The field's frame.
+        resolution: Texels along an axis of the planes.
+    """
+    distance = (views.camera_to_world[:, :3, 3] - frame.centre).double().norm(dim=-1)
+    pixel = distance / views.intrinsics.pinhole.amax(dim=1)
+    return float((2 / frame.scale / resolution / pixel).median())
+
+
+def time_steps(views: Views) -> Tensor:
+    """The views' different times, in order. [T]"""
+    return views.times.double().unique()
+
+
+def time_gaps(views: Views) -> list[tuple[float, float]]:
+    """Stretches without views that are far longer than the usual spacing, first and last time."""
+    times = time_steps(views)
+    if len(times) < 5:
+        return []
+    spacing = times.diff()
+    least = max(GAP_SPACINGS * float(spacing.median()), GAP_SPAN * float(times[-1] - times[0]))
+    return [
+        (float(times[i]), float(times[i + 1])) for i in (spacing > least).nonzero()[:, 0].tolist()
+    ]
+
+
+def _times(scene: Scene, train: Views) -> Iterator[Finding]:
+    times = time_steps(train)
+    gaps = time_gaps(train)
+    if gaps:
+        longest = max(gaps, key=lambda gap: gap[1] - gap[0])
+        more = f" ({len(gaps)} such gaps in all)" if len(gaps) > 1 else ""
+        yield Finding(
+            "times",
+            f"no training view shows the times between {longest[0]:.3g} and {longest[1]:.3g}, "
+            f"{(longest[1] - longest[0]) / float(times.diff().median()):.0f} times the median "
+            f"spacing{more}: the field can only guess there. Add views, or correct the times",
+        )
+    span = float(times[-1] - times[0])
+    if 0 < span < SHORT_SPAN:
+        yield Finding(
+            "times",
+            f"training times run from {float(times[0]):.3g} to {float(times[-1]):.3g}, "
+            f"{span:.0%} of [0, 1]: most of the field's timesteps are never seen. Divide frame "
+            "numbers by the last one",
+        )
+    if span == 0 and not scene.static_reason and (pair := _same_camera_other_image(train)):
+        first, second = (train.files[i] for i in pair)
+        yield Finding(
+            "one_time",
+            f"all training views have the time {float(times[0]):.3g}, but {first} and {second} "
+            "have one camera and show different things: the scene moves. Give every image its "
+            "time, or take those of one timestep alone",
+        )
+
+
+def _same_camera_other_image(views: Views) -> tuple[int, int] | None:
+    """Two images of one pose that differ."""
+    groups: dict[bytes, int] = {}
+    for index, pose in enumerate(views.camera_to_world):
+        other = groups.setdefault(pose.contiguous().numpy().tobytes(), index)
+        if other == index or views.size(other) != views.size(index):
+            continue
+        apart = (views.image(index).short() - views.image(other).short()).abs().amax(dim=-1)
+        if float((apart > PALE_STEPS).float().mean()) > 1e-3:
+            return other, index
+    return None
+
+
+def _shared(scene: Scene) -> Iterator[Finding]:
+    """Scored views that are training views by their file, or by camera and time."""
+    train = scene.splits["train"]
+    names = dict(zip(train.files, range(len(train)), strict=True))
+    poses = train.camera_to_world.double()
+    room = 1e-5 * float((poses[:, :3, 3] - poses[:, :3, 3].mean(dim=0)).norm(dim=-1).median())
+    for split, views in scene.splits.items():
+        if split == "train":
+            continue
+        found = []
+        for index, file in enumerate(views.files):
+            pose, time = views.camera_to_world[index], views.times[index]
+            other = names.get(file)
+            # Formats of the user's own may name the files of each split by themselves.
+            if other is not None and torch.equal(views.image(index), train.image(other)):
+                found.append((file, file))
+                continue
+            near = (poses - pose.double()).abs().flatten(1).amax(dim=1) <= max(room, 1e-9)
+            near &= (train.times - time).abs() <= 1e-6
+            if near.any():
+                found.append((file, train.files[int(near.nonzero()[0, 0])]))
+        if found:
+            yield _shared_finding(split, len(views), found, "file, or the same camera and time")
+
+
+def _shared_images(scene: Scene, looks: Mapping[str, list[Look]]) -> Iterator[Finding]:
+    """Scored views whose pixels are those of a training view with another camera or file."""
+    if any(_shared(scene)):
+        return
+    train = scene.splits["train"]
+    known = {
+        each.digest: index
+        for index, each in zip(looked_at(train), looks["train"], strict=True)
+        if each.digest is not None
+    }
+    for split, views in scene.splits.items():
+        if split == "train":
+            continue
+        found = []
+        for index, each in zip(looked_at(views), looks[split], strict=True):
+            other = known.get(each.digest) if each.digest is not None else None
+            # One camera shows the same again as long as nothing moves.
+            if other is not None and not torch.equal(
+                views.camera_to_world[index], train.camera_to_world[other]
+            ):
+                found.append((views.files[index], train.files[other]))
+        if found:
+            yield _shared_finding(split, len(views), found, "pixels")
+
+
+def _shared_finding(split: str, total: int, found: list[tuple[str, str]], what: str) -> Finding:
+    file, other = found[0]
+    return Finding(
+        "shared",
+        f"{len(found)} of {total} {split} views are training views too, by the same {what} "
+        f"({file} is {other}): scores would flatter the field. Take them out of one of the splits",
+    )
+
+
+def _sizes(scene: Scene) -> Iterator[Finding]:
+    """Images of one camera that differ in size."""
+    sizes: dict[tuple[float, ...], dict[tuple[int, int], int]] = {}
+    for views in scene.splits.values():
+        for key, size in zip(calibrations(views), views.intrinsics.size.tolist(), strict=True):
+            found = sizes.setdefault(key, {})
+            found[(size[1], size[0])] = found.get((size[1], size[0]), 0) + 1
+    mixed = [found for found in sizes.values() if len(found) > 1]
+    if mixed:
+        words = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in mixed[0].items())
+        yield Finding(
+            "sizes",
+            f"images of one camera differ in size ({words}): small ones count less and show less. "
+            "Export all at one size, or set data.resolution",
+        )
+
+
+def calibrations(views: Views) -> list[tuple[float, ...]]:
+    """What tells the cameras of images apart, whatever the images' sizes are. [V]"""
+    intrinsics = views.intrinsics
+    scale = intrinsics.size.flip(1).double()
+    parts = [intrinsics.focal / scale, intrinsics.centre / scale]
+    if (lenses := intrinsics.lenses) is not None:
+        parts += [lenses.model[:, None].double(), lenses.coefficients]
+    return [tuple(round(value, 4) for value in row) for row in torch.cat(parts, dim=1).tolist()]
+
+
+def _outward(views: Views) -> Finding | None:
+    """Whether the cameras look away from the point in which their axes meet."""
+    axis = -backwards(views).double()
+    eye = torch.eye(3, dtype=torch.float64)
+    projector = (eye - axis[:, :, None] * axis[:, None, :]).mean(dim=0)
+    if float(torch.linalg.eigvalsh(projector)[0]) < CONVERGENCE:
+        return None  # Axes that are nearly parallel may meet anywhere.
+    to_centre = optical_centre(views).double() - views.camera_to_world[:, :3, 3].double()
+    away = int(((to_centre * axis).sum(dim=-1) < 0).sum())
+    if 2 * away <= len(views):
+        return None
+    return Finding(
+        "axes",
+        f"{away} of {len(views)} cameras look away from the point where their axes meet. Axes must "
+        "be OpenGL's (x right, y up, z backward): where those of the file are OpenCV's (y down, z "
+        "forward), negate the second and third column of every pose. Cameras that do look outward, "
+        "as in a panorama, see no common volume",
+    )
+
+
+def sees_centre(views: Views, frame: Frame) -> Tensor:
+    """Which cameras have the centre of the cube in their image. bool [V]"""
+    found = torch.zeros(len(views), dtype=torch.bool)
+    for index, pose in enumerate(views.camera_to_world):
+        intrinsics = views.intrinsics
+        column, row, seen = project(
+            pose,
+            frame.centre[None],
+            focal=intrinsics.focal[index],
+            centre=intrinsics.centre[index],
+            lenses=intrinsics.lens(index),
+        )
+        height, width = views.size(index)
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        found[index] = seen & inside
+    return found
+
+
+def _astray(views: Views, frame: Frame) -> Iterator[Finding]:
+    sees = sees_centre(views, frame)
+    blind = (~sees).nonzero()[:, 0].tolist()
+    if len(blind) > ASTRAY * len(views):
+        centre = ", ".join(f"{value:.3g}" for value in frame.centre.tolist())
+        yield Finding(
+            "astray",
+            f"{len(blind)} of {len(views)} cameras do not see the centre of the cube ({centre}), "
+            f"such as that of {views.files[blind[0]]}. All must look at one thing, from around it: "
+            "check their poses, or leave these views out",
+        )
+
+
+def _scale(views: Views, frame: Frame) -> Iterator[Finding]:
+    away = (views.camera_to_world[:, :3, 3] - frame.centre).norm(dim=-1)
+    distance, half = float(away.median()), 1 / frame.scale
+    if not SMALL * distance <= half <= LARGE * distance:
+        word = "small" if half < distance else "large"
+        yield Finding(
+            "scale",
+            f"the cube is {2 * half:.3g} world units wide, but the cameras are {distance:.3g} away "
+            f"from its centre: it is too {word}, or in other units than the poses. Set "
+            f"data.half_side to half the width of the scene (null estimates it)",
+        )
+
+
+def _masks(scene: Scene, looks: Mapping[str, list[Look]]) -> Iterator[Finding]:
+    """Masks that hide everything, nothing, or the wrong side."""
+    named = [
+        (scene.splits[split].files[index], each)
+        for split, found in looks.items()
+        for index, each in zip(looked_at(scene.splits[split]), found, strict=True)
+    ]
+    count = len(named)
+    empty = [file for file, each in named if each.coverage < EMPTY]
+    if len(empty) > 0.05 * count:
+        yield Finding(
+            "empty",
+            f"{len(empty)} of {count} images show next to nothing (under {EMPTY:.1%} of their "
+            f"pixels are opaque), such as {empty[0]}. Check alpha and masks, or leave them out",
+        )
+    inside_out = [
+        file
+        for file, each in named
+        if each.border > 0.9 and each.middle < 0.1 and 0.3 < each.coverage < 1
+    ]
+    if 2 * len(inside_out) > count:
+        coverage = _mean([each.coverage for _, each in named])
+        yield Finding(
+            "inverted",
+            f"{len(inside_out)} of {count} images are opaque at their edges and transparent in the "
+            f"middle; {coverage:.0%} of all pixels are opaque. The masks seem inverted: they must "
+            "be white, or alpha opaque, where the scene is",
+        )
+        return
+    full = [file for file, each in named if each.coverage >= 0.9995]
+    masked = [each for _, each in named if each.coverage < 0.9995]
+    hardly = [each for each in masked if each.coverage > FULL]
+    if 2 * len(hardly) > count:
+        yield Finding(
+            "opaque",
+            f"{len(hardly)} of {count} images have a mask that hides less than "
+            f"{1 - FULL:.0%} of the pixels. Check the masks: they must hide the background, or be "
+            "left out",
+        )
+    elif full and _mean([each.coverage for each in masked] or [1.0]) < 0.5:
+        yield Finding(
+            "opaque",
+            f"{len(full)} of {count} images are opaque all over, such as {full[0]}, while the "
+            f"others hide {1 - _mean([each.coverage for each in masked]):.0%} of their pixels. "
+            "Their masks are missing: add them, or leave the images out",
+        )
+
+
+def _white_edges(seen: list[Look]) -> Iterator[Finding]:
+    """Silhouettes that look like the background."""
+    edges = [each.pale_edge for each in seen if each.pale_edge is not None]
+    pale = _mean(edges) if edges else 0.0
+    if pale > PALE:
+        yield Finding(
+            "white",
+            f"{pale:.0%} of the silhouettes have the background's colour: colour alone cannot tell "
+            "the scene from empty space there. Keep model.loss.opacity above 0, which learns them "
+            "from alpha, or set model.rays.background=random",
+        )
+
+
+def _mean(values: list[float]) -> float:
+    return math.fsum(values) / len(values)

@@ -1,0 +1,460 @@
+"""`xplanes inspect`: what is read of a capture, as a table and a picture, with warnings."""
+
+import math
+import re
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from xplanes.components import build, plugins
+from xplanes.config import compose_plain, group_options
+from xplanes.errors import ConfigError
+from xplanes.evaluation.findings import (
+    Finding,
+    Look,
+    calibrations,
+    camera_findings,
+    image_findings,
+    look,
+    looked_at,
+    pixels_per_texel,
+    texel_findings,
+    time_gaps,
+    time_steps,
+)
+from xplanes.evaluation.tabulate import markdown
+from xplanes.models.base import ModelSettings
+from xplanes.process import train_command
+from xplanes.scenes.cameras import cast_rays, image_plane
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
+from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.views import Scene, Views
+
+CONSEQUENCES = {"scale": ("cut", "texels"), "astray": ("cut",)}
+"""Findings that say no more than another one does."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a capture is read with.
+
+    Attributes:
+        overrides: Settings of train.py that read the same.
+        scene: The settings of the scene.
+        model: Those of the model, for the field's frame and its planes.
+    """
+
+    overrides: tuple[str, ...]
+    scene: SceneSettings
+    model: ModelSettings
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A capture that was read and looked at.
+
+    Attributes:
+        choice: What it was read with.
+        scene: What was read.
+        frame: The field's frame; None where none can be found.
+        problem: Why none can be found; empty where one was.
+        looks: Looks at the images of each split.
+        findings: What may be wrong.
+        texels: Texels along an axis of the planes; None for fields without planes.
+    """
+
+    choice: "Choice"
+    scene: Scene
+    frame: Frame | None
+    problem: str
+    looks: Mapping[str, list[Look]]
+    findings: tuple[Finding, ...]
+    texels: int | None
+
+
+@dataclass(frozen=True)
+class CameraGroup:
+    """The views of one physical camera, as far as poses and lenses tell.
+
+    Attributes:
+        name: Their folder where it tells cameras apart, or a number.
+        indices: Numbers of the views.
+        fixed: Whether it stands still.
+    """
+
+    name: str
+    indices: list[int]
+    fixed: bool
+
+
+def choose(arguments: Sequence[str]) -> Choice:
+    """The settings of a capture: of the format that a folder is recognised as, or those given.
+
+    Args:
+        arguments: A folder, whose images are then taken at their native size; settings of train.py;
+            or both.
+
+    Raises:
+        ConfigError: If the settings cannot work, or several formats fit.
+        SceneError: If there is no such folder, or no format fits.
+    """
+    changed = [text for text in arguments if "=" in text and not Path(text).exists()]
+    folders = [Path(text) for text in arguments if text not in changed]
+    if len(folders) > 1:
+        raise ConfigError(f"{folders[1]}: give one folder, and settings as key=value")
+    if folders:
+        folder = folders[0] if folders[0].name not in ("", "..") else folders[0].resolve()
+        if not folder.is_dir():
+            raise SceneError(f"{folder} is not a folder. Give the folder of a scene")
+        given = {text.partition("=")[0] for text in changed}
+        data = [] if "data" in given else [f"data={_recognised(folder, changed)}"]
+        size = [] if "data.resolution" in given else ["data.resolution=null"]
+        changed = [*data, *_place(folder), *size, *changed]
+    plain = compose_plain("train", changed)
+    with plugins(plain.get("plugins") or []):
+        scene = build(plain["data"], SceneSettings, "data")
+        return Choice(tuple(changed), scene, build(plain["model"], ModelSettings, "model"))
+
+
+def _place(folder: Path) -> list[str]:
+    """Where a scene is, as settings."""
+    parts = {"data.root": str(folder.parent), "data.scene": folder.name}
+    return [f"{key}={_quoted(text)}" for key, text in parts.items()]
+
+
+def _quoted(text: str) -> str:
+    """Text as Hydra reads it."""
+    if re.fullmatch(r"[A-Za-z_./][\w./-]*", text):
+        return text
+    escaped = re.sub(r"(\\*)'", r"\1\1\'", text)
+    return f"'{escaped}'"
+
+
+def _recognised(folder: Path, changed: Sequence[str]) -> str:
+    """The option of ``data`` whose format a folder is in."""
+    search = [text for text in changed if text.startswith(("hydra.searchpath=", "plugins="))]
+    modules = compose_plain("train", search).get("plugins") or []
+    search = [text for text in search if text.startswith("hydra.")]
+    known: dict[type[SceneSettings], str] = {}
+    with plugins(modules):
+        for option in group_options("data", search):
+            node = compose_plain(None, [f"+data={option}", *_place(folder), *search])["data"]
+            known.setdefault(type(build(node, SceneSettings, "data")), option)
+    found = [option for cls, option in known.items() if cls.recognises(folder)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise ConfigError(
+            f"{folder} holds files of several formats ({', '.join(found)}): choose one with "
+            f"data={found[0]}"
+        )
+    inside = sorted(
+        path.name
+        for path in folder.iterdir()
+        if path.is_dir() and any(cls.recognises(path) for cls in known)
+    )
+    scenes = f" Scenes inside it: {', '.join(inside)}." if inside else ""
+    raise SceneError(
+        f"{folder} is no scene of a known format.{scenes} docs/your_own_data.md lists the files of "
+        "each format; data=NAME chooses one"
+    )
+
+
+def inspect(choice: Choice) -> Capture:
+    """Read a capture and look at all of it.
+
+    Raises:
+        SceneError: If it cannot be used.
+    """
+    choice.scene.prepare()
+    scene, model = choice.scene.read(), choice.model
+    train = scene.splits["train"]
+    frame, problem = None, ""
+    try:
+        frame = model.frame(train, choice.scene.half_side)
+    except SceneError as error:
+        problem = str(error)
+    looks = {
+        split: [look(views, index, scene.background, frame) for index in looked_at(views)]
+        for split, views in scene.splits.items()
+    }
+    texels = getattr(model, "resolution", None)
+    texels = texels if isinstance(texels, int) else None
+    findings = [*camera_findings(scene, frame), *image_findings(scene, looks)]
+    if frame is not None and texels is not None:
+        findings += texel_findings(pixels_per_texel(train, frame, texels), train, texels)
+    follows = {kind for each in findings for kind in CONSEQUENCES.get(each.kind, ())}
+    findings = [each for each in findings if each.kind not in follows]
+    return Capture(choice, scene, frame, problem, looks, tuple(findings), texels)
+
+
+def cameras_of(views: Views) -> list[CameraGroup]:
+    """The views by camera: fixed ones by their poses, others by their lenses.
+
+    Cameras count as fixed where each pose has two views or more on average.
+    """
+    poses: dict[Any, list[int]] = {}
+    for index, pose in enumerate(views.camera_to_world):
+        poses.setdefault(pose.contiguous().numpy().tobytes(), []).append(index)
+    fixed = len(views) > 1 and 2 * len(poses) <= len(views)
+    groups = poses
+    if not fixed:
+        groups = {}
+        for index, key in enumerate(calibrations(views)):
+            groups.setdefault(key, []).append(index)
+    found = list(groups.values())
+    folders = [{Path(views.files[i]).parent.name for i in indices} for indices in found]
+    told = all(len(names) == 1 for names in folders) and len(set.union(*folders)) == len(found)
+    names = [min(names) if told else f"camera {n}" for n, names in enumerate(folders)]
+    return [CameraGroup(name, indices, fixed) for name, indices in zip(names, found, strict=True)]
+
+
+def lens_words(views: Views) -> str:
+    """The kinds of lenses, with the coefficients that they have."""
+    lenses = views.intrinsics.lenses
+    if lenses is None:
+        return "pinhole"
+    words = []
+    rows = torch.cat([lenses.model[:, None].double(), (lenses.coefficients != 0).double()], dim=1)
+    for kind, *has in rows.unique(dim=0).tolist():
+        model = LensModel(int(kind))
+        named = [name for name, given in zip(COEFFICIENTS, has, strict=True) if given]
+        if model == LensModel.FOV:
+            named = ["omega"] if named else []
+        plain = model == LensModel.PERSPECTIVE and not named
+        words.append("pinhole" if plain else " ".join([model.name.lower(), *named]))
+    return ", ".join(words)
+
+
+def distortion(views: Views) -> float:
+    """How far distortion moves the images' corners at most, in pixels.
+
+    Fisheye lenses are compared with an equidistant one, others with a pinhole. Corners that no
+    direction belongs to are left out.
+    """
+    intrinsics, largest = views.intrinsics, 0.0
+    if intrinsics.lenses is None:
+        return largest
+    done = set()
+    for index, key in enumerate(calibrations(views)):
+        key = (*key, *views.size(index))
+        if key in done:
+            continue
+        done.add(key)
+        height, width = views.size(index)
+        lens = intrinsics.lenses.subset(slice(index, index + 1))
+        rows = torch.tensor([-0.5, -0.5, height - 0.5, height - 0.5], dtype=torch.float64)
+        columns = torch.tensor([-0.5, width - 0.5, -0.5, width - 0.5], dtype=torch.float64)
+        x, y = image_plane(
+            rows,
+            columns,
+            focal=intrinsics.focal[index],
+            centre=intrinsics.centre[index],
+            lenses=lens,
+        )
+        local, found = lens.directions(x, y)
+        straight = replace(Lenses.pinholes(1), model=lens.model, limit=None)
+        if lens.model[0] == LensModel.FOV:
+            straight = Lenses.pinholes(1)
+        ideal_x, ideal_y, seen = straight.image_points(local)
+        moved = torch.stack([x - ideal_x, y - ideal_y], dim=1) * intrinsics.focal[index]
+        moved = moved.norm(dim=1)[found & seen]
+        if len(moved):
+            largest = max(largest, float(moved.max()))
+    return largest
+
+
+def field_of_view(views: Views) -> tuple[float, float]:
+    """Angles in degrees between the middles of opposite edges, across and down; the first view."""
+    intrinsics = views.intrinsics
+    height, width = views.size(0)
+    rows = torch.tensor([height / 2 - 0.5] * 2 + [-0.5, height - 0.5], dtype=torch.float64)
+    columns = torch.tensor([-0.5, width - 0.5] + [width / 2 - 0.5] * 2, dtype=torch.float64)
+    looks = cast_rays(
+        torch.eye(4, dtype=torch.float64),
+        rows,
+        columns,
+        focal=intrinsics.focal[0],
+        centre=intrinsics.centre[0],
+        lenses=intrinsics.lens(0),
+    )[1]
+    across, down = (
+        math.degrees(math.acos(max(-1.0, min(1.0, float(looks[i] @ looks[i + 1]))))) for i in (0, 2)
+    )
+    return across, down
+
+
+def facts(capture: Capture) -> dict[str, Any]:
+    """What was read, as builtins for JSON: lengths in world units, sizes as height and width."""
+    scene, frame = capture.scene, capture.frame
+    train = scene.splits["train"]
+    content: dict[str, Any] = {
+        "scene": scene.name,
+        "format": capture.choice.scene.name,
+        "folder": str(capture.choice.scene.folder),
+        "overrides": list(capture.choice.overrides),
+        "splits": {
+            split: _split_facts(views, capture.looks[split])
+            for split, views in scene.splits.items()
+        },
+        "video_frames": None if scene.video is None else len(scene.video),
+        "static_reason": scene.static_reason,
+        "cube": None,
+        "texels": capture.texels,
+        "pixels_per_texel": None,
+        "bytes": sum(views.nbytes for views in scene.splits.values()),
+        "warnings": [{"kind": each.kind, "text": each.text} for each in capture.findings],
+        "error": capture.problem or None,
+    }
+    if frame is not None:
+        away = (train.camera_to_world[:, :3, 3] - frame.centre).norm(dim=-1)
+        content["cube"] = {
+            "centre": [_rounded(float(value), frame) for value in frame.centre],
+            "side": 2 / frame.scale,
+            "source": _cube_source(capture),
+            "camera_distance": [float(away.min()), float(away.median()), float(away.max())],
+        }
+        if capture.texels is not None:
+            content["pixels_per_texel"] = pixels_per_texel(train, frame, capture.texels)
+    return content
+
+
+def _rounded(value: float, frame: Frame) -> float:
+    """A coordinate to a millionth of the cube's size: rounding errors show as 0."""
+    return round(value * frame.scale, 6) / frame.scale + 0.0
+
+
+def _cube_source(capture: Capture) -> str:
+    if capture.choice.scene.half_side is not None:
+        return "data.half_side"
+    opaque = all(each.coverage >= 0.9995 for each in capture.looks["train"])
+    return "cameras" if opaque else "cameras and silhouettes"
+
+
+def _split_facts(views: Views, looks: Sequence[Look]) -> dict[str, Any]:
+    groups = cameras_of(views)
+    times = time_steps(views)
+    spacing = times.diff()
+    coverage = sorted(each.coverage for each in looks)
+    return {
+        "views": len(views),
+        "looked_at": len(looks),
+        "sizes": sorted({views.size(index) for index in range(len(views))}),
+        "cameras": len(groups),
+        "cameras_fixed": groups[0].fixed,
+        "lens": lens_words(views),
+        "distortion_pixels": distortion(views),
+        "field_of_view": list(field_of_view(views)),
+        "times": [float(times[0]), float(times[-1])],
+        "timesteps": len(times),
+        "median_spacing": float(spacing.median()) if len(spacing) else None,
+        "largest_gap": float(spacing.max()) if len(spacing) else None,
+        "gaps": time_gaps(views),
+        "opaque": [coverage[0], coverage[len(coverage) // 2], coverage[-1]],
+        "bytes": views.nbytes,
+    }
+
+
+def table(capture: Capture) -> str:
+    """What was read, as text."""
+    known = facts(capture)
+    rows = {
+        "views": lambda each: str(each["views"]),
+        "pixels": lambda each: _size_words(each["sizes"]),
+        "cameras": _camera_words,
+        "lens": lambda each: each["lens"],
+        "distortion": _distortion_words,
+        "field of view": lambda each: "{:.0f} x {:.0f} degrees".format(*each["field_of_view"]),
+        "times": _time_words,
+        "longest gap": _gap_words,
+        "opaque pixels": _cover_words,
+        "memory": lambda each: f"{each['bytes'] / 2**20:.1f} MB",
+    }
+    splits = known["splits"]
+    lines = [[name, *(words(each) for each in splits.values())] for name, words in rows.items()]
+    text = [
+        f"scene   {known['scene']}, read from {known['folder']} as {known['format']}",
+        "",
+        markdown(["split", *splits], lines),
+        "",
+    ]
+    if known["video_frames"]:
+        text.append(f"video   {known['video_frames']} frames of a fixed camera")
+    if known["static_reason"]:
+        text.append(f"static  {known['static_reason']}")
+    elif known["splits"]["train"]["timesteps"] == 1:
+        text.append("static  all training views have one time, so nothing can move")
+    if (cube := known["cube"]) is not None:
+        centre = ", ".join(f"{value:.3g}" for value in cube["centre"])
+        near, middle, far = cube["camera_distance"]
+        text.append(
+            f"cube    {cube['side']:.3g} world units wide around ({centre}), from "
+            f"{cube['source']}; cameras are {near:.3g} to {far:.3g} away, median {middle:.3g}"
+        )
+    if known["pixels_per_texel"] is not None:
+        text.append(
+            f"texels  {known['texels']} a side (model.resolution): each covers "
+            f"{known['pixels_per_texel']:.1f} image pixels at the centre of the cube"
+        )
+    warned = [f"warning ({each.kind})  {each.text}" for each in capture.findings]
+    text += ["", *(warned or ["no warnings"])]
+    return "\n".join(text)
+
+
+def next_command(capture: Capture) -> str:
+    """The command that trains on the capture."""
+    return f"{train_command()} {shlex.join(capture.choice.overrides)}"
+
+
+def _size_words(sizes: Sequence[tuple[int, int]]) -> str:
+    words = [f"{width}x{height}" for height, width in sizes]
+    return words[0] if len(words) == 1 else f"{words[0]} to {words[-1]}"
+
+
+def _camera_words(each: Mapping[str, Any]) -> str:
+    return f"{each['cameras']} {'fixed' if each['cameras_fixed'] else 'moving'}"
+
+
+def _distortion_words(each: Mapping[str, Any]) -> str:
+    pixels = each["distortion_pixels"]
+    return f"{pixels:.1f} px at a corner" if pixels else "none"
+
+
+def _gap_words(each: Mapping[str, Any]) -> str:
+    gap = each["largest_gap"]
+    return "none" if gap is None else f"{gap:.3g}, median {each['median_spacing']:.3g}"
+
+
+def _time_words(each: Mapping[str, Any]) -> str:
+    first, last = each["times"]
+    if first == last:
+        return f"all {first:g}"
+    return f"{each['timesteps']} from {first:.3g} to {last:.3g}"
+
+
+def _cover_words(each: Mapping[str, Any]) -> str:
+    low, middle, high = each["opaque"]
+    words = "all" if low >= 0.9995 else f"{low:.0%} to {high:.0%}, median {middle:.0%}"
+    return words if each["looked_at"] == each["views"] else f"{words}, {each['looked_at']} views"
+
+
+def check_out(out: Path, settings: SceneSettings) -> None:
+    """Refuse to write the picture where it cannot or must not be.
+
+    Raises:
+        ConfigError: If it is no PNG, or lies in the folder of the scene.
+    """
+    if out.suffix.lower() != ".png":
+        raise ConfigError(f"--out {out}: must end in .png")
+    folder = settings.folder.resolve()
+    if out.resolve().is_relative_to(folder):
+        raise ConfigError(
+            f"--out {out}: lies in the scene's own folder {folder}, where nothing is written. Name "
+            "another place"
+        )

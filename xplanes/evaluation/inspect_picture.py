@@ -1,0 +1,371 @@
+"""The picture of `xplanes inspect`: cameras, times, masks, and images with the cube's edges."""
+
+import math
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from xplanes.evaluation.findings import sees_centre, time_gaps
+from xplanes.evaluation.inspect import CameraGroup, Capture, cameras_of
+from xplanes.files import replacing
+from xplanes.scenes.cameras import cast_rays, project
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.views import Views
+
+WIDTH, HEIGHT, MARGIN = 1600, 960, 24
+SCALE = 2
+"""The picture is drawn so many times as large, then reduced: lines and letters become smooth."""
+
+INK, FAINT, PAPER, PANEL = "#1f2933", "#9aa5b1", "#ffffff", "#f5f7fa"
+SPLITS = {"train": "#2b6cb0", "val": "#d97706", "test": "#2f855a"}
+OTHER, ASTRAY, CUBE, GAP = "#6b46c1", "#d64545", "#c026a3", "#f9d6d5"
+MOST_FRUSTA, MOST_RAYS, MOST_STRIPS, SAMPLES = 80, 3, 12, 6
+EDGE_POINTS = 48
+"""Points along an edge of the cube, which a lens may bend."""
+
+Box = tuple[float, float, float, float]
+"""Left, top, right and bottom, in pixels of the finished picture."""
+
+
+def write_picture(path: Path, capture: Capture) -> None:
+    """Draw a capture to a PNG file, whole or not at all."""
+    picture = draw(capture)
+    with replacing(path) as temporary:
+        picture.save(temporary, format="PNG")
+
+
+def draw(capture: Capture) -> Image.Image:
+    """A capture as a picture."""
+    sheet = _Sheet(WIDTH, HEIGHT)
+    scene = capture.scene
+    sheet.text((MARGIN, 16), scene.name, size=26)
+    _legend(sheet, capture)
+    top, side = 76, 520
+    for number, (title, axes) in enumerate((("from above", "xy"), ("from the side", "xz"))):
+        left = MARGIN + number * (side + MARGIN)
+        sheet.paste(_cameras(side, title, axes, capture), (left, top))
+    left, right = MARGIN + 2 * (side + MARGIN), WIDTH - MARGIN
+    _times(sheet, (left, top, right, top + 300), capture)
+    _coverage(sheet, (left, top + 324, right, top + side), capture)
+    _samples(sheet, (MARGIN, top + side + MARGIN, right, HEIGHT - 12), capture)
+    return sheet.finished()
+
+
+class _Sheet:
+    """A picture that is drawn in pixels of its final size, and finer."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.size = (width, height)
+        self.image = Image.new("RGB", (SCALE * width, SCALE * height), PAPER)
+        self.pen = ImageDraw.Draw(self.image)
+
+    def finished(self) -> Image.Image:
+        return self.image.reduce(SCALE)
+
+    def line(self, points: Sequence[tuple[float, float]], colour: str, width: float = 1.0) -> None:
+        places = [(SCALE * x, SCALE * y) for x, y in points]
+        self.pen.line(places, fill=colour, width=max(1, round(SCALE * width)), joint="curve")
+
+    def box(self, box: Box, fill: str | None = None, outline: str | None = None) -> None:
+        self.pen.rectangle([SCALE * value for value in box], fill=fill, outline=outline)
+
+    def dot(self, place: tuple[float, float], radius: float, colour: str) -> None:
+        x, y = place
+        corners = (x - radius, y - radius, x + radius, y + radius)
+        self.pen.ellipse([SCALE * value for value in corners], fill=colour)
+
+    def text(
+        self,
+        place: tuple[float, float],
+        text: str,
+        *,
+        size: int = 14,
+        colour: str = INK,
+        anchor: str = "la",
+        room: float | None = None,
+    ) -> float:
+        """Write a line, shortened in the middle to ``room`` pixels; gives its width."""
+        font = ImageFont.load_default(SCALE * size)
+        whole, kept = text, len(text)
+        while room is not None and kept > 2 and font.getlength(text) > SCALE * room:
+            kept -= 1
+            text = f"{whole[: kept // 2]}..{whole[len(whole) - (kept - kept // 2) :]}"
+        self.pen.text(
+            (SCALE * place[0], SCALE * place[1]), text, fill=colour, font=font, anchor=anchor
+        )
+        return font.getlength(text) / SCALE
+
+    def paste(self, image: Image.Image, place: tuple[float, float]) -> None:
+        self.image.paste(image, (round(SCALE * place[0]), round(SCALE * place[1])))
+
+
+def _colour(split: str) -> str:
+    return SPLITS.get(split, OTHER)
+
+
+def _legend(sheet: _Sheet, capture: Capture) -> None:
+    entries = [
+        (_colour(split), f"{split}, {len(views)} views")
+        for split, views in capture.scene.splits.items()
+    ]
+    frame = capture.frame
+    if frame is not None:
+        entries.append((CUBE, f"the field's cube, {2 / frame.scale:.3g} wide"))
+        blind = sum(
+            int((~sees_centre(views, frame)).sum()) for views in capture.scene.splits.values()
+        )
+        if blind:
+            entries.append((ASTRAY, f"{blind} do not see the centre of the cube"))
+    else:
+        entries.append((ASTRAY, "no cube: the cameras see no common volume"))
+    warned = ", ".join(dict.fromkeys(each.kind for each in capture.findings))
+    entries.append((INK, f"warnings: {warned}" if warned else "no warnings"))
+    x = float(MARGIN)
+    for colour, words in entries:
+        sheet.box((x, 54, x + 11, 65), fill=colour)
+        x += 17 + sheet.text((x + 17, 60), words, anchor="lm") + 26
+
+
+class _Plan:
+    """World points in a panel, seen along an axis from afar."""
+
+    def __init__(self, box: Box, axes: str, points: Tensor) -> None:
+        self.columns = ["xyz".index(name) for name in axes]
+        flat = points[:, self.columns].double()
+        low, high = flat.amin(dim=0), flat.amax(dim=0)
+        self.middle = 0.5 * (low + high)
+        self.span = max(float((high - low).max()), 1e-9)
+        left, top, right, bottom = box
+        self.per_unit = 0.88 * min(right - left, bottom - top) / self.span
+        self.x, self.y = 0.5 * (left + right), 0.5 * (top + bottom)
+
+    def __call__(self, points: Tensor) -> list[tuple[float, float]]:
+        flat = (points[..., self.columns].double() - self.middle) * self.per_unit
+        return [(self.x + x, self.y - y) for x, y in flat.tolist()]
+
+
+def _cameras(side: int, title: str, axes: str, capture: Capture) -> Image.Image:
+    """Cameras with their frusta, the cube, and rays through the corners of some images.
+
+    They are drawn by themselves, since rays leave the panel.
+    """
+    sheet = _Sheet(side, side)
+    sheet.box((0, 0, side, side), fill=PANEL)
+    frame, splits = capture.frame, capture.scene.splits
+    places = torch.cat([views.camera_to_world[:, :3, 3] for views in splits.values()])
+    points = places if frame is None else torch.cat([places, _cube_edges(frame).flatten(0, 1)])
+    plan = _Plan((12, 30, side - 12, side - 30), axes, points)
+    length = 0.07 * plan.span
+    train = splits["train"]
+    count = min(MOST_RAYS, len(train))
+    for index in [round((i + 0.5) * len(train) / count - 0.5) for i in range(count)]:
+        reach = 0.5 * plan.span
+        if frame is not None:
+            place = train.camera_to_world[index, :3, 3]
+            reach = float((place - frame.centre).norm()) + 0.5 / frame.scale
+        for tip in _corners(train, index, reach):
+            sheet.line(plan(torch.stack([train.camera_to_world[index, :3, 3], tip])), FAINT, 0.6)
+    if frame is not None:
+        for edge in _cube_edges(frame):
+            sheet.line(plan(edge[[0, -1]]), CUBE, 1.4)
+    for split, views in splits.items():
+        sees = torch.ones(len(views), dtype=torch.bool)
+        if frame is not None:
+            sees = sees_centre(views, frame)
+        chosen = set(_spread(len(views), MOST_FRUSTA))
+        for index in range(len(views)):
+            colour = _colour(split) if sees[index] else ASTRAY
+            place = views.camera_to_world[index, :3, 3]
+            sheet.dot(plan(place[None])[0], 2.2, colour)
+            if index in chosen or not sees[index]:
+                tips = _corners(views, index, length)
+                outline = torch.cat([tips, tips[:1]])
+                sheet.line(plan(outline), colour, 1.0)
+                for tip in tips:
+                    sheet.line(plan(torch.stack([place, tip])), colour, 0.8)
+    sheet.text((12, 8), f"{title}: {axes[0]} to the right, {axes[1]} up", size=15)
+    step = 10.0 ** math.floor(math.log10(0.4 * plan.span))
+    wide = step * plan.per_unit
+    sheet.line([(14, side - 14), (14 + wide, side - 14)], INK, 2)
+    words = f"{step:g} world unit{'' if step == 1 else 's'}"
+    sheet.text((22 + wide, side - 14), words, anchor="lm", size=13)
+    return sheet.image
+
+
+def _spread(total: int, most: int) -> list[int]:
+    count = min(total, most)
+    return [round(i * (total - 1) / max(count - 1, 1)) for i in range(count)]
+
+
+def _corners(views: Views, index: int, reach: float) -> Tensor:
+    """Points at a distance on the rays through an image's corners, around the image. [4, 3]"""
+    height, width = views.size(index)
+    rows = torch.tensor([-0.5, -0.5, height - 0.5, height - 0.5])
+    columns = torch.tensor([-0.5, width - 0.5, width - 0.5, -0.5])
+    intrinsics = views.intrinsics
+    origins, directions = cast_rays(
+        views.camera_to_world[index],
+        rows,
+        columns,
+        focal=intrinsics.focal[index],
+        centre=intrinsics.centre[index],
+        lenses=intrinsics.lens(index),
+    )
+    return origins + reach * directions
+
+
+def _cube_edges(frame: Frame) -> Tensor:
+    """Points along the cube's edges in the world. [12, P, 3]"""
+    along = torch.linspace(-1, 1, EDGE_POINTS)
+    edges = []
+    for axis in range(3):
+        for signs in product((-1.0, 1.0), repeat=2):
+            points = torch.empty(EDGE_POINTS, 3)
+            points[:, axis] = along
+            for other, sign in zip([i for i in range(3) if i != axis], signs, strict=True):
+                points[:, other] = sign
+            edges.append(points)
+    return frame.to_world(torch.stack(edges))
+
+
+def _strips(capture: Capture) -> list[tuple[str, str, list[float]]]:
+    """Split, label and times of each strip; cameras for which there is no room share the last."""
+    found = []
+    for split, views in capture.scene.splits.items():
+        groups = cameras_of(views)
+        if len(groups) > MOST_STRIPS:
+            rest = [index for group in groups[MOST_STRIPS - 1 :] for index in group.indices]
+            name = f"{len(groups) - MOST_STRIPS + 1} others"
+            groups = [*groups[: MOST_STRIPS - 1], CameraGroup(name, rest, groups[0].fixed)]
+        for group in groups:
+            label = split if len(groups) == 1 else f"{split} {group.name}"
+            found.append((split, label, views.times[group.indices].tolist()))
+    return found
+
+
+def _times(sheet: _Sheet, box: Box, capture: Capture) -> None:
+    """The times of each camera's views."""
+    left, top, right, bottom = box
+    sheet.box(box, fill=PANEL)
+    sheet.text((left + 12, top + 8), "times of the views", size=15)
+    strips = _strips(capture)
+    start, end = left + 130, right - 18
+    above, below = top + 34, bottom - 34
+    pitch = min(34.0, (below - above) / len(strips))
+    for first, last in time_gaps(capture.scene.splits["train"]):
+        place = (start + first * (end - start), start + last * (end - start))
+        sheet.box((place[0], above, place[1], below), fill=GAP)
+    for number, (split, label, times) in enumerate(strips):
+        middle = above + (number + 0.5) * pitch
+        size = min(14, max(8, int(0.8 * pitch)))
+        sheet.text((left + 12, middle), label, anchor="lm", size=size, room=start - left - 24)
+        sheet.line([(start, middle), (end, middle)], "#d9dee4", 1)
+        half = min(9.0, 0.38 * pitch)
+        for time in sorted(set(times)):
+            x = start + time * (end - start)
+            sheet.line([(x, middle - half), (x, middle + half)], _colour(split), 1.2)
+    for value in (0.0, 0.25, 0.5, 0.75, 1.0):
+        x = start + value * (end - start)
+        sheet.line([(x, below + 2), (x, below + 7)], INK, 1)
+        sheet.text((x, below + 10), f"{value:g}", anchor="ma", size=13)
+
+
+def _coverage(sheet: _Sheet, box: Box, capture: Capture) -> None:
+    """How much of each image is opaque."""
+    left, top, right, bottom = box
+    sheet.box(box, fill=PANEL)
+    sheet.text((left + 12, top + 8), "opaque pixels of each view", size=15)
+    start, end, above, below = left + 60, right - 18, top + 40, bottom - 16
+    for share in (0.0, 0.5, 1.0):
+        y = below - share * (below - above)
+        sheet.line([(start, y), (end, y)], "#d9dee4", 1)
+        sheet.text((start - 8, y), f"{share:.0%}", anchor="rm", size=13)
+    bars = [(split, each.coverage) for split, looks in capture.looks.items() for each in looks]
+    pitch = min(24.0, (end - start) / len(bars))
+    for number, (split, share) in enumerate(bars):
+        x = start + number * pitch
+        room = 0.12 * pitch
+        y = below - share * (below - above)
+        sheet.box((x + room, min(y, below - 1), x + pitch - room, below), fill=_colour(split))
+
+
+def _samples(sheet: _Sheet, box: Box, capture: Capture) -> None:
+    """Some images with the cube's edges in front."""
+    left, top, right, bottom = box
+    chosen = _chosen(capture)
+    cell = (right - left - (SAMPLES - 1) * 12) / SAMPLES
+    high = bottom - top - 44
+    for number, (split, index) in enumerate(chosen):
+        views = capture.scene.splits[split]
+        height, width = views.size(index)
+        scale = min(cell / width, high / height)
+        size = max(1, round(scale * width)), max(1, round(scale * height))
+        x = left + number * (cell + 12)
+        sheet.paste(_sample(views, index, size, capture.frame), (x, top))
+        y = top + size[1] + 6
+        name, time = views.files[index], float(views.times[index])
+        sheet.text((x, y), name, size=13, colour=_colour(split), room=cell)
+        sheet.text(
+            (x, y + 17), f"{split}, time {time:.3g}, {width}x{height} px", size=13, room=cell
+        )
+
+
+def _chosen(capture: Capture) -> list[tuple[str, int]]:
+    """Views to show: training views over the times, and one of each other split."""
+    splits = capture.scene.splits
+    others = [(split, len(views) // 2) for split, views in splits.items() if split != "train"]
+    train = splits["train"]
+    by_time = train.times.argsort(stable=True).tolist()
+    count = min(len(train), SAMPLES - len(others))
+    ranks = [round((i + 0.5) * len(train) / count - 0.5) for i in range(count)]
+    return [*(("train", by_time[rank]) for rank in ranks), *others]
+
+
+def _sample(views: Views, index: int, size: tuple[int, int], frame: Frame | None) -> Image.Image:
+    """An image in front of a chequered ground, with the edges of the cube as its lens shows them.
+
+    Args:
+        views: The images.
+        index: Which of them.
+        size: Width and height in pixels of the finished picture.
+        frame: The field's frame.
+    """
+    height, width = views.size(index)
+    wide, high = SCALE * size[0], SCALE * size[1]
+    pixels = views.image(index).numpy()
+    # Pillow would multiply the colours of an RGBA image by alpha, which they are already.
+    parts = [Image.fromarray(part.copy()) for part in (pixels[..., :3], pixels[..., 3])]
+    smooth = Image.Resampling.BOX if width > wide else Image.Resampling.NEAREST
+    colour, alpha = (
+        np.asarray(part.resize((wide, high), smooth), dtype=np.float32) / 255 for part in parts
+    )
+    rows, columns = np.indices((high, wide)) // (10 * SCALE)
+    ground = np.where((rows + columns) % 2 == 0, 0.86, 0.78)[..., None]
+    picture = colour + (1 - alpha[..., None]) * ground
+    image = Image.fromarray((255 * picture.clip(0, 1)).astype(np.uint8))
+    if frame is None:
+        return image
+    pen, intrinsics = ImageDraw.Draw(image), views.intrinsics
+    edges = _cube_edges(frame)
+    x, y, seen = project(
+        views.camera_to_world[index],
+        edges.flatten(0, 1),
+        focal=intrinsics.focal[index],
+        centre=intrinsics.centre[index],
+        lenses=intrinsics.lens(index),
+    )
+    places = torch.stack([x * wide / width, y * high / height], dim=1).view(*edges.shape[:2], 2)
+    # Beyond the picture by far, Pillow's coordinates overflow.
+    near = seen.view(edges.shape[:2]) & (places.abs().amax(dim=-1) < 20 * max(wide, high))
+    for ink, thick in ((PAPER, 3.2), (CUBE, 1.6)):
+        for edge, shown in zip(places.tolist(), near.tolist(), strict=True):
+            for i in range(EDGE_POINTS - 1):
+                if shown[i] and shown[i + 1]:
+                    line = [*edge[i], *edge[i + 1]]
+                    pen.line(line, fill=ink, width=round(SCALE * thick))
+    return image

@@ -11,10 +11,12 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.captures import write_colmap
 from tests.synthetic import ball_views, surrounding, swinging
 from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
+from xplanes.evaluation.inspect import choose
 from xplanes.lrm.canonical import OPENLRM_VIEW
 from xplanes.models.initialisation import Method, Place
 from xplanes.optional import MissingExtraError
@@ -97,6 +99,19 @@ def with_transforms(folder: Path, name: Callable[[int], str]) -> None:
     (folder / "transforms.json").write_text(json.dumps(content))
 
 
+def with_colmap(folder: Path, name: Callable[[int], str], **changes) -> None:
+    """A sparse model of one image of each camera, twice as large as the frames."""
+    focal, middle = 2 * float(VIEWS.intrinsics.focal[0, 0]), float(SIZE)
+    lens = {
+        1: ("PINHOLE", 2 * SIZE, changes.get("height", 2 * SIZE), (focal, focal, middle, middle))
+    }
+    images = [
+        (name(camera), VIEWS.camera_to_world[camera * FRAMES].double().numpy(), 1, 3)
+        for camera in range(changes.get("cameras", CAMERAS))
+    ]
+    write_colmap(folder / "sparse" / "0", lens, images, text=changes.get("text", False))
+
+
 @pytest.fixture(scope="module")
 def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return neural_3d_video(tmp_path_factory.mktemp("n3v") / "scene", write_video, ".mp4")
@@ -155,6 +170,75 @@ def test_transforms_may_name_videos(videos: Path, tmp_path: Path) -> None:
     with_transforms(tmp_path, lambda camera: f"cam{camera:02d}.mp4")
     one, other = read(tmp_path), read(videos)
     assert torch.equal(one.splits["train"].in_memory(), other.splits["train"].in_memory())
+
+
+def test_colmap_may_have_registered_an_image_of_each_camera(tmp_path: Path) -> None:
+    folder = neural_3d_video(tmp_path / "scene", write_images, "")
+    (folder / "poses_bounds.npy").unlink()
+    with_transforms(folder, lambda camera: f"cam{camera:02d}")
+    expected = read(folder)
+    (folder / "transforms.json").unlink()
+    for name in (
+        lambda camera: f"cam{camera:02d}.jpg",
+        lambda camera: f"cam{camera:02d}/0005.png",
+        lambda camera: f"first frames/cam{camera:02d}.png",
+    ):
+        for text in (False, True):
+            with_colmap(folder, name, text=text)
+            found = read(folder)
+            assert choose([str(folder)]).overrides[0] == "data=multicamera"
+            for split, views in expected.splits.items():
+                assert found.splits[split].files == views.files
+                assert torch.equal(found.splits[split].in_memory(), views.in_memory())
+                assert torch.equal(found.splits[split].times, views.times)
+                for index in range(len(views)):
+                    mine, theirs = found.splits[split].image_rays(index), views.image_rays(index)
+                    for one, other in zip(mine, theirs, strict=True):
+                        assert (one - other).abs().max() < 1e-5
+            for path in (folder / "sparse" / "0").iterdir():
+                path.unlink()
+    assert found.video.files == expected.video.files
+
+
+def test_images_and_cameras_that_do_not_belong_together(videos: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    for path in videos.glob("*.mp4"):
+        (folder / path.name).write_bytes(path.read_bytes())
+
+    def refused(match: str, name: Callable[[int], str], **changes) -> None:
+        with_colmap(folder, name, **changes)
+        with pytest.raises(SceneError, match=match):
+            read(folder)
+
+    def plain(camera: int) -> str:
+        return f"cam{camera:02d}.png"
+
+    both = r"images\.bin: {}.*Registered images: {}.*cam\*, in .*scene: cam00\.mp4, cam01\.mp4"
+    (folder / "images").mkdir()
+    with_colmap(folder, plain)
+    assert len(read_cameras(folder)) == CAMERAS
+    left = r"left0\.png, left1\.png, left2\.png, left3\.png"
+    refused(both.format("no video or folder belongs to left0.png", left), "left{}.png".format)
+    refused(
+        both.format("cam00/2.png is of cam00.mp4, as an earlier", "cam00/1.png, cam00/2.png"),
+        lambda camera: f"cam00/{camera + 1}.png",
+    )
+    three = r"cam00\.png, cam01\.png, cam02\.png\. "
+    refused(
+        both.format("no registered image belongs to cam03.mp4", three) + ".*Register an image",
+        plain,
+        cameras=3,
+    )
+    refused(r"cam00\.mp4 has 48x48 pixels, but .* 96x48, of another aspect", plain, height=SIZE)
+    (folder / "cam02.mov").write_bytes(b"")
+    refused(r"cam02\.png may be of cam02\.mov or of cam02\.mp4", plain)
+    (folder / "cam02.mov").unlink()
+    (folder / "0001").mkdir()
+    refused("cam00/0001.png may be of 0001 or of cam00", lambda camera: f"cam{camera:02d}/0001.png")
+    (folder / "sparse" / "0" / "images.bin").unlink()
+    with pytest.raises(SceneError, match=r"holds neither images\.bin nor images\.txt"):
+        read(folder)
 
 
 def test_frames_by_range_and_stride(videos: Path) -> None:

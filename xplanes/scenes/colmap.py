@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 import torch
 
 from xplanes.errors import ConfigError
-from xplanes.scenes.colmap_model import SparseModel, read_model
+from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, read_model
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.listing import (
     Listing,
@@ -30,14 +30,12 @@ from xplanes.scenes.listing import (
     thinned,
     unit_times,
 )
+from xplanes.scenes.multicamera import recordings_of_cameras
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene
 from xplanes.settings import Count
 
 logger = logging.getLogger(__name__)
-
-MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
-"""Where sparse models are looked for."""
 
 KINDS = (".png", ".jpg", ".jpeg")
 
@@ -65,11 +63,8 @@ class ColmapSettings(SceneSettings):
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:
-        # The model in colmap/ is what transforms.json beside it was made of.
-        places = [folder / name for name in MODELS if not name.startswith("colmap/")]
-        return any(
-            (place / f"cameras.{end}").is_file() for place in places for end in ("bin", "txt")
-        )
+        # A model beside videos of several cameras is their calibration.
+        return find_model(folder, MODELS[:2]) is not None and len(recordings_of_cameras(folder)) < 2
 
     def check(self) -> None:
         if self.time_pattern is None:
@@ -208,21 +203,19 @@ class ColmapSettings(SceneSettings):
 def _model_folder(folder: Path, name: str | None) -> Path:
     """The folder of the sparse model."""
     names = MODELS if name is None else (name,)
-    for each in names:
-        path = folder / each
-        if any((path / f"cameras.{end}").is_file() for end in ("bin", "txt")):
-            others = [
-                other.name
-                for other in path.parent.iterdir()
-                if other != path and other.name.isdigit() and other.is_dir()
-            ]
-            if name is None and path.name == "0" and others:
-                logger.warning(
-                    "%s holds %d models, because COLMAP could not join them all: %s is read. "
-                    "Choose another with data.model",
-                    *(path.parent, len(others) + 1, path),
-                )
-            return path
+    if (path := find_model(folder, names)) is not None:
+        others = [
+            other.name
+            for other in path.parent.iterdir()
+            if other != path and other.name.isdigit() and other.is_dir()
+        ]
+        if name is None and path.name == "0" and others:
+            logger.warning(
+                "%s holds %d models, because COLMAP could not join them all: %s is read. "
+                "Choose another with data.model",
+                *(path.parent, len(others) + 1, path),
+            )
+        return path
     if not folder.is_dir():
         raise SceneError(
             f"The folder {folder.absolute()} does not exist. Set data.root and data.scene to a "

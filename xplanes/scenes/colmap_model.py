@@ -37,6 +37,9 @@ LENSES: dict[str, tuple[int, LensModel, str]] = {
 }
 """COLMAP's camera models: their numbers in binary files, and their parameters in order."""
 
+MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
+"""Where sparse models are looked for. That in colmap/ is what transforms.json was made of."""
+
 UNIT_TOLERANCE = 1e-2
 """By how much the length of a quaternion may differ from 1."""
 
@@ -69,6 +72,14 @@ class SparseModel:
     points: np.ndarray | None
 
 
+def find_model(folder: Path, names: Sequence[str] = MODELS) -> Path | None:
+    """The first of some folders inside ``folder`` that holds a sparse model."""
+    for name in names:
+        if any((folder / name / f"cameras.{end}").is_file() for end in ("bin", "txt")):
+            return folder / name
+    return None
+
+
 def read_model(folder: Path) -> SparseModel:
     """Read and check a sparse model, from binary files where there are both kinds.
 
@@ -84,7 +95,7 @@ def read_model(folder: Path) -> SparseModel:
     if not images:
         raise SceneError(
             f"{images_path} lists no images: COLMAP has registered none. Run its mapper again, or "
-            "choose another model with data.model."
+            "choose another model."
         )
     images.sort(key=lambda image: image[0])
     for (name, *_), (after, *_) in pairwise(images):
@@ -118,8 +129,8 @@ def _part(folder: Path, name: str) -> Path:
         if (path := folder / f"{name}.{end}").is_file():
             return path
     raise SceneError(
-        f"{folder} holds neither {name}.bin nor {name}.txt. Export the model again, or set "
-        "data.model to the folder that holds it, relative to the scene's folder."
+        f"{folder} holds neither {name}.bin nor {name}.txt. Export the model again, or copy all of "
+        "it there."
     )
 
 

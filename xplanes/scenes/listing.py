@@ -263,25 +263,38 @@ def require_shapes(listing: Listing) -> None:
     """Refuse images that cannot be those that their cameras were calibrated for.
 
     Args:
-        listing: Images whose calibrations tell width and height.
+        listing: The images.
 
     Raises:
         SceneError: If an aspect ratio is another.
     """
     sizes = native_sizes(listing.paths)
-    for path, (height, width), camera in zip(
-        listing.paths, sizes, listing.calibrations, strict=True
-    ):
-        assert camera.w is not None
-        assert camera.h is not None
-        # Images that were made smaller have rounded sizes.
-        off = abs(width * camera.h - height * camera.w)
-        if off > max(1.5 * max(camera.w, camera.h), SHAPE_TOLERANCE * width * camera.h):
-            raise SceneError(
-                f"{path} has {width}x{height} pixels, but its camera was calibrated for images of "
-                f"{camera.w:g}x{camera.h:g}, of another aspect ratio. Perhaps the image was turned "
-                "or cut: take the one that the camera was calibrated with."
-            )
+    for path, size, camera in zip(listing.paths, sizes, listing.calibrations, strict=True):
+        require_shape(path, size, camera)
+
+
+def require_shape(path: Path, size: Size, camera: Calibration) -> None:
+    """Refuse an image or a video that cannot be what its camera was calibrated for.
+
+    Args:
+        path: The file, for messages.
+        size: Its height and width.
+        camera: Its calibration.
+
+    Raises:
+        SceneError: If the calibration tells width and height, of another aspect ratio.
+    """
+    if camera.w is None or camera.h is None:
+        return
+    height, width = size
+    # Images that were made smaller have rounded sizes.
+    off = abs(width * camera.h - height * camera.w)
+    if off > max(1.5 * max(camera.w, camera.h), SHAPE_TOLERANCE * width * camera.h):
+        raise SceneError(
+            f"{path} has {width}x{height} pixels, but its camera was calibrated for images of "
+            f"{camera.w:g}x{camera.h:g}, of another aspect ratio. Perhaps the image was turned "
+            "or cut: take the one that the camera was calibrated with."
+        )
 
 
 def final_intrinsics(

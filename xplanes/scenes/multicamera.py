@@ -2,15 +2,16 @@
 
 Neural 3D Video keeps the calibration in poses_bounds.npy and the cameras as cam00.mp4, cam01.mp4,
 ... in the same order. In other folders a transforms.json names each camera's video, its folder of
-images, or one of these images.
+images, or one of these images; or COLMAP has registered one image of each camera, of the camera's
+name.
 """
 
 import logging
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PureWindowsPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from xplanes.errors import ConfigError
 from xplanes.scenes import store, videos
+from xplanes.scenes.colmap_model import MODELS, find_model, read_model
 from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.images import (
     Size,
@@ -37,8 +39,11 @@ from xplanes.scenes.listing import (
     checked_pose,
     final_intrinsics,
     is_positive,
+    require_precision,
     require_rays,
+    require_shape,
     short,
+    some,
     thinned,
 )
 from xplanes.scenes.source import SceneSettings
@@ -81,7 +86,9 @@ class MultiCameraSettings(SceneSettings):
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:
-        return (folder / POSES).is_file() and any(folder.glob("cam*"))
+        if (folder / POSES).is_file():
+            return any(folder.glob("cam*"))
+        return find_model(folder, MODELS[:2]) is not None and len(recordings_of_cameras(folder)) > 1
 
     def load(self, splits: Sequence[str]) -> Scene:
         if self.train_on_video:
@@ -175,7 +182,7 @@ def read_multicamera(
     if not folder.is_dir():
         raise SceneError(
             f"The scene folder {folder.absolute()} does not exist. Set data.root and data.scene to "
-            f"a folder with {POSES} or {TRANSFORMS} and the cameras' videos."
+            f"a folder with {POSES}, {TRANSFORMS} or {MODELS[0]} and the cameras' videos."
         )
     cameras = read_cameras(folder)
     parts = _split_cameras(folder, cameras, test_cameras)
@@ -216,11 +223,14 @@ def read_cameras(folder: Path) -> list[Camera]:
         cameras = _from_poses_bounds(folder)
     elif (folder / TRANSFORMS).is_file():
         cameras = _from_transforms(folder)
+    elif (model := find_model(folder)) is not None:
+        cameras = _from_colmap(folder, model)
     else:
         found = ", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "nothing"
         raise SceneError(
             f"{folder} holds neither {POSES} (Neural 3D Video) nor {TRANSFORMS} (a frame for each "
-            f"camera), but {found}. Add the calibration of the cameras."
+            f"camera) nor {MODELS[0]} (COLMAP's model of an image of each), but {found}. Add the "
+            "calibration of the cameras."
         )
     twice = [
         name for name, count in Counter(camera.name for camera in cameras).items() if count > 1
@@ -230,6 +240,15 @@ def read_cameras(folder: Path) -> list[Camera]:
             f"{folder}: several cameras are called {twice[0]}. Name their videos or folders apart."
         )
     return cameras
+
+
+def recordings_of_cameras(folder: Path) -> list[Path]:
+    """Videos and folders of the name cam*, which several cameras have, by name."""
+    return sorted(path for path in folder.glob("cam*") if _is_recording(path))
+
+
+def _is_recording(path: Path) -> bool:
+    return path.is_dir() or path.suffix.lower() in videos.SUFFIXES
 
 
 def _from_poses_bounds(folder: Path) -> list[Camera]:
@@ -246,13 +265,8 @@ def _from_poses_bounds(folder: Path) -> list[Camera]:
             f"{path} holds {rows.dtype} {list(rows.shape)}, not one row of 17 numbers for each "
             "camera: a pose of 3 rows and 5 columns, then the nearest and the farthest depth."
         )
-    sources = sorted(
-        source
-        for source in folder.glob("cam*")
-        if source.is_dir() or source.suffix.lower() in videos.SUFFIXES
-    )
     # A video may lie beside a folder of images made of it.
-    sources = list({source.stem: source for source in sources}.values())
+    sources = list({source.stem: source for source in recordings_of_cameras(folder)}.values())
     if len(sources) != len(rows):
         names = ", ".join(source.name for source in sources) or "none"
         raise SceneError(
@@ -293,6 +307,65 @@ def _from_transforms(folder: Path) -> list[Camera]:
             continue
         calibration = read_calibration(str(path), content, label, frame)
         cameras[source] = Camera(source.stem, source, pose, calibration, label)
+    return list(cameras.values())
+
+
+def _from_colmap(folder: Path, place: Path) -> list[Camera]:
+    """Cameras of a sparse model in which one image of each is registered."""
+    model = read_model(place)
+    require_precision(model.source, model.camera_to_world[:, :3, 3])
+    sources: dict[str, list[Path]] = defaultdict(list)
+    for path in sorted(folder.iterdir()):
+        if _is_recording(path):
+            sources[path.stem].append(path)
+    # Other folders, such as images and sparse, need be no cameras.
+    expected = {path for paths in sources.values() for path in paths if path.is_file()}
+    expected = sorted(expected | set(recordings_of_cameras(folder)))
+
+    def refused(problem: str, way_out: str) -> SceneError:
+        return SceneError(
+            f"{model.source}: {problem}. Registered images: {some(model.names)}. Videos, and "
+            f"folders of the name cam*, in {folder}: "
+            f"{some([path.name for path in expected]) or 'none'}. {way_out}"
+        )
+
+    cameras: dict[Path, Camera] = {}
+    for name, pose, calibration in zip(
+        model.names, model.camera_to_world, model.calibrations, strict=True
+    ):
+        image = PurePosixPath(name)
+        found = [
+            path
+            for text in dict.fromkeys((image.stem, image.parent.name))
+            # A video may lie beside a folder of images made of it.
+            for path in [path for path in sources[text] if path.is_file()] or sources[text]
+        ]
+        if not found:
+            raise refused(
+                f"no video or folder belongs to {name}",
+                "One image of each camera must have its name: cam00.png or cam00/0001.png is of "
+                "cam00.mp4, or of the folder cam00.",
+            )
+        if len(found) > 1:
+            raise refused(
+                f"{name} may be of {' or of '.join(path.name for path in found)}",
+                "Rename what it is not of, or move it elsewhere.",
+            )
+        (source,) = found
+        label = f"{model.source}: {name}"
+        if source in cameras:
+            raise refused(
+                f"{name} is of {source.name}, as an earlier image is",
+                "Register one image of each camera, or read all images that are registered with "
+                "data=colmap.",
+            )
+        cameras[source] = Camera(source.stem, source, pose, calibration, label)
+    known = {camera.name for camera in cameras.values()}
+    if bare := [path.name for path in expected if path.stem not in known]:
+        raise refused(
+            f"no registered image belongs to {some(bare)}",
+            "Register an image of each camera, or move what is not calibrated elsewhere.",
+        )
     return list(cameras.values())
 
 
@@ -453,6 +526,8 @@ def _read_views(
     sources = [recording.camera.source for recording in recordings]
     sizes = final_sizes(sources, native, resolution)
     calibrations = [recording.camera.calibration for recording in recordings]
+    for source, size, calibration in zip(sources, native, calibrations, strict=True):
+        require_shape(source, size, calibration)
     labels = [recording.camera.label for recording in recordings]
     intrinsics = final_intrinsics(labels, calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(recordings))]

@@ -19,6 +19,7 @@ from xplanes.errors import ConfigError
 from xplanes.pipeline import run
 from xplanes.rendering import warming
 from xplanes.rendering.grid_renderer import OccupancySampler
+from xplanes.scenes import store
 from xplanes.training import evaluation, fit
 from xplanes.training.checkpoints import Checkpoints
 from xplanes.training.clock import TrainingClock
@@ -186,6 +187,43 @@ def test_a_run_resumed_in_a_later_epoch_equals_an_uninterrupted_one(
         run(config, tmp_path / "broken", [], resume=True)
     assert epochs == {0, 1, 2, 3}
     assert exact(tmp_path / "broken") == exact(tmp_path / "whole")
+
+
+def test_a_resumed_run_on_images_from_disk_equals_an_uninterrupted_one(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After the second failure the decoded images are gone, and are decoded anew."""
+    monkeypatch.setattr(store, "IN_MEMORY", 0)
+    cache = tmp_path / "cache"
+    config = small_config(scenes, f"data.cache={cache}", "trainer.max_steps=30")
+    run(config, tmp_path / "whole", [], resume=False)
+    tiles = sorted(cache.glob("*.tiles"))
+    assert [path.stat().st_size for path in tiles]
+    original = TrainingClock.on_train_batch_end
+    stop = 0
+
+    def break_down(self, trainer, module, *rest) -> None:
+        original(self, trainer, module, *rest)
+        assert trainer.datamodule.scene.splits["train"].is_stored
+        if trainer.global_step == stop:
+            raise OSError("power cut")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingClock, "on_train_batch_end", break_down)
+        for stop in (13, 21):
+            with pytest.raises(OSError, match="power cut"):
+                run(config, tmp_path / "broken", [], resume=stop > 13)
+        for path in tiles:
+            path.unlink()
+        stop = 0
+        run(config, tmp_path / "broken", [], resume=True)
+    assert sorted(cache.glob("*.tiles")) == tiles
+    assert exact(tmp_path / "broken") == exact(tmp_path / "whole")
+    rows = [
+        [(row["step"], row["psnr"]) for row in curve(tmp_path / name)]
+        for name in ("broken", "whole")
+    ]
+    assert rows[0] == rows[1]
 
 
 def interrupt_where(

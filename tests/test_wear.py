@@ -11,10 +11,10 @@ import torch
 from tests.training.runs import small_config
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
-from xplanes.files import MARK, StorageError
+from xplanes.files import DAY, MARK, StorageError
 from xplanes.launch import prepare
 from xplanes.pipeline import run
-from xplanes.preparation.cache import DAY, StageCache
+from xplanes.preparation.cache import StageCache
 from xplanes.pretraining.pool import RECORD, SHARD, ensure_pool
 from xplanes.scenes.demo import ensure_demo_scene, write
 from xplanes.scenes.errors import SceneError

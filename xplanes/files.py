@@ -15,6 +15,9 @@ from typing import Any
 MARK = ".tmp-"
 """Part of the name of every file that is not whole yet."""
 
+DAY = 86_400.0
+"""Seconds of a day, the age from which an unfinished file in a cache counts as abandoned."""
+
 
 class StorageError(OSError):
     """What cannot be written; the message names it, the reason and the way out."""

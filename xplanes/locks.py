@@ -45,6 +45,28 @@ def in_turn(path: Path | None) -> Iterator[bool]:
 
 
 @contextmanager
+def if_free(path: Path) -> Iterator[bool]:
+    """Hold what other processes wait for, unless one of them holds it.
+
+    Args:
+        path: The lock's file.
+
+    Returns:
+        Whether this process holds it.
+    """
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        lock.release()
+
+
+@contextmanager
 def alone_in(run: Path) -> Iterator[None]:
     """Hold a run directory, so that no second process writes into it.
 

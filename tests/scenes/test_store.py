@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock
 from PIL import Image
 
 from tests.synthetic import ball_views
-from xplanes.files import StorageError
+from xplanes.files import DAY, MARK, StorageError
 from xplanes.scenes import store
 from xplanes.scenes.batches import AHEAD, RayBatches, RaySettings
 from xplanes.scenes.errors import SceneError
@@ -407,6 +408,61 @@ def test_the_cache_is_the_users_if_none_is_named(tmp_path: Path, small, monkeypa
     paths = pictures(tmp_path / "scene", [(65, 65)], alpha=False)
     read_images(paths, None)
     assert len(list((tmp_path / "home" / "xplanes" / "images").glob("*.tiles"))) == 1
+
+
+def test_what_no_run_has_used_for_a_month_is_removed(
+    tmp_path: Path, small, monkeypatch, capsys
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("sys.platform", "linux")
+    cache = tmp_path / "home" / "xplanes" / "images"
+    paths = pictures(tmp_path / "scene", [(65, 65)] * 6, alpha=False)
+    read_images(paths[:1], None)
+    assert "after 30 days without use" in capsys.readouterr().out
+    (old,) = cache.glob("*.tiles")
+
+    def aged(path: Path, days: float) -> Path:
+        if not path.exists():
+            path.write_bytes(b"tiles")
+        past = time.time() - days * DAY
+        os.utime(path, (past, past))
+        return path
+
+    locked = aged(cache / f"{'1' * 32}.tiles", 31)
+    kept = [
+        locked,
+        aged(cache / f"{'2' * 32}.tiles", 29),
+        aged(cache / "mine.tiles", 99),
+        aged(cache / f"{'3' * 32}.npy", 99),
+        aged(cache / f".{'4' * 32}.tiles{MARK}x", 0.5),
+    ]
+    gone = [aged(cache / f".{'5' * 32}.tiles{MARK}x", 2), aged(cache / f"{'6' * 32}.tiles", 31)]
+    # Use makes a file young again.
+    aged(old, 31)
+    images = read_images(paths[:1], None)[0]
+    with FileLock(locked.with_suffix(".lock")):
+        read_images(paths[1:3], None)
+    assert [path for path in [old, *kept, *gone] if path.exists()] == [old, *kept]
+    assert "removed 0.0 GB of decoded images" in capsys.readouterr().out
+    # A reader keeps what it has opened; the next one decodes it anew.
+    aged(old, 31)
+    expected = images.image(0).clone()
+    read_images(paths[3:], None)
+    assert not old.exists()
+    assert not locked.exists()
+    assert torch.equal(images.image(0), expected)
+    assert torch.equal(read_images(paths[:1], None)[0].image(0), expected)
+
+
+def test_a_cache_that_is_named_is_the_users_to_clean(tmp_path: Path, small, capsys) -> None:
+    paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=False)
+    cache = tmp_path / "cache"
+    read_images(paths[:1], None, cache)
+    assert "without use" not in capsys.readouterr().out
+    (old,) = cache.glob("*.tiles")
+    os.utime(old, (0, 0))
+    read_images(paths[1:], None, cache)
+    assert old.exists()
 
 
 def test_an_interrupted_decoder_stops_soon(tmp_path: Path) -> None:

@@ -20,13 +20,10 @@ import torch
 from torch import Tensor
 
 from xplanes.backend import warm_up
-from xplanes.files import clear_unfinished, replacing, require_writable
+from xplanes.files import DAY, clear_unfinished, replacing, require_writable
 from xplanes.locks import in_turn
 
 logger = logging.getLogger(__name__)
-
-DAY = 86_400.0
-"""Age in seconds from which an unfinished entry counts as abandoned."""
 
 VERSION = 3
 """Version of the stages; increase it whenever a stage gives a different result."""

@@ -3,7 +3,8 @@
 A file holds the tiles of all images one after the other, each image's row by row, then one byte a
 tile that says what its alpha shows (`LIT`, `SOLID`); images without alpha have three channels and
 no such bytes. Its name is a hash of the sources and of how they were decoded, so it needs no
-header: a file of that name and of the right length is the right one.
+header: a file of that name and of the right length is the right one. Its time of change is when it
+was used last.
 
 Tiles are read, not mapped: pages of a mapping count as the process's own memory, those that reading
 leaves in the system's cache do not.
@@ -12,11 +13,14 @@ leaves in the system's cache do not.
 import hashlib
 import json
 import os
+import re
 import shutil
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +29,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from xplanes.files import MARK, StorageError, existing, replacing, require_writable
-from xplanes.locks import in_turn
+from xplanes.files import (
+    DAY,
+    MARK,
+    StorageError,
+    clear_unfinished,
+    existing,
+    replacing,
+    require_writable,
+)
+from xplanes.locks import if_free, in_turn
 
 IN_MEMORY = 2**30
 """Bytes up to which the decoded images of a split are held in memory."""
@@ -40,8 +52,14 @@ VERSION = 1
 SPARE = 2**28
 """Bytes of the disk that are left free."""
 
+UNUSED_DAYS = 30
+"""Days after which a file of the user's cache that no run has used is removed."""
+
 LIT, SOLID = 1, 2
 """What a tile's byte says: some pixel has alpha above 0; all pixels have."""
+
+NAME = re.compile(r"[0-9a-f]{32}\.tiles")
+"""Names of the files."""
 
 Job = Callable[[], Iterable[tuple[int, np.ndarray]]]
 """Decodes some of the images: gives their numbers and pixels, uint8 [h, w, 3 or 4]."""
@@ -277,7 +295,8 @@ def decoded(
     """Decode images to a file of the cache, unless it is there already.
 
     Of processes that want the same images one decodes, the others wait. What a process that was
-    killed left behind is removed by the next one.
+    killed left behind is removed by the next one. Before the user's cache takes a new file, those
+    that were not used for `UNUSED_DAYS` are removed from it.
 
     Args:
         sources: Files that the images come from; the result belongs to their sizes and times.
@@ -290,6 +309,7 @@ def decoded(
     Raises:
         StorageError: If the disk lacks the space, or cannot be written.
     """
+    is_default = folder is None
     folder = default_cache() if folder is None else folder
     states = [(str(path.resolve()), path.stat()) for path in sources]
     files = [[name, state.st_size, state.st_mtime_ns] for name, state in states]
@@ -300,9 +320,14 @@ def decoded(
     length = total * (TILE**2 * channels + (channels == 4))
 
     def found() -> StoredImages | None:
-        if not path.is_file() or path.stat().st_size != length:
+        try:
+            if path.stat().st_size != length:
+                return None
+            with suppress(PermissionError):  # The cache may be another user's.
+                os.utime(path)
+            return StoredImages.all_of(TileFile(path, key, sizes, channels))
+        except FileNotFoundError:
             return None
-        return StoredImages.all_of(TileFile(path, key, sizes, channels))
 
     if (ready := found()) is not None:
         return ready
@@ -313,12 +338,15 @@ def decoded(
         # Whoever holds the lock owns what others left unfinished under this name.
         for leftover in folder.glob(f".{path.name}{MARK}*"):
             leftover.unlink(missing_ok=True)
+        if is_default:
+            _remove_unused(folder)
         _require_space(folder, length)
         height, width = _largest(sizes)
         print(
             f"{len(sizes)} images of up to {width}x{height} px take {length / 2**30:.1f} GB "
             f"decoded, too much for memory: decoding them once to {path} (it can be deleted when "
-            "no run needs it)",
+            "no run needs it"
+            f"{f', and is after {UNUSED_DAYS} days without use' if is_default else ''})",
             flush=True,
         )
         with replacing(path) as temporary:
@@ -326,6 +354,27 @@ def decoded(
     ready = found()
     assert ready is not None
     return ready
+
+
+def _remove_unused(folder: Path) -> None:
+    """Remove files of tiles that were not used for long, and what killed writers left behind."""
+    clear_unfinished(folder, older_than=DAY)
+    oldest, freed = time.time() - UNUSED_DAYS * DAY, 0
+    for path in folder.glob("*.tiles"):
+        # Windows does not remove what is open; elsewhere readers keep what they have opened.
+        with suppress(OSError):
+            if not NAME.fullmatch(path.name) or path.stat().st_mtime > oldest:
+                continue
+            with if_free(path.with_suffix(".lock")) as free:
+                if free and (state := path.stat()).st_mtime <= oldest:
+                    path.unlink()
+                    freed += state.st_size
+    if freed:
+        print(
+            f"removed {freed / 2**30:.1f} GB of decoded images that no run has used for "
+            f"{UNUSED_DAYS} days from {folder}",
+            flush=True,
+        )
 
 
 def _require_space(folder: Path, length: int) -> None:

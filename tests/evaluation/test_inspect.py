@@ -29,6 +29,7 @@ from xplanes.evaluation.inspect import (
     facts,
     inspect,
     lens_words,
+    next_command,
     table,
 )
 from xplanes.evaluation.inspect_picture import CUBE, HEIGHT, SCALE, WIDTH, _sample, draw
@@ -462,6 +463,18 @@ def test_a_folder_is_recognised_read_and_drawn(tmp_path, monkeypatch, capsys):
     assert known["cube"]["side"] == pytest.approx(0.2)
     assert [each["kind"] for each in known["warnings"]] == ["scale"]
     assert Path(known["picture"]).is_file()
+
+
+def test_large_images_are_trained_on_at_the_usual_width_unless_asked_for(tmp_path):
+    folder = tmp_path / "ball"
+    write_nerfstudio(folder, ball_views(6, 0.6, size=404))
+    for given, width in (((), "400"), (("data.resolution=null",), "null")):
+        capture = inspect(choose([str(folder), *given]))
+        assert capture.scene.splits["train"].width == 404
+        command = shlex.split(next_command(capture))
+        assert [text for text in command if "resolution" in text] == [f"data.resolution={width}"]
+        again = choose([text for text in command if text.startswith("data")])
+        assert again.scene.read().splits["train"].width == (400 if width == "400" else 404)
 
 
 def test_errors_are_one_line_and_leave_1(tmp_path, monkeypatch, capsys):

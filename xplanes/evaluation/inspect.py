@@ -39,6 +39,9 @@ from xplanes.scenes.views import Scene, Views
 CONSEQUENCES = {"scale": ("cut", "texels"), "astray": ("cut",)}
 """Findings that say no more than another one does."""
 
+NATIVE = "data.resolution=null"
+"""The setting that takes images at their native size."""
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -48,11 +51,14 @@ class Choice:
         overrides: Settings of train.py that read the same.
         scene: The settings of the scene.
         model: Those of the model, for the field's frame and its planes.
+        usual_width: Width of the images that the format's YAML file sets, where they are taken at
+            their native size although nobody asked for it; None elsewhere.
     """
 
     overrides: tuple[str, ...]
     scene: SceneSettings
     model: ModelSettings
+    usual_width: int | None = None
 
 
 @dataclass(frozen=True)
@@ -104,6 +110,7 @@ def choose(arguments: Sequence[str]) -> Choice:
         ConfigError: If the settings cannot work, or several formats fit.
         SceneError: If there is no such folder, or no format fits.
     """
+    usual_width = None
     changed = [text for text in arguments if "=" in text and not Path(text).exists()]
     folders = [Path(text) for text in arguments if text not in changed]
     if len(folders) > 1:
@@ -114,12 +121,16 @@ def choose(arguments: Sequence[str]) -> Choice:
             raise SceneError(f"{folder} is not a folder. Give the folder of a scene")
         given = {text.partition("=")[0] for text in changed}
         data = [] if "data" in given else [f"data={_recognised(folder, changed)}"]
-        size = [] if "data.resolution" in given else ["data.resolution=null"]
-        changed = [*data, *_place(folder), *size, *changed]
+        place = [*data, *_place(folder)]
+        if "data.resolution" not in given:
+            usual_width = compose_plain("train", [*place, *changed])["data"]["resolution"]
+            place.append(NATIVE)
+        changed = [*place, *changed]
     plain = compose_plain("train", changed)
     with plugins(plain.get("plugins") or []):
         scene = build(plain["data"], SceneSettings, "data")
-        return Choice(tuple(changed), scene, build(plain["model"], ModelSettings, "model"))
+        model = build(plain["model"], ModelSettings, "model")
+    return Choice(tuple(changed), scene, model, usual_width)
 
 
 def _place(folder: Path) -> list[str]:
@@ -408,8 +419,12 @@ def table(capture: Capture) -> str:
 
 
 def next_command(capture: Capture) -> str:
-    """The command that trains on the capture."""
-    return f"{train_command()} {shlex.join(capture.choice.overrides)}"
+    """The command that trains on the capture, at the usual width where images are wider."""
+    overrides, width = capture.choice.overrides, capture.choice.usual_width
+    sizes = [views.intrinsics.size for views in capture.scene.splits.values()]
+    if width is not None and width < int(torch.cat(sizes)[:, 1].min()):
+        overrides = [f"data.resolution={width}" if text == NATIVE else text for text in overrides]
+    return f"{train_command()} {shlex.join(overrides)}"
 
 
 def _size_words(sizes: Sequence[tuple[int, int]]) -> str:

@@ -10,8 +10,9 @@ import torch
 from tests.synthetic import ball_views, inside_ball, swinging
 from xplanes.scenes.cameras import look_at, orbit
 from xplanes.scenes.errors import SceneError
-from xplanes.scenes.frame import Frame, cube_frame, optical_centre, scene_frame
-from xplanes.scenes.views import Views
+from xplanes.scenes.frame import Frame, _reach, cube_frame, optical_centre, scene_frame
+from xplanes.scenes.lenses import Lenses, LensModel
+from xplanes.scenes.views import Intrinsics, Views
 
 
 def turned(scale=0.4):
@@ -162,6 +163,49 @@ def test_images_of_nothing_leave_the_cameras_cube():
     empty = replace(views, images=torch.zeros_like(views.images))
     opaque = replace(views, images=torch.full_like(views.images, 255))
     assert scene_frame(empty).scale == pytest.approx(scene_frame(opaque).scale)
+
+
+def all_rays_reach(views, centre):
+    """The same of the rays through all pixels of the foreground."""
+    found = []
+    for index in range(len(views)):
+        shown = views.image(index)[..., 3].flatten() > 0
+        origins, directions = (part[shown].double() for part in views.image_rays(index))
+        offset = centre - origins
+        along = (offset * directions).sum(dim=-1, keepdim=True)
+        found.append((offset - along * directions).norm(dim=-1))
+    return float(torch.cat(found).max())
+
+
+def test_rays_through_outlines_reach_as_far_as_all():
+    ball = ball_views(8, 0.6, centre=swinging(0.5, 1), size=60)
+    ring = ball.in_memory().clone()
+    ring[:, 20:40, 25:35] = 0
+    whole = torch.full_like(ring, 255)
+    coefficients = torch.zeros(8, 12, dtype=torch.float64)
+    for k1, model, tolerance in (
+        (0.0, LensModel.PERSPECTIVE, 1e-6),
+        (-0.2, LensModel.PERSPECTIVE, 1e-3),
+        (0.2, LensModel.PERSPECTIVE, 1e-3),
+        (0.05, LensModel.FISHEYE, 1e-3),
+    ):
+        coefficients[:, 0] = k1
+        kinds = torch.full((8,), int(model))
+        lenses = Lenses(kinds, coefficients.clone(), torch.zeros(8, dtype=torch.float64))
+        centres = torch.tensor([[27.0, 33.5]]).double().expand(8, 2)
+        intrinsics = Intrinsics(
+            torch.full((8, 2), 70.0).double(), centres, torch.tensor([[60, 60]] * 8), lenses
+        )
+        for images in (ball.in_memory(), ring, whole):
+            views = replace(ball, images=images, intrinsics=intrinsics)
+            centre = optical_centre(views)
+            expected = all_rays_reach(views, centre)
+            assert _reach(views, centre) == pytest.approx(expected, rel=tolerance)
+            rays = [len(views.outline_rays(index)[0]) for index in range(8)]
+            assert max(rays) <= 4 * 60 + 60
+    # A camera that looks past the centre on both sides passes it at its own distance.
+    beside = views_of(look_at(torch.tensor([[4.0, 0.0, 0.0]]), torch.tensor([4.0, 9.0, 0.0])))
+    assert _reach(beside, torch.zeros(3)) == pytest.approx(4.0, rel=1e-5)
 
 
 def test_one_stray_pixel_widens_the_cube_to_hold_what_it_shows():

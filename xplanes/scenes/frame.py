@@ -174,12 +174,19 @@ def _spread(views: Views) -> float:
 
 
 def _reach(views: Views, centre: Tensor) -> float:
-    """Largest distance from ``centre`` at which a ray through the foreground passes it."""
+    """Largest distance from ``centre`` at which a ray through the foreground passes it.
+
+    The farther a ray points away from the centre, the farther it passes, up to a right angle: the
+    farthest one leads through the outline, unless the camera looks past the centre on all sides.
+    """
     largest = 0.0
     for index in range(len(views)):
-        origins, directions = views.foreground_rays(index)
+        origins, directions = views.outline_rays(index)
         if len(origins):
             offset = centre - origins
             along = (offset * directions).sum(dim=-1, keepdim=True)
-            largest = max(largest, float((offset - along * directions).norm(dim=-1).max()))
+            away = (offset - along * directions).norm(dim=-1)
+            # Rays on both sides of the right angle enclose one that passes at the camera.
+            beyond = bool((along > 0).any() and (along < 0).any())
+            largest = max(largest, float((offset.norm(dim=-1) if beyond else away).max()))
     return largest if largest > 0 else math.inf

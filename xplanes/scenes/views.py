@@ -331,19 +331,25 @@ class Views:
         lens = self.intrinsics.lens(index)
         return camera_rays(self.camera_to_world[index], focal, height, width, centre, lens)
 
-    def foreground_rays(self, index: int) -> tuple[Tensor, Tensor]:
-        """Rays through the pixels of image ``index`` with alpha above 0. [N, 3], [N, 3]
+    def outline_rays(self, index: int) -> tuple[Tensor, Tensor]:
+        """Rays through the outline of what image ``index`` shows with alpha above 0.
 
-        Of images in a file of tiles, rays through the corners of the tiles that hold such pixels.
+        These are the pixels with such alpha that have a neighbour without, or lie at the image's
+        edge. Of images in a file of tiles, the corners of the tiles that hold such pixels.
+
+        Returns:
+            Origins and unit directions in the world. [N, 3], [N, 3]
         """
         mask, cell = self.silhouette(index)
         if cell == 1:
-            origins, directions = self.image_rays(index)
-            return origins[mask.flatten()], directions[mask.flatten()]
-        first = mask.nonzero() * cell
-        last = torch.minimum(first + cell, self.intrinsics.size[index]) - 1
-        corners = torch.cat([first, last, torch.stack([first[:, 0], last[:, 1]], dim=1)])
-        rows, columns = torch.cat([corners, torch.stack([last[:, 0], first[:, 1]], dim=1)]).T
+            around = F.pad(mask, (1, 1, 1, 1))
+            inside = around[:-2, 1:-1] & around[2:, 1:-1] & around[1:-1, :-2] & around[1:-1, 2:]
+            rows, columns = (mask & ~inside).nonzero().T
+        else:
+            first = mask.nonzero() * cell
+            last = torch.minimum(first + cell, self.intrinsics.size[index]) - 1
+            corners = torch.cat([first, last, torch.stack([first[:, 0], last[:, 1]], dim=1)])
+            rows, columns = torch.cat([corners, torch.stack([last[:, 0], first[:, 1]], dim=1)]).T
         return self.pixel_rays(torch.full_like(rows, index), rows.float(), columns.float())
 
     def pixel_rays(self, views: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from xplanes.decomposition.sparse_loss import SparseProduct
+from xplanes.fields.background import Background
 from xplanes.fields.decoder import Decoder
 from xplanes.fields.regularisers import (
     add_distance_gradient,
@@ -36,7 +37,7 @@ from xplanes.rendering.base import Rendering
 from xplanes.rendering.sampler import Group, Site
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
-from xplanes.streams import Stream, TrainingState, step_generator
+from xplanes.streams import Stream, TrainingState, initial_values, step_generator
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +53,16 @@ class DecoderSettings(Settings):
     colour_bias: float  # Initial bias of the colour logits; above 0 nears the white background.
     colour_margin: Weight  # Margin by which colours may exceed [0, 1].
     freeze: bool  # Do not train the decoder.
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackgroundSettings(Settings):
+    """A static world behind the field's cube, where training images are opaque."""
+
+    resolution: Count  # Texels along each side of its planes, over contracted space.
+    channels: Count  # Channels of each plane.
+    samples: Steps  # Samples of a ray behind the cube; 0: its colour depends on direction alone.
+    width: Count  # Neurons of the decoder's hidden layer.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +96,8 @@ class XPlanesSettings(ModelSettings):
     space_scale: Weight  # Standard deviation of randomly initialised space planes.
     time_scale: Weight  # Standard deviation of randomly initialised time planes.
     decoder: DecoderSettings
+    # null: a plain one, of the colour that training images without alpha are set before.
+    background: BackgroundSettings | None = None
     loss: XPlanesLoss
     plane_lr: Positive  # Learning rate of the space planes.
     time_lr: Positive  # Learning rate of the time planes.
@@ -141,7 +154,22 @@ class XPlanesSettings(ModelSettings):
                 decoder.layers[-1].bias[0] += options.density_bias  # type: ignore[index]
                 decoder.layers[-1].bias[1:] += options.colour_bias  # type: ignore[index]
         decoder.requires_grad_(not options.freeze)
-        return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set)
+        background = self._background(site)
+        return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set, background=background)
+
+    def _background(self, site: Site) -> Background | None:
+        """What lies behind the cube; None where alpha tells the scene from a plain background."""
+        if self.background is None or not site.opaque:
+            return None
+        options = self.background
+        with initial_values(site.seed, Stream.BACKGROUND):
+            return Background(
+                options.channels,
+                options.resolution,
+                width=options.width,
+                samples=options.samples,
+                precision="bf16" if site.precision == "bf16" else "32",
+            )
 
 
 class XPlanesModel(Model):
@@ -166,7 +194,7 @@ class XPlanesModel(Model):
         steps = self.weights.initial_steps
         self.fade = None if steps is None else steps / views
         self.opacity = self.weights.opacity
-        self._opaque = site.views is not None and site.views.is_opaque
+        self._opaque = site.opaque
         self.product: SparseProduct | None = None
         self.initial_weight, self._initial = 0.0, []
         if initial is not None:
@@ -196,10 +224,18 @@ class XPlanesModel(Model):
         decoder = [p for p in field.decoder.parameters() if p.requires_grad]
         if decoder:
             groups.append({"params": decoder, "lr": settings.decoder_lr, "name": "decoder"})
+        if (world := field.background) is not None:
+            decoder = list(world.decoder.parameters())
+            groups += [
+                {"params": [world.planes], "lr": settings.plane_lr, "name": "background"},
+                {"params": decoder, "lr": settings.decoder_lr, "name": "background_decoder"},
+            ]
         return groups
 
     def losses(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
         terms = super().losses(rendering, rays, state)
+        if self._field.background is not None:
+            return terms  # Neither alpha nor a known background says what is opaque.
         if self.opacity:
             error = opacity_shortfall if self._opaque else opacity_error
             terms["opacity"] = self.opacity * error(rendering, rays)

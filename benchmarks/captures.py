@@ -4,8 +4,8 @@
         [--variants plain,sky,world,masks] [--seeds 1] [--pictures FOLDER] [KEY=VALUE ...]
 
 Writes results/captures.md and captures.csv beside this file. The scenes are procedural captures of
-the suite, whose masks of the thing are known: scores are those of whole pictures, and of the thing's
-pixels alone. `plain` trains without a background, `sky` with one whose colour depends on direction
+the suite, whose masks of the thing are known: scores are those of whole pictures, and of the pixels
+that show the thing. `plain` trains without a background, `sky` with one whose colour depends on direction
 alone, `world` with the default, and `masks` is told by silhouettes what is the thing.
 """
 
@@ -113,9 +113,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--resolution", type=int, default=100)
     parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument(
-        "--root", type=Path, default=Path("data/suite"), help="folder of the scenes"
-    )
+    parser.add_argument("--root", type=Path, default=Path("data/suite"), help="of the scenes")
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--pictures", type=Path, help="folder of rendered views beside the truth")
     parser.add_argument("overrides", nargs="*", help="settings of train.py")

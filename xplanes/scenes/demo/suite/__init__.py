@@ -8,8 +8,8 @@ import difflib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from xplanes.scenes.demo.assembly import Assembly
 from xplanes.scenes.demo import scenes
+from xplanes.scenes.demo.assembly import Assembly
 from xplanes.scenes.demo.capture import Array, Phone, Rig
 from xplanes.scenes.demo.motions import Variation
 from xplanes.scenes.demo.render import CAMERA_DISTANCE

@@ -29,7 +29,9 @@ def _ground(thing: Assembly, surface: Surface) -> tuple[float, Part]:
     return height, Part(Box((60.0, 60.0, 0.5)), surface, position=(0, 0, height - 0.5))
 
 
-def _tree(x: float, y: float, ground: float, size: float, trunk: Surface, crown: Surface):
+def _tree(
+    x: float, y: float, ground: float, size: float, trunk: Surface, crown: Surface
+) -> list[Part]:
     """A tree: a trunk with three round masses of leaves."""
     height = 1.1 * size
     places: list[Vector] = [(0.0, 0.0, 0.0), (0.3, 0.1, -0.25), (-0.25, -0.2, -0.3)]
@@ -113,7 +115,8 @@ def hall(thing: Assembly, variation: Variation) -> World:
                  position=(7.0, 0, ground + 3)),
             *(Part(Box((s, s, s)), crate, "world", (x, y, ground + s), (0, 0, 25 * x))
               for x, y, s in ((-2.3, 2.4, 0.4), (-1.7, 3.2, 0.55), (2.6, 2.6, 0.45))),
-            Part(Cylinder(0.3, 0.45), Stripes((variation.paint("#c03a3a"), (0.9, 0.9, 0.9)), 2, 0.3),
+            Part(Cylinder(0.3, 0.45),
+                 Stripes((variation.paint("#c03a3a"), (0.9, 0.9, 0.9)), 2, 0.3),
                  position=(1.2, 3.6, ground + 0.45)),
             *(rod((x, 4.6, ground), (x, 4.6, ground + 1.8), 0.05, Plain((0.2, 0.2, 0.22)))
               for x in (-3.0, 3.2)),

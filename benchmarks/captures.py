@@ -5,8 +5,8 @@
 
 Writes results/captures.md and captures.csv beside this file. The scenes are procedural captures of
 the suite, whose masks of the thing are known: scores are those of whole pictures, and of the pixels
-that show the thing. `plain` trains without a background, `sky` with one whose colour depends on direction
-alone, `world` with the default, and `masks` is told by silhouettes what is the thing.
+that show the thing. `plain` trains without a background, `sky` with one whose colour depends on
+direction alone, `world` with the default, and `masks` is told by silhouettes what is the thing.
 """
 
 import os

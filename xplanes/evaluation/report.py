@@ -51,6 +51,7 @@ def header(
     where = " (training views on disk)" if train.is_stored else ""
     trainable = sum(p.numel() for p in module.parameters() if p.requires_grad)
     frozen = sum(p.numel() for p in module.parameters()) - trainable
+    cube = f"cube {2 / frame.scale:.2f} wide" + (f", from {frame.source}" if frame.source else "")
     moving = ""
     if not module.field.moves:
         reason = scene.static_reason or "one timestep only"
@@ -64,7 +65,7 @@ def header(
         f"{backend.name(device)}",
         "run": str(run),
         "data": f"{experiment.data.name} {scene.name} · {counts} views · "
-        f"{train.outline} · {size:.1f} MB{where} · cube {2 / frame.scale:.2f} wide",
+        f"{train.outline} · {size:.1f} MB{where} · {cube}",
         "model": f"{experiment.method.model.name} {module.field.outline} · "
         f"{trainable:,} parameters, {frozen:,} frozen{moving}",
         "from": module.initialisation.words,

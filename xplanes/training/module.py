@@ -155,7 +155,7 @@ class RadianceModule(LightningModule):
         views, method = scene.splits["train"], self.method
         device = device or torch.device("cpu")
         if frame is None:
-            frame = method.model.frame(views, half_side)
+            frame = method.model.frame(views, half_side, scene.points)
         if initialise is None and (source := method.lrm.load(say)) is not None:
             initialise = source.initialise
         found = Initialisation(method.model, frame)

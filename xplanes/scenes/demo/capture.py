@@ -145,7 +145,7 @@ class Rig:
 class Phone(Rig):
     """One camera that is carried along an arc while time runs, up and down a little.
 
-    Validation and test cameras stand where it was a little earlier or later.
+    Validation and test cameras stand above where it was a little earlier or later.
     """
 
     def _stations(
@@ -153,10 +153,13 @@ class Phone(Rig):
     ) -> list[Station]:
         if training:
             return [(time, *self._carried(time)) for time in even_times(count)]
-        return [
-            (time, *self._carried(time + draw.choice((-1, 1)) * draw.uniform(0.06, 0.15)))
-            for time in held_out_times(count, draw)
-        ]
+        stations = []
+        for time in held_out_times(count, draw):
+            shift = draw.choice((-1, 1)) * draw.uniform(0.06, 0.15)
+            other = time + shift if 0 <= time + shift <= 1 else time - shift
+            azimuth, elevation = self._carried(other)
+            stations.append((time, azimuth, elevation + draw.uniform(2.0, 5.0)))
+        return stations
 
     def _carried(self, time: float) -> tuple[float, float]:
         """Azimuth and elevation at a time."""

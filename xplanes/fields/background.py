@@ -9,6 +9,9 @@ from xplanes.fields.lookup import plane_features
 RADIUS = 2.0
 """Radius of the ball into which `contract` maps all of space."""
 
+FARTHEST = 1e30
+"""Distance of what lies on the ball's surface."""
+
 INITIAL_SCALE = 0.1
 """Standard deviation of the planes' random initial values."""
 
@@ -39,10 +42,11 @@ def contract(points: Tensor) -> Tensor:
 
 
 def expand(points: Tensor) -> Tensor:
-    """The inverse of `contract`; what lies on the ball's surface, or beyond, is infinitely far.
+    """The inverse of `contract`.
 
     Args:
-        points: Positions in the ball of radius 2. [..., 3]
+        points: Positions in the ball of radius 2; what lies on its surface, or beyond, becomes
+            `FARTHEST`. [..., 3]
 
     Returns:
         [..., 3]
@@ -50,7 +54,7 @@ def expand(points: Tensor) -> Tensor:
     length = points.norm(dim=-1, keepdim=True)
     outside = length > 1
     unit = points / torch.where(outside, length, 1)
-    return torch.where(outside, unit / (RADIUS - length).clamp_min(0), points)
+    return torch.where(outside, unit / (RADIUS - length).clamp_min(1 / FARTHEST), points)
 
 
 class Background(nn.Module):

@@ -57,7 +57,7 @@ class DecoderSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class BackgroundSettings(Settings):
-    """A static world behind the field's cube, where training images are opaque."""
+    """A static world behind the field's cube, for opaque images of a scene in a world."""
 
     resolution: Count  # Texels along each side of its planes, over contracted space.
     channels: Count  # Channels of each plane.
@@ -96,7 +96,7 @@ class XPlanesSettings(ModelSettings):
     space_scale: Weight  # Standard deviation of randomly initialised space planes.
     time_scale: Weight  # Standard deviation of randomly initialised time planes.
     decoder: DecoderSettings
-    # null: a plain one, of the colour that training images without alpha are set before.
+    # null: nothing but the plain colour that images with alpha are set before, as for these.
     background: BackgroundSettings | None = None
     loss: XPlanesLoss
     plane_lr: Positive  # Learning rate of the space planes.
@@ -158,8 +158,8 @@ class XPlanesSettings(ModelSettings):
         return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set, background=background)
 
     def _background(self, site: Site) -> Background | None:
-        """What lies behind the cube; None where alpha tells the scene from a plain background."""
-        if self.background is None or not site.opaque:
+        """What lies behind the cube; None for a plain colour."""
+        if self.background is None or not site.surrounded:
             return None
         options = self.background
         with initial_values(site.seed, Stream.BACKGROUND):
@@ -194,7 +194,7 @@ class XPlanesModel(Model):
         steps = self.weights.initial_steps
         self.fade = None if steps is None else steps / views
         self.opacity = self.weights.opacity
-        self._opaque = site.opaque
+        self._opaque = site.views is not None and site.views.is_opaque
         self.product: SparseProduct | None = None
         self.initial_weight, self._initial = 0.0, []
         if initial is not None:

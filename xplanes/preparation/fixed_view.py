@@ -88,7 +88,11 @@ def fixed_view(
         )
     times = scene.splits["train"].times
     count = 1 if scene.splits["train"].is_static else options.frames
-    if scene.video is not None and options.fixed_view != "train":
+    # A video without alpha shows a world around the thing, which LRMs would take for a part of it.
+    whole = scene.video is not None and scene.is_surrounded and scene.video.is_opaque
+    if scene.video is not None and (
+        options.fixed_view == "video" or (options.fixed_view == "auto" and not whole)
+    ):
         check_camera(scene.video)
         views = pick_frames(scene.video, torch.linspace(0, 1, count) if count > 1 else times[:1])
         return FixedView(views, frame.centre, 0.0, f"{len(views)} frames of the scene's video")
@@ -279,6 +283,8 @@ def _render(
 ) -> Tensor:
     """Frames at evenly spaced timesteps, premultiplied. uint8 [T, side, side, 4]"""
     device = module.renderer.device
+    if getattr(module.field, "background", None) is not None:
+        module.field.background = None  # Cut out of the world behind it.
     origins, directions = camera_rays(pose, focal, side, side)
     origins, directions = frame.rays(origins - back * directions, directions)
     rays = origins.to(device), directions.to(device)

@@ -74,7 +74,7 @@ def look(
     points = torch.cat([points, horizon], dim=1)
     colour, density = background(points.flatten(0, 1))
     depth = torch.cat(
-        [density.view(rays, -1)[:, :-1] * lengths, torch.full_like(first, OPAQUE)], dim=1
+        [density.view(rays, count + 1)[:, :-1] * lengths, torch.full_like(first, OPAQUE)], dim=1
     )
     index = torch.arange(rays, device=origins.device)
     total, _ = composite(

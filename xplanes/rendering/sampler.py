@@ -37,8 +37,8 @@ class Site:
         bounds: Box in world units that some fields cover; None for those that need none. [2, 3]
         views: Training views; None where a checkpoint is loaded without its data.
         initialised: Whether the initial field already shows the scene.
-        opaque: Whether the training images have no alpha that says anything: a world may lie behind
-            the field's cube.
+        surrounded: Whether the training images show a world around the scene, so that there is
+            something to see behind the field's cube.
         device: Where it is going to be trained; the CPU when None.
     """
 
@@ -49,7 +49,7 @@ class Site:
     bounds: Tensor | None = None
     views: Views | None = None
     initialised: bool = False
-    opaque: bool = False
+    surrounded: bool = False
     device: torch.device | None = None
 
     @property

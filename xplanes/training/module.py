@@ -170,7 +170,7 @@ class RadianceModule(LightningModule):
             bounds=found.model.bounds(views),
             views=views,
             initialised=found.values is not None,
-            opaque=views.is_opaque,
+            surrounded=scene.is_surrounded,
             device=device,
         )
         self.initialisation = found
@@ -461,7 +461,7 @@ class RadianceModule(LightningModule):
                 "times": self.site.times,
                 "bounds": self.site.bounds,
                 "initialised": self.site.initialised,
-                "opaque": self.site.opaque,
+                "surrounded": self.site.surrounded,
             }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -497,7 +497,7 @@ class RadianceModule(LightningModule):
             seed=self.method.seed,
             precision=_precision(settings, torch.device("cpu")),
             bounds=content["bounds"],
-            opaque=content.get("opaque", False),  # Not in older checkpoints.
+            surrounded=content.get("surrounded", False),  # Not in older checkpoints.
         )
         self._assemble(settings, site)
 

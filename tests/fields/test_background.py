@@ -1,4 +1,4 @@
-"""The background: contraction of space, colours against a ray-by-ray oracle, rays that need none."""
+"""The background: contraction of space, colours against an oracle, rays that need none."""
 
 import math
 

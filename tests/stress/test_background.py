@@ -39,7 +39,7 @@ def test_contraction(tally, kind) -> None:
 
 
 def test_expansion(tally) -> None:
-    """Expansion undoes contraction: points 0 to 1e6 away in float64; the ball's surface is finite"""
+    """Expansion undoes contraction: points 0 to 1e6 away, and at infinity, in float64"""
     for length in (each for each in LENGTHS if each <= 1e6):
         points = torch.from_numpy(length * towards())
         back = expand(contract(points))

@@ -50,7 +50,8 @@ class DecoderSettings(Settings):
     density: Literal["softplus", "exp"]  # Activation of the density.
     density_scale: Positive  # Factor on the density.
     density_bias: float  # Initial bias of the density logit; lower is emptier.
-    colour_bias: float  # Initial bias of the colour logits; above 0 nears the white background.
+    # Initial bias of the colour logits; above 0 nears the white background. 0 before a world.
+    colour_bias: float
     colour_margin: Weight  # Margin by which colours may exceed [0, 1].
     freeze: bool  # Do not train the decoder.
 
@@ -120,6 +121,7 @@ class XPlanesSettings(ModelSettings):
     def build_field(self, site: Site, initial: InitialValues | None = None) -> XPlanes:
         """The field: planes and decoder from what is given, the rest of it random."""
         plane_set = self.plane_set if site.moves else "three"
+        background = self._background(site)
         generator = step_generator(site.seed, 0, Stream.INITIAL_FIELD)
         planes: Mapping[str, Tensor]
         if initial is not None:
@@ -152,9 +154,9 @@ class XPlanesSettings(ModelSettings):
         else:
             with torch.no_grad():
                 decoder.layers[-1].bias[0] += options.density_bias  # type: ignore[index]
-                decoder.layers[-1].bias[1:] += options.colour_bias  # type: ignore[index]
+                if background is None:  # White fog before a world would thin out to nothing.
+                    decoder.layers[-1].bias[1:] += options.colour_bias  # type: ignore[index]
         decoder.requires_grad_(not options.freeze)
-        background = self._background(site)
         return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set, background=background)
 
     def _background(self, site: Site) -> Background | None:

@@ -97,7 +97,7 @@ class XPlanesSettings(ModelSettings):
     space_scale: Weight  # Standard deviation of randomly initialised space planes.
     time_scale: Weight  # Standard deviation of randomly initialised time planes.
     decoder: DecoderSettings
-    # null: nothing but the plain colour that images with alpha are set before, as for these.
+    # What lies behind the cube, for opaque images of a scene in a world; null: a plain colour.
     background: BackgroundSettings | None = None
     loss: XPlanesLoss
     plane_lr: Positive  # Learning rate of the space planes.

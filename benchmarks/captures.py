@@ -1,12 +1,13 @@
 """What captures without silhouettes reach, with and without a background behind the field's cube.
 
     python benchmarks/captures.py [--scenes phone,rig] [--steps 1000] [--resolution 100]
-        [--variants plain,sky,world,masks] [--seeds 1] [--pictures FOLDER] [KEY=VALUE ...]
+        [--variants plain,sky,world,masks,world_tiny,masks_tiny] [--seeds 1] [--pictures FOLDER] [KEY=VALUE ...]
 
 Writes results/captures.md and captures.csv beside this file. The scenes are procedural captures of
 the suite, whose masks of the thing are known: scores are those of whole pictures, and of the pixels
 that show the thing. `plain` trains without a background, `sky` with one whose colour depends on
-direction alone, `world` with the default, and `masks` is told by silhouettes what is the thing.
+direction alone, `world` with the default, and `masks` is told by silhouettes what is the thing; all
+begin from random values, those with `_tiny` from the LRM that is bundled.
 """
 
 import os
@@ -39,10 +40,12 @@ from xplanes.training.fit import fit_quietly
 from xplanes.training.module import RadianceModule
 
 VARIANTS = {
-    "plain": ["model.background=null"],
-    "sky": ["model.background.samples=0"],
-    "world": [],
-    "masks": [],
+    "plain": ["lrm=none", "model.background=null"],
+    "sky": ["lrm=none", "model.background.samples=0"],
+    "world": ["lrm=none"],
+    "masks": ["lrm=none"],
+    "world_tiny": ["lrm=tiny"],
+    "masks_tiny": ["lrm=tiny"],
 }
 VIEWS = {"phone": 60, "rig": 96}
 COLUMNS = ("scene", "variant", "PSNR, dB", "PSNR of the thing, dB", "seconds", "ms a step")
@@ -68,10 +71,10 @@ def measure(
     scene: Scene, folder: Path, variant: str, overrides: list[str], steps: int, picture: Path | None
 ) -> list[float]:
     """PSNR of whole pictures and of the thing, and seconds of training."""
-    module = RadianceModule.compose("lrm=none", *VARIANTS[variant], *overrides)
+    module = RadianceModule.compose(*VARIANTS[variant], *overrides)
     train, test = scene.splits["train"], scene.splits["test"]
     given = scene
-    if variant == "masks":
+    if variant.startswith("masks"):
         given = replace(scene, splits={"train": cut_out(train, masks_of(folder, train))})
     module.build(given)
     began = time.perf_counter()

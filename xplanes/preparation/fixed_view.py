@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from xplanes.config import compose_plain
+from xplanes.fields.xplanes import XPlanes
 from xplanes.lrm.canonical import CanonicalView
 from xplanes.models.initialisation import Method, Place
 from xplanes.preparation.cache import StageCache
@@ -283,8 +284,8 @@ def _render(
 ) -> Tensor:
     """Frames at evenly spaced timesteps, premultiplied. uint8 [T, side, side, 4]"""
     device = module.renderer.device
-    if getattr(module.field, "background", None) is not None:
-        module.field.background = None  # Cut out of the world behind it.
+    if isinstance(module.field, XPlanes):
+        module.field.background = None  # What is in the cube is cut out of the world behind it.
     origins, directions = camera_rays(pose, focal, side, side)
     origins, directions = frame.rays(origins - back * directions, directions)
     rays = origins.to(device), directions.to(device)

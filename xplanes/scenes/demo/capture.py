@@ -181,4 +181,7 @@ class Array(Rig):
         if not training:
             return stations
         times = even_times(math.ceil(count / self.fixed))
-        return [(times[i // self.fixed], *place) for i, (_, *place) in enumerate(stations)]
+        return [
+            (times[i // self.fixed], azimuth, elevation)
+            for i, (_, azimuth, elevation) in enumerate(stations)
+        ]

@@ -1,7 +1,8 @@
 """What captures without silhouettes reach, with and without a background behind the field's cube.
 
     python benchmarks/captures.py [--scenes phone,rig] [--steps 1000] [--resolution 100]
-        [--variants plain,sky,world,masks,world_tiny,masks_tiny] [--seeds 1] [--pictures FOLDER] [KEY=VALUE ...]
+        [--variants plain,sky,world,masks,world_tiny,masks_tiny] [--seeds 1]
+        [--pictures FOLDER] [KEY=VALUE ...]
 
 Writes results/captures.md and captures.csv beside this file. The scenes are procedural captures of
 the suite, whose masks of the thing are known: scores are those of whole pictures, and of the pixels

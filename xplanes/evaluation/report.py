@@ -16,7 +16,14 @@ from xplanes.process import train_command
 from xplanes.rendering.pictures import write_png
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.training.clock import TrainingClock, find_callback, training_seconds
-from xplanes.training.evaluation import ViewScore, blank_psnr, device_memory, log_image, mean_scores
+from xplanes.training.evaluation import (
+    ViewScore,
+    blank_psnr,
+    device_memory,
+    log_image,
+    mean_colour,
+    mean_scores,
+)
 from xplanes.training.fit import Estimate, Trainer
 from xplanes.training.module import RadianceModule
 from xplanes.training.plateau import PlateauStop
@@ -111,10 +118,13 @@ def summary(
     threads = find_callback(trainer, StepThreads)
     counts = module.counts
     candidates = max(1, counts["candidates"])
+    tested, blank = data.scene.splits[data.test_split], data.scene.background
+    if data.scene.is_surrounded:
+        blank = mean_colour(tested, blank)  # No colour is that of the background.
     return {
         "split": data.test_split,
         "test": mean_scores(scores),
-        "blank_psnr": blank_psnr(data.scene.splits[data.test_split], data.scene.background),
+        "blank_psnr": blank_psnr(tested, blank),
         "views": [{"file": s.file, "time": s.time, **s.scores} for s in scores],
         "step": trainer.global_step,
         "seconds": seconds,

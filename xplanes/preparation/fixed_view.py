@@ -4,7 +4,6 @@ A scene may provide it. Otherwise a field is trained on the scene for a short ti
 the canonical camera of the Large Reconstruction Model.
 """
 
-import logging
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,8 +23,6 @@ from xplanes.scenes.frame import Frame, frame_content
 from xplanes.scenes.views import Intrinsics, Views, camera_rays
 from xplanes.training.fit import fit_quietly
 from xplanes.training.module import RadianceModule
-
-logger = logging.getLogger(__name__)
 
 OBLONG = 0.01
 """Largest relative difference of the two focal lengths: LRMs expect square pixels."""
@@ -101,10 +98,9 @@ def fixed_view(
         views = pick_frames(scene.video, torch.linspace(0, 1, count) if count > 1 else times[:1])
         return FixedView(views, frame.centre, 0.0, f"{len(views)} frames of the scene's video")
     if scene.is_surrounded:
-        logger.warning(
-            "%s: the images have no silhouettes, so the LRM is shown all that is found in the "
-            "cube, the ground included: give masks, which show it the thing alone, or set lrm=none",
-            scene.name,
+        place.say(
+            f"fixed view: the images of {scene.name} have no silhouettes, so the LRM is shown all "
+            "that is found in the cube, the ground included; masks would show it the thing alone"
         )
     return _rendered(method, place, view, size, count, cache)
 

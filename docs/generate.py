@@ -145,6 +145,11 @@ def rows(cls: type[Settings], options: Mapping[str, Any], prefix: str) -> list[s
             continue
         words = [meaning.get(entry.name, ""), choices(hint)]
         inner = {name: value[entry.name] for name, value in options.items()}
+        own = [kind for kind in get_args(hint) if isinstance(kind, type)]
+        if nested := [kind for kind in own if issubclass(kind, Settings)]:
+            lines.append(row(key, " ".join(filter(None, words)), dict.fromkeys(inner, "below")))
+            lines += rows(nested[0], inner, f"{key}.")
+            continue
         lines.append(row(key, " ".join(filter(None, words)), inner))
     return lines
 

@@ -233,8 +233,9 @@ def class_of(node):
 
 
 def nested(hint):
-    """The settings class of a type hint; None for a plain value."""
-    return hint if isinstance(hint, type) and issubclass(hint, Settings) else None
+    """The settings class of a type hint, or of one of its alternatives; None for a plain value."""
+    kinds = [kind for kind in (hint, *get_args(hint)) if isinstance(kind, type)]
+    return next((kind for kind in kinds if issubclass(kind, Settings)), None)
 
 
 def names_of(cls, prefix=""):

@@ -188,7 +188,7 @@ def train(
     scene, views = data.scene, data.scene.splits["train"]
     if resume and record is not None and _has_checkpoint(folder):
         require_same_views(folder, record.content, views)
-    frame = method.model.frame(views, settings.half_side)
+    frame = method.model.frame(views, settings.half_side, scene.points)
     for finding in camera_findings(scene, frame) if record is not None else ():
         logger.warning("%s", finding.text)
     loaded = time.monotonic() - started

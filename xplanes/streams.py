@@ -36,6 +36,8 @@ class Stream(IntEnum):
     """Samples whose gradients are passed on."""
     NOISE = 1_000_271
     """Noise of time planes that are initialised from an LRM."""
+    BACKGROUND = 1_000_289
+    """Initial values of what lies behind the field's cube."""
 
 
 def step_generator(seed: int, step: int, stream: int = 0) -> torch.Generator:

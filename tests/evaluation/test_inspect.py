@@ -32,7 +32,7 @@ from xplanes.evaluation.inspect import (
     next_command,
     table,
 )
-from xplanes.evaluation.inspect_picture import CUBE, HEIGHT, SCALE, WIDTH, _sample, draw
+from xplanes.evaluation.inspect_picture import CUBE, HEIGHT, POINT, SCALE, WIDTH, _sample, draw
 from xplanes.models.base import ModelSettings
 from xplanes.scenes.cameras import look_at
 from xplanes.scenes.errors import MissingSplitError, SceneError
@@ -400,6 +400,26 @@ def test_the_picture_shows_the_cameras(inspected):
     # The strips of time are the same: no camera stands still.
     strips = np.s_[80:370, 1120:1570]
     assert np.array_equal(picture[strips], others[strips])
+
+
+def test_points_give_opaque_scenes_their_cube_and_are_drawn(inspected):
+    bare = ball()
+    for views in bare.splits.values():
+        views.images[..., 3] = 255
+    generator = torch.Generator().manual_seed(0)
+    near = 0.7 * (2 * torch.rand(300, 3, generator=generator) - 1)
+    far = 50 + torch.rand(100, 3, generator=generator)
+    scene = replace(bare, points=torch.cat([near, far]))
+    known = facts(inspected(scene))["cube"]
+    assert known["source"] == "points"
+    assert known["side"] == pytest.approx(2 * 1.15 * 0.96 * 0.7, rel=0.05)
+    assert facts(inspected(bare))["cube"]["source"] == "cameras"
+    assert facts(inspected(scene, half_side=1.5))["cube"]["source"] == "data.half_side"
+    ink = [int(POINT[i : i + 2], 16) for i in (1, 3, 5)]
+    plans = np.asarray(draw(inspected(scene)))[100:580, 24:1088].astype(int)
+    dots = (np.abs(plans - ink).max(axis=-1) < 40).sum()
+    # Twice 300 dots, of which some lie on one another, and none of those outside of the panels.
+    assert 250 < dots < 2500
 
 
 def test_the_edges_of_the_cube_are_where_the_lens_shows_them():

@@ -323,3 +323,42 @@ def test_an_interrupted_field_is_resumed(tmp_path: Path, small_fields, monkeypat
     video_of(method, scene, cache)
     assert steps == []  # all were done
     assert not list(cache.glob("fixed_view-*/"))
+
+
+def walled(views, *, alpha=255):
+    """The views before a wall of colours, or with alpha that hides the wall."""
+    images = views.images.clone()
+    clear = images[..., 3] == 0
+    images[clear] = torch.tensor([90, 140, 60, alpha], dtype=torch.uint8)
+    return replace(views, images=images)
+
+
+def test_a_video_of_the_world_around_the_thing_is_not_the_lrms(tmp_path: Path, monkeypatch):
+    rendered = object()
+    monkeypatch.setattr(module, "_rendered", lambda *_: rendered)
+    bare = ball_scene()
+    camera = bare.splits["train"].camera_to_world[:1].expand(6, 4, 4)
+    video = ball_views(6, 0.6, poses=camera, size=16)
+    opaque = {split: walled(views) for split, views in bare.splits.items()}
+    surrounded = replace(bare, splits=opaque, video=walled(video))
+    masked = replace(surrounded, video=video)
+    given = partial(settings, tmp_path)
+    assert video_of(given(), surrounded, tmp_path)[0] is rendered
+    assert (
+        video_of(given(), masked, tmp_path)[0].views.files
+        == pick_frames(video, torch.linspace(0, 1, 4)).files
+    )
+    asked = video_of(given("preparation.fixed_view=video"), surrounded, tmp_path)[0]
+    assert bool((asked.views.in_memory()[..., 3] == 255).all())
+
+
+def test_the_video_of_a_field_in_a_world_shows_the_cube_alone(tmp_path: Path):
+    bare = ball_scene(size=24)
+    scene = replace(bare, splits={split: walled(v) for split, v in bare.splits.items()})
+    method = settings(tmp_path, "preparation.fixed_view_steps=3")
+    made, said = video_of(method, scene, tmp_path)
+    frames = made.views.in_memory().short()
+    # Colours are multiplied by alpha: none has more than its opacity, as a wall behind would.
+    assert (frames[..., :3] <= frames[..., 3:] + 1).all()
+    assert frames[..., 3].min() < 250
+    assert "no silhouettes" in said[0]

@@ -221,3 +221,76 @@ def test_the_frame_is_finite_for_every_kind_of_path():
         frame = scene_frame(views)
         assert math.isfinite(frame.scale)
         assert frame.centre.isfinite().all()
+
+
+CLUSTER = torch.tensor([0.2, -0.1, 0.3])
+
+
+def points_of(count=400, half=(0.5, 0.3, 0.4), *, stray=200, seed=0):
+    """Points spread over a box around `CLUSTER`, and stray ones on a far shell and nearby."""
+    generator = torch.Generator().manual_seed(seed)
+    box = CLUSTER + (2 * torch.rand(count, 3, generator=generator) - 1) * torch.tensor(half)
+    far = torch.randn(stray, 3, generator=generator)
+    return torch.cat([box, far / far.norm(dim=1, keepdim=True) * 7.0, torch.full((2, 3), math.nan)])
+
+
+def ring(count=24, seed=0):
+    """Opaque views from around, looking at `CLUSTER`."""
+    angles = torch.arange(count) * (2 * math.pi / count)
+    places = torch.stack([4 * angles.cos(), 4 * angles.sin(), 1 + 0.3 * angles.sin()], dim=1)
+    poses = look_at(places + CLUSTER, CLUSTER)
+    views = ball_views(count, 0.5, poses=poses, size=20)
+    images = views.images.clone()
+    images[..., 3] = 255
+    return replace(views, images=images)
+
+
+def test_opaque_scenes_take_the_cube_of_the_points_in_the_middle():
+    frame = scene_frame(ring(), points=points_of())
+    assert frame.source == "points"
+    # 96% of evenly spread points, with 15% of room.
+    assert 1 / frame.scale == pytest.approx(1.15 * 0.96 * 0.5, rel=0.05)
+    assert torch.allclose(frame.centre, CLUSTER, atol=0.04)
+    inside = frame.points(points_of()[:400]).abs().amax(dim=1) <= 1
+    assert inside.float().mean() > 0.95
+    # Units and place of the world do not matter.
+    views, shift = ring(), torch.tensor([50.0, -20.0, 5.0])
+    poses = views.camera_to_world.clone()
+    poses[:, :3, 3] = 10 * poses[:, :3, 3] + shift
+    moved = scene_frame(replace(views, camera_to_world=poses), points=10 * points_of() + shift)
+    assert moved.scale == pytest.approx(frame.scale / 10, rel=1e-3)
+
+
+def test_a_half_side_that_is_given_keeps_its_size_around_the_points():
+    frame = scene_frame(ring(), 2.5, points_of())
+    assert (frame.scale, frame.source) == (0.4, "data.half_side")
+    assert torch.allclose(frame.centre, CLUSTER, atol=0.04)
+
+
+def test_silhouettes_come_before_points():
+    views = ball_views(24, 0.5, poses=ring().camera_to_world, size=20)
+    frame = scene_frame(views, points=points_of())
+    assert frame.source == "cameras and silhouettes"
+    assert frame.scale == scene_frame(views).scale
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        pytest.param(torch.zeros(0, 3), id="none"),
+        pytest.param(torch.full((50, 3), math.nan), id="not finite"),
+        pytest.param(points_of(20), id="too few"),
+        pytest.param(CLUSTER.repeat(100, 1), id="all in one place"),
+        pytest.param(points_of() + torch.tensor([0.0, 0.0, 40.0]), id="elsewhere"),
+        pytest.param(0.1 * points_of(stray=0) + torch.tensor([0.5, 0.3, 0.2]), id="beside"),
+    ],
+)
+def test_points_that_tell_nothing_leave_the_cameras_cube(points):
+    frame = scene_frame(ring(), points=points)
+    assert frame.source == "cameras"
+    assert frame.scale == scene_frame(ring()).scale
+
+
+def test_the_source_of_a_cube_is_named():
+    assert scene_frame(ring()).source == "cameras"
+    assert scene_frame(ring(), 1.0).source == "data.half_side"

@@ -270,9 +270,10 @@ def test_the_video_is_that_of_a_training_camera(videos: Path) -> None:
         read(videos, video_camera="cam9")
 
 
-def test_the_lrm_sees_that_video_as_it_is(videos: Path) -> None:
+def test_the_lrm_sees_that_video_as_it_is_if_it_is_asked_for(videos: Path) -> None:
     scene = read(videos, video_camera="cam02")
-    method = Method.read(compose_plain("train", ["lrm=tiny", "preparation.frames=3"]))
+    settings = ["lrm=tiny", "preparation.frames=3", "preparation.fixed_view=video"]
+    method = Method.read(compose_plain("train", settings))
     place = Place(scene, scene_frame(scene.splits["train"]), torch.device("cpu"))
     made = fixed_view(method, place, OPENLRM_VIEW, 24, StageCache(None))
     assert made.seconds == 0

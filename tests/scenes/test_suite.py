@@ -23,7 +23,7 @@ from xplanes.scenes.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE, render_i
 from xplanes.scenes.demo.shading import Light
 from xplanes.scenes.demo.suite import KINDS, SUITE_SCENES, suite_scene
 from xplanes.scenes.demo.suite.pieces import ball
-from xplanes.scenes.demo.write import ensure_suite_scene
+from xplanes.scenes.demo.write import MASKS, ensure_suite_scene
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.source import SceneSettings
 
@@ -89,7 +89,10 @@ def test_every_view_shows_the_scene_within_the_picture(name):
 @pytest.mark.parametrize("name", SUITE_SCENES)
 def test_times_and_cameras_of_the_splits(name):
     last = SUITE_SCENES[name].rig.end
-    assert times(name) == pytest.approx(np.linspace(0, last, 50).tolist())
+    expected = np.linspace(0, last, 50)
+    if name in both("rig"):  # Eight cameras at each of seven times, but for six at the last.
+        expected = np.linspace(0, last, 7).repeat(8)[:50]
+    assert times(name) == pytest.approx(expected.tolist())
     for split in ("val", "test"):
         held_out = times(name, split)
         assert held_out[0] == 0
@@ -104,7 +107,7 @@ def test_things_move_unless_the_scene_is_static(name):
     first, later = (picture(name, time, camera).astype(int) for time in (0.0, 0.37))
     moved = (np.abs(first - later) > 25).any(axis=-1).sum()
     assert moved == 0 if name.startswith("static") else moved >= 4
-    assert len(set(times(name))) == 50
+    assert len(set(times(name))) == (7 if name in both("rig") else 50)
 
 
 @pytest.mark.parametrize("name", both("white_floor"))
@@ -270,6 +273,50 @@ def test_times_end_early(name):
     assert max(times(name, "test")) < SUITE_SCENES[name].rig.end
 
 
+@pytest.mark.parametrize("name", both("phone"))
+def test_a_phone_is_carried_along_an_arc(name):
+    poses = cameras(name)
+    places = poses[:, :2, 3]
+    turns = torch.atan2(places[:, 1], places[:, 0]).diff()
+    assert (turns * turns[0].sign() > 0).all()
+    assert 1.9 < turns.sum().abs() < 2.6
+    assert poses[:, 2, 3].std() > 0.1
+    # Held-out cameras stand where the phone was at another time, and above.
+    for (time, pose), distance in zip(
+        capture_of(name).shots["test"],
+        torch.cdist(cameras(name, "test")[:, :3, 3], poses[:, :3, 3]),
+        strict=True,
+    ):
+        assert abs(times(name)[int(distance.argmin())] - time) > 0.04, pose
+
+
+@pytest.mark.parametrize("name", both("rig"))
+def test_a_rig_takes_eight_pictures_at_once(name):
+    poses = cameras(name)
+    assert len(poses[:8].unique(dim=0)) == 8
+    assert torch.equal(poses[:42], poses[8:])
+
+
+@pytest.mark.parametrize("name", [*both("phone"), *both("rig")])
+def test_captures_have_a_world_behind_and_masks_of_the_thing(name, tmp_path):
+    counts = {"train_views": 3, "val_views": 1, "test_views": 2}
+    folder = ensure_suite_scene(tmp_path, name, resolution=SIDE, **counts, announce=lambda _: None)
+    data = ("data=suite", f"data.scene={name}", f"data.resolution={SIDE}", f"data.root={tmp_path}",
+            *(f"data.{key}={value}" for key, value in counts.items()))  # fmt: skip
+    scene = build(compose_plain("train", data)["data"], SceneSettings, "data").read()
+    assert scene.splits["train"].is_opaque
+    shots = SUITE_SCENES[name].rig.capture({"train": 3}, f"{name} 0").shots["train"]
+    for number, (time, camera) in enumerate(shots):
+        mask = np.asarray(Image.open(folder / MASKS / "train" / f"r_{number:03d}.png"))
+        alone = render_image(assembly_of(name).pose(time), camera, SIDE)
+        # The world hides nothing of the thing, but for what a pixel's rays share with it.
+        assert np.abs(mask.astype(int) - alone[..., 3]).max() <= 64
+        colours = scene.splits["train"].image(number)[..., :3].numpy()
+        border = np.concatenate([colours[0], colours[-1], colours[:, 0], colours[:, -1]])
+        assert len(np.unique(border // 16, axis=0)) > 8
+        assert 0.03 < (mask > 127).mean() < 0.5
+
+
 def test_layers_are_composited_from_front_to_back():
     """Through a ball of jelly in a box of glass, against the formula."""
     jelly = Translucent(Plain((0.0, 1.0, 0.0)), density=2.0)
@@ -325,7 +372,7 @@ def test_the_experiments_list_every_kind(experiment, ending):
     text = (CONF / "experiment" / f"{experiment}.yaml").read_text(encoding="utf-8")
     listed = yaml.safe_load(text)["hydra"]["sweeper"]["params"]["data.scene"].split(",")
     assert listed == [kind + ending for kind in KINDS]
-    assert len(listed) == 16
+    assert len(listed) == 18
 
 
 def test_unknown_names_are_refused_with_the_nearest():

@@ -1,4 +1,4 @@
-"""Forty beginnings on scenes of all kinds: no field shows nothing, or fog."""
+"""Beginnings on scenes of all kinds: no field shows nothing, or fog."""
 
 import json
 from pathlib import Path
@@ -41,4 +41,4 @@ def test_no_field_collapses(folder: Path, tmp_path: Path, kind: str, lrm: str, s
     assert metrics["restarts"] == 0
     # Thin wires that turn are hardly more than their stand after so few steps.
     assert metrics["test"]["psnr"] > metrics["blank_psnr"]
-    assert metrics["test"]["floaters"] < 0.5
+    assert metrics["test"].get("floaters", 0.0) < 0.5  # Captures have no transparent pixels.

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from xplanes.rendering.box import ray_box
 from xplanes.scenes.cameras import cast_rays, project
-from xplanes.scenes.frame import Frame, backwards, optical_centre
+from xplanes.scenes.frame import Frame, axes_meet, backwards, optical_centre
 from xplanes.scenes.views import Scene, Views
 
 GAP_SPACINGS, GAP_SPAN = 12.0, 0.05
@@ -19,9 +19,6 @@ GAP_SPACINGS, GAP_SPAN = 12.0, 0.05
 
 SHORT_SPAN = 0.2
 """Share of [0, 1] that times cover at least, unless they were scaled wrongly."""
-
-CONVERGENCE = 0.02
-"""Least eigenvalue at which optical axes, which are not parallel then, meet in a point."""
 
 ASTRAY = 0.1
 """Share of the cameras that may look past the centre of the cube."""
@@ -386,9 +383,7 @@ def calibrations(views: Views) -> list[tuple[float, ...]]:
 def _outward(views: Views) -> Finding | None:
     """Whether the cameras look away from the point in which their axes meet."""
     axis = -backwards(views).double()
-    eye = torch.eye(3, dtype=torch.float64)
-    projector = (eye - axis[:, :, None] * axis[:, None, :]).mean(dim=0)
-    if float(torch.linalg.eigvalsh(projector)[0]) < CONVERGENCE:
+    if not axes_meet(views):
         return None  # Axes that are nearly parallel may meet anywhere.
     to_centre = optical_centre(views).double() - views.camera_to_world[:, :3, 3].double()
     away = int(((to_centre * axis).sum(dim=-1) < 0).sum())

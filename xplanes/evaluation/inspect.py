@@ -188,7 +188,7 @@ def inspect(choice: Choice) -> Capture:
     train = scene.splits["train"]
     frame, problem = None, ""
     try:
-        frame = model.frame(train, choice.scene.half_side)
+        frame = model.frame(train, choice.scene.half_side, scene.points)
     except SceneError as error:
         problem = str(error)
     looks = {
@@ -328,7 +328,7 @@ def facts(capture: Capture) -> dict[str, Any]:
         content["cube"] = {
             "centre": [_rounded(float(value), frame) for value in frame.centre],
             "side": 2 / frame.scale,
-            "source": _cube_source(capture),
+            "source": frame.source,
             "camera_distance": [float(away.min()), float(away.median()), float(away.max())],
         }
         if capture.texels is not None:
@@ -339,13 +339,6 @@ def facts(capture: Capture) -> dict[str, Any]:
 def _rounded(value: float, frame: Frame) -> float:
     """A coordinate to a millionth of the cube's size: rounding errors show as 0."""
     return round(value * frame.scale, 6) / frame.scale + 0.0
-
-
-def _cube_source(capture: Capture) -> str:
-    if capture.choice.scene.half_side is not None:
-        return "data.half_side"
-    opaque = all(each.coverage >= 0.9995 for each in capture.looks["train"])
-    return "cameras" if opaque else "cameras and silhouettes"
 
 
 def _split_facts(views: Views, looks: Sequence[Look]) -> dict[str, Any]:

@@ -24,7 +24,9 @@ SCALE = 2
 INK, FAINT, PAPER, PANEL = "#1f2933", "#9aa5b1", "#ffffff", "#f5f7fa"
 SPLITS = {"train": "#2b6cb0", "val": "#d97706", "test": "#2f855a"}
 OTHER, ASTRAY, CUBE, GAP = "#6b46c1", "#d64545", "#c026a3", "#f9d6d5"
+POINT = "#627d98"
 MOST_FRUSTA, MOST_RAYS, MOST_STRIPS, SAMPLES = 80, 3, 12, 6
+MOST_POINTS = 3000
 EDGE_POINTS = 48
 """Points along an edge of the cube, which a lens may bend."""
 
@@ -123,6 +125,8 @@ def _legend(sheet: _Sheet, capture: Capture) -> None:
             entries.append((ASTRAY, f"{blind} do not see the centre of the cube"))
     else:
         entries.append((ASTRAY, "no cube: the cameras see no common volume"))
+    if (points := capture.scene.points) is not None:
+        entries.append((POINT, f"{len(points)} points"))
     warned = ", ".join(dict.fromkeys(each.kind for each in capture.findings))
     entries.append((INK, f"warnings: {warned}" if warned else "no warnings"))
     x = float(MARGIN)
@@ -150,7 +154,7 @@ class _Plan:
 
 
 def _cameras(side: int, title: str, axes: str, capture: Capture) -> Image.Image:
-    """Cameras with their frusta, the cube, and rays through the corners of some images.
+    """Cameras with their frusta, points, the cube, and rays through the corners of some images.
 
     They are drawn by themselves, since rays leave the panel.
     """
@@ -161,6 +165,11 @@ def _cameras(side: int, title: str, axes: str, capture: Capture) -> Image.Image:
     points = places if frame is None else torch.cat([places, _cube_edges(frame).flatten(0, 1)])
     plan = _Plan((12, 30, side - 12, side - 30), axes, points)
     length = 0.07 * plan.span
+    if (known := capture.scene.points) is not None:
+        known = known[known.isfinite().all(dim=1)]
+        for place in plan(known[:: -(-len(known) // MOST_POINTS) or 1]):
+            if all(0 < value < side for value in place):
+                sheet.dot(place, 0.8, POINT)
     train = splits["train"]
     count = min(MOST_RAYS, len(train))
     for index in [round((i + 0.5) * len(train) / count - 0.5) for i in range(count)]:

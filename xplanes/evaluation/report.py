@@ -16,7 +16,14 @@ from xplanes.process import train_command
 from xplanes.rendering.pictures import write_png
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.training.clock import TrainingClock, find_callback, training_seconds
-from xplanes.training.evaluation import ViewScore, blank_psnr, device_memory, log_image, mean_scores
+from xplanes.training.evaluation import (
+    ViewScore,
+    blank_psnr,
+    device_memory,
+    log_image,
+    mean_colour,
+    mean_scores,
+)
 from xplanes.training.fit import Estimate, Trainer
 from xplanes.training.module import RadianceModule
 from xplanes.training.plateau import PlateauStop
@@ -51,6 +58,7 @@ def header(
     where = " (training views on disk)" if train.is_stored else ""
     trainable = sum(p.numel() for p in module.parameters() if p.requires_grad)
     frozen = sum(p.numel() for p in module.parameters()) - trainable
+    cube = f"cube {2 / frame.scale:.2f} wide" + (f", from {frame.source}" if frame.source else "")
     moving = ""
     if not module.field.moves:
         reason = scene.static_reason or "one timestep only"
@@ -64,7 +72,7 @@ def header(
         f"{backend.name(device)}",
         "run": str(run),
         "data": f"{experiment.data.name} {scene.name} · {counts} views · "
-        f"{train.outline} · {size:.1f} MB{where} · cube {2 / frame.scale:.2f} wide",
+        f"{train.outline} · {size:.1f} MB{where} · {cube}",
         "model": f"{experiment.method.model.name} {module.field.outline} · "
         f"{trainable:,} parameters, {frozen:,} frozen{moving}",
         "from": module.initialisation.words,
@@ -110,10 +118,13 @@ def summary(
     threads = find_callback(trainer, StepThreads)
     counts = module.counts
     candidates = max(1, counts["candidates"])
+    tested, blank = data.scene.splits[data.test_split], data.scene.background
+    if data.scene.is_surrounded:
+        blank = mean_colour(tested, blank)  # No colour is that of the background.
     return {
         "split": data.test_split,
         "test": mean_scores(scores),
-        "blank_psnr": blank_psnr(data.scene.splits[data.test_split], data.scene.background),
+        "blank_psnr": blank_psnr(tested, blank),
         "views": [{"file": s.file, "time": s.time, **s.scores} for s in scores],
         "step": trainer.global_step,
         "seconds": seconds,

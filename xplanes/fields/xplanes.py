@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
+from xplanes.fields.background import Background
 from xplanes.fields.base import RadianceField
 from xplanes.fields.decoder import Decoder
 from xplanes.fields.lookup import Rows, plane_features
@@ -40,6 +41,7 @@ class XPlanes(RadianceField):
             [C, H, H] and the plane set's time planes [C, T, H'], T rows of time.
         decoder: From features [N, 3 C] to colour [N, 3] and density [N].
         plane_set: "six" (K-Planes' set), "nine" (Tensor4D's) or "three" (no time).
+        background: What lies behind the cube; None for the plain colour that renderers are given.
 
     Raises:
         ValueError: If a plane is missing or superfluous, or the shapes do not fit one another.
@@ -48,7 +50,12 @@ class XPlanes(RadianceField):
     """
 
     def __init__(
-        self, *, planes: Mapping[str, Tensor], decoder: Decoder, plane_set: str = "six"
+        self,
+        *,
+        planes: Mapping[str, Tensor],
+        decoder: Decoder,
+        plane_set: str = "six",
+        background: Background | None = None,
     ) -> None:
         super().__init__()
         if plane_set not in PLANE_SETS:
@@ -71,6 +78,7 @@ class XPlanes(RadianceField):
                 f"{self.space.shape[3]}: must be equal"
             )
         self.decoder = decoder
+        self.background = background
 
     @property
     def planes(self) -> dict[str, Tensor]:
@@ -94,7 +102,8 @@ class XPlanes(RadianceField):
 
     @property
     def outline(self) -> str:
-        return f"({' '.join(self.planes)}) · {self.space.shape[3]} channels"
+        behind = "" if self.background is None else " · a background"
+        return f"({' '.join(self.planes)}) · {self.space.shape[3]} channels{behind}"
 
     def features(self, points: Tensor, times: Tensor) -> Tensor:
         """Features that the decoder sees. [N, 3], [N] -> [N, 3 C]"""

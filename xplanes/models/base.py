@@ -119,14 +119,15 @@ class ModelSettings(Settings, ABC):
         """
         return None
 
-    def frame(self, views: Views, half_side: float | None) -> Frame:
+    def frame(self, views: Views, half_side: float | None, points: Tensor | None = None) -> Frame:
         """The frame in which the field lives: the scene's cube, if the model has none of its own.
 
         Args:
             views: Training views.
             half_side: Half the side of the scene's cube in world units; None finds it.
+            points: World points on surfaces, if known. [N, 3]
         """
-        return scene_cube(views, half_side)
+        return scene_cube(views, half_side, points)
 
     def bounds(self, views: Views) -> Tensor | None:
         """Box in world units that the field covers, where it needs one. [2, 3]"""

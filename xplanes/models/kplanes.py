@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import torch
+from torch import Tensor
 
 from xplanes.errors import ConfigError
 from xplanes.fields.kplanes import ExplicitDecoder, HybridDecoder, KPlanes
@@ -54,9 +55,9 @@ class KPlanesSettings(ModelSettings):
                 f"space_low={self.space_low}: must not be above space_high={self.space_high}"
             )
 
-    def frame(self, views: Views, half_side: float | None) -> Frame:
+    def frame(self, views: Views, half_side: float | None, points: Tensor | None = None) -> Frame:
         if self.half_side is None:
-            return scene_cube(views, half_side)
+            return scene_cube(views, half_side, points)
         return origin_cube(self.half_side, views, half_side)
 
     def build(self, site: Site, initial: InitialValues | None = None) -> "KPlanesModel":

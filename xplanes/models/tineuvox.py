@@ -65,7 +65,7 @@ class TiNeuVoxSettings(ModelSettings):
             return frusta_box(views, self.near, self.far, self.margin)
         return torch.tensor([[-1.0] * 3, [1.0] * 3]) * self.half_side
 
-    def frame(self, views: Views, half_side: float | None) -> Frame:
+    def frame(self, views: Views, half_side: float | None, points: Tensor | None = None) -> Frame:
         """The smallest cube around the world's origin that holds the grid's box."""
         if self.half_side is not None:
             return origin_cube(self.half_side, views, half_side)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from xplanes.decomposition.sparse_loss import SparseProduct
+from xplanes.fields.background import Background
 from xplanes.fields.decoder import Decoder
 from xplanes.fields.regularisers import (
     add_distance_gradient,
@@ -36,7 +37,7 @@ from xplanes.rendering.base import Rendering
 from xplanes.rendering.sampler import Group, Site
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
-from xplanes.streams import Stream, TrainingState, step_generator
+from xplanes.streams import Stream, TrainingState, initial_values, step_generator
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,9 +50,20 @@ class DecoderSettings(Settings):
     density: Literal["softplus", "exp"]  # Activation of the density.
     density_scale: Positive  # Factor on the density.
     density_bias: float  # Initial bias of the density logit; lower is emptier.
-    colour_bias: float  # Initial bias of the colour logits; above 0 nears the white background.
+    # Initial bias of the colour logits; above 0 nears the white background. 0 before a world.
+    colour_bias: float
     colour_margin: Weight  # Margin by which colours may exceed [0, 1].
     freeze: bool  # Do not train the decoder.
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackgroundSettings(Settings):
+    """A static world behind the field's cube, for opaque images of a scene in a world."""
+
+    resolution: Count  # Texels along each side of its planes, over contracted space.
+    channels: Count  # Channels of each plane.
+    samples: Steps  # Samples of a ray behind the cube; 0: its colour depends on direction alone.
+    width: Count  # Neurons of the decoder's hidden layer.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +97,8 @@ class XPlanesSettings(ModelSettings):
     space_scale: Weight  # Standard deviation of randomly initialised space planes.
     time_scale: Weight  # Standard deviation of randomly initialised time planes.
     decoder: DecoderSettings
+    # What lies behind the cube, for opaque images of a scene in a world; null: a plain colour.
+    background: BackgroundSettings | None = None
     loss: XPlanesLoss
     plane_lr: Positive  # Learning rate of the space planes.
     time_lr: Positive  # Learning rate of the time planes.
@@ -107,6 +121,7 @@ class XPlanesSettings(ModelSettings):
     def build_field(self, site: Site, initial: InitialValues | None = None) -> XPlanes:
         """The field: planes and decoder from what is given, the rest of it random."""
         plane_set = self.plane_set if site.moves else "three"
+        background = self._background(site)
         generator = step_generator(site.seed, 0, Stream.INITIAL_FIELD)
         planes: Mapping[str, Tensor]
         if initial is not None:
@@ -139,9 +154,24 @@ class XPlanesSettings(ModelSettings):
         else:
             with torch.no_grad():
                 decoder.layers[-1].bias[0] += options.density_bias  # type: ignore[index]
-                decoder.layers[-1].bias[1:] += options.colour_bias  # type: ignore[index]
+                if background is None:  # White fog before a world would thin out to nothing.
+                    decoder.layers[-1].bias[1:] += options.colour_bias  # type: ignore[index]
         decoder.requires_grad_(not options.freeze)
-        return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set)
+        return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set, background=background)
+
+    def _background(self, site: Site) -> Background | None:
+        """What lies behind the cube; None for a plain colour."""
+        if self.background is None or not site.surrounded:
+            return None
+        options = self.background
+        with initial_values(site.seed, Stream.BACKGROUND):
+            return Background(
+                options.channels,
+                options.resolution,
+                width=options.width,
+                samples=options.samples,
+                precision="bf16" if site.precision == "bf16" else "32",
+            )
 
 
 class XPlanesModel(Model):
@@ -196,10 +226,18 @@ class XPlanesModel(Model):
         decoder = [p for p in field.decoder.parameters() if p.requires_grad]
         if decoder:
             groups.append({"params": decoder, "lr": settings.decoder_lr, "name": "decoder"})
+        if (world := field.background) is not None:
+            decoder = list(world.decoder.parameters())
+            groups += [
+                {"params": [world.planes], "lr": settings.plane_lr, "name": "background"},
+                {"params": decoder, "lr": settings.decoder_lr, "name": "background_decoder"},
+            ]
         return groups
 
     def losses(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
         terms = super().losses(rendering, rays, state)
+        if self._field.background is not None:
+            return terms  # Neither alpha nor a known background says what is opaque.
         if self.opacity:
             error = opacity_shortfall if self._opaque else opacity_error
             terms["opacity"] = self.opacity * error(rendering, rays)

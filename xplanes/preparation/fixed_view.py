@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from xplanes.config import compose_plain
+from xplanes.fields.xplanes import XPlanes
 from xplanes.lrm.canonical import CanonicalView
 from xplanes.models.initialisation import Method, Place
 from xplanes.preparation.cache import StageCache
@@ -88,10 +89,19 @@ def fixed_view(
         )
     times = scene.splits["train"].times
     count = 1 if scene.splits["train"].is_static else options.frames
-    if scene.video is not None and options.fixed_view != "train":
+    # A video without alpha shows a world around the thing, which LRMs would take for a part of it.
+    whole = scene.video is not None and scene.is_surrounded and scene.video.is_opaque
+    if scene.video is not None and (
+        options.fixed_view == "video" or (options.fixed_view == "auto" and not whole)
+    ):
         check_camera(scene.video)
         views = pick_frames(scene.video, torch.linspace(0, 1, count) if count > 1 else times[:1])
         return FixedView(views, frame.centre, 0.0, f"{len(views)} frames of the scene's video")
+    if scene.is_surrounded:
+        place.say(
+            f"fixed view: the images of {scene.name} have no silhouettes, so the LRM is shown all "
+            "that is found in the cube, the ground included; masks would show it the thing alone"
+        )
     return _rendered(method, place, view, size, count, cache)
 
 
@@ -200,7 +210,7 @@ def _rendered(
     side = min(size, max(train.height, train.width))
     focal = view.focal * side
     rendering = rendering_method(method)
-    own_frame = rendering.model.frame(train, None)
+    own_frame = rendering.model.frame(train, None, scene.points)
     # Samplers may have a fixed near bound. The LRM's camera is closer than the training cameras, so
     # its ray origins are moved back.
     away = (train.camera_to_world[:, :3, 3] - frame.centre).norm(dim=-1).mean()
@@ -279,6 +289,8 @@ def _render(
 ) -> Tensor:
     """Frames at evenly spaced timesteps, premultiplied. uint8 [T, side, side, 4]"""
     device = module.renderer.device
+    if isinstance(module.field, XPlanes):
+        module.field.background = None  # What is in the cube is cut out of the world behind it.
     origins, directions = camera_rays(pose, focal, side, side)
     origins, directions = frame.rays(origins - back * directions, directions)
     rays = origins.to(device), directions.to(device)

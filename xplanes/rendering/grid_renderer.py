@@ -10,6 +10,7 @@ from torch import Tensor, distributed, nn
 from xplanes.errors import ConfigError
 from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
+from xplanes.rendering.behind import behind
 from xplanes.rendering.box import Field, shade
 from xplanes.rendering.carving import carve
 from xplanes.rendering.compositing import composite
@@ -100,6 +101,7 @@ class GridRenderer(RayRenderer):
             density * self.step, colour, samples.distances, samples.ray, samples.starts
         )
         opacity = total[:, 3]
+        background = behind(field, origins, directions, opacity, background, jitter)
         return Rendering(
             colour=total[:, :3] + (1 - opacity)[:, None] * background,
             opacity=opacity,

@@ -13,6 +13,7 @@ from xplanes.fields.kplanes import DensityField
 from xplanes.fields.products import PlaneProducts
 from xplanes.fields.regularisers import PlaneTerms
 from xplanes.rendering.base import RayRenderer, Rendering
+from xplanes.rendering.behind import behind
 from xplanes.rendering.box import ray_box, shade
 from xplanes.rendering.compositing import composite
 from xplanes.rendering.marching import Samples
@@ -138,6 +139,7 @@ class ProposalRenderer(RayRenderer):
         )
         levels.append(Level(edges, weights.view_as(distances)))
         opacity = total[:, 3]
+        background = behind(field, origins, directions, opacity, background)
         return ProposalRendering(
             colour=total[:, :3] + (1 - opacity)[:, None] * background,
             opacity=opacity,

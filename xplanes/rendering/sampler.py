@@ -37,6 +37,8 @@ class Site:
         bounds: Box in world units that some fields cover; None for those that need none. [2, 3]
         views: Training views; None where a checkpoint is loaded without its data.
         initialised: Whether the initial field already shows the scene.
+        surrounded: Whether the training images show a world around the scene, so that there is
+            something to see behind the field's cube.
         device: Where it is going to be trained; the CPU when None.
     """
 
@@ -47,6 +49,7 @@ class Site:
     bounds: Tensor | None = None
     views: Views | None = None
     initialised: bool = False
+    surrounded: bool = False
     device: torch.device | None = None
 
     @property
@@ -162,9 +165,9 @@ class SamplerSettings(Settings, ABC):
         return self
 
 
-def scene_cube(views: Views, half_side: float | None) -> Frame:
-    """The scene's own cube; ``half_side`` in world units, found from the views when None."""
-    return scene_frame(views, half_side)
+def scene_cube(views: Views, half_side: float | None, points: Tensor | None = None) -> Frame:
+    """The scene's own cube; ``half_side`` in world units, found when None, see `scene_frame`."""
+    return scene_frame(views, half_side, points)
 
 
 def origin_cube(half_side: float, views: Views, given: float | None = None) -> Frame:
@@ -186,7 +189,7 @@ def origin_cube(half_side: float, views: Views, given: float | None = None) -> F
     try:
         scene = scene_frame(views, None)
     except SceneError:
-        return cube_frame(half_side, torch.zeros(3))
+        return cube_frame(half_side, torch.zeros(3), "model.half_side")
     reach = 1 / scene.scale + float(scene.centre.norm())
     # A scene that fills the cube's corners reaches sqrt(3) times as far as its sides.
     if not half_side / 4 < reach < half_side * 3**0.5:
@@ -196,7 +199,7 @@ def origin_cube(half_side: float, views: Views, given: float | None = None) -> F
             half_side,
             reach,
         )
-    return cube_frame(half_side, torch.zeros(3))
+    return cube_frame(half_side, torch.zeros(3), "model.half_side")
 
 
 def check_range(site: Site, near: float, far: float) -> None:

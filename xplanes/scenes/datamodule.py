@@ -197,7 +197,8 @@ class SceneDataModule(LightningDataModule):
         """The batches of a process for a LightningModule, or for none that says anything."""
         if rank not in self._batches:
             views = self.scene.splits["train"]
-            frame = getattr(module, "frame", None) or scene_frame(views, self.settings.half_side)
+            frame = getattr(module, "frame", None)
+            frame = frame or scene_frame(views, self.settings.half_side, self.scene.points)
             settings = getattr(module, "ray_settings", UNIFORM)
             self._batches[rank] = RayBatches(views, frame, settings, seed=self.seed, rank=rank)
         return self._batches[rank]

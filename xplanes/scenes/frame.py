@@ -7,12 +7,27 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from xplanes.scenes.cameras import cast_rays
+from xplanes.scenes.cameras import cast_rays, project
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.views import Views
 
 MARGIN = 1.03
 """Room around the farthest thing that any view shows."""
+
+MIDDLE = 0.6
+"""Share of an image's width and height that counts as its middle."""
+
+OUTLIERS = 0.02
+"""Share of points that a cube may leave out on either side of an axis."""
+
+ROOM = 1.15
+"""Room around points, which lie on surfaces and are few on what moves."""
+
+LEAST_POINTS, MOST_POINTS, MOST_CAMERAS = 32, 20_000, 64
+"""Points in the middle that a cube needs; points and cameras that are looked at."""
+
+CONVERGENCE = 0.02
+"""Least eigenvalue at which optical axes, which are not parallel then, meet in a point."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +38,13 @@ class Frame:
         scale: Field units per world unit.
         rotation: Turns world axes into the field's. [3, 3]
         centre: World point that becomes the origin. [3]
+        source: What the cube was found by, in words; empty where it is not known.
     """
 
     scale: float
     rotation: Tensor
     centre: Tensor
+    source: str = ""
 
     def points(self, world: Tensor) -> Tensor:
         """World points in the field's frame. [..., 3]"""
@@ -89,9 +106,9 @@ def check_frame(frame: Frame, name: str) -> None:
         raise SceneError(f"{name}: frame.rotation is no rotation (orthonormal, determinant 1)")
 
 
-def cube_frame(half_side: float, centre: Tensor) -> Frame:
+def cube_frame(half_side: float, centre: Tensor, source: str = "") -> Frame:
     """The frame in which a world-aligned cube becomes [-1, 1]^3."""
-    return Frame(1 / half_side, torch.eye(3), centre)
+    return Frame(1 / half_side, torch.eye(3), centre, source)
 
 
 def backwards(views: Views) -> Tensor:
@@ -116,33 +133,50 @@ def optical_centre(views: Views) -> Tensor:
 
     Cameras that all look the same way leave the depth open: it is then that of the world's origin.
     """
-    origin = views.camera_to_world[:, :3, 3].double()
-    axis = -backwards(views).double()
-    projector = torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]
+    origin, projector = views.camera_to_world[:, :3, 3].double(), _projectors(views)
     target = (projector @ origin[..., None])[..., 0].mean(dim=0)
     # Of all points that solve it equally well, the pseudo-inverse takes the one nearest the origin.
     inverse = torch.linalg.pinv(projector.mean(dim=0), atol=1e-4, hermitian=True)
     return (inverse @ target).float()
 
 
-def scene_frame(views: Views, half_side: float | None = None) -> Frame:
+def axes_meet(views: Views) -> bool:
+    """Whether the rays through images' middles meet in a point; those nearly parallel do not."""
+    return float(torch.linalg.eigvalsh(_projectors(views).mean(dim=0))[0]) >= CONVERGENCE
+
+
+def _projectors(views: Views) -> Tensor:
+    """What takes from vectors their part along each optical axis. float64 [V, 3, 3]"""
+    axis = backwards(views).double()
+    return torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]
+
+
+def scene_frame(
+    views: Views, half_side: float | None = None, points: Tensor | None = None
+) -> Frame:
     """Frame a scene: the smallest cube that its cameras and silhouettes leave room for.
 
     The cameras' common view gives a first cube around the point that they look at. No ray through
     the foreground passes the centre farther away than the scene reaches, and over views from many
     sides the farthest comes close to it: that distance, with a margin, shrinks the cube. Views from
-    one side alone tell little about depth and shrink it less.
+    one side alone tell little about depth and shrink it less. Opaque images have no silhouettes:
+    there the cube is that of the points in the middle of most images, if enough are known.
 
     Args:
         views: Training views.
         half_side: Half the side of the cube in world units, if known; None finds it.
+        points: World points on surfaces, if known. [N, 3]
 
     Raises:
         SceneError: If the cameras see no common volume.
     """
-    centre = optical_centre(views)
+    centre, seen = optical_centre(views), None
+    if points is not None and views.is_opaque:
+        seen = _middle_box(views, points, centre)
+    if seen is not None:
+        centre = seen.mean(dim=0)
     if half_side is not None:
-        return cube_frame(half_side, centre)
+        return cube_frame(half_side, centre, "data.half_side")
     offset = views.camera_to_world[:, :3, 3] - centre
     depth = (offset * views.camera_to_world[:, :3, 2]).sum(dim=-1)
     extent = (0.5 * views.intrinsics.size.flip(1) / views.intrinsics.pinhole).amax(dim=1)
@@ -154,10 +188,49 @@ def scene_frame(views: Views, half_side: float | None = None) -> Frame:
             "second and third column of every pose. If the poses are right, set data.half_side, in "
             "world units"
         )
+    if seen is not None:
+        return cube_frame(min(half, float((seen[1] - centre).max())), centre, "points")
     spread = _spread(views)
     reach = MARGIN * _reach(views, centre) / spread if spread > 0 else math.inf
-    half = min(half, reach)
-    return cube_frame(half, centre)
+    source = "cameras" if half <= reach or views.is_opaque else "cameras and silhouettes"
+    return cube_frame(min(half, reach), centre, source)
+
+
+def _middle_box(views: Views, points: Tensor, centre: Tensor) -> Tensor | None:
+    """The box of the points that most cameras see in the middle of their images, with some room.
+
+    Args:
+        views: Training views.
+        points: World points. [N, 3]
+        centre: What the cameras look at, which the box must hold if they look at a point. [3]
+
+    Returns:
+        Least and largest corner; None where there is no such box. [2, 3]
+    """
+    points = points[points.isfinite().all(dim=1)]
+    points = points[:: -(-len(points) // MOST_POINTS) or 1]
+    cameras = range(0, len(views), -(-len(views) // MOST_CAMERAS))
+    count = torch.zeros(len(points))
+    for index in cameras:
+        column, row, seen = project(
+            views.camera_to_world[index],
+            points,
+            focal=views.intrinsics.focal[index],
+            centre=views.intrinsics.centre[index],
+            lenses=views.intrinsics.lens(index),
+        )
+        height, width = views.size(index)
+        across, down = (column / width - 0.5).abs(), (row / height - 0.5).abs()
+        count += seen & (across < 0.5 * MIDDLE) & (down < 0.5 * MIDDLE)
+    points = points[count > 0.5 * len(cameras)]
+    if len(points) < LEAST_POINTS:
+        return None
+    low, high = points.quantile(torch.tensor([OUTLIERS, 1 - OUTLIERS]), dim=0)
+    box = torch.stack([low, high])
+    box = box.mean(dim=0) + ROOM * (box - box.mean(dim=0))
+    half = 0.5 * (box[1] - box[0]).max()
+    left_out = bool(((centre - box.mean(dim=0)).abs() > half).any())
+    return None if half <= 0 or (left_out and axes_meet(views)) else box
 
 
 def _spread(views: Views) -> float:

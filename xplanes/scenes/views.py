@@ -13,6 +13,15 @@ from xplanes.scenes.cameras import cast_rays
 from xplanes.scenes.lenses import Lenses, Sight, sight
 from xplanes.scenes.store import LIT, SOLID, TILE, StoredImages, TileFile, count_in_tiles
 
+PALE_STEPS, PALE_EDGE = 16, 0.9
+"""Pixels so far from the background look like it; share of an image's edge that ends in it then."""
+
+RIM = 0.02
+"""Width of an image's edge, as a share of its smaller side."""
+
+MOST_EDGES = 32
+"""Views whose edges are looked at, spread evenly."""
+
 SAME_CAMERA = 1e-4
 """Share by which intrinsics of one camera differ at most."""
 
@@ -324,6 +333,16 @@ class Views:
         image = self.image(index).float() / 255
         return image[..., :3] + (1 - image[..., 3:]) * background
 
+    def edge_share_of(self, index: int, colour: Tensor) -> float:
+        """Share of the pixels at the edge of image ``index`` that look like a colour. [3]"""
+        image, has_ray = self.image(index), self.intrinsics.has_ray(index)
+        pale = (image[..., :3].short() - (255 * colour).short()).abs().amax(dim=-1) < PALE_STEPS
+        edge = torch.ones_like(pale) if has_ray is None else has_ray.clone()
+        height, width = pale.shape
+        rim = max(1, round(RIM * min(height, width)))
+        edge[rim : height - rim, rim : width - rim] = False
+        return float(pale[edge].float().mean()) if edge.any() else 0.0
+
     def image_rays(self, index: int) -> tuple[Tensor, Tensor]:
         """Rays through every pixel of image ``index``, row by row. [h w, 3], [h w, 3]"""
         height, width = self.size(index)
@@ -425,6 +444,19 @@ class Scene:
     background: Tensor = field(default_factory=lambda: torch.ones(3))
     static_reason: str = ""
     points: Tensor | None = None
+
+    @cached_property
+    def is_surrounded(self) -> bool:
+        """Whether the training images show a world around the scene, not a plain background.
+
+        They are opaque then, and most of them do not end in the background's colour.
+        """
+        views = self.splits["train"]
+        if not views.is_opaque:
+            return False
+        chosen = range(0, len(views), -(-len(views) // MOST_EDGES))
+        plain = [views.edge_share_of(index, self.background) > PALE_EDGE for index in chosen]
+        return 2 * sum(plain) <= len(plain)
 
 
 def camera_rays(

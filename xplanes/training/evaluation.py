@@ -140,6 +140,12 @@ def mean_scores(scores: Sequence[ViewScore]) -> dict[str, float]:
     return {name: mean(values) for name, values in found.items() if values}
 
 
+def mean_colour(views: Views, background: Tensor) -> Tensor:
+    """Mean over images in front of ``background`` [3] of their mean colour. [3]"""
+    images = (views.composite(index, background) for index in range(len(views)))
+    return torch.stack([image.flatten(0, 1).mean(dim=0) for image in images]).mean(dim=0)
+
+
 def blank_psnr(views: Views, background: Tensor) -> float:
     """Mean PSNR in dB of images that show nothing but the background."""
     truths = (views.composite(index, background) for index in range(len(views)))

@@ -155,7 +155,7 @@ class RadianceModule(LightningModule):
         views, method = scene.splits["train"], self.method
         device = device or torch.device("cpu")
         if frame is None:
-            frame = method.model.frame(views, half_side)
+            frame = method.model.frame(views, half_side, scene.points)
         if initialise is None and (source := method.lrm.load(say)) is not None:
             initialise = source.initialise
         found = Initialisation(method.model, frame)
@@ -170,6 +170,7 @@ class RadianceModule(LightningModule):
             bounds=found.model.bounds(views),
             views=views,
             initialised=found.values is not None,
+            surrounded=scene.is_surrounded,
             device=device,
         )
         self.initialisation = found
@@ -277,7 +278,9 @@ class RadianceModule(LightningModule):
         self._count(rendering.samples, len(rays["times"]))
         error = float(colour_error(rendering, rays).detach())
         self.last |= {"loss": value, "psnr": -10 * math.log10(max(error, 1e-10))}
-        if self.batches % OPACITIES == 0:
+        # Before a background that is learnt, no pixel is known to need opacity or to lack it.
+        plain = getattr(self.field, "background", None) is None
+        if plain and self.batches % OPACITIES == 0:
             self.last |= mean_opacities(rendering, rays)
         self._log_terms(terms, state)
         if self.between_updates:
@@ -458,6 +461,7 @@ class RadianceModule(LightningModule):
                 "times": self.site.times,
                 "bounds": self.site.bounds,
                 "initialised": self.site.initialised,
+                "surrounded": self.site.surrounded,
             }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -493,6 +497,7 @@ class RadianceModule(LightningModule):
             seed=self.method.seed,
             precision=_precision(settings, torch.device("cpu")),
             bounds=content["bounds"],
+            surrounded=content.get("surrounded", False),  # Not in older checkpoints.
         )
         self._assemble(settings, site)
 

@@ -15,6 +15,10 @@ Shot = tuple[float, Tensor]
 """Time and camera-to-world matrix [4, 4] of a view."""
 
 
+Station = tuple[float, float, float]
+"""Time, and azimuth and elevation in degrees, of a view."""
+
+
 @dataclass(frozen=True)
 class Capture:
     """The views of a scene.
@@ -78,22 +82,28 @@ class Rig:
         shots = {}
         for split, count in counts.items():
             draw = random.Random(f"{seed} {split}")
-            training = split == "train"
-            if self.fixed is not None:
-                places = self._fixed(self.fixed, random.Random(f"{seed} fixed"))
-                places = (
-                    [places[i % self.fixed] for i in range(count)]
-                    if training
-                    else [self._between(places, draw) for _ in range(count)]
-                )
-            else:
-                places = [self._anywhere(draw) for _ in range(count)]
-            times = even_times(count) if training else held_out_times(count, draw)
+            stations = self._stations(count, draw, seed, training=split == "train")
             shots[split] = [
-                (time * self.end, self._camera(*place))
-                for time, place in zip(times, places, strict=True)
+                (time * self.end, self._camera(azimuth, elevation))
+                for time, azimuth, elevation in stations
             ]
         return Capture(shots, self.angle_x, self.samples)
+
+    def _stations(
+        self, count: int, draw: random.Random, seed: str, *, training: bool
+    ) -> list[Station]:
+        """Times and places of the views of a split."""
+        if self.fixed is not None:
+            places = self._fixed(self.fixed, random.Random(f"{seed} fixed"))
+            places = (
+                [places[i % self.fixed] for i in range(count)]
+                if training
+                else [self._between(places, draw) for _ in range(count)]
+            )
+        else:
+            places = [self._anywhere(draw) for _ in range(count)]
+        times = even_times(count) if training else held_out_times(count, draw)
+        return [(time, *place) for time, place in zip(times, places, strict=True)]
 
     def _camera(self, azimuth: float, elevation: float) -> Tensor:
         target = torch.tensor(self.target, dtype=torch.float64)
@@ -129,3 +139,49 @@ class Rig:
             right += 360
         share = draw.uniform(0.25, 0.75)
         return left + share * (right - left), low + share * (high - low)
+
+
+@dataclass(frozen=True)
+class Phone(Rig):
+    """One camera that is carried along an arc while time runs, up and down a little.
+
+    Validation and test cameras stand above where it was a little earlier or later.
+    """
+
+    def _stations(
+        self, count: int, draw: random.Random, seed: str, *, training: bool
+    ) -> list[Station]:
+        if training:
+            return [(time, *self._carried(time)) for time in even_times(count)]
+        stations = []
+        for time in held_out_times(count, draw):
+            shift = draw.choice((-1, 1)) * draw.uniform(0.06, 0.15)
+            other = time + shift if 0 <= time + shift <= 1 else time - shift
+            azimuth, elevation = self._carried(other)
+            stations.append((time, azimuth, elevation + draw.uniform(2.0, 5.0)))
+        return stations
+
+    def _carried(self, time: float) -> tuple[float, float]:
+        """Azimuth and elevation at a time."""
+        (left, right), (low, high) = self.azimuths, self.elevations
+        wave = 0.5 + 0.5 * math.sin(2 * math.pi * 1.7 * time)
+        return left + (right - left) * time, low + (high - low) * wave
+
+
+@dataclass(frozen=True)
+class Array(Rig):
+    """Fixed cameras that all take a picture at each timestep; the last one may lack some."""
+
+    fixed: int = 8  # type: ignore[assignment]
+
+    def _stations(
+        self, count: int, draw: random.Random, seed: str, *, training: bool
+    ) -> list[Station]:
+        stations = super()._stations(count, draw, seed, training=training)
+        if not training:
+            return stations
+        times = even_times(math.ceil(count / self.fixed))
+        return [
+            (times[i // self.fixed], azimuth, elevation)
+            for i, (_, azimuth, elevation) in enumerate(stations)
+        ]

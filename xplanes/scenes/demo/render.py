@@ -1,6 +1,7 @@
 """Rendering of posed assemblies to antialiased RGBA images, and the demo cameras."""
 
 import random
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -36,6 +37,31 @@ def render_image(
     Returns:
         Straight-alpha RGBA. uint8 [resolution, resolution, 4]
     """
+    layers = image_samples(posed.render, camera_to_world, resolution, samples, angle_x)
+    alpha = layers[..., 3:]
+    straight = torch.cat([layers[..., :3] / alpha.clamp_min(1e-6), alpha], dim=-1)
+    return (straight.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+def image_samples(
+    see: Callable[[Tensor, Tensor], Tensor],
+    camera_to_world: Tensor,
+    resolution: int,
+    samples: int,
+    angle_x: float,
+) -> Tensor:
+    """Mean over the rays of each pixel of what they see.
+
+    Args:
+        see: From origins and unit directions [N, 3] to [N, 4].
+        camera_to_world: Camera-to-world matrix. [4, 4]
+        resolution: Height and width in pixels.
+        samples: Rays per pixel and axis.
+        angle_x: Field of view in radians.
+
+    Returns:
+        [resolution, resolution, 4]
+    """
     steps = (torch.arange(resolution * samples) + 0.5) / samples - 0.5
     rows, columns = torch.meshgrid(steps, steps, indexing="ij")
     origins, directions = pixel_rays(
@@ -46,11 +72,8 @@ def render_image(
         height=resolution,
         width=resolution,
     )
-    layers = posed.render(origins, directions)
-    layers = layers.reshape(resolution, samples, resolution, samples, 4).mean(dim=(1, 3))
-    alpha = layers[..., 3:]
-    straight = torch.cat([layers[..., :3] / alpha.clamp_min(1e-6), alpha], dim=-1)
-    return (straight.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    layers = see(origins, directions)
+    return layers.reshape(resolution, samples, resolution, samples, 4).mean(dim=(1, 3))
 
 
 def hemisphere_cameras(count: int, draw: random.Random) -> Tensor:

@@ -24,6 +24,7 @@ from xplanes.scenes.demo.motions import Variation
 from xplanes.scenes.demo.render import camera_at, hemisphere_cameras, render_image
 from xplanes.scenes.demo.scenes import build_demo_scene, demo_scene
 from xplanes.scenes.demo.suite import suite_scene
+from xplanes.scenes.demo.world import World
 from xplanes.scenes.dnerf import read_scene
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.source import SceneSettings
@@ -38,6 +39,9 @@ SUITE_VERSION = 1
 
 RECORD = "demo.json"
 """File that describes the content of a scene folder; written last."""
+
+MASKS = "masks"
+"""Folder of the masks of a thing in a world, with the names of the images."""
 
 USUAL_VIEWS = {"train": 50, "val": 10, "test": 12}
 """Default number of views per split; other numbers become part of the folder name."""
@@ -118,13 +122,18 @@ def ensure_suite_scene(
     """Render a scene of the suite unless its folder exists already.
 
     Arguments, folder and errors are those of `ensure_demo_scene`. There is no fixed-view video.
+    Beside the opaque images of a thing in a world lie masks of the thing, in ``masks``, which
+    nothing but scores may read.
     """
     counts = {"train": train_views, "val": val_views, "test": test_views}
     _require_some(resolution, counts)
     scene = suite_scene(name)
-    assembly = scene.build(Variation(name, seed))
+    variation = Variation(name, seed)
+    assembly = scene.build(variation)
+    world = None if scene.world is None else scene.world(assembly, variation)
     capture = scene.rig.capture(counts, f"{name} {seed}")
-    content = repr((SUITE_VERSION, assembly, scene.rig))
+    around = () if world is None else (world,)
+    content = repr((SUITE_VERSION, assembly, scene.rig, *around))
     record = {
         "version": SUITE_VERSION,
         "scene": name,
@@ -140,6 +149,7 @@ def ensure_suite_scene(
         capture,
         record,
         announce or print,
+        world,
     )
 
 
@@ -159,6 +169,7 @@ def _ensure(
     capture: Capture,
     record: dict[str, Any],
     announce: Callable[[str], None],
+    world: World | None = None,
 ) -> Path:
     """Render a scene to a folder unless the folder matches the record."""
     if _holds(folder, record):
@@ -171,7 +182,7 @@ def _ensure(
     try:
         with _one_thread():
             for split in capture.shots:
-                _write_split(fresh, split, capture, assembly, resolution)
+                _write_split(fresh, split, capture, assembly, resolution, world)
         (fresh / RECORD).write_text(json.dumps(record, indent=2) + "\n")
         _publish(fresh, folder, record)
     finally:
@@ -193,14 +204,25 @@ def _demo_capture(name: str, seed: int, counts: dict[str, int]) -> Capture:
 
 
 def _write_split(
-    folder: Path, split: str, capture: Capture, assembly: Assembly, resolution: int
+    folder: Path,
+    split: str,
+    capture: Capture,
+    assembly: Assembly,
+    resolution: int,
+    world: World | None,
 ) -> None:
     (folder / split).mkdir()
+    if world is not None:
+        (folder / MASKS / split).mkdir(parents=True)
     frames = []
     for number, (time, camera) in enumerate(capture.shots[split]):
         file = f"./{split}/r_{number:03d}"
-        posed = assembly.pose(time)
-        image = render_image(posed, camera, resolution, capture.samples, capture.angle_x)
+        how = (camera, resolution, capture.samples, capture.angle_x)
+        if world is None:
+            image = render_image(assembly.pose(time), *how)
+        else:
+            image, mask = world.picture(assembly, time, *how)
+            Image.fromarray(mask).save(folder / MASKS / f"{file}.png", compress_level=6)
         Image.fromarray(image).save(folder / f"{file}.png", compress_level=6)
         frames.append({"file_path": file, "time": time, "transform_matrix": camera.tolist()})
     index = {"camera_angle_x": capture.angle_x, "frames": frames}

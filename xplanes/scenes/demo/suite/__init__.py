@@ -8,11 +8,13 @@ import difflib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from xplanes.scenes.demo import scenes
 from xplanes.scenes.demo.assembly import Assembly
-from xplanes.scenes.demo.capture import Rig
+from xplanes.scenes.demo.capture import Array, Phone, Rig
 from xplanes.scenes.demo.motions import Variation
 from xplanes.scenes.demo.render import CAMERA_DISTANCE
-from xplanes.scenes.demo.suite import materials, motions, places, shapes
+from xplanes.scenes.demo.suite import captures, materials, motions, places, shapes
+from xplanes.scenes.demo.world import World
 from xplanes.scenes.errors import SceneError
 
 __all__ = ["KINDS", "SUITE_SCENES", "SuiteScene", "suite_scene"]
@@ -25,10 +27,13 @@ class SuiteScene:
     Attributes:
         build: Builds the assembly with the colours of a variation.
         rig: Its cameras and times.
+        world: Builds what is around the assembly, with the colours of a variation: the pictures
+            are opaque then. None for pictures of the assembly alone, with alpha.
     """
 
     build: Callable[[Variation], Assembly]
     rig: Rig = field(default_factory=Rig)
+    world: Callable[[Assembly, Variation], World] | None = None
 
 
 SUITE_SCENES: dict[str, SuiteScene] = {
@@ -74,6 +79,22 @@ SUITE_SCENES: dict[str, SuiteScene] = {
     "short_times_test": SuiteScene(motions.short_times_test, Rig(distance=4.3, end=0.4)),
     "static": SuiteScene(shapes.static),
     "static_test": SuiteScene(shapes.static_test),
+    "phone": SuiteScene(
+        scenes.walker, Phone(azimuths=(-160.0, -20.0), elevations=(8.0, 24.0)), captures.park
+    ),
+    "phone_test": SuiteScene(
+        scenes.excavator,
+        Phone(distance=4.3, azimuths=(-30.0, -150.0), elevations=(10.0, 30.0)),
+        captures.desert,
+    ),
+    "rig": SuiteScene(
+        scenes.balls, Array(azimuths=(-150.0, -30.0), elevations=(8.0, 26.0)), captures.hall
+    ),
+    "rig_test": SuiteScene(
+        scenes.windmill,
+        Array(distance=4.3, azimuths=(-145.0, -35.0), elevations=(6.0, 24.0)),
+        captures.square,
+    ),
 }
 """Scenes by name; the test scene of a kind follows its tuning scene."""
 

@@ -1,0 +1,140 @@
+"""The background: contraction of space, colours against an oracle, rays that need none."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from xplanes.fields.background import FARTHEST, Background, contract, expand
+from xplanes.rendering.behind import behind, look
+from xplanes.streams import Stream, initial_values
+
+
+def contracted(point):
+    """Mip-NeRF 360, Eq. 10, in float64."""
+    point = np.asarray(point, np.float64)
+    length = math.hypot(*point)
+    return point if length <= 1 else (2 - 1 / length) * point / length
+
+
+def world(samples=5, channels=3):
+    with initial_values(3, Stream.BACKGROUND):
+        background = Background(channels, 16, width=8, samples=samples)
+    with torch.no_grad():
+        background.planes.mul_(20)  # Colours and densities that differ from place to place.
+    return background
+
+
+def some_rays(count, seed=0):
+    """Rays from around the cube: most hit it, some miss it, some begin inside."""
+    generator = torch.Generator().manual_seed(seed)
+    origins = 4 * torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    origins[::7] *= 0.1
+    target = 1.2 * torch.randn(count, 3, generator=generator)
+    return origins, torch.nn.functional.normalize(target - origins, dim=1)
+
+
+def test_contraction_is_the_formula_and_keeps_the_unit_ball():
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(500, 3, generator=generator) * 10 ** (
+        6 * torch.rand(500, 1, generator=generator) - 3
+    )
+    found = contract(points)
+    expected = np.stack([contracted(point) for point in points.tolist()])
+    assert np.abs(found.numpy() - expected).max() < 5e-7
+    inside = points.norm(dim=1) < 0.999
+    assert inside.sum() > 50
+    assert torch.equal(found[inside], points[inside])
+    assert (found.norm(dim=1) < 2 + 1e-6).all()
+
+
+def test_expansion_undoes_the_contraction():
+    generator = torch.Generator().manual_seed(1)
+    points = torch.randn(400, 3, generator=generator, dtype=torch.float64) * 100 ** (
+        torch.rand(400, 1, generator=generator, dtype=torch.float64)
+    )
+    torch.testing.assert_close(expand(contract(points)), points, rtol=1e-9, atol=1e-12)
+    edge = expand(torch.tensor([[2.0, 0.0, 0.0], [0.0, -3.0, 0.0]]))
+    assert edge.tolist() == [[pytest.approx(FARTHEST), 0, 0], [0, pytest.approx(-FARTHEST), 0]]
+
+
+def exit_of(origin, direction):
+    """Where a ray leaves the cube; None if it misses it."""
+    near, far = 0.0, math.inf
+    for o, d in zip(origin, direction, strict=True):
+        first, second = sorted(((-1 - o) / d, (1 - o) / d))
+        near, far = max(near, first), min(far, second)
+    return far if far > near else None
+
+
+@pytest.mark.parametrize("samples", [0, 1, 5])
+def test_rays_are_composited_from_the_cube_to_infinity(samples):
+    background = world(samples)
+    origins, directions = some_rays(40)
+    found = look(background, origins, directions).detach().numpy()
+    misses = 0
+    for origin, direction, colour in zip(
+        origins.double().numpy(), directions.double().numpy(), found, strict=True
+    ):
+        start = exit_of(origin, direction)
+        misses += start is None
+        start = start or 0.5 * np.linalg.norm(origin)
+        steps = [start / (1 - i / samples) for i in range(samples)]
+        middles = [start / (1 - (i + 0.5) / samples) for i in range(samples)]
+        edges = [*(contracted(origin + t * direction) for t in steps), 2 * direction]
+        points = [*(contracted(origin + t * direction) for t in middles), 2 * direction]
+        shown, density = background(torch.tensor(np.array(points), dtype=torch.float32))
+        expected, light = np.zeros(3), 1.0
+        for i, (own, thick) in enumerate(zip(shown.tolist(), density.tolist(), strict=True)):
+            depth = math.inf
+            if i < samples:
+                depth = thick * np.linalg.norm(edges[i + 1] - edges[i])
+            expected += light * (1 - math.exp(-depth)) * np.array(own)
+            light *= math.exp(-depth)
+        assert colour == pytest.approx(expected, abs=2e-5)
+    assert 3 < misses < 30
+
+
+class Before:
+    """A field's background, and nothing else of it."""
+
+    def __init__(self, background):
+        self.background = background
+
+
+def test_rays_without_light_left_look_no_further():
+    background = world()
+    origins, directions = some_rays(30)
+    opacity = torch.linspace(0, 1, 30)
+    opacity[::3] = 1.0
+    seen = []
+    background.decoder.register_forward_hook(lambda *given: seen.append(len(given[2][0])))
+    plain = torch.ones(3)
+    found = behind(Before(background), origins, directions, opacity, plain)
+    whole = look(background, origins, directions)
+    stopped = opacity > 0.999
+    assert seen == [6 * int((~stopped).sum()), 6 * 30]
+    assert torch.equal(found[stopped], torch.zeros(int(stopped.sum()), 3))
+    torch.testing.assert_close(found[~stopped], whole[~stopped])
+    assert behind(Before(None), origins, directions, opacity, plain) is plain
+    assert behind(lambda *_: None, origins, directions, opacity, plain) is plain
+
+
+def test_gradients_reach_the_background_and_are_zero_where_nothing_is_seen():
+    background = world()
+    origins, directions = some_rays(30)
+    behind(Before(background), origins, directions, torch.zeros(30), torch.ones(3)).sum().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in background.parameters())
+    background.zero_grad()
+    behind(Before(background), origins, directions, torch.ones(30), torch.ones(3)).sum().backward()
+    assert all(p.grad is not None and not p.grad.any() for p in background.parameters())
+
+
+def test_jitter_moves_samples_within_their_steps():
+    background = world(3)
+    origins, directions = some_rays(20)
+    middle = look(background, origins, directions)
+    assert torch.equal(look(background, origins, directions, torch.full((20,), 0.5)), middle)
+    moved = look(background, origins, directions, torch.full((20,), 0.99))
+    assert (moved - middle).abs().max() > 1e-3

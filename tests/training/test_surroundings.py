@@ -1,0 +1,192 @@
+"""Scenes in a world: a background joins where images show one, and nothing changes elsewhere."""
+
+import functools
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import lightning
+import pytest
+import torch
+
+from tests.synthetic import ball_views, swinging
+from tests.training.runs import small_config
+from xplanes import RadianceModule, SceneDataModule
+from xplanes.rendering.behind import look
+from xplanes.scenes.views import Scene
+from xplanes.training.collapse import CollapseWatch
+from xplanes.training.evaluation import render_view
+from xplanes.training.fit import Trainer
+
+STEPS = 30
+
+
+def world(directions):
+    """What lies behind the ball: colours that depend on direction alone. [..., 3]"""
+    x, y, z = directions.unbind(dim=-1)
+    return 0.5 + 0.4 * torch.stack([(2 * x).sin(), (3 * y).cos(), z], dim=-1)
+
+
+@functools.cache
+def scene(kind):
+    """A ball that swings: with alpha, before a white wall without alpha, or in a world."""
+    splits = {}
+    for split, count, seed in (("train", 12, 0), ("test", 2, 1)):
+        views = ball_views(count, 0.5, centre=swinging(0.3, 1), size=24, seed=seed)
+        images = views.images.clone()
+        for index in range(count if kind != "alpha" else 0):
+            behind = torch.ones(24, 24, 3)
+            if kind == "world":
+                behind = world(views.image_rays(index)[1]).view(24, 24, 3)
+            clear = images[index, ..., 3] == 0
+            images[index, clear] = torch.cat(
+                [(255 * behind).to(torch.uint8), torch.full((24, 24, 1), 255, dtype=torch.uint8)],
+                dim=-1,
+            )[clear]
+        splits[split] = replace(views, images=images)
+    return Scene("ball", splits)
+
+
+def built(kind, *overrides):
+    module = RadianceModule(small_config(Path(), "model.rays.per_batch=512", *overrides))
+    module.build(scene(kind))
+    return module
+
+
+def fitted(module, kind, folder, steps=STEPS, checkpoint=None, **options):
+    trainer = Trainer(
+        accelerator="cpu",
+        max_steps=steps,
+        default_root_dir=folder,
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        enable_checkpointing=False,
+        limit_val_batches=0,
+        **options,
+    )
+    trainer.train(module, SceneDataModule.of(scene(kind)), checkpoint)
+    return trainer
+
+
+def picture(module, kind="world"):
+    views, background = scene(kind).splits["train"], scene(kind).background
+    return render_view(module.field, module.renderer, module.frame, views, 0, background)
+
+
+@pytest.mark.parametrize("kind", ["alpha", "white"])
+def test_a_plain_background_stays_as_it_was(kind):
+    with_, without = built(kind), built(kind, "model.background=null")
+    assert not scene(kind).is_surrounded
+    assert with_.field.background is None
+    assert with_.state_dict().keys() == without.state_dict().keys()
+    for name, value in with_.state_dict().items():
+        assert torch.equal(value, without.state_dict()[name]), name
+    assert [group["name"] for group in with_.model.groups()] == ["space", "time", "decoder"]
+    batch = SceneDataModule.of(scene(kind)).batches_for(with_, 0).draw(0)
+    terms = with_._terms(with_.sampler.render(with_.field, batch, with_.state), batch, with_.state)
+    assert "opacity" in terms
+
+
+def test_a_world_gets_a_background_and_the_planes_are_initialised_as_ever():
+    with_, without = built("world"), built("world", "model.background=null")
+    assert scene("world").is_surrounded
+    assert without.field.background is None
+    assert "a background" in with_.field.outline
+    for name, value in without.state_dict().items():
+        if name == "field.decoder.layers.3.bias":  # No colour that nears a white background.
+            value = value - torch.tensor([0.0, 1.0, 1.0, 1.0])
+        torch.testing.assert_close(value, with_.state_dict()[name])
+    groups = {group["name"]: group["params"] for group in with_.model.groups()}
+    listed = [id(p) for params in groups.values() for p in params]
+    assert sorted(listed) == sorted(id(p) for p in with_.parameters())
+    batch = SceneDataModule.of(scene("world")).batches_for(with_, 0).draw(0)
+    terms = with_._terms(with_.sampler.render(with_.field, batch, with_.state), batch, with_.state)
+    assert set(terms) == {"colour"}
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("world")
+    module = built("world")
+    before = picture(module)
+    trainer = fitted(module, "world", folder, 2 * STEPS, callbacks=[CollapseWatch()])
+    trainer.save_checkpoint(folder / "end.ckpt")
+    return module.eval(), before, folder / "end.ckpt"
+
+
+def test_training_learns_what_lies_behind(trained):
+    module, before, _ = trained
+    truth = scene("world").splits["train"].composite(0, torch.ones(3))
+    error, first = (
+        float((found["colour"] - truth).square().mean()) for found in (picture(module), before)
+    )
+    assert error < 0.7 * first
+    # Light that passes the cube has the background's colour, in images as in training.
+    found = picture(module)
+    rays = module.frame.rays(*scene("world").splits["train"].image_rays(0))
+    with torch.no_grad():
+        behind = look(module.field.background, *rays).view(24, 24, 3)
+    clear = found["opacity"] < 1e-4
+    if clear.any():
+        torch.testing.assert_close(found["colour"][clear], behind[clear], atol=1e-3, rtol=0)
+
+
+def test_nothing_is_known_of_opacity(trained):
+    module, _, _ = trained
+    assert "foreground" not in module.last
+    assert "background" not in module.last
+    assert module.restarts == 0
+    assert math.isfinite(module.last["loss"])
+
+
+def test_a_checkpoint_brings_the_background_back(trained):
+    module, _, path = trained
+    again = RadianceModule.load_from_checkpoint(path)
+    assert again.site.surrounded
+    assert torch.equal(picture(again.eval())["colour"], picture(module)["colour"])
+
+
+def test_a_checkpoint_from_before_backgrounds_has_none(tmp_path):
+    module = built("world", "model.background=null")
+    trainer = fitted(module, "world", tmp_path, 3)
+    trainer.save_checkpoint(tmp_path / "old.ckpt")
+    content = torch.load(tmp_path / "old.ckpt", weights_only=True)
+    del content["site"]["surrounded"]
+    del content["hyper_parameters"]["config"]["model"]["background"]
+    torch.save(content, tmp_path / "old.ckpt")
+    again = RadianceModule.load_from_checkpoint(tmp_path / "old.ckpt")
+    assert again.field.background is None
+    assert torch.equal(picture(again.eval())["colour"], picture(module.eval())["colour"])
+
+
+class SaveHalfway(lightning.Callback):
+    """Writes a checkpoint after half of the steps."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def on_train_batch_end(self, trainer, *rest):
+        if trainer.global_step == STEPS // 2:
+            trainer.save_checkpoint(self.path)
+
+
+def test_a_resumed_training_ends_with_the_same_numbers(trained, tmp_path):
+    straight = built("world")
+    fitted(straight, "world", tmp_path, STEPS)
+    half = built("world")
+    fitted(half, "world", tmp_path, STEPS, callbacks=[SaveHalfway(tmp_path / "half.ckpt")])
+    resumed = built("world")
+    fitted(resumed, "world", tmp_path, STEPS, checkpoint=tmp_path / "half.ckpt")
+    for name, value in straight.state_dict().items():
+        assert torch.equal(value, resumed.state_dict()[name]), name
+
+
+def test_samplers_of_proposals_see_the_background_too():
+    small = ("lrm=none", "model.resolution=16", "model.channels=8", "model.background.samples=4")
+    module = RadianceModule.compose("model/sampler=proposal", *small)
+    module.build(scene("world"))
+    batch = SceneDataModule.of(scene("world")).batches_for(module, 0).draw(0)
+    rendering = module.sampler.render(module.field, batch, module.state)
+    rendering.colour.sum().backward()
+    assert module.field.background.planes.grad.abs().sum() > 0

@@ -18,13 +18,13 @@ from xplanes.scenes.demo.motions import Variation
 from xplanes.scenes.demo.suite.pieces import ball, rod
 from xplanes.scenes.demo.world import World
 
-MOMENTS = 11
+TIMESTEPS = 11
 """Timesteps at which the lowest point of a thing is looked for."""
 
 
 def _ground(thing: Assembly, surface: Surface) -> tuple[float, Part]:
     """Height of the ground that a thing stands on, and the ground."""
-    lows = [thing.pose(i / (MOMENTS - 1)).bounds()[0][2] for i in range(MOMENTS)]
+    lows = [thing.pose(i / (TIMESTEPS - 1)).bounds()[0][2] for i in range(TIMESTEPS)]
     height = float(min(lows)) - 0.005
     return height, Part(Box((60.0, 60.0, 0.5)), surface, position=(0, 0, height - 0.5))
 

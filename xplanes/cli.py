@@ -227,12 +227,13 @@ def _add_render(commands: "argparse._SubParsersAction") -> None:
     parser.add_argument(
         "--path",
         default="orbit",
-        help="camera path: orbit, fixed, or view:FILE (camera of a view); default: %(default)s",
+        help="orbit, fixed, view:FILE (camera of a view), or FILE.json (camera_path.json of "
+        "nerfstudio, or a transforms file); default: %(default)s",
     )
     parser.add_argument(
         "--time",
-        default="back-and-forth",
-        help="sweep, back-and-forth, or a number from 0 to 1; default: %(default)s",
+        help="sweep, back-and-forth, or a number from 0 to 1; default: back-and-forth, or the "
+        "times of FILE.json",
     )
     parser.add_argument(
         "--frames",
@@ -240,10 +241,12 @@ def _add_render(commands: "argparse._SubParsersAction") -> None:
         help="number of frames; default: 48, or 1 if neither camera nor time moves",
     )
     parser.add_argument(
-        "--fps", type=int, default=16, help="frames per second; default: %(default)s"
+        "--fps", type=int, help="frames per second; default: 16, or as FILE.json says"
     )
     parser.add_argument(
-        "--size", type=int, help="pixels per side; default: that of the training views"
+        "--size",
+        type=int,
+        help="pixels of the longer side; default: that of the training views, or as FILE.json says",
     )
     parser.add_argument(
         "--elevation",
@@ -279,9 +282,10 @@ def _render(options: argparse.Namespace) -> None:
     check_out(options.out, wanted)
     trained = _load(options)
     views = trained.scene.splits["train"]
-    size = options.size or max(views.height, views.width)
-    camera = f"{options.path} camera, time {options.time}"
-    _say(f"frames      {wanted.count} of {size}x{size} px, {options.what}, {camera}\n")
+    height, width = wanted.shape(views)
+    written = "as written" if wanted.cameras is not None else "back-and-forth"
+    camera = f"{options.path} camera, time {options.time or written}"
+    _say(f"frames      {wanted.count} of {width}x{height} px, {options.what}, {camera}\n")
     _say(f"wrote {render_video(trained, wanted, options.out)}")
 
 

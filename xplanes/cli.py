@@ -74,7 +74,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     commands.add_parser("train", help="train a field: key=value ..., and the options of Hydra")
     verbs = (_add_download, _add_inspect, _add_triplanes, _add_evaluate, _add_render, _add_view)
-    for add in (*verbs, _add_table, _add_pretrain, _add_score):
+    for add in (*verbs, _add_export, _add_table, _add_pretrain, _add_score):
         add(commands)
     return parser
 
@@ -317,6 +317,69 @@ def _view(options: argparse.Namespace) -> None:
         _say("")
     finally:
         viewer.close()
+
+
+def _add_export(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser(
+        "export", help="write meshes, point clouds or planes for other programs (extra: export)"
+    )
+    _add_run(parser)
+    parser.add_argument(
+        "--what",
+        choices=["mesh", "points", "planes"],
+        default="mesh",
+        help="what to write; planes of X-Planes alone; default: %(default)s",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="FOLDER", help="empty or new; default: RUN/export/WHAT"
+    )
+    parser.add_argument(
+        "--times",
+        help="a number of times spread evenly from 0 to 1, or times separated by commas; "
+        "default: 10, or 1 in a static scene",
+    )
+    parser.add_argument(
+        "--resolution",
+        type=int,
+        default=128,
+        help="grid points along each side of the field's cube; default: %(default)s",
+    )
+    parser.add_argument(
+        "--threshold",
+        type=float,
+        help="density of the surface; default: the one with the field's silhouettes",
+    )
+    parser.add_argument(
+        "--points",
+        type=int,
+        default=100_000,
+        metavar="COUNT",
+        help="points of a point cloud; default: %(default)s",
+    )
+    parser.add_argument(
+        "--format",
+        choices=["ply", "glb"],
+        default="ply",
+        help="of meshes and point clouds; default: %(default)s",
+    )
+    parser.set_defaults(command=_export)
+
+
+def _export(options: argparse.Namespace) -> None:
+    from xplanes.evaluation.export import ExportOptions, check_folder, export
+
+    wanted = ExportOptions(
+        what=options.what,
+        times=options.times,
+        resolution=options.resolution,
+        threshold=options.threshold,
+        count=options.points,
+        form=options.format,
+    )
+    wanted.check()
+    if options.out is not None:
+        check_folder(options.out)
+    _say(f"wrote {export(_load(options), wanted, options.out, say=_say)}")
 
 
 def _add_table(commands: "argparse._SubParsersAction") -> None:

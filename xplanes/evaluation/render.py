@@ -254,7 +254,7 @@ class VideoOptions:
         """Rows and columns of a frame, where ``views`` are the training views."""
         side = max(views.height, views.width)
         if self.cameras is None:
-            return (self.size or side,) * 2
+            return self.size or side, self.size or side
         height = self.cameras.height or self.cameras.width or side
         width = self.cameras.width or height
         if self.size is None:

@@ -163,13 +163,13 @@ def test_colours_of_vertices_are_those_that_the_field_shows_along_normals(tmp_pa
 
 
 def test_a_point_cloud_lies_on_the_surface(tmp_path: Path):
-    trained = set_up(tmp_path, Ball(200.0, 0.005))
+    trained = set_up(tmp_path, Ball())
     options = ExportOptions(what="points", times="0.5", resolution=40, count=500)
     cloud = trimesh.load(export(trained, options, say=quiet) / "points_0000.ply")
     assert cloud.vertices.shape == (500, 3)
     points = FRAME.points(torch.tensor(np.asarray(cloud.vertices)).float())
     outward = points - Ball.centre(0.5)
-    assert float((outward.norm(dim=1) - Ball.RADIUS).abs().max()) < 0.05
+    assert float((outward.norm(dim=1) - Ball.RADIUS).abs().max()) < 0.07
     expected = (0.5 + 0.2 * points + 0.2 * outward / outward.norm(dim=1, keepdim=True)).numpy()
     assert np.abs(cloud.colors[:, :3] / 255 - expected).max() < 0.08
 

@@ -203,7 +203,10 @@ def _write_each(
         else:
             places, normals = mesh.vertices, mesh.vertex_normals
         points = torch.tensor(places, dtype=torch.float32)
-        colours = surface_colours(trained, points, torch.tensor(normals).float(), time)
+        outward = torch.tensor(normals, dtype=torch.float32)
+        # What one sees of a soft surface lies a little below it.
+        depth = 0 if threshold is None else 2 / options.resolution
+        colours = surface_colours(trained, points - depth * outward, outward, time)
         if options.form == "glb":
             colours = _linear(colours)  # As its standard has it; PLY files are in sRGB.
         pixels = (255 * colours).round().byte().numpy()
@@ -380,7 +383,7 @@ def _peaks(volume: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
 
 @torch.no_grad()
 def surface_colours(trained: TrainedRun, points: Tensor, normals: Tensor, time: float) -> Tensor:
-    """Colours of points on a surface, looked at along their normals where the field wants to know.
+    """Colours of points on or below a surface, looked at against their normals.
 
     Args:
         trained: The run.

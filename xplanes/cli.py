@@ -74,7 +74,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     commands.add_parser("train", help="train a field: key=value ..., and the options of Hydra")
     verbs = (_add_download, _add_inspect, _add_triplanes, _add_evaluate, _add_render, _add_view)
-    for add in (*verbs, _add_table, _add_pretrain, _add_score):
+    for add in (*verbs, _add_export, _add_table, _add_pretrain, _add_score):
         add(commands)
     return parser
 
@@ -227,12 +227,13 @@ def _add_render(commands: "argparse._SubParsersAction") -> None:
     parser.add_argument(
         "--path",
         default="orbit",
-        help="camera path: orbit, fixed, or view:FILE (camera of a view); default: %(default)s",
+        help="orbit, fixed, view:FILE (camera of a view), or FILE.json (camera_path.json of "
+        "nerfstudio, or a transforms file); default: %(default)s",
     )
     parser.add_argument(
         "--time",
-        default="back-and-forth",
-        help="sweep, back-and-forth, or a number from 0 to 1; default: %(default)s",
+        help="sweep, back-and-forth, or a number from 0 to 1; default: back-and-forth, or the "
+        "times of FILE.json",
     )
     parser.add_argument(
         "--frames",
@@ -240,10 +241,12 @@ def _add_render(commands: "argparse._SubParsersAction") -> None:
         help="number of frames; default: 48, or 1 if neither camera nor time moves",
     )
     parser.add_argument(
-        "--fps", type=int, default=16, help="frames per second; default: %(default)s"
+        "--fps", type=int, help="frames per second; default: 16, or as FILE.json says"
     )
     parser.add_argument(
-        "--size", type=int, help="pixels per side; default: that of the training views"
+        "--size",
+        type=int,
+        help="pixels of the longer side; default: that of the training views, or as FILE.json says",
     )
     parser.add_argument(
         "--elevation",
@@ -279,9 +282,10 @@ def _render(options: argparse.Namespace) -> None:
     check_out(options.out, wanted)
     trained = _load(options)
     views = trained.scene.splits["train"]
-    size = options.size or max(views.height, views.width)
-    camera = f"{options.path} camera, time {options.time}"
-    _say(f"frames      {wanted.count} of {size}x{size} px, {options.what}, {camera}\n")
+    height, width = wanted.shape(views)
+    written = "as written" if wanted.cameras is not None else "back-and-forth"
+    camera = f"{options.path} camera, time {options.time or written}"
+    _say(f"frames      {wanted.count} of {width}x{height} px, {options.what}, {camera}\n")
     _say(f"wrote {render_video(trained, wanted, options.out)}")
 
 
@@ -313,6 +317,69 @@ def _view(options: argparse.Namespace) -> None:
         _say("")
     finally:
         viewer.close()
+
+
+def _add_export(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser(
+        "export", help="write meshes, point clouds or planes for other programs (extra: export)"
+    )
+    _add_run(parser)
+    parser.add_argument(
+        "--what",
+        choices=["mesh", "points", "planes"],
+        default="mesh",
+        help="what to write; planes of X-Planes alone; default: %(default)s",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="FOLDER", help="empty or new; default: RUN/export/WHAT"
+    )
+    parser.add_argument(
+        "--times",
+        help="a number of times spread evenly from 0 to 1, or times separated by commas; "
+        "default: 10, or 1 in a static scene",
+    )
+    parser.add_argument(
+        "--resolution",
+        type=int,
+        default=128,
+        help="grid points along each side of the field's cube; default: %(default)s",
+    )
+    parser.add_argument(
+        "--threshold",
+        type=float,
+        help="density of the surface; default: the one with the field's silhouettes",
+    )
+    parser.add_argument(
+        "--points",
+        type=int,
+        default=100_000,
+        metavar="COUNT",
+        help="points of a point cloud; default: %(default)s",
+    )
+    parser.add_argument(
+        "--format",
+        choices=["ply", "glb"],
+        default="ply",
+        help="of meshes and point clouds; default: %(default)s",
+    )
+    parser.set_defaults(command=_export)
+
+
+def _export(options: argparse.Namespace) -> None:
+    from xplanes.evaluation.export import ExportOptions, check_folder, export
+
+    wanted = ExportOptions(
+        what=options.what,
+        times=options.times,
+        resolution=options.resolution,
+        threshold=options.threshold,
+        count=options.points,
+        form=options.format,
+    )
+    wanted.check()
+    if options.out is not None:
+        check_folder(options.out)
+    _say(f"wrote {export(_load(options), wanted, options.out, say=_say)}")
 
 
 def _add_table(commands: "argparse._SubParsersAction") -> None:

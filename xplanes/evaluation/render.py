@@ -4,6 +4,7 @@ import difflib
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -11,6 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from xplanes.errors import ConfigError
+from xplanes.evaluation.camera_path import CameraPath, read_camera_path
 from xplanes.evaluation.progress import progress
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.files import replacing, require_writable
@@ -47,13 +49,13 @@ def render_path(
     times: Tensor,
     *,
     focal: float | Tensor,
-    size: int,
+    size: int | tuple[int, int],
     centre: Tensor | None = None,
     lens: Lenses | None = None,
     background: Tensor,
     what: str = "colour",
 ) -> Iterator[Tensor]:
-    """Render square frames along a path of cameras and times, one at a time.
+    """Render frames along a path of cameras and times, one at a time.
 
     Args:
         field: The field.
@@ -61,25 +63,28 @@ def render_path(
         frame: The field's frame.
         poses: Camera-to-world matrices. [F, 4, 4]
         times: Time of each frame, from 0 to 1. [F]
-        focal: Focal length in pixels of these frames, or those along x and y. [2]
-        size: Pixels per side.
+        focal: Focal length in pixels of these frames, those along x and y [2], or those of each
+            frame. [F, 2]
+        size: Pixels per side of a square, or rows and columns.
         centre: Principal point in pixels; the middle when None. [2]
         lens: Lens of these frames; a pinhole when None.
         background: Colour behind the scene. [3]
         what: ``colour``, or ``depth`` as colours whose scale is the same in all frames.
 
     Yields:
-        Pictures. uint8 [size, size, 3]
+        Pictures. uint8 [rows, columns, 3]
     """
     device = renderer.device
-    for pose, time in zip(poses, times.tolist(), strict=True):
-        origins, directions = frame.rays(*camera_rays(pose, focal, size, size, centre, lens))
+    rows, columns = (size, size) if isinstance(size, int) else size
+    focals = torch.as_tensor(focal).expand(len(poses), 2)
+    for pose, each, time in zip(poses, focals, times.tolist(), strict=True):
+        origins, directions = frame.rays(*camera_rays(pose, each, rows, columns, centre, lens))
         rays = origins.to(device), directions.to(device)
         image = renderer.image(field, *rays, time, background.to(device))
         picture = image["colour"]
         if what == "depth":
             picture = _depth(image, float(origins[0].norm()))
-        yield to_bytes(picture.view(size, size, 3))
+        yield to_bytes(picture.view(rows, columns, 3))
 
 
 def _depth(image: dict[str, Tensor], distance: float) -> Tensor:
@@ -178,7 +183,7 @@ def _write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> None:
             writer.append_data(frame[:height, :width].numpy())
 
 
-FRAMES = 48
+FRAMES, FPS = 48, 16
 LARGEST = 8192
 """Pixels per side; WebP ends at twice as many."""
 
@@ -188,47 +193,107 @@ class VideoOptions:
     """What to render.
 
     Attributes:
-        path: Camera: ``orbit``, ``fixed`` (the first camera of the orbit), or ``view:FILE``.
-        time: ``sweep`` (from 0 to 1), ``back-and-forth``, or a number from 0 to 1.
-        frames: Number of frames; None for 48, or 1 where neither camera nor time moves.
-        fps: Frames per second.
-        size: Pixels per side; None for those of the training views.
+        path: Camera: ``orbit``, ``fixed`` (the first camera of the orbit), ``view:FILE``, or a
+            camera path, FILE.json.
+        time: ``sweep`` (from 0 to 1), ``back-and-forth``, or a number from 0 to 1; None for
+            back-and-forth, or the times of a camera path.
+        frames: Number of frames; None for 48, for 1 where neither camera nor time moves, or for
+            those of a camera path.
+        fps: Frames per second; None for 16, or as a camera path says.
+        size: Pixels of the longer side; None for those of the training views, or as a camera path
+            says.
         elevation: Height angle of orbit and fixed camera, in degrees.
         what: ``colour`` or ``depth``.
     """
 
     path: str = "orbit"
-    time: str = "back-and-forth"
+    time: str | None = None
     frames: int | None = None
-    fps: int = 16
+    fps: int | None = None
     size: int | None = None
     elevation: float = ELEVATION
     what: str = "colour"
 
+    @cached_property
+    def cameras(self) -> CameraPath | None:
+        """The camera path that is named, read from its file; None where none is.
+
+        Raises:
+            SceneError: If it cannot be used.
+        """
+        return read_camera_path(Path(self.path)) if self.path.endswith(".json") else None
+
     @property
     def count(self) -> int:
         """Number of frames."""
+        if self.cameras is not None:
+            return len(self.cameras)
         if self.frames is not None:
             return self.frames
-        frozen = self.path != "orbit" and self.time not in ("sweep", "back-and-forth")
+        frozen = self.path != "orbit" and self.time not in (None, "sweep", "back-and-forth")
         return 1 if frozen else FRAMES
+
+    @property
+    def rate(self) -> int:
+        """Frames per second."""
+        written = None if self.cameras is None else self.cameras.fps
+        return self.fps or written or FPS
+
+    @property
+    def times(self) -> Tensor:
+        """Time of each frame, from 0 to 1. [F]
+
+        Raises:
+            ConfigError: As `times`.
+        """
+        if self.cameras is not None and self.time is None:
+            return self.cameras.times
+        return times(self.time or "back-and-forth", self.count)
+
+    def shape(self, views: Views) -> tuple[int, int]:
+        """Rows and columns of a frame, where ``views`` are the training views."""
+        side = max(views.height, views.width)
+        if self.cameras is None:
+            return self.size or side, self.size or side
+        height = self.cameras.height or self.cameras.width or side
+        width = self.cameras.width or height
+        if self.size is None:
+            return height, width
+        scale = self.size / max(height, width)
+        return max(1, round(height * scale)), max(1, round(width * scale))
 
     def check(self) -> None:
         """Refuse options that cannot be rendered.
 
         Raises:
             ConfigError: With the option, its value and what is allowed.
+            SceneError: If a camera path cannot be used.
         """
-        times(self.time, 1)
-        if self.path not in ("orbit", "fixed") and not self.path.startswith("view:"):
-            raise ConfigError(f"--path {self.path}: must be orbit, fixed or view:FILE")
+        times(self.time or "back-and-forth", 1)
+        named = self.path in ("orbit", "fixed") or self.path.startswith("view:")
+        if not named and self.cameras is None:
+            raise ConfigError(
+                f"--path {self.path}: must be orbit, fixed, view:FILE or a camera path, FILE.json"
+            )
+        if self.cameras is not None and self.frames is not None:
+            raise ConfigError(
+                f"--frames {self.frames}: {self.path} has {self.count} cameras, and each of them "
+                "is one frame; leave --frames out"
+            )
         for name, value, most in (
             ("frames", self.count, 100_000),
-            ("fps", self.fps, 240),
+            ("fps", self.rate if self.fps is None else self.fps, 240),
             ("size", 1 if self.size is None else self.size, LARGEST),
         ):
             if not 1 <= value <= most:
                 raise ConfigError(f"--{name} {value}: must lie between 1 and {most}")
+        if self.cameras is not None and self.size is None:
+            longer = max(self.cameras.height or 1, self.cameras.width or 1)
+            if longer > LARGEST:
+                raise ConfigError(
+                    f"{self.path} asks for frames of {longer} px: name fewer with --size, at most "
+                    f"{LARGEST}"
+                )
         if not -90 <= self.elevation <= 90:
             raise ConfigError(
                 f"--elevation {self.elevation:g}: must lie between -90 and 90 degrees"
@@ -255,15 +320,17 @@ def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = N
     check_out(out, options)
     target, folder = destination(trained.path, options, out, trained.checkpoint)
     require_writable(target.parent)
-    views = trained.scene.splits["train"]
-    size = max(views.height, views.width) if options.size is None else options.size
-    focal, centre, distortion = lens(trained.scene.splits, options.path, size)
+    size = options.shape(trained.scene.splits["train"])
+    if options.cameras is None:
+        focal, centre, distortion = lens(trained.scene.splits, options.path, size[0])
+    else:
+        focal, centre, distortion = options.cameras.focal(*size)[:, None], None, None
     frames = render_path(
         trained.module.field,
         trained.module.renderer,
         trained.frame,
         poses(trained, options),
-        times(options.time, options.count),
+        options.times,
         focal=focal,
         size=size,
         centre=centre,
@@ -272,7 +339,7 @@ def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = N
         what=options.what,
     )
     shown = progress(frames, options.count, "frames")
-    return write_video(target, shown, fps=options.fps, folder=folder)
+    return write_video(target, shown, fps=options.rate, folder=folder)
 
 
 def check_out(out: str | None, options: VideoOptions) -> None:
@@ -292,8 +359,11 @@ def destination(
     """The file or folder to write, and whether it is a folder."""
     if out is not None:
         return Path(out), out.endswith("/") or Path(out).is_dir()
-    camera = options.path.replace(":", "_").replace("/", "_").removesuffix(".png")
-    parts = ["render", camera, options.time]
+    if options.cameras is not None:
+        parts = ["render", Path(options.path).stem, *([options.time] if options.time else [])]
+    else:
+        camera = options.path.replace(":", "_").replace("/", "_").removesuffix(".png")
+        parts = ["render", camera, options.time or "back-and-forth"]
     parts += [part for part in (options.what, checkpoint) if part not in ("colour", "last")]
     ending = ".png" if options.count == 1 else ".webp"
     return run / "media" / ("_".join(parts) + ending), False
@@ -301,6 +371,8 @@ def destination(
 
 def poses(trained: TrainedRun, options: VideoOptions) -> Tensor:
     """Camera of each frame. [F, 4, 4]"""
+    if options.cameras is not None:
+        return options.cameras.poses
     views = trained.scene.splits["train"]
     if options.path == "orbit":
         return orbit_poses(views, trained.frame, options.count, options.elevation)

@@ -63,6 +63,14 @@ class OccupancyGrid(nn.Module):
         """Time bin of each time from 0 to 1. int64 [N]"""
         return (times * self.time_bins).long().clamp_(0, self.time_bins - 1)
 
+    def cells(self, points: Tensor, times: Tensor) -> Tensor:
+        """Cell that holds each point of the cube at its time. [N, 3], [N] -> int64 [N]"""
+        place = (0.5 * self.resolution * (points + 1)).long().clamp_(0, self.resolution - 1)
+        cells = self.bins(times)
+        for axis in (2, 1, 0):
+            cells = cells * self.resolution + place[:, axis]
+        return cells
+
     def allow(self, allowed: Tensor) -> None:
         """Rule out cells for good. bool [time_bins, G, G, G], axes z, y, x
 

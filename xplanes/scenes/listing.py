@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import torch
@@ -603,7 +603,7 @@ def refuse_repeats(
             )
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: Any) -> TypeGuard[float]:
     """Whether a value read from a file is a finite number."""
     if not isinstance(value, int | float) or isinstance(value, bool):
         return False
@@ -614,7 +614,7 @@ def is_number(value: Any) -> bool:
         return False
 
 
-def is_positive(value: Any) -> bool:
+def is_positive(value: Any) -> TypeGuard[float]:
     """Whether a value read from a file is a finite number above 0."""
     return is_number(value) and value > 0
 

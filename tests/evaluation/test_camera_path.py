@@ -1,0 +1,137 @@
+"""Camera paths from files: what is read, what is rendered, what is refused."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from xplanes.errors import ConfigError
+from xplanes.evaluation.camera_path import read_camera_path
+from xplanes.evaluation.render import VideoOptions, render_video
+from xplanes.evaluation.runs import TrainedRun, load_run
+from xplanes.rendering.pictures import to_bytes
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.views import Views, camera_rays
+
+
+@pytest.fixture(scope="module")
+def trained(trained_run: Path) -> TrainedRun:
+    return load_run(trained_run)
+
+
+@pytest.fixture(scope="module")
+def views(trained: TrainedRun) -> Views:
+    return trained.scene.splits["train"]
+
+
+def write(path: Path, content: Any) -> Path:
+    path.write_text(json.dumps(content), encoding="utf-8")
+    return path
+
+
+def nerfstudio(views: Views, **changed: Any) -> dict[str, Any]:
+    """Two cameras of training views, with different fields of view."""
+    return {
+        "camera_type": "perspective",
+        "render_height": 12,
+        "render_width": 20,
+        "seconds": 0.5,
+        "keyframes": [],
+        "camera_path": [
+            {"camera_to_world": pose.flatten().tolist(), "fov": fov, "aspect": 20 / 12, **times}
+            for pose, fov, times in zip(
+                views.camera_to_world[:2],
+                (40.0, 55.0),
+                ({"render_time": 0.75}, {"render_time": 0.25}),
+                strict=True,
+            )
+        ],
+        **changed,
+    }
+
+
+def transforms(views: Views, **changed: Any) -> dict[str, Any]:
+    frames = [{"transform_matrix": pose.tolist()} for pose in views.camera_to_world[:3]]
+    return {"camera_angle_x": 0.8, "w": 16, "h": 10, "frames": frames, **changed}
+
+
+def test_a_frame_is_the_render_from_its_camera_at_its_time(
+    trained: TrainedRun, views: Views, tmp_path: Path
+):
+    path = write(tmp_path / "camera_path.json", nerfstudio(views))
+    folder = render_video(trained, VideoOptions(path=str(path)), f"{tmp_path}/frames/")
+    for index, (fov, time) in enumerate(((40, 0.75), (55, 0.25))):
+        focal = 6 / math.tan(math.radians(fov / 2))
+        rays = camera_rays(views.camera_to_world[index], focal, 12, 20)
+        image = trained.module.renderer.image(
+            trained.module.field, *trained.frame.rays(*rays), time, trained.scene.background
+        )
+        expected = to_bytes(image["colour"].view(12, 20, 3)).numpy().astype(int)
+        found = np.asarray(Image.open(folder / f"frame_{index:04d}.png")).astype(int)
+        assert np.abs(found - expected).max() <= 1
+        assert np.ptp(expected) > 30
+
+
+def test_a_transforms_file_is_a_path(views: Views, tmp_path: Path):
+    path = read_camera_path(write(tmp_path / "a.json", transforms(views, fps=7)))
+    assert torch.equal(path.poses, views.camera_to_world[:3])
+    assert path.times.tolist() == [0, 0.5, 1]
+    assert (path.height, path.width, path.fps) == (10, 16, 7)
+    assert path.focal(10, 16).tolist() == pytest.approx([8 / math.tan(0.4)] * 3)
+
+
+def test_sizes_rates_and_times_can_be_set(views: Views, tmp_path: Path):
+    path = str(write(tmp_path / "a.json", nerfstudio(views)))
+    written, changed = VideoOptions(path=path), VideoOptions(path=path, size=10, fps=9, time="0.5")
+    assert (written.shape(views), written.rate) == ((12, 20), 4)
+    assert (changed.shape(views), changed.rate) == ((6, 10), 9)
+    assert written.times.tolist() == [0.75, 0.25]
+    assert changed.times.tolist() == [0.5, 0.5]
+
+
+def test_a_video_is_named_after_its_path(trained: TrainedRun, views: Views, tmp_path: Path):
+    path = write(tmp_path / "flight.json", transforms(views, w=8, h=6))
+    video = render_video(trained, VideoOptions(path=str(path)))
+    assert video == trained.path / "media" / "render_flight.webp"
+    with Image.open(video) as picture:
+        assert (picture.n_frames, picture.size) == (3, (8, 6))  # type: ignore[attr-defined]
+
+
+def test_damaged_paths_are_refused(views: Views, tmp_path: Path):
+    def entry(**changed: Any) -> dict[str, Any]:
+        first, second = nerfstudio(views)["camera_path"]
+        return nerfstudio(views, camera_path=[first, {**second, **changed}])
+
+    refused = [
+        ([], "must hold a JSON object"),
+        ({}, 'Its key "camera_path"'),
+        (nerfstudio(views, camera_path=[]), "holds no cameras"),
+        (nerfstudio(views, camera_path=[3]), r"camera_path\[0\] is 3"),
+        (nerfstudio(views, camera_type="fisheye"), "camera_type is 'fisheye'"),
+        (nerfstudio(views, render_width=0), "render_width is 0"),
+        (entry(fov=180), r"camera_path\[1\]: fov is 180"),
+        (entry(render_time=None), r"camera_path\[1\]: render_time is None"),
+        (entry(render_time=1.5), r"camera_path\[1\]: render_time is 1.5"),
+        (entry(camera_to_world=[1.0] * 12), r"camera_path\[1\]: camera_to_world must be"),
+        (transforms(views, camera_angle_x=None), "camera_angle_x is None"),
+    ]
+    for content, words in refused:
+        with pytest.raises(SceneError, match=words):
+            read_camera_path(write(tmp_path / "a.json", content))
+    with pytest.raises(SceneError, match="no such camera path"):
+        VideoOptions(path=str(tmp_path / "none.json")).check()
+
+
+def test_options_that_contradict_the_path_are_refused(views: Views, tmp_path: Path):
+    path = str(write(tmp_path / "a.json", nerfstudio(views)))
+    with pytest.raises(ConfigError, match=r"--frames 5.*2 cameras"):
+        VideoOptions(path=path, frames=5).check()
+    wide = str(write(tmp_path / "b.json", nerfstudio(views, render_width=10_000)))
+    with pytest.raises(ConfigError, match="10000 px"):
+        VideoOptions(path=wide).check()
+    VideoOptions(path=wide, size=64).check()

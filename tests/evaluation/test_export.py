@@ -1,0 +1,355 @@
+"""Exports: what other programs read is what the field shows."""
+
+import json
+import re
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.baselines.test_kplanes_field import products
+from tests.baselines.test_tensor4d_field import surface as tensor4d
+from tests.baselines.test_tineuvox_field import BOX
+from xplanes.cli import main
+from xplanes.errors import ConfigError
+from xplanes.evaluation import export as module
+from xplanes.evaluation.export import ExportOptions, export, export_times
+from xplanes.evaluation.runs import TrainedRun, load_run
+from xplanes.fields import Decoder, XPlanes
+from xplanes.fields.base import ViewDependentField
+from xplanes.fields.kplanes import HybridDecoder, KPlanes
+from xplanes.fields.tineuvox import TiNeuVox
+from xplanes.fields.xplanes import random_planes
+from xplanes.optional import MissingExtraError
+from xplanes.rendering.base import RayRenderer
+from xplanes.rendering.fixed_step import FixedStepRenderer
+from xplanes.rendering.grid_renderer import GridRenderer
+from xplanes.rendering.neus import NeusRenderer
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.scenes.cameras import orbit
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.views import Views, camera_rays
+
+trimesh: Any = pytest.importorskip("trimesh")
+pytest.importorskip("skimage")
+
+ROOT = Path(__file__).resolve().parents[2]
+SIZE = 40
+
+TURN = torch.linalg.qr(torch.tensor([[1.0, 0.5, 0.2], [-0.3, 1.0, 0.4], [0.1, -0.6, 1.0]]))[0]
+FRAME = Frame(0.5, TURN * torch.linalg.det(TURN).sign(), torch.tensor([1.0, -2.0, 0.5]))
+
+
+class Ball(ViewDependentField):
+    """A ball with a soft border that moves along y; its colour tells place and direction."""
+
+    RADIUS = 0.45
+
+    def __init__(self, density: float = 60.0, softness: float = 0.02) -> None:
+        super().__init__()
+        self.density, self.softness = density, softness
+
+    planes = {}  # noqa: RUF012
+    moves = True
+    precision = "32"
+    outline = "a ball"
+
+    @staticmethod
+    def centre(time: float) -> Tensor:
+        return torch.tensor([0.2, 0.4 * time - 0.3, -0.1])
+
+    def geometry(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+        centre = self.centre(0) + times[:, None] * (self.centre(1) - self.centre(0))
+        inside = self.RADIUS - (points - centre).norm(dim=1)
+        return self.density * (inside / self.softness).sigmoid(), points
+
+    def colour(self, features: Tensor, directions: Tensor) -> Tensor:
+        return 0.5 + 0.2 * features - 0.2 * directions
+
+
+def whole_grid() -> OccupancyGrid:
+    return OccupancyGrid(16, 2, step=0.02)
+
+
+def set_up(
+    tmp_path: Path, field: Any, renderer: RayRenderer | None = None, frame: Frame = FRAME
+) -> TrainedRun:
+    """A run of a field that was set, not trained, with cameras all around it."""
+    poses = orbit(6, radius=3 / frame.scale, elevation=20, target=frame.centre)
+    images = torch.zeros(6, SIZE, SIZE, 4, dtype=torch.uint8)
+    views = Views(images, poses, torch.zeros(6), 1.2 * SIZE, tuple("abcdef"))  # type: ignore[arg-type]
+    parts = SimpleNamespace(field=field, renderer=renderer or GridRenderer(whole_grid(), 192))
+    method = SimpleNamespace(method=SimpleNamespace(model=SimpleNamespace(name="some model")))
+    scene = SimpleNamespace(splits={"train": views}, background=torch.ones(3))
+    content: Any = (tmp_path / "run", method, scene, "train", frame, parts, "last", 7)
+    return TrainedRun(*content)
+
+
+def quiet(text: str) -> None:
+    """Takes messages."""
+
+
+def silhouettes(trained: TrainedRun, mesh: Any, time: float, pose: Tensor) -> tuple[Tensor, Tensor]:
+    """What a mesh in the world covers, and where the field stops half the light. bool [P], [P]"""
+    origins, directions = camera_rays(pose, 1.2 * SIZE, SIZE, SIZE)
+    rays = trained.frame.rays(origins, directions)
+    image = trained.module.renderer.image(trained.module.field, *rays, time, torch.ones(3))
+    corners = torch.tensor(np.asarray(mesh.triangles)).float()
+    first, *sides = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    hit = []
+    for origin, direction in zip(origins, directions, strict=True):  # Möller and Trumbore
+        across = torch.linalg.cross(direction.expand_as(sides[1]), sides[1])
+        scale = (sides[0] * across).sum(dim=1)
+        offset = origin - first
+        beside = torch.linalg.cross(offset, sides[0])
+        u, v = (offset * across).sum(dim=1) / scale, (beside @ direction) / scale
+        hit.append(((u >= 0) & (v >= 0) & (u + v <= 1)).any())
+    return torch.stack(hit), image["opacity"] >= 0.5
+
+
+def agreement(first: Tensor, second: Tensor) -> float:
+    return float((first & second).sum() / (first | second).sum())
+
+
+@pytest.mark.parametrize("form", ["ply", "glb"])
+def test_a_ball_comes_out_where_it_is_in_the_world(tmp_path: Path, form: str):
+    trained, resolution = set_up(tmp_path, Ball(500.0, 0.002)), 40
+    options = ExportOptions(times="0,1", resolution=resolution, form=form)
+    folder = export(trained, options, say=quiet)
+    assert folder == trained.path / "export" / "mesh"
+    texel = 2 / resolution / FRAME.scale
+    listed = json.loads((folder / "export.json").read_text())
+    assert listed["files"] == [f"mesh_0000.{form}", f"mesh_0001.{form}"]
+    for name, time in zip(listed["files"], listed["times"], strict=True):
+        mesh = trimesh.load(folder / name, force="mesh")
+        mesh.merge_vertices()
+        centre = FRAME.to_world(Ball.centre(time)).numpy()
+        distance = np.linalg.norm(mesh.vertices - centre, axis=1)
+        assert np.abs(mesh.bounds.mean(axis=0) - centre).max() < 0.5 * texel
+        assert np.abs(distance - Ball.RADIUS / FRAME.scale).max() < texel
+        assert mesh.is_watertight
+        assert mesh.volume > 0
+
+
+@pytest.mark.parametrize(("density", "softness"), [(500.0, 0.002), (60.0, 0.02), (6.0, 0.05)])
+def test_the_silhouette_of_a_mesh_is_that_of_the_field(
+    tmp_path: Path, density: float, softness: float
+):
+    trained = set_up(tmp_path, Ball(density, softness))
+    folder = export(trained, ExportOptions(times="0.5", resolution=32), say=quiet)
+    mesh = trimesh.load(folder / "mesh_0000.ply")
+    pose = orbit(5, radius=7, elevation=-35, target=FRAME.centre)[2]
+    covered, shown = silhouettes(trained, mesh, 0.5, pose)
+    assert shown.sum() > 100
+    assert agreement(covered, shown) > 0.95
+
+
+def test_colours_of_vertices_are_those_that_the_field_shows_along_normals(tmp_path: Path):
+    trained = set_up(tmp_path, Ball())
+    folder = export(trained, ExportOptions(times="0.5", resolution=32), say=quiet)
+    mesh = trimesh.load(folder / "mesh_0000.ply")
+    points = FRAME.points(torch.tensor(np.asarray(mesh.vertices)).float())
+    outward = points - Ball.centre(0.5)
+    outward = outward / outward.norm(dim=1, keepdim=True)
+    expected = (0.5 + 0.2 * (points - outward / 16) + 0.2 * outward).numpy()
+    found = np.asarray(mesh.visual.vertex_colors)[:, :3] / 255
+    assert np.abs(found - expected).max() < 0.05
+    assert np.ptp(expected, axis=0).min() > 0.4
+
+
+def test_a_point_cloud_lies_on_the_surface(tmp_path: Path):
+    trained = set_up(tmp_path, Ball())
+    options = ExportOptions(what="points", times="0.5", resolution=40, count=500)
+    cloud = trimesh.load(export(trained, options, say=quiet) / "points_0000.ply")
+    assert cloud.vertices.shape == (500, 3)
+    points = FRAME.points(torch.tensor(np.asarray(cloud.vertices)).float())
+    outward = points - Ball.centre(0.5)
+    assert float((outward.norm(dim=1) - Ball.RADIUS).abs().max()) < 0.07
+    outward = outward / outward.norm(dim=1, keepdim=True)
+    expected = (0.5 + 0.2 * (points - outward / 20) + 0.2 * outward).numpy()
+    assert np.abs(cloud.colors[:, :3] / 255 - expected).max() < 0.08
+
+
+def test_what_lies_in_empty_cells_is_left_out_and_not_asked_for(tmp_path: Path):
+    grid = whole_grid()
+    allowed = torch.ones(2, 16, 16, 16, dtype=torch.bool)
+    allowed[:, :, :, 9:] = False  # x
+    grid.allow(allowed)
+    asked = []
+
+    class Watched(Ball):
+        def geometry(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+            asked.append(float(points[:, 0].max()))
+            return super().geometry(points, times)
+
+    trained = set_up(tmp_path, Watched(), GridRenderer(grid, 192))
+    mesh = module.surface(trained, 0.5, 32, 10.0)
+    border = 9 / 8 - 1
+    assert max(asked) < border
+    assert mesh.vertices[:, 0].max() < border + 1 / 16
+    assert mesh.is_watertight
+
+
+def test_a_field_that_fills_the_cube_has_the_cube_for_a_surface(tmp_path: Path):
+    trained = set_up(tmp_path, Ball(density=300, softness=1e3))
+    mesh = module.surface(trained, 0.0, 16, 10.0)
+    assert mesh.is_watertight
+    assert mesh.bounds.ravel().tolist() == pytest.approx([-1, -1, -1, 1, 1, 1], abs=0.13)
+
+
+def dense(tmp_path: Path, name: str) -> TrainedRun:
+    """An untrained field of a model whose density varies in its cube."""
+    torch.manual_seed(0)
+    flat = Frame(1.0, torch.eye(3), torch.zeros(3))
+    if name == "K-Planes":
+        field = KPlanes(products(), HybridDecoder(4, 16))
+        return set_up(tmp_path, field, frame=flat)
+    field = TiNeuVox(BOX, 8, 4, 16, alpha=0.9)
+    torch.nn.init.normal_(field.grid, std=3)
+    renderer = FixedStepRenderer(field, near=1, far=5, step=0.5, threshold=1e-4)
+    return set_up(tmp_path, field, renderer, flat)
+
+
+@pytest.mark.parametrize("name", ["K-Planes", "TiNeuVox"])
+def test_the_threshold_is_the_density_of_the_surface(tmp_path: Path, name: str):
+    trained, resolution = dense(tmp_path, name), 48
+    volume, _ = module.solidity(trained, 0.5, resolution)
+    threshold = float(-torch.log1p(-volume[volume > 0]).median()) * resolution / 2
+    options = ExportOptions(times="0.5", resolution=resolution, threshold=threshold)
+    mesh = trimesh.load(export(trained, options, say=quiet) / "mesh_0000.ply")
+    points = torch.tensor(np.asarray(mesh.vertices)).float()
+    low, high = BOX if name == "TiNeuVox" else torch.tensor([[-1.0] * 3, [1.0] * 3])
+    points = points[((points > low + 0.05) & (points < high - 0.05)).all(dim=1)]
+    assert len(points) > 100
+    with torch.no_grad():
+        density = trained.module.field(points, torch.full_like(points[:, 0], 0.5))[1]
+    assert density.median() == pytest.approx(threshold, rel=0.05)
+
+
+def test_a_field_of_signed_distances_gives_its_own_surface(tmp_path: Path):
+    torch.manual_seed(0)
+    field = tensor4d(width=64, filled=False)
+    renderer = NeusRenderer(field, samples=8, more=8, coarse_sharpness=64.0)
+    trained = set_up(tmp_path, field, renderer)
+    folder = export(trained, ExportOptions(times="0.0", resolution=32), say=quiet)
+    mesh = trimesh.load(folder / "mesh_0000.ply")
+    points = FRAME.points(torch.tensor(np.asarray(mesh.vertices)).float())
+    with torch.no_grad():
+        distance = field.distance(field.canonical(points, torch.zeros(len(points))))[0]
+    assert float(distance.abs().max()) < 0.03
+    assert len(points) > 500
+    with pytest.raises(ConfigError, match="--threshold 3: this field has a surface"):
+        export(trained, ExportOptions(threshold=3), tmp_path / "other", say=quiet)
+
+
+def written_reader() -> Any:
+    """The class that docs/recipes.md prints."""
+    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
+    found = re.search(r"^    import json\n.*?^    class Planes:.*?(?=^\S)", page, re.M | re.S)
+    assert found
+    code = re.sub(r"^    ", "", found[0], flags=re.M)
+    assert len(code.splitlines()) < 60
+    names: dict[str, Any] = {}
+    exec(code, names)
+    return names["Planes"]
+
+
+@pytest.mark.parametrize("plane_set", ["three", "six", "nine"])
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"activation": "silu", "density": "exp", "density_scale": 3.0, "colour_margin": 0.0}],
+)
+def test_the_documented_reader_gives_the_values_of_the_field(
+    tmp_path: Path, plane_set: str, options: dict[str, Any]
+):
+    made = random_planes(
+        plane_set,
+        channels=5,
+        resolution=9,
+        time_resolution=4,
+        space_scale=1,
+        time_scale=1,
+        generator=torch.Generator().manual_seed(0),
+    )
+    field = XPlanes(planes=made, decoder=Decoder(5, width=16, **options), plane_set=plane_set)
+    trained = set_up(tmp_path, field)
+    folder = export(trained, ExportOptions(what="planes"), say=quiet)
+    world = FRAME.to_world(torch.rand(200, 3) * 2.2 - 1.1)
+    times = torch.rand(200)
+    colour, density = written_reader()(folder / "planes.safetensors")(world, times)
+    with torch.no_grad():
+        expected = field(FRAME.points(world), times)
+    torch.testing.assert_close(colour, expected[0], atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(density, expected[1], atol=1e-5, rtol=1e-5)
+    assert float(expected[0].std()) > 0.01
+
+
+def test_the_command_exports_a_run(trained_run: Path, tmp_path: Path, capsys):
+    out = tmp_path / "meshes"
+    arguments = ["--times", "2", "--resolution", "32", "--out", str(out)]
+    assert main(["export", str(trained_run), *arguments]) == 0
+    assert f"wrote {out}" in capsys.readouterr().out
+    mesh = trimesh.load(out / "mesh_0001.ply")
+    corners = load_run(trained_run).frame.points(torch.tensor(mesh.vertices).float())
+    assert float(corners.abs().max()) <= 1.001
+    assert len(mesh.faces) > 100
+    assert mesh.is_watertight
+    assert main(["export", str(trained_run), "--what", "planes", "--out", str(out)]) == 1
+    assert "holds files already" in capsys.readouterr().err
+
+
+def test_times():
+    assert export_times("3") == [0, 0.5, 1]
+    assert export_times("1") == [0]
+    assert export_times("0.5") == [0.5]
+    assert export_times("0,0.25, 1") == [0, 0.25, 1]
+    for text in ("0", "", "soon", "0,2", "nan,", "-0.5"):
+        with pytest.raises(ConfigError, match=f"--times {text}"):
+            export_times(text)
+
+
+def test_bad_options_are_refused(tmp_path: Path):
+    for options, words in {
+        ExportOptions(what="video"): "--what video: must be mesh or points or planes",
+        ExportOptions(form="obj"): "--format obj",
+        ExportOptions(resolution=4): "--resolution 4: must lie between 8 and",
+        ExportOptions(count=0): "--points 0",
+        ExportOptions(threshold=-1.0): "--threshold -1",
+        ExportOptions(threshold=float("nan")): "--threshold nan",
+        ExportOptions(times="2.5"): "--times 2.5",
+    }.items():
+        with pytest.raises(ConfigError, match=words):
+            options.check()
+
+
+def test_exports_that_cannot_be_are_refused(tmp_path: Path):
+    trained, out = set_up(tmp_path, Ball(density=0.1)), tmp_path / "out"
+    with pytest.raises(ConfigError, match="stops half of the light in no pixel"):
+        export(trained, ExportOptions(resolution=16), out, say=quiet)
+    with pytest.raises(ConfigError, match=r"nowhere above the threshold 5; the largest is 0\.1"):
+        export(trained, ExportOptions(resolution=16, threshold=5.0), out, say=quiet)
+    with pytest.raises(ConfigError, match="--what planes: some model has no planes"):
+        export(trained, ExportOptions(what="planes"), out, say=quiet)
+    out.write_text("in the way")
+    with pytest.raises(ConfigError, match="is a file"):
+        export(trained, ExportOptions(), out, say=quiet)
+
+
+def test_a_missing_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "skimage.measure", None)
+    with pytest.raises(MissingExtraError, match=r'-e "\.\[export\]"'):
+        ExportOptions().check()
+    ExportOptions(what="planes").check()
+
+
+def test_a_static_scene_has_one_timestep(tmp_path: Path):
+    field = Ball()
+    field.moves = False
+    trained = set_up(tmp_path, field)
+    folder = export(trained, ExportOptions(resolution=16), say=quiet)
+    assert json.loads((folder / "export.json").read_text())["times"] == [0]

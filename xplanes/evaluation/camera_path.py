@@ -1,0 +1,160 @@
+"""Camera paths from JSON files: nerfstudio's, and those of transforms files."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.listing import checked_pose, is_number, is_positive, read_object, short
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Cameras and times of a video.
+
+    Attributes:
+        poses: Camera-to-world matrices. [F, 4, 4]
+        times: Time of each frame, from 0 to 1. [F]
+        tangents: Tangent of half the field of view of each frame, along ``upright``. [F]
+        upright: Whether that field of view is the vertical one; the horizontal one otherwise.
+        height: Rows of a frame; None where the file does not say.
+        width: Columns of a frame; None where the file does not say.
+        fps: Frames per second; None where the file does not say.
+    """
+
+    poses: Tensor
+    times: Tensor
+    tangents: Tensor
+    upright: bool
+    height: int | None = None
+    width: int | None = None
+    fps: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def focal(self, height: int, width: int) -> Tensor:
+        """Focal length of each frame in pixels of frames of this size. [F]"""
+        return 0.5 * (height if self.upright else width) / self.tangents
+
+
+def read_camera_path(path: Path) -> CameraPath:
+    """Read a camera path and check all of it.
+
+    Two formats are read. ``camera_path.json`` of nerfstudio's viewer: ``camera_path``, a list of
+    ``camera_to_world`` (16 numbers, row by row), ``fov`` (vertical, in degrees) and optionally
+    ``render_time`` or ``time``; ``render_height``, ``render_width``, and ``fps`` or ``seconds``.
+    And transforms files: ``frames``, a list of ``transform_matrix`` [4, 4] and optionally ``time``;
+    ``camera_angle_x`` (horizontal, in radians); optionally ``w``, ``h`` and ``fps``.
+
+    Times run from 0 to 1 over the path where the file has none.
+
+    Args:
+        path: The file. Poses are those of the run's world, with OpenGL's axes.
+
+    Raises:
+        SceneError: If the file is missing or damaged, or an entry is missing or out of range.
+    """
+    if not path.is_file():
+        raise SceneError(f"{path}: there is no such camera path")
+    content = read_object(path, '"camera_path" (nerfstudio) or "frames"')
+    if "camera_path" in content:
+        return _read_nerfstudio(path, content)
+    entries = _entries(path, content, "frames")
+    angle = content.get("camera_angle_x")
+    if not is_positive(angle) or angle >= math.pi:
+        raise SceneError(
+            f"{path}: camera_angle_x is {short(angle)}; it must lie between 0 and pi radians"
+        )
+    return CameraPath(
+        poses=_poses(entries, "transform_matrix"),
+        times=_times(path, entries, ("time",)),
+        tangents=torch.full((len(entries),), math.tan(0.5 * angle)),
+        upright=False,
+        height=_count(path, content, "h"),
+        width=_count(path, content, "w"),
+        fps=_count(path, content, "fps"),
+    )
+
+
+Entries = dict[str, Mapping[str, Any]]
+"""Cameras of a path by what messages call them."""
+
+
+def _read_nerfstudio(path: Path, content: Mapping[str, Any]) -> CameraPath:
+    if (kind := content.get("camera_type", "perspective")) != "perspective":
+        raise SceneError(
+            f"{path}: camera_type is {short(kind)}; only perspective cameras are rendered"
+        )
+    entries = _entries(path, content, "camera_path")
+    tangents = []
+    for label, entry in entries.items():
+        fov = entry.get("fov")
+        if not is_positive(fov) or fov >= 180:
+            raise SceneError(f"{label}: fov is {short(fov)}; it must lie between 0 and 180 degrees")
+        tangents.append(math.tan(0.5 * math.radians(fov)))
+    fps, seconds = _count(path, content, "fps"), content.get("seconds")
+    if fps is None and is_positive(seconds):
+        fps = max(1, round(len(entries) / seconds))
+    return CameraPath(
+        poses=_poses(entries, "camera_to_world"),
+        times=_times(path, entries, ("render_time", "time")),
+        tangents=torch.tensor(tangents),
+        upright=True,
+        height=_count(path, content, "render_height"),
+        width=_count(path, content, "render_width"),
+        fps=fps,
+    )
+
+
+def _entries(path: Path, content: Mapping[str, Any], key: str) -> Entries:
+    found = content.get(key)
+    if not isinstance(found, list) or not found:
+        raise SceneError(
+            f'{path} holds no cameras. Its key "camera_path" (nerfstudio) or "frames" must hold at '
+            "least one"
+        )
+    entries = {f"{path}: {key}[{index}]": entry for index, entry in enumerate(found)}
+    for label, entry in entries.items():
+        if not isinstance(entry, dict):
+            raise SceneError(f"{label} is {short(entry)}, not an object with keys")
+    return entries
+
+
+def _poses(entries: Entries, key: str) -> Tensor:
+    poses = []
+    for label, entry in entries.items():
+        matrix = entry.get(key)
+        if isinstance(matrix, list) and len(matrix) == 16:
+            matrix = [matrix[start : start + 4] for start in range(0, 16, 4)]
+        poses.append(checked_pose(label, matrix, key))
+    return torch.from_numpy(np.stack(poses)).float()
+
+
+def _times(path: Path, entries: Entries, keys: tuple[str, ...]) -> Tensor:
+    """Time of each camera; from 0 to 1 over the path where no camera has one. [F]"""
+    found = [next((e[k] for k in keys if e.get(k) is not None), None) for e in entries.values()]
+    if all(time is None for time in found):
+        return torch.linspace(0, 1, len(entries))
+    for label, time in zip(entries, found, strict=True):
+        if not is_number(time) or not 0 <= time <= 1:
+            raise SceneError(
+                f"{label}: {keys[0]} is {short(time)}; it must be a number from 0 to 1 in every "
+                f"camera of {path.name}, or in none"
+            )
+    return torch.tensor(found, dtype=torch.float32)
+
+
+def _count(path: Path, content: Mapping[str, Any], key: str) -> int | None:
+    value = content.get(key)
+    if value is None:
+        return None
+    if not is_positive(value) or round(value) < 1:
+        raise SceneError(f"{path}: {key} is {short(value)}; it must be a whole number above 0")
+    return round(value)

@@ -1,0 +1,448 @@
+"""Meshes, point clouds and planes for other programs: `xplanes export`."""
+
+import json
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from safetensors.torch import save_file
+from torch import Tensor
+
+from xplanes.errors import ConfigError
+from xplanes.evaluation.progress import progress
+from xplanes.evaluation.runs import TrainedRun
+from xplanes.fields.base import ViewDependentField
+from xplanes.fields.tensor4d import Tensor4D
+from xplanes.fields.tineuvox import TiNeuVox
+from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES, XPlanes
+from xplanes.files import replacing, require_writable, write_json
+from xplanes.optional import require
+from xplanes.rendering.box import ray_box
+from xplanes.rendering.grid_renderer import GridRenderer
+
+KINDS = ("mesh", "points", "planes")
+FORMATS = ("ply", "glb")
+
+TIMES = 10
+"""Timesteps of a dynamic scene where none are named."""
+
+LARGEST = 1024
+"""Grid points along each side of the cube; as many as that take 4 GB."""
+
+CAMERAS, RAYS, SAMPLES = 8, 4096, 256
+"""Training cameras, rays of each and samples of a ray that silhouettes are compared in."""
+
+THINNEST, DENSEST, CANDIDATES = 1e-3, 5.0, 96
+"""Optical depths of one grid cell between which the threshold lies, and how many are compared."""
+
+PLATEAU = 0.001
+"""Intersections over union that differ by less count as equal."""
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What to export.
+
+    Attributes:
+        what: ``mesh``, ``points`` or ``planes``.
+        times: A number of times spread evenly from 0 to 1, or times separated by commas; None for
+            10, or for 1 in a static scene.
+        resolution: Grid points along each side of the field's cube.
+        threshold: Density of the surface, per unit length of the field's frame; found when None.
+        count: Points of a point cloud.
+        form: File format of meshes and point clouds: ``ply`` or ``glb``.
+    """
+
+    what: str = "mesh"
+    times: str | None = None
+    resolution: int = 128
+    threshold: float | None = None
+    count: int = 100_000
+    form: str = "ply"
+
+    def check(self) -> None:
+        """Refuse options that nothing can be exported with.
+
+        Raises:
+            ConfigError: With the option, its value and what is allowed.
+            MissingExtraError: For meshes and points without the extra ``export``.
+        """
+        for name, value, allowed in (("what", self.what, KINDS), ("format", self.form, FORMATS)):
+            if value not in allowed:
+                raise ConfigError(f"--{name} {value}: must be {' or '.join(allowed)}")
+        for name, value, least, most in (
+            ("resolution", self.resolution, 8, LARGEST),
+            ("points", self.count, 1, 10**8),
+        ):
+            if not least <= value <= most:
+                raise ConfigError(f"--{name} {value}: must lie between {least} and {most}")
+        if self.threshold is not None and not 0 < self.threshold < math.inf:
+            raise ConfigError(f"--threshold {self.threshold:g}: must be a finite number above 0")
+        if self.times is not None:
+            export_times(self.times)
+        if self.what != "planes":
+            require("skimage.measure", extra="export")
+            require("trimesh", extra="export")
+
+
+def export_times(text: str) -> list[float]:
+    """Times from "5" (evenly spread from 0 to 1) or "0,0.25,1" (a list).
+
+    Raises:
+        ConfigError: If it is neither.
+    """
+    try:
+        if text.isdecimal() and 1 <= int(text) <= 100_000:
+            return torch.linspace(0, 1, int(text)).tolist()
+        times = [float(part) for part in text.split(",") if part.strip()]
+    except ValueError:
+        times = []
+    # NaN compares as false.
+    if text.isdecimal() or not times or not all(0 <= time <= 1 for time in times):
+        raise ConfigError(
+            f"--times {text}: must be a number of times above 0, such as 5, or times from 0 to 1 "
+            'separated by commas, such as 0,0.25,1; one time is written with a point: "0.5"'
+        )
+    return times
+
+
+def export(
+    trained: TrainedRun,
+    options: ExportOptions,
+    out: Path | None = None,
+    *,
+    say: Callable[[str], None],
+) -> Path:
+    """Write meshes, point clouds or planes of a run, and ``export.json``, which lists them.
+
+    Args:
+        trained: The run.
+        options: What to export.
+        out: Folder to write into, empty or new; ``export/WHAT`` in the run directory when None.
+        say: Receives progress messages.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ConfigError: If options are out of range, do not fit the run, or the field shows nothing.
+        MissingExtraError: For meshes and points without the extra ``export``.
+    """
+    options.check()
+    folder = out or trained.path / "export" / options.what
+    check_folder(folder)
+    require_writable(folder)
+    facts: dict[str, Any] = {
+        "what": options.what,
+        "run": str(trained.path),
+        "checkpoint": trained.checkpoint,
+        "step": trained.step,
+    }
+    if options.what == "planes":
+        write_planes(folder / "planes.safetensors", trained)
+        write_json(folder / "export.json", {**facts, "files": ["planes.safetensors"]})
+        return folder
+    times = export_times(options.times or str(1 if trained.is_static else TIMES))
+    threshold = options.threshold
+    if isinstance(trained.module.field, Tensor4D):
+        if threshold is not None:
+            raise ConfigError(
+                f"--threshold {threshold:g}: this field has a surface of its own and no density; "
+                "leave it out"
+            )
+    elif threshold is None:
+        threshold = find_threshold(trained, options.resolution, times[len(times) // 2])
+    if threshold is not None:
+        say(f"threshold   density {threshold:.4g}")
+    names = [f"{options.what}_{number:04d}.{options.form}" for number in range(len(times))]
+    files = [folder / name for name in names]
+    for _ in progress(_write_each(trained, options, threshold, times, files), len(times), "times"):
+        pass
+    write_json(
+        folder / "export.json",
+        {
+            **facts,
+            "files": names,
+            "times": times,
+            "resolution": options.resolution,
+            "threshold": threshold,
+        },
+    )
+    return folder
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder in which files of two exports would mix.
+
+    Raises:
+        ConfigError: If it holds files, or is one.
+    """
+    if folder.is_file():
+        raise ConfigError(f"--out {folder} is a file: name a folder")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise ConfigError(f"{folder} holds files already: empty it, or name another with --out")
+
+
+def _write_each(
+    trained: TrainedRun,
+    options: ExportOptions,
+    threshold: float | None,
+    times: Iterable[float],
+    files: Iterable[Path],
+) -> Iterable[Path]:
+    trimesh = require("trimesh", extra="export")
+    for time, path in zip(times, files, strict=True):
+        mesh = surface(trained, time, options.resolution, threshold)
+        if options.what == "points":
+            places, faces = trimesh.sample.sample_surface(mesh, options.count, seed=0)
+            normals = mesh.face_normals[faces]
+        else:
+            places, normals = mesh.vertices, mesh.vertex_normals
+        points = torch.tensor(places, dtype=torch.float32)
+        outward = torch.tensor(normals, dtype=torch.float32)
+        # What one sees of a soft surface lies a little below it.
+        depth = 0 if threshold is None else 2 / options.resolution
+        colours = surface_colours(trained, points - depth * outward, outward, time)
+        if options.form == "glb":
+            colours = _linear(colours)  # As its standard has it; PLY files are in sRGB.
+        pixels = (255 * colours).round().byte().numpy()
+        world = trained.frame.to_world(points).numpy()
+        if options.what == "points":
+            found = trimesh.PointCloud(world, colors=pixels)
+        else:
+            found = trimesh.Trimesh(world, mesh.faces, vertex_colors=pixels, process=False)
+        with replacing(path) as temporary:
+            scene = trimesh.Scene(found) if options.form == "glb" else found
+            temporary.write_bytes(scene.export(file_type=options.form))
+        yield path
+
+
+def _linear(colours: Tensor) -> Tensor:
+    """Colours of sRGB in proportion to light. [...]"""
+    return torch.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+
+
+@torch.no_grad()
+def surface(trained: TrainedRun, time: float, resolution: int, threshold: float | None) -> Any:
+    """The surface of one timestep, by marching cubes.
+
+    Args:
+        trained: The run.
+        time: From 0 to 1.
+        resolution: Grid points along each side of the field's cube.
+        threshold: Density of the surface; None for a field of signed distances, whose surface is
+            where they are 0.
+
+    Returns:
+        A closed ``trimesh.Trimesh`` in the field's frame, without colours.
+
+    Raises:
+        ConfigError: If there is no surface.
+    """
+    measure = require("skimage.measure", extra="export")
+    trimesh = require("trimesh", extra="export")
+    volume, empty = solidity(trained, time, resolution)
+    level = 0.0 if threshold is None else -math.expm1(-threshold * 2 / resolution)
+    if not float(volume.max()) > level:
+        raise ConfigError(_nothing(time, volume, threshold))
+    # Beyond the cube there is nothing, so that a surface is closed where it meets the cube.
+    padded = F.pad(volume, [1] * 6, value=empty).numpy()
+    # Faces turn counter-clockwise seen from where values are smaller.
+    vertices, faces, _, _ = measure.marching_cubes(
+        padded, level, gradient_direction="ascent", allow_degenerate=False
+    )
+    return trimesh.Trimesh((vertices - 0.5) * (2 / resolution) - 1, faces, process=False)
+
+
+def _nothing(time: float, volume: Tensor, threshold: float | None) -> str:
+    if threshold is None:
+        return f"at time {time:g} the field has no surface in its cube: train longer"
+    largest = float(volume.max())
+    most = -math.log1p(-largest) * len(volume) / 2 if largest < 1 else math.inf
+    return (
+        f"at time {time:g} the field's density is nowhere above the threshold {threshold:.4g}; the "
+        f"largest is {most:.4g}: set --threshold to less"
+    )
+
+
+@torch.no_grad()
+def solidity(trained: TrainedRun, time: float, resolution: int) -> tuple[Tensor, float]:
+    """How solid the field is at the centres of the cells of a grid, where its renderer looks.
+
+    That is the opacity of one cell, which interpolates better than a density, whose values in
+    solid things mean little; for a field of signed distances the depth below the surface, limited
+    to a cell on either side. Points in empty cells of the occupancy grid are not looked at.
+
+    Args:
+        trained: The run.
+        time: From 0 to 1.
+        resolution: Grid points along each side of the field's cube.
+
+    Returns:
+        Values on the CPU [resolution, resolution, resolution], axes x, y, z; and the value where
+        there is nothing.
+    """
+    field, renderer = trained.module.field, trained.module.renderer
+    device, cell = renderer.device, 2 / resolution
+    empty = -cell if isinstance(field, Tensor4D) else 0.0
+    volume = torch.full((resolution**3,), empty)
+    chunk = 2**15 if device.type == "cpu" else 2**19
+    for index in torch.arange(resolution**3).split(chunk):
+        place = torch.stack([index // resolution**2, index // resolution, index], dim=1)
+        points = ((place % resolution + 0.5) * cell - 1).to(device)
+        seen = _looked_at(trained, points, time).nonzero()[:, 0]
+        if not len(seen):
+            continue
+        points = points[seen]
+        times = torch.full_like(points[:, 0], time)
+        if isinstance(field, Tensor4D):
+            value = -field.distance(field.canonical(points, times))[0].clamp(-cell, cell)
+        else:
+            whole = not isinstance(field, ViewDependentField)
+            density = field(points, times)[1] if whole else field.geometry(points, times)[0]
+            value = -torch.expm1(-cell * density.float())
+        volume[index[seen.cpu()]] = value.nan_to_num(empty).cpu().float()
+    return volume.view(resolution, resolution, resolution), empty
+
+
+def _looked_at(trained: TrainedRun, points: Tensor, time: float) -> Tensor:
+    """Whether rays that pass points of the cube see what is there. bool [N]"""
+    renderer, field = trained.module.renderer, trained.module.field
+    if isinstance(renderer, GridRenderer) and renderer.skip_empty:
+        grid = renderer.grid
+        return grid.occupied[grid.cells(points, torch.full_like(points[:, 0], time))]
+    if isinstance(field, TiNeuVox):
+        low, high = field.bounds()
+        return ((points >= low) & (points <= high)).all(dim=1)
+    return torch.ones_like(points[:, 0], dtype=torch.bool)
+
+
+@torch.no_grad()
+def find_threshold(trained: TrainedRun, resolution: int, time: float) -> float:
+    """The density whose surface has the silhouettes that the field shows the training cameras.
+
+    A pixel lies in the field's silhouette where at least half of the light is stopped, and in the
+    surface's where its ray passes a density above the threshold. Of all thresholds it is the one
+    at which the two agree best, by intersection over union.
+
+    Args:
+        trained: The run.
+        resolution: Grid points along each side of the field's cube.
+        time: From 0 to 1.
+
+    Returns:
+        Density per unit length of the field's frame.
+
+    Raises:
+        ConfigError: If the field stops half of the light nowhere.
+    """
+    volume = solidity(trained, time, resolution)[0]
+    views, renderer = trained.scene.splits["train"], trained.module.renderer
+    shown, peaks = [], []
+    for index in range(0, len(views), -(-len(views) // CAMERAS)):
+        origins, directions = trained.frame.rays(*views.image_rays(index))
+        stride = -(-len(origins) // RAYS)
+        origins, directions = origins[::stride], directions[::stride]
+        image = renderer.image(
+            trained.module.field,
+            origins.to(renderer.device),
+            directions.to(renderer.device),
+            time,
+            trained.scene.background.to(renderer.device),
+        )
+        shown.append(image["opacity"].cpu() >= 0.5)
+        peaks.append(_peaks(volume, origins, directions))
+    inside, peak = torch.cat(shown), torch.cat(peaks)
+    if not inside.any():
+        raise ConfigError(
+            f"at time {time:g} the field stops half of the light in no pixel of the training "
+            "cameras, so that it has no silhouette: train longer, or set --threshold"
+        )
+    depths = torch.logspace(math.log10(THINNEST), math.log10(DENSEST), CANDIDATES)
+    hit = peak[:, None] > -torch.expm1(-depths)
+    both = (hit & inside[:, None]).sum(dim=0)
+    agreement = both / (hit | inside[:, None]).sum(dim=0)
+    best = (agreement >= agreement.max() - PLATEAU).nonzero()[:, 0]
+    return float(depths[best[len(best) // 2]]) * resolution / 2
+
+
+def _peaks(volume: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
+    """Largest value that rays pass in a grid over the cube, interpolated. [R]"""
+    near, far = ray_box(origins, directions)
+    share = (torch.arange(SAMPLES) + 0.5) / SAMPLES
+    distances = near[:, None] + (far - near)[:, None] * share
+    points = origins[:, None] + distances[..., None] * directions[:, None]
+    grid = volume.permute(2, 1, 0)[None, None].contiguous()
+    found = F.grid_sample(grid, points[None, None], align_corners=False)
+    return found[0, 0, 0].amax(dim=1) * (far > near)
+
+
+@torch.no_grad()
+def surface_colours(trained: TrainedRun, points: Tensor, normals: Tensor, time: float) -> Tensor:
+    """Colours of points on or below a surface, looked at against their normals.
+
+    Args:
+        trained: The run.
+        points: In the field's frame. [N, 3]
+        normals: Unit vectors out of the surface. [N, 3]
+        time: From 0 to 1.
+
+    Returns:
+        From 0 to 1, on the CPU. [N, 3]
+    """
+    field, device = trained.module.field, trained.module.renderer.device
+    colours = []
+    for part, normal in zip(points.split(2**15), normals.split(2**15), strict=True):
+        place, facing = part.to(device), -normal.to(device)
+        times = torch.full_like(place[:, 0], time)
+        if isinstance(field, Tensor4D):
+            _, slopes, features, _ = field.distance_and_slope(place, times)
+            colour = field.colour(place, slopes, features, facing)
+        elif field.view_dependent:
+            colour = field(place, times, facing)[0]
+        else:
+            colour = field(place, times)[0]
+        colours.append(colour.float().clamp(0, 1).cpu())
+    return torch.cat(colours)
+
+
+def write_planes(path: Path, trained: TrainedRun) -> None:
+    """Write an X-Planes field as safetensors; docs/recipes.md describes the layout.
+
+    Args:
+        path: The file.
+        trained: The run.
+
+    Raises:
+        ConfigError: If the run's field is another one.
+    """
+    field, renderer, frame = trained.module.field, trained.module.renderer, trained.frame
+    if not isinstance(field, XPlanes):
+        raise ConfigError(
+            f"--what planes: {trained.experiment.method.model.name} has no planes that X-Planes' "
+            "layout describes; mesh and points work with every model"
+        )
+    tensors = {f"planes.{name}": plane for name, plane in field.planes.items()}
+    tensors |= {f"decoder.{name}": value for name, value in field.decoder.state_dict().items()}
+    if isinstance(renderer, GridRenderer):
+        grid = renderer.grid
+        tensors["occupied"] = grid.occupied.view(grid.time_bins, *[grid.resolution] * 3)
+    names = TIME_PLANES[field.plane_set]
+    pairs = [[names[plane] for plane in pair] for pair in PLANE_SETS[field.plane_set]]
+    content = {
+        "format": 1,
+        "products": dict(zip(SPACE_PLANES, pairs or [[]] * 3, strict=True)),
+        "decoder": field.decoder.options,
+        "frame": {
+            "scale": frame.scale,
+            "rotation": frame.rotation.tolist(),
+            "centre": frame.centre.tolist(),
+        },
+    }
+    whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    with replacing(path) as temporary:
+        save_file(whole, temporary, metadata={"xplanes": json.dumps(content)})

@@ -293,20 +293,24 @@ def _add_view(commands: "argparse._SubParsersAction") -> None:
     parser = commands.add_parser("view", help="interactive viewer in the browser (extra: viewer)")
     _add_run(parser)
     parser.add_argument(
-        "--port", type=int, default=8080, help="port of the viewer; default: %(default)s"
+        "--port", type=int, default=8080, help="port; 0: any free one; default: %(default)s"
+    )
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address that is served; default: %(default)s"
     )
     parser.set_defaults(command=_view)
 
 
 def _view(options: argparse.Namespace) -> None:
-    from xplanes.errors import ConfigError
-    from xplanes.evaluation.viewer import Viewer
-    from xplanes.optional import require
+    from xplanes.evaluation.viewer import Viewer, check_address
 
-    if not 1 <= options.port <= 65535:
-        raise ConfigError(f"--port {options.port}: must lie between 1 and 65535")
-    require("viser", extra="viewer")
-    viewer = Viewer(_load(options), options.port)
+    check_address(options.host, options.port, key="--{} ")
+    trained = _load(options)
+    module = trained.module
+    viewer = Viewer(
+        module, trained.scene, lambda: module.renderer, host=options.host, port=options.port
+    )
+    viewer.tell(f"**{trained.path.name}**  \nstep {trained.step}, {trained.checkpoint}.ckpt")
     port = viewer.port
     _say(f"\nopen        http://localhost:{port}")
     _say(f"remotely    ssh -L {port}:localhost:{port} USER@THIS_MACHINE, then the same address")

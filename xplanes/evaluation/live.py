@@ -1,6 +1,7 @@
 """The viewer of a field that is training: `viewer=true`."""
 
 import logging
+import math
 import time
 from typing import Annotated, Any
 
@@ -17,7 +18,7 @@ from xplanes.training.module import RadianceModule
 logger = logging.getLogger(__name__)
 
 PATIENCE = 1.0
-"""Seconds that training waits for a picture at most."""
+"""Seconds that training waits for a picture at most, or as long as its last step took."""
 
 TOLD_SECONDS = 0.5
 """From one line about training to the next."""
@@ -71,9 +72,9 @@ class LiveViewer(Callback):
             lambda: pl_module.renderer_now,
             host=self.host,
             port=self.port,
-            patience=PATIENCE,
             trains=True,
         )
+        self._drawn = time.monotonic()
         print(f"viewer      http://localhost:{self.viewer.port}", flush=True)
 
     def on_train_batch_start(
@@ -96,9 +97,12 @@ class LiveViewer(Callback):
             viewer.tell(status(trainer, module))
             self._told = time.monotonic()
         # For as long as the step took: a camera need not wait for a step at each picture.
-        viewer.catch_up(time.monotonic() - self._drawn)
+        stepped = time.monotonic() - self._drawn
+        viewer.patience = max(PATIENCE, stepped)
+        viewer.catch_up(stepped)
         interrupt = find_callback(trainer, Interrupt)
         while viewer.paused and not (interrupt is not None and interrupt.asked):
+            viewer.patience = math.inf
             viewer.catch_up(PATIENCE)
             viewer.wait()
 

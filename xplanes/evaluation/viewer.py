@@ -31,9 +31,9 @@ LOOP_SECONDS = 4.0
 TICK_SECONDS = 0.04
 SETTLE_SECONDS = 0.25
 """How long a camera must rest before the picture is drawn in full."""
-MOVING_SECONDS = 0.1
+MOVING_SECONDS = 0.08
 """What a picture may take while the camera moves or time plays."""
-FEWEST = 24
+FEWEST = 16
 """Rows of a picture at least."""
 REFRESH_SECONDS, SHARE = 0.5, 3
 """A picture at rest is drawn anew, of a field that trains, when so many seconds and so many times
@@ -114,10 +114,10 @@ class Viewer:
         renderer: Gives the renderer for the next picture.
         host: Address to listen on.
         port: Port to listen on; the next free one if it is taken.
-        patience: Seconds that a picture at rest may take; larger ones become smaller.
         trains: Whether the field trains, and can be paused.
 
     Attributes:
+        patience: Seconds that a picture at rest may take; larger ones become smaller.
         step: Training step of the field; pictures are drawn anew once it changes.
         paused: Whether someone paused training.
 
@@ -133,14 +133,13 @@ class Viewer:
         *,
         host: str = HOST,
         port: int = PORT,
-        patience: float = math.inf,
         trains: bool = False,
     ) -> None:
         viser: Any = require("viser", extra="viewer")
         assert module.frame is not None
         self.module, self.scene, self.renderer = module, scene, renderer
         self.frame, self.views = module.frame, scene.splits["train"]
-        self.patience, self.trains = patience, trains
+        self.patience, self.trains = math.inf, trains
         self.step, self.paused, self.playing = 0, False, False
         self._browsers: dict[int, _Browser] = {}
         self._wake = threading.Event()
@@ -288,6 +287,7 @@ class Viewer:
     def _toggle_pause(self) -> None:
         self.paused = not self.paused
         self.pause.label = "Continue training" if self.paused else "Pause training"
+        self._refresh()
         self._wake.set()
 
     def _play(self) -> None:
@@ -393,12 +393,12 @@ class _Browser:
         )
         if picture is None:
             return
-        spent = max(time.monotonic() - now, 1e-6)
-        self.rate = 0.5 * (self.rate + shot.height * shot.width / spent)
         self.drawn, self.step, self.began = version, viewer.step, now
         self.sharp = resting or height >= int(viewer.size.value)
-        self.again = now + max(REFRESH_SECONDS, SHARE * spent)
         self._send(picture)
+        spent = max(time.monotonic() - now, 1e-6)
+        self.rate = 0.5 * (self.rate + shot.height * shot.width / spent)
+        self.again = now + max(REFRESH_SECONDS, SHARE * spent)
 
     def _send(self, picture: Picture) -> None:
         depth = None

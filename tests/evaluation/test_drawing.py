@@ -67,7 +67,9 @@ def grid_renderer(filled: ViewDependentField | None = None) -> GridRenderer:
     return GridRenderer(grid, 192)
 
 
-def views_of(frame: Frame = FLAT, alpha: Tensor | None = None, times: Tensor | None = None) -> Views:
+def views_of(
+    frame: Frame = FLAT, alpha: Tensor | None = None, times: Tensor | None = None
+) -> Views:
     poses = orbit(4, radius=3 / frame.scale, elevation=10, target=frame.centre)
     images = torch.zeros(4, SIZE, SIZE, 4, dtype=torch.uint8)
     if alpha is not None:
@@ -85,9 +87,7 @@ def drawn(
     field: Any, renderer: RayRenderer, wanted: Shot, views: Views | None = None, **more: Any
 ) -> Picture:
     views = views_of() if views is None else views
-    found = draw(
-        field, renderer, wanted, views=views, frame=FLAT, background=torch.ones(3), **more
-    )
+    found = draw(field, renderer, wanted, views=views, frame=FLAT, background=torch.ones(3), **more)
     assert found is not None
     return found
 
@@ -176,6 +176,22 @@ def test_every_renderer_crops(name: str):
     assert float(opacity[through].max()) > 0.02
 
 
+@pytest.mark.parametrize("distance", [1.9, 8.0])
+def test_bounds_of_the_training_cameras_do_not_cut_the_scene_off(distance: float):
+    field = every_renderer()["fixed step"][0]
+    options: Any = {"step": 0.5, "threshold": 1e-4}
+    bounded = FixedStepRenderer(field, near=1.5, far=4.5, **options)
+    free = FixedStepRenderer(field, near=0.01, far=20.0, **options)
+    pose = look_at(torch.tensor([[0.0, -distance, 0.0]]))[0]
+    wanted = shot(pose=pose, fov=1.5 / distance, mode="opacity")
+    cut = bounded.image(field, *wanted.rays(), 0.0, torch.ones(3))["depth"].view(SIZE, 36)
+    found, expected = (drawn(field, renderer, wanted) for renderer in (bounded, free))
+    torch.testing.assert_close(found.colours, expected.colours, atol=0.02, rtol=0)
+    seen = expected.depth.isfinite() & found.depth.isfinite()
+    torch.testing.assert_close(found.depth[seen], expected.depth[seen], atol=0.1, rtol=0)
+    assert float((cut - expected.depth)[seen].abs().min()) > 0.3
+
+
 def test_a_background_stays_where_the_scene_is_cropped():
     field: Any = Balls(FRONT)
     torch.manual_seed(0)
@@ -198,7 +214,9 @@ def test_floaters_are_what_no_silhouette_covers(hidden: bool):
     both = Balls(FRONT, floater)
     alpha = []
     for pose in views_of().camera_to_world:
-        seen = drawn(there, grid_renderer(), shot(pose=pose, aspect=1.0, fov=2 * math.atan(1 / 2.4)))
+        seen = drawn(
+            there, grid_renderer(), shot(pose=pose, aspect=1.0, fov=2 * math.atan(1 / 2.4))
+        )
         alpha.append(255 * seen.depth.isfinite())
     # Views of other times show nothing, and are not looked at.
     views = views_of(alpha=torch.stack(alpha))

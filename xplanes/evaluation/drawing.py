@@ -91,9 +91,7 @@ class Masked:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._field, name)
 
-    def __call__(
-        self, points: Tensor, times: Tensor, *directions: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def __call__(self, points: Tensor, times: Tensor, *directions: Tensor) -> tuple[Tensor, Tensor]:
         """As `RadianceField.forward`."""
         colour, density = self._field(points, times, *directions)
         return colour, density * self._keep(points)
@@ -147,18 +145,21 @@ def draw(
     if shot.mode == "floaters":
         outside = Masked(shown, ruled_out(views, frame, shot.time))
     origins, directions = shot.rays()
+    moved = shift(renderer, shot.pose[:3, 3], views, frame)
     parts: list[Tensor] = []
-    for rays in zip(origins.split(at_once), directions.split(at_once), strict=True):
+    for rays in zip(
+        (origins + moved * directions).split(at_once), directions.split(at_once), strict=True
+    ):
         if stop():
             return None
-        given = (*(ray.to(device) for ray in rays), shot.time, background)
+        given = rays[0].to(device), rays[1].to(device), shot.time, background
         seen = (solid if box is not None else renderer).image(shown, *given)
         columns = [seen["colour"], seen["opacity"][:, None], seen["depth"][:, None]]
         if outside is not None:
             columns.append(solid.image(outside, *given)["opacity"][:, None])
         parts.append(torch.cat(columns, dim=1).float().cpu())
     image = torch.cat(parts).view(shot.height, shot.width, -1)
-    colours, opacity, depth = image[..., :3], image[..., 3], image[..., 4]
+    colours, opacity, depth = image[..., :3], image[..., 3], image[..., 4] + moved
     forward = (directions @ -shot.pose[:3, 2]).view_as(depth)
     if shot.mode == "depth":
         colours = depth_picture(depth, opacity)
@@ -168,6 +169,25 @@ def draw(
         colours = mark(colours, image[..., 5])
     nearest = torch.where(opacity >= 0.5, depth * forward, torch.inf)
     return Picture(colours.clamp(0, 1), nearest)
+
+
+def shift(renderer: RayRenderer, position: Tensor, views: Views, frame: Frame) -> float:
+    """How far along its rays a camera must be moved for a renderer with near and far bounds.
+
+    These bounds hold for cameras as far from the scene as the training cameras; from elsewhere they
+    would cut it off. A camera among things stays where its near bound begins behind it.
+
+    Args:
+        renderer: Has ``near``, in the field's frame, if it has such bounds.
+        position: The camera's, in the field's frame. [3]
+        views: Training views.
+        frame: The field's frame.
+    """
+    near = getattr(renderer, "near", None)
+    if near is None:
+        return 0.0
+    usual = frame.points(views.camera_to_world[:, :3, 3]).norm(dim=-1).median()
+    return max(float(position.norm() - usual), -near)
 
 
 def mark(colours: Tensor, share: Tensor) -> Tensor:

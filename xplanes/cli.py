@@ -325,14 +325,15 @@ def _view(options: argparse.Namespace) -> None:
 
 def _add_export(commands: "argparse._SubParsersAction") -> None:
     parser = commands.add_parser(
-        "export", help="write meshes, point clouds or planes for other programs (extra: export)"
+        "export", help="write meshes, point clouds, planes or camera paths for other programs"
     )
     _add_run(parser)
     parser.add_argument(
         "--what",
-        choices=["mesh", "points", "planes"],
+        choices=["mesh", "points", "planes", "path"],
         default="mesh",
-        help="what to write; planes of X-Planes alone; default: %(default)s",
+        help="what to write: mesh and points (extra: export), planes of X-Planes alone, or a path "
+        "of the training cameras; default: %(default)s",
     )
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="empty or new; default: RUN/export/WHAT"

@@ -19,7 +19,7 @@ Batch = dict[str, Tensor]
 NEAR_SILHOUETTE = 0.02
 """Share of the image's side around silhouettes that counts as near."""
 
-PER_TILE = 16
+PER_TILE = 32
 """Rays from one tile, of images in a file of tiles."""
 
 LEAST_TILES = 32

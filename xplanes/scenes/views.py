@@ -227,7 +227,7 @@ class Views:
         sights = self.intrinsics.sights or []
         return self.is_padded or any(each.has_ray is not None for each in sights)
 
-    @property
+    @cached_property
     def is_opaque(self) -> bool:
         """Whether no pixel lets the background through whole: alpha says nothing then."""
         for index in range(len(self)):

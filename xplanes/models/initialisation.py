@@ -128,7 +128,7 @@ class PreparationSettings(Settings):
     frames: Count  # Timesteps of the fixed-view video.
     fixed_view: Literal["auto", "video", "train"]  # The scene's video, or one rendered by a field.
     fixed_view_model: str  # Model of that field: a file of conf/model.
-    fixed_view_seconds: Positive  # Training time of that field in seconds.
+    fixed_view_seconds: Positive  # Maximum training time of that field in seconds.
     fixed_view_steps: Count  # Maximum number of training steps of that field.
     azimuth: float | None  # Azimuth of the fixed view in degrees; null: a world axis.
     elevation: Annotated[float, Range(-90, 90)]  # Elevation of the fixed view in degrees.

@@ -15,7 +15,7 @@ from torch import Tensor
 from xplanes.config import compose_plain
 from xplanes.fields.xplanes import XPlanes
 from xplanes.lrm.canonical import CanonicalView
-from xplanes.models.initialisation import Method, Place
+from xplanes.models.initialisation import Method, Place, PreparationSettings
 from xplanes.preparation.cache import StageCache
 from xplanes.scenes.cameras import camera_around
 from xplanes.scenes.errors import SceneError
@@ -228,9 +228,8 @@ def _rendered(
 
     def make() -> dict[str, Any]:
         place.say(
-            f"fixed view: training {options.fixed_view_model} for "
-            f"{options.fixed_view_seconds:g} s to render {count} frames from where the LRM's "
-            "camera stands"
+            f"fixed view: training {options.fixed_view_model} for {_budget(options)} to render "
+            f"{count} frames from where the LRM's camera stands"
         )
         with cache.workshop("fixed_view", inputs) as folder:
             module = _train(rendering, method, place, own_frame, folder)
@@ -244,11 +243,13 @@ def _rendered(
         Intrinsics.shared(focal, side, side, count),
         tuple(f"fixed_{number:03d}.png" for number in range(count)),
     )
-    words = (
-        f"{count} frames rendered by {options.fixed_view_model} "
-        f"trained for {options.fixed_view_seconds:g} s"
-    )
+    words = f"{count} frames rendered by {options.fixed_view_model} trained for {_budget(options)}"
     return FixedView(views, frame.centre, stage.seconds, words)
+
+
+def _budget(options: PreparationSettings) -> str:
+    """How long the field that renders the video is trained, in words."""
+    return f"up to {options.fixed_view_steps} steps or {options.fixed_view_seconds:g} s"
 
 
 def _intrinsics_key(intrinsics: Intrinsics) -> list[Tensor]:

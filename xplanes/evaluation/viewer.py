@@ -228,10 +228,13 @@ class Viewer:
         return bool(self.cameras.value or self.outline.visible)
 
     def _place_camera(self) -> None:
-        pose = orbit_poses(self.views, self.frame, 1)[0]
+        """Put browsers beside the training camera nearest to where videos begin."""
+        cameras = self.views.camera_to_world[:, :3, 3]
+        begin = orbit_poses(self.views, self.frame, 1)[0, :3, 3]
+        nearest = cameras[(cameras - begin).norm(dim=-1).argmin()]
         self.server.scene.set_up_direction(tuple(self.frame.rotation[:, 2].tolist()))
         start = self.server.initial_camera
-        start.position = tuple((AWAY * self.frame.points(pose[:3, 3])).tolist())
+        start.position = tuple((AWAY * self.frame.points(nearest)).tolist())
         start.look_at = (0.0, 0.0, 0.0)
         start.fov = self.views.intrinsics.fov_y
 

@@ -73,6 +73,7 @@ def commands() -> list[list[str]]:
     return [
         [*(["train"] if call["train"] else []), *shlex.split(call["rest"] or "", comments=True)]
         for page in PAGES
+        if page.name != "CONTRIBUTING.md"  # Its commands name components that the reader adds.
         for call in CALL.finditer(page.read_text(encoding="utf-8"))
     ]
 

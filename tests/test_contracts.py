@@ -50,6 +50,7 @@ OPTIONS = sorted(
     (path.parent.relative_to(CONF).as_posix(), path.stem)
     for path in CONF.rglob("*.yaml")
     if path.parent != CONF and not {"hydra", "pretrain"} & set(path.relative_to(CONF).parts)
+    if path.parent != CONF / "recipe" / "model"  # Chosen by recipe and model together.
 )
 """Every option of every group that train.py knows; tests/pretraining looks after the other."""
 
@@ -81,6 +82,7 @@ COMPOSITIONS = [
     ["data=multicamera", "model=tensor4d", "model/sampler=neus"],
     ["data=colmap", "model=tensor4d_density"],
     ["data=nerfies", "model=kplanes_explicit"],
+    ["recipe=paper", "preparation=paper"],
     ["model=tineuvox_b"],
     *(
         [f"{group}={name}" for group, name in both if name is not None]
@@ -146,7 +148,7 @@ def built(plain, scene):
 
 def test_there_is_something_to_test():
     groups = {group for group, _ in OPTIONS}
-    assert groups == {*KINDS, "trainer", "callbacks", "logger", "entry", "experiment"}
+    assert groups == {*KINDS, "trainer", "callbacks", "logger", "recipe", "entry", "experiment"}
 
 
 def test_every_option_is_composed():

@@ -88,7 +88,7 @@ def fixed_view(
             "(transforms_video.json); set preparation.fixed_view=train"
         )
     times = scene.splits["train"].times
-    count = 1 if scene.splits["train"].is_static else options.frames
+    count = 1 if scene.splits["train"].is_static else options.frames or len(times.unique())
     # A video without alpha shows a world around the thing, which LRMs would take for a part of it.
     whole = scene.video is not None and scene.is_surrounded and scene.video.is_opaque
     if scene.video is not None and (
@@ -215,6 +215,8 @@ def _rendered(
     # its ray origins are moved back.
     away = (train.camera_to_world[:, :3, 3] - frame.centre).norm(dim=-1).mean()
     back = float(away - (pose[:3, 3] - frame.centre).norm())
+    seconds = options.fixed_view_seconds
+    budget = f"{options.fixed_view_steps} steps" if seconds is None else f"{seconds:g} s"
     inputs = [
         train.identity,
         train.camera_to_world,
@@ -228,9 +230,8 @@ def _rendered(
 
     def make() -> dict[str, Any]:
         place.say(
-            f"fixed view: training {options.fixed_view_model} for "
-            f"{options.fixed_view_seconds:g} s to render {count} frames from where the LRM's "
-            "camera stands"
+            f"fixed view: training {options.fixed_view_model} for {budget} to render {count} "
+            "frames from where the LRM's camera stands"
         )
         with cache.workshop("fixed_view", inputs) as folder:
             module = _train(rendering, method, place, own_frame, folder)
@@ -244,10 +245,7 @@ def _rendered(
         Intrinsics.shared(focal, side, side, count),
         tuple(f"fixed_{number:03d}.png" for number in range(count)),
     )
-    words = (
-        f"{count} frames rendered by {options.fixed_view_model} "
-        f"trained for {options.fixed_view_seconds:g} s"
-    )
+    words = f"{count} frames rendered by {options.fixed_view_model} trained for {budget}"
     return FixedView(views, frame.centre, stage.seconds, words)
 
 

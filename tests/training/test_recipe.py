@@ -116,8 +116,8 @@ def test_the_largest_lrm_is_its_own_and_others_can_be_chosen() -> None:
 
 def test_baselines_refuse_it() -> None:
     for name in ("kplanes", "tensor4d"):
+        plain = compose_plain("train", ["recipe=paper", f"model={name}", "lrm=none"])
         with pytest.raises(ConfigError, match=r"model\.\S+: there is no such setting"):
-            plain = compose_plain("train", ["recipe=paper", f"model={name}", "lrm=none"])
             Experiment.read(plain)
 
 
@@ -159,7 +159,7 @@ def test_k_planes_terms_are_those_of_k_planes_on_the_same_planes() -> None:
     module, _ = module_of("model=six_planes", "model.loss.sparse_weight=0")
     field = module.field
     products = PlaneProducts(8, 8, [1], 3, low=0.0, high=1.0)
-    named = {name: plane for name, plane in products.planes()}
+    named = dict(products.planes())
     with torch.no_grad():
         for name, plane in field.planes.items():
             named[name][0].copy_(plane)

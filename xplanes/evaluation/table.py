@@ -124,7 +124,7 @@ class SweepTable(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         self._folder = Path(config.hydra.sweep.dir).absolute()
-        self._sheet = config.get("sheet")
+        self._sheet = getattr(config, "sheet", None)
         atexit.register(self._finish)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:

@@ -329,12 +329,14 @@ class XPlanesModel(Model):
     def _variation(self) -> list[tuple[Tensor, tuple[int, ...], float]]:
         """Stacks of planes, the axes along which they shall be smooth, and factors."""
         space, time = self._field.space, self._field.time
-        if self.weights.variation == "mean":
-            found = [(space, (1, 2), 1.0)]
-            return found if time is None else [*found, (time, (2,), 1.0)]
-        # Twice the sum over planes, in which space planes count twice (as `PlaneTerms`).
-        found = [(space, (1, 2), 4.0 * len(space))]
-        return found if time is None else [*found, (time, (1, 2), 2.0 * len(time))]
+        coded = self.weights.variation == "coded"
+        # Coded: twice the sum over planes, in which space planes count twice (as `PlaneTerms`).
+        found: list[tuple[Tensor, tuple[int, ...], float]] = [
+            (space, (1, 2), 4.0 * len(space) if coded else 1.0)
+        ]
+        if time is not None:
+            found.append((time, (1, 2), 2.0 * len(time)) if coded else (time, (2,), 1.0))
+        return found
 
     def _distance(self) -> float:
         """Sum over the planes' stacks of the mean squared distance from their initial values."""

@@ -128,7 +128,7 @@ class PreparationSettings(Settings):
     frames: Count | None  # Timesteps of the fixed-view video; null: as many as the views have.
     fixed_view: Literal["auto", "video", "train"]  # The scene's video, or one rendered by a field.
     fixed_view_model: str  # Model of that field: a file of conf/model.
-    fixed_view_seconds: Positive | None  # Training time of that field; null: no limit.
+    fixed_view_seconds: Positive | None  # Maximum training time of that field; null: no limit.
     fixed_view_steps: Count  # Maximum number of training steps of that field.
     azimuth: float | None  # Azimuth of the fixed view in degrees; null: a world axis.
     elevation: Annotated[float, Range(-90, 90)]  # Elevation of the fixed view in degrees.

@@ -15,7 +15,7 @@ from torch import Tensor
 from xplanes.config import compose_plain
 from xplanes.fields.xplanes import XPlanes
 from xplanes.lrm.canonical import CanonicalView
-from xplanes.models.initialisation import Method, Place
+from xplanes.models.initialisation import Method, Place, PreparationSettings
 from xplanes.preparation.cache import StageCache
 from xplanes.scenes.cameras import camera_around
 from xplanes.scenes.errors import SceneError
@@ -215,8 +215,6 @@ def _rendered(
     # its ray origins are moved back.
     away = (train.camera_to_world[:, :3, 3] - frame.centre).norm(dim=-1).mean()
     back = float(away - (pose[:3, 3] - frame.centre).norm())
-    seconds = options.fixed_view_seconds
-    budget = f"{options.fixed_view_steps} steps" if seconds is None else f"{seconds:g} s"
     inputs = [
         train.identity,
         train.camera_to_world,
@@ -230,8 +228,8 @@ def _rendered(
 
     def make() -> dict[str, Any]:
         place.say(
-            f"fixed view: training {options.fixed_view_model} for {budget} to render {count} "
-            "frames from where the LRM's camera stands"
+            f"fixed view: training {options.fixed_view_model} for {_budget(options)} to render "
+            f"{count} frames from where the LRM's camera stands"
         )
         with cache.workshop("fixed_view", inputs) as folder:
             module = _train(rendering, method, place, own_frame, folder)
@@ -245,8 +243,14 @@ def _rendered(
         Intrinsics.shared(focal, side, side, count),
         tuple(f"fixed_{number:03d}.png" for number in range(count)),
     )
-    words = f"{count} frames rendered by {options.fixed_view_model} trained for {budget}"
+    words = f"{count} frames rendered by {options.fixed_view_model} trained for {_budget(options)}"
     return FixedView(views, frame.centre, stage.seconds, words)
+
+
+def _budget(options: PreparationSettings) -> str:
+    """How long the field that renders the video is trained, in words."""
+    steps, seconds = options.fixed_view_steps, options.fixed_view_seconds
+    return f"{steps} steps" if seconds is None else f"up to {steps} steps or {seconds:g} s"
 
 
 def _intrinsics_key(intrinsics: Intrinsics) -> list[Tensor]:

@@ -150,13 +150,14 @@ def draw(rows: Sequence[dict[str, object]], path: Path) -> None:
     figure.savefig(path, format="png", dpi=110)
 
 
-def nearest(rows: Sequence[dict[str, object]], sweep: str) -> str:
-    """Where the mean rank over all LRMs, scenes and planes is nearest to the published one."""
+def nearest(rows: Sequence[dict[str, object]], sweep: str) -> tuple[float, str]:
+    """Where the mean rank over LRMs, scenes and planes is nearest to the published one."""
     chosen = [row for row in rows if row["sweep"] == sweep]
     values = sorted({float(str(row["value"])) for row in chosen})
-    ranks = {v: mean([row for row in chosen if row["value"] == v], "rank") for v in values}
-    best = min(values, key=lambda value: abs(ranks[value] - PUBLISHED))
-    return f"{best:g} (mean rank {ranks[best]:.2f})"
+    at = {value: [row for row in chosen if row["value"] == value] for value in values}
+    best = min(values, key=lambda value: abs(mean(at[value], "rank") - PUBLISHED))
+    rank, converged = mean(at[best], "rank"), 100 * mean(at[best], "converged")
+    return best, f"{best:g} (mean rank {rank:.2f}, {converged:.0f}% converged)"
 
 
 def main() -> None:
@@ -171,6 +172,7 @@ def main() -> None:
     found = tables(rows)
     units = [float(str(row["value"])) for row in rows if row["sweep"] == "paper"]
     ranks = [float(str(row["rank"])) for row in rows if row["sweep"] == "paper"]
+    product = nearest(rows, "mu x scale")
     size = 1 / math.sqrt(matrices(args.scenes[0], args.lrms[0], args.root)[0].shape[0])
     args.out.mkdir(parents=True, exist_ok=True)
     draw(rows, args.out / "rank_curve.png")
@@ -198,7 +200,7 @@ features' rms is {min(units):.2f} to {max(units):.2f}.
 Solved to a relative residual of 1e-4 (`method=adaptive`). The solution does not depend on mu or on
 the scale of the features: L and S grow with them. The usual choice, one over the root of the number
 of rows, is {size:.4f} for `{args.lrms[0]}`. The rank is nearest to the published one at
-lambda = {nearest(rows, "lambda")}.
+lambda = {nearest(rows, "lambda")[1]}.
 
 {found["lambda"]}
 
@@ -206,8 +208,7 @@ lambda = {nearest(rows, "lambda")}.
 
 The paper's ADMM (`method=admm`, lambda {LAMBDA}) on features with an rms of value / {MU}, until
 the residual is {TOLERANCE:g} or for 500 iterations. The rank is nearest to the published one at
-mu times rms = {nearest(rows, "mu x scale")}: far from convergence, on features with an
-rms of a few thousandths.
+mu times rms = {product[1]}: features with an rms of {product[0] / MU:g}.
 
 {found["mu x scale"]}
 

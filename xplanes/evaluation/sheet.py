@@ -115,7 +115,8 @@ def _parts(found: dict[Path, RunRow], over: Sequence[str]) -> list[tuple[str, li
 
 
 def _title(row: RunRow, over: Sequence[str]) -> str:
-    return " · ".join(filter(None, (str(row.settings.get(SCENE, "")), run_label(row, over))))
+    label = run_label(row, over) if over else ""
+    return " · ".join(filter(None, (str(row.settings.get(SCENE, "")), label)))
 
 
 def _views(

@@ -34,6 +34,7 @@ def scripts(folder: Path) -> dict[str, list[list[str]]]:
         "decomposition_speed": [[]],
         "decomposition_stress": [[]],
         "conversion_options": [[]],
+        "rank_curve": [[]],
         "stability": [[]],
         "faults": [[]],
     }

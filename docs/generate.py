@@ -270,6 +270,8 @@ NODES = {
 """Groups of components that have names of their own."""
 
 SETS = {
+    "recipe": "A way to train; see [the method and the paper](paper.md).",
+    "scale": "How large an experiment is.",
     "experiment": "Settings for a purpose; most are sweeps.",
     "entry": "One model with its initialisation, as a row of a table: "
     "`entry=six_planes_tiny,kplanes`.",

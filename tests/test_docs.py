@@ -1,6 +1,7 @@
 """Pages that are generated are up to date, and the pages' commands and keys are real."""
 
 import os
+import pkgutil
 import re
 import runpy
 import shlex
@@ -124,3 +125,15 @@ def test_keys_in_the_text_of_the_pages_exist() -> None:
         if key.rpartition(".")[2].isupper() or "NAME" in key:
             continue
         assert key in known, f"{page}: {key}{near_names(f'{key!r} is no Key')}"
+
+
+CODE = re.compile(r"`(xplanes(?:\.\w+)+)`")
+"""A module, class or function in the text of a page."""
+
+
+def test_code_named_in_the_text_of_the_pages_exists() -> None:
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    named = sorted(set(CODE.findall(text)))
+    assert len(named) > 12
+    for name in named:
+        assert pkgutil.resolve_name(name), name

@@ -74,7 +74,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     commands.add_parser("train", help="train a field: key=value ..., and the options of Hydra")
     verbs = (_add_download, _add_inspect, _add_triplanes, _add_evaluate, _add_render, _add_view)
-    for add in (*verbs, _add_export, _add_table, _add_pretrain, _add_score):
+    for add in (*verbs, _add_export, _add_table, _add_sheet, _add_pretrain, _add_score):
         add(commands)
     return parser
 
@@ -403,6 +403,52 @@ def _table(options: argparse.Namespace) -> None:
     from xplanes.evaluation.table import write_tables
 
     print(write_tables(options.folder, options.out), end="")
+
+
+def _add_sheet(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser(
+        "sheet", help="put pictures of runs side by side: the same view over runs or steps"
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="a run, or a folder of runs")
+    parser.add_argument(
+        "--what",
+        choices=["runs", "steps", "parts"],
+        default="runs",
+        help="a column per run, a column per step, or the low-rank and sparse parts of the LRM's "
+        "triplanes; default: %(default)s",
+    )
+    parser.add_argument(
+        "--show",
+        choices=["colour", "error", "depth"],
+        default="colour",
+        help="what is shown of a view; default: %(default)s",
+    )
+    parser.add_argument("--view", help="a view, as named in RUN/media; default: one that all show")
+    parser.add_argument("--steps", help="steps, separated by commas; default: all, or the last")
+    parser.add_argument(
+        "--size", type=int, default=160, help="pixels of a picture; default: %(default)s"
+    )
+    parser.add_argument("--out", type=Path, metavar="FILE.png", help="default: sheet.png in FOLDER")
+    parser.set_defaults(command=_sheet)
+
+
+def _sheet(options: argparse.Namespace) -> None:
+    from xplanes.errors import ConfigError
+    from xplanes.evaluation.sheet import write_sheet
+
+    words = [] if options.steps is None else options.steps.split(",")
+    if not all(word.strip().isdecimal() for word in words):
+        raise ConfigError(f"--steps {options.steps}: must be numbers separated by commas")
+    path = write_sheet(
+        options.folder,
+        options.out,
+        what=options.what,
+        show=options.show,
+        view=options.view,
+        steps=[int(word) for word in words] or None,
+        size=options.size,
+    )
+    _say(f"wrote {path}")
 
 
 def _add_pretrain(commands: "argparse._SubParsersAction") -> None:

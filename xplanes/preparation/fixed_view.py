@@ -88,7 +88,7 @@ def fixed_view(
             "(transforms_video.json); set preparation.fixed_view=train"
         )
     times = scene.splits["train"].times
-    count = 1 if scene.splits["train"].is_static else options.frames
+    count = 1 if scene.splits["train"].is_static else options.frames or len(times.unique())
     # A video without alpha shows a world around the thing, which LRMs would take for a part of it.
     whole = scene.video is not None and scene.is_surrounded and scene.video.is_opaque
     if scene.video is not None and (
@@ -249,7 +249,8 @@ def _rendered(
 
 def _budget(options: PreparationSettings) -> str:
     """How long the field that renders the video is trained, in words."""
-    return f"up to {options.fixed_view_steps} steps or {options.fixed_view_seconds:g} s"
+    steps, seconds = options.fixed_view_steps, options.fixed_view_seconds
+    return f"{steps} steps" if seconds is None else f"up to {steps} steps or {seconds:g} s"
 
 
 def _intrinsics_key(intrinsics: Intrinsics) -> list[Tensor]:

@@ -1,12 +1,17 @@
 """Differentiable rasterisation of 3D Gaussians (Kerbl et al. 2023)."""
 
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from xplanes.rendering.gaussians import reference
+from xplanes.backend import compiled, cpu_loops
 from xplanes.rendering.gaussians.camera import Camera
+from xplanes.rendering.gaussians.reference import Projection, blend, project
 
 
 class GaussianError(ValueError):
@@ -72,35 +77,151 @@ def rasterise(
         **{"opacities": opacities, "colours": colours},
     }
     _check(given, background)
-    projection = reference.project(means, quaternions, scales, camera)
-    if antialiased:
-        opacities = opacities * projection.compensation
-    drawn = _drawn(projection, opacities, camera)
-    colour, opacity = reference.blend(
-        projection.means,
-        projection.whitening,
-        opacities,
-        torch.cat([colours, projection.depths[:, None]], dim=1),
-        projection.depths,
-        drawn,
-        camera,
-    )
-    colour, depth = colour[..., :-1], colour[..., -1]
+    draw = _draw if cpu_loops(means) and means.dtype == torch.float32 else _draw_reference
+    projection, image, opacity = draw(*given.values(), camera, antialiased)
+    colour, depth = image[..., :-1], image[..., -1]
     if background is not None:
         colour = colour + (1 - opacity)[..., None] * background.to(colour)
-    radii = torch.where(drawn, reference.longest_radii(projection.whitening), 0).long()
-    return RasterisedImage(
-        colour, opacity, depth / opacity.clamp(min=1e-10), radii, projection.means
-    )
+    depth = depth / opacity.clamp(min=1e-10)
+    return RasterisedImage(colour, opacity, depth, projection.radii, projection.means)
 
 
-def _drawn(projection: reference.Projection, opacities: Tensor, camera: Camera) -> Tensor:
-    """Which Gaussians reach a pixel of the image. bool [N]"""
-    means = projection.means.detach()
-    extent = reference.extents(projection.whitening.detach(), opacities.detach())
-    size = extent.new_tensor([camera.width, camera.height])
-    touches = ((means + extent > 0) & (means - extent < size)).all(-1)
-    return projection.valid & touches & (opacities.detach() >= reference.LEAST_ALPHA)
+def _draw_reference(
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colours: Tensor,
+    camera: Camera,
+    antialiased: bool,
+) -> tuple[Projection, Tensor, Tensor]:
+    """The projection, and sums of colours and depths and the opacity of its pixels."""
+    projection = project(means, quaternions, scales, opacities, camera, antialiased=antialiased)
+    features = torch.cat([colours, projection.depths[:, None]], dim=1)
+    return projection, *blend(projection, features, camera)
+
+
+def _draw(
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colours: Tensor,
+    camera: Camera,
+    antialiased: bool,
+) -> tuple[Projection, Tensor, Tensor]:
+    """The same in compiled loops."""
+    parts = _Project.apply(means, quaternions, scales, opacities, camera, antialiased)
+    projection = Projection(*parts)  # type: ignore[misc]
+    features = torch.cat([colours, projection.depths[:, None]], dim=1)
+    return projection, *_Blend.apply(*parts, features, camera)  # type: ignore[misc]
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quaternions: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        camera: Camera,
+        antialiased: bool,
+    ) -> tuple[Tensor, ...]:
+        cpu = compiled("xplanes.rendering.gaussians.cpu")
+        inputs = [t.contiguous() for t in (means, quaternions, scales, opacities)]
+        ctx.camera = np.array(
+            [
+                *camera.world_to_camera[:3].double().flatten().tolist(),
+                *(camera.fx, camera.fy, camera.cx, camera.cy),
+                *camera.slant,
+            ]
+        )
+        ctx.antialiased, count = antialiased, len(means)
+        shapes = ((count, 2), (count, 3), (count,), (count,))
+        outputs = [means.new_empty(shape) for shape in shapes]
+        outputs.append(means.new_empty(count, dtype=torch.int64))
+        cpu.project(
+            *(t.detach().numpy() for t in inputs),
+            ctx.camera,
+            *(camera.near, camera.far, antialiased, camera.width, camera.height),
+            *(t.numpy() for t in outputs),
+        )
+        ctx.save_for_backward(*inputs, outputs[-1])
+        ctx.mark_non_differentiable(outputs[-1])
+        return tuple(outputs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        cpu = compiled("xplanes.rendering.gaussians.cpu")
+        *inputs, radii = ctx.saved_tensors
+        found = [torch.empty_like(t) for t in inputs]
+        cpu.project_backward(
+            *(t.detach().numpy() for t in inputs),
+            *(ctx.camera, ctx.antialiased, radii.numpy()),
+            *(t.contiguous().numpy() for t in gradients[:-1]),
+            *(t.numpy() for t in found),
+        )
+        return *found, None, None
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        whitening: Tensor,
+        depths: Tensor,
+        opacities: Tensor,
+        radii: Tensor,
+        features: Tensor,
+        camera: Camera,
+    ) -> tuple[Tensor, Tensor]:
+        cpu = compiled("xplanes.rendering.gaussians.cpu")
+        order = cpu.depth_order(depths.numpy(), radii.numpy())
+        channels = -(-features.shape[1] // cpu.GROUP) * cpu.GROUP
+        geometry = np.empty((len(order), cpu.GEOMETRY), np.float32)
+        gathered = np.empty((len(order), channels), np.float32)
+        arrays = [t.detach().numpy() for t in (means, whitening, opacities, features)]
+        cpu.gather(order, *arrays, geometry, gathered)
+        columns, rows = -(-camera.width // cpu.TILE_WIDTH), -(-camera.height // cpu.TILE_HEIGHT)
+        slots = np.zeros(len(order) + 1, np.int64)
+        cpu.count_tiles(geometry, columns, rows, slots[1:])
+        slots.cumsum(out=slots)
+        tiles, owners = np.empty((2, slots[-1]), np.int32)
+        cpu.list_tiles(geometry, columns, rows, slots, tiles, owners)
+        members, starts = cpu.bin_tiles(tiles, columns * rows)
+        image = means.new_empty(camera.height, camera.width, channels)
+        state = np.empty((columns * rows, 2, cpu.PIXELS), np.float32)
+        opacity = means.new_empty(camera.height, camera.width)
+        blended = (geometry, gathered, owners, members, starts, columns)
+        cpu.blend(*blended, image.numpy(), opacity.numpy(), state)
+        ctx.order, ctx.slots, ctx.blended, ctx.state = order, slots, blended, state
+        ctx.shapes = [t.shape for t in (means, whitening, opacities, features)]
+        return image[..., : features.shape[1]], opacity
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, d_image: Tensor, d_opacity: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        cpu = compiled("xplanes.rendering.gaussians.cpu")
+        geometry, gathered = ctx.blended[:2]
+        partial = np.empty((ctx.slots[-1], cpu.MOMENTS + gathered.shape[1]), np.float32)
+        padded = F.pad(d_image, (0, gathered.shape[1] - d_image.shape[2]))
+        cpu.blend_backward(
+            *ctx.blended,
+            ctx.state,
+            *(padded.contiguous().numpy(), d_opacity.contiguous().numpy()),
+            partial,
+        )
+        d_means, d_whitening, d_opacities, d_features = (d_image.new_zeros(s) for s in ctx.shapes)
+        found = [t.numpy() for t in (d_means, d_whitening, d_opacities, d_features)]
+        cpu.scatter(ctx.order, geometry, ctx.slots, partial, *found)
+        return d_means, d_whitening, None, d_opacities, None, d_features, None
 
 
 def _check(given: dict[str, Tensor], background: Tensor | None) -> None:

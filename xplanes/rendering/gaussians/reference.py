@@ -3,7 +3,6 @@
 Zwicker et al. 2002 (EWA splatting), Kerbl et al. 2023 (3D Gaussian splatting).
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -40,22 +39,28 @@ class Projection:
         whitening: Entries xx, xy and yy of the upper triangular W with W^T W the inverse of the
             covariance: W times an offset in pixels is the offset in standard deviations. [N, 3]
         depths: Of the means, along the camera's axis. [N]
-        compensation: Share of a Gaussian's peak that the low-pass filter leaves. [N]
-        valid: Whether its mean lies between near and far and its projection is finite. bool [N]
+        opacities: Alpha at the means. [N]
+        radii: See `RasterisedImage`; 0 for those that are not drawn, whose other numbers mean
+            nothing. int64 [N]
     """
 
     means: Tensor
     whitening: Tensor
     depths: Tensor
-    compensation: Tensor
-    valid: Tensor
+    opacities: Tensor
+    radii: Tensor
 
 
-def project(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) -> Projection:
-    """Project Gaussians by the linearised perspective of EWA splatting.
-
-    Arguments as in `rasterise`.
-    """
+def project(
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    camera: Camera,
+    *,
+    antialiased: bool,
+) -> Projection:
+    """Project Gaussians by the linearised perspective of EWA splatting; arguments of `rasterise`."""
     world_to_camera = camera.world_to_camera.to(means)
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     x, y, z = (means @ rotation.T + translation).unbind(-1)
@@ -64,25 +69,32 @@ def project(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) 
     left, right, top, bottom = camera.slant
     slant_x, slant_y = (x / z).clamp(left, right), (y / z).clamp(top, bottom)
     zero = torch.zeros_like(z)
-    jacobian = torch.stack(
-        [camera.fx / z, zero, -camera.fx * slant_x / z]
-        + [zero, camera.fy / z, -camera.fy * slant_y / z],
-        dim=-1,
-    ).view(-1, 2, 3)
-    root = jacobian @ rotation @ rotations(quaternions) * scales[:, None, :]
-    along_x, along_y = root.unbind(1)
-    # The covariance is root root^T + LOW_PASS. Its determinant from areas: no difference of large
-    # numbers, however thin the Gaussian.
-    area = torch.linalg.cross(along_x, along_y).norm(dim=-1)
-    xx, yy = along_x.square().sum(-1), along_y.square().sum(-1)
+    along_x = torch.stack([camera.fx / z, zero, -camera.fx * slant_x / z], dim=-1)
+    along_y = torch.stack([zero, camera.fy / z, -camera.fy * slant_y / z], dim=-1)
+    jacobian = torch.stack([along_x, along_y], dim=1)
+    root = jacobian @ rotation @ rotations(quaternions) * scales[:, None, :]  # [N, 2, 3]
+    # The covariance is root root^T + LOW_PASS. Its determinant is made of areas, without a
+    # difference of large numbers, however thin the Gaussian.
+    area = torch.linalg.cross(root[:, 0], root[:, 1]).norm(dim=-1)
+    xx, yy = root.square().sum(-1).unbind(-1)
     determinant = area.square() + LOW_PASS * (xx + yy) + LOW_PASS**2
-    yy = yy + LOW_PASS
+    xx, yy = xx + LOW_PASS, yy + LOW_PASS
+    xy = (root[:, 0] * root[:, 1]).sum(-1)
     first = (yy / determinant).sqrt()
-    shear = -(along_x * along_y).sum(-1) / yy
+    whitening = torch.stack([first, -first * xy / yy, yy.rsqrt()], dim=-1)
     projected = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
-    whitening = torch.stack([first, first * shear, yy.rsqrt()], dim=-1)
-    finite = projected.isfinite().all(-1) & whitening.isfinite().all(-1) & (whitening[:, 0] > 0)
-    return Projection(projected, whitening, z, area / determinant.sqrt(), valid & finite)
+    if antialiased:
+        opacities = opacities * area / determinant.sqrt()
+    with torch.no_grad():
+        finite = projected.isfinite().all(-1) & whitening.isfinite().all(-1)
+        positive = (whitening[:, ::2] > 0).all(-1)
+        extent = extents(whitening, opacities)
+        size = extent.new_tensor([camera.width, camera.height])
+        touches = ((projected + extent > 0) & (projected - extent < size)).all(-1)
+        drawn = valid & finite & positive & touches & (opacities >= LEAST_ALPHA)
+        longest = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
+        radii = torch.where(drawn, (3 * longest.sqrt()).ceil().clamp(max=1e9), 0).long()
+    return Projection(projected, whitening, z, opacities, radii)
 
 
 def rotations(quaternions: Tensor) -> Tensor:
@@ -108,33 +120,26 @@ def extents(whitening: Tensor, opacities: Tensor) -> Tensor:
     return reach[:, None] * torch.stack([deviation_x, deviation_y], dim=-1)
 
 
-def blend(
-    means: Tensor,
-    whitening: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    depths: Tensor,
-    visible: Tensor,
-    camera: Camera,
-) -> tuple[Tensor, Tensor]:
+def blend(projection: Projection, features: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Blend projected Gaussians from front to back, one tile of the image after the other.
 
     Args:
-        means: See `Projection`. [N, 2]
-        whitening: See `Projection`. [N, 3]
-        opacities: Alpha at the means. [N]
+        projection: Gaussians of equal depth keep their order.
         features: What is blended. [N, K]
-        depths: By which Gaussians are sorted; those of equal depth keep their order. [N]
-        visible: Which of them to draw. bool [N]
         camera: Size of the image.
 
     Returns:
         Sums of weight times feature, and opacity. [H, W, K], [H, W]
     """
-    order = depths.detach().argsort(stable=True)
-    order = order[visible[order]]
-    extent = extents(whitening.detach(), opacities.detach())[order] + 1  # A pixel for rounding.
-    low, high = means.detach()[order] - extent, means.detach()[order] + extent
+    order = projection.depths.detach().argsort(stable=True)
+    order = order[projection.radii[order] > 0]
+    means, whitening, opacities = (
+        t[order] for t in (projection.means, projection.whitening, projection.opacities)
+    )
+    features = features[order]
+    with torch.no_grad():
+        extent = extents(whitening, opacities) + 1  # A pixel for rounding.
+        low, high = means - extent, means + extent
     rows = []
     for top in range(0, camera.height, TILE):
         bottom = min(top + TILE, camera.height)
@@ -142,12 +147,9 @@ def blend(
         for left in range(0, camera.width, TILE):
             right = min(left + TILE, camera.width)
             near = (low < low.new_tensor([right, bottom])) & (high > low.new_tensor([left, top]))
-            columns.append(
-                _blend_tile(
-                    *(t[order[near.all(-1)]] for t in (means, whitening, opacities, features)),
-                    (top, bottom, left, right),
-                )
-            )
+            members = near.all(-1).nonzero()[:, 0]
+            given = (t[members] for t in (means, whitening, opacities, features))
+            columns.append(_blend_tile(*given, box=(top, bottom, left, right)))
         rows.append(torch.cat(columns, dim=1))
     image = torch.cat(rows)
     return image[..., :-1], image[..., -1]
@@ -158,9 +160,10 @@ def _blend_tile(
     whitening: Tensor,
     opacities: Tensor,
     features: Tensor,
+    *,
     box: tuple[int, int, int, int],
 ) -> Tensor:
-    """Features and opacity of the pixels in ``box`` from Gaussians sorted by depth. [h, w, K + 1]"""
+    """Features and opacity of the pixels of a box; Gaussians sorted by depth. [h, w, K + 1]"""
     top, bottom, left, right = box
     y = torch.arange(top, bottom).to(means)[:, None, None] + 0.5 - means[:, 1]
     x = torch.arange(left, right).to(means)[:, None] + 0.5 - means[:, 0]
@@ -172,13 +175,3 @@ def _blend_tile(
     before = torch.cat([torch.ones_like(x + y)[..., :1], after[..., :-1]], dim=-1)
     weights = alpha * before
     return torch.cat([weights @ features, weights.sum(-1, keepdim=True)], dim=-1)
-
-
-def longest_radii(whitening: Tensor) -> Tensor:
-    """Three standard deviations along the longest axis, rounded up to pixels. [N]"""
-    first, shear, last = whitening.detach().double().unbind(-1)
-    # Eigenvalues of the inverse covariance: the smaller one without a difference of large numbers.
-    xx, xy, yy = first * first, first * shear, shear * shear + last * last
-    larger = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
-    smaller = (first * last).square() / larger
-    return (3 / smaller.sqrt()).ceil().clamp(max=math.ceil(1e9))

@@ -24,7 +24,7 @@ COMPILE = {**EXACT, "fastmath": {"contract"}}
 SUMS = {**EXACT, "fastmath": {"contract", "reassoc"}}
 """For loops whose sums may take vector registers, in an order that is the same each time."""
 
-TILE_WIDTH, TILE_HEIGHT = 16, 16
+TILE_WIDTH, TILE_HEIGHT = 16, 32
 """Pixels of a tile. A row fills a vector register, or a few of them."""
 
 PIXELS = TILE_WIDTH * TILE_HEIGHT
@@ -47,10 +47,11 @@ SLACK = 1.001
 
 # Planes of a tile's buffer: the pixels' centres, what of the light is left for the next Gaussian
 # (0 once a pixel is done), what is left in the end, the member before which the pixel was done, and
-# opacity and features or their gradients. All lie in one array: the compiler must see that they are apart.
-X, Y, LIGHT, LEFT, STOP, OPACITY, FEATURES = (np.int64(n * PIXELS) for n in range(7))
+# opacity and features or their gradients. All lie in one array: the compiler must see that no write
+# to one changes another, or it leaves vector registers alone.
+X, Y, LIGHT, LEFT, STOP, OPACITY, F0, F1, F2, F3 = range(10)
 BEHIND = LIGHT
-BUFFER = int(FEATURES) + GROUP * PIXELS
+PLANES = 10
 
 f32 = np.float32
 
@@ -125,7 +126,7 @@ def project(
     peaks,
     radii,
 ):
-    """Fills the last five. ``camera``: the pose's first three rows, fx, fy, cx, cy, then `slant`."""
+    """Fills the last five; ``camera`` holds the pose's rows, fx, fy, cx, cy and `slant`. [20]"""
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
     for n in prange(len(means)):
         radii[n] = 0
@@ -447,16 +448,23 @@ def _alpha(u, v, peak):
 
 
 @njit(**EXACT)
-def _offset(buffer, i, mean_x, mean_y, first, shear, last):
-    """Offset of a pixel from a mean, whitened, and along y in pixels."""
-    y = buffer[i + Y] - mean_y
-    return first * (buffer[i + X] - mean_x) + shear * y, last * y, y
+def _at(plane, pixel):
+    """Place of a pixel in a flat buffer."""
+    return np.uint64(plane * PIXELS) + np.uint64(pixel)
 
 
 @njit(**EXACT)
-def _rows(g, top):
+def _offset(flat, i, mean_x, mean_y, first, shear, last):
+    """Offset of a pixel from a mean, whitened, and along y in pixels."""
+    y = flat[_at(Y, i)] - mean_y
+    return first * (flat[_at(X, i)] - mean_x) + shear * y, last * y, y
+
+
+@njit(**EXACT)
+def _rows(geometry, m, top):
     """Pixels of the tile's rows that a Gaussian reaches."""
-    first, last = _span(g[1] - g[8] - top, g[1] + g[8] - top, 1, TILE_HEIGHT)
+    middle, extent = geometry[m, 1] - top, geometry[m, 8]
+    first, last = _span(middle - extent, middle + extent, 1, TILE_HEIGHT)
     return first * TILE_WIDTH, last * TILE_WIDTH
 
 
@@ -477,35 +485,36 @@ def _scattered(step, count):
 def _open(buffer, tile, columns):
     """Centres of a tile's pixels, which see no Gaussian so far; and its corner."""
     top, left = tile // columns * TILE_HEIGHT, tile % columns * TILE_WIDTH
+    buffer[:] = 0
+    buffer[LIGHT], buffer[LEFT], buffer[STOP] = 1, 1, np.inf
     for i in range(PIXELS):
-        buffer[i + X] = f32(left + i % TILE_WIDTH) + f32(0.5)
-        buffer[i + Y] = f32(top + i // TILE_WIDTH) + f32(0.5)
-        buffer[i + LIGHT], buffer[i + LEFT], buffer[i + STOP] = f32(1), f32(1), f32(np.inf)
-    for i in range(OPACITY, len(buffer)):
-        buffer[i] = f32(0)
+        buffer[X, i] = f32(left + i % TILE_WIDTH) + f32(0.5)
+        buffer[Y, i] = f32(top + i // TILE_WIDTH) + f32(0.5)
     return top, left
 
 
 @njit(**COMPILE)
-def _blend_one(buffer, begin, end, member, g, features):
-    mean_x, mean_y, first, shear, last, peak = g[0], g[1], g[2], g[3], g[4], g[5]
-    f0, f1, f2, f3 = features[0], features[1], features[2], features[3]
+def _blend_one(flat, begin, end, member, geometry, features, m, group):
+    mean_x, mean_y, peak = geometry[m, 0], geometry[m, 1], geometry[m, 5]
+    first, shear, last = geometry[m, 2], geometry[m, 3], geometry[m, 4]
+    f0, f1 = features[m, group], features[m, group + 1]
+    f2, f3 = features[m, group + 2], features[m, group + 3]
     for i in range(begin, end):
-        u, v, _ = _offset(buffer, i, mean_x, mean_y, first, shear, last)
+        u, v, _ = _offset(flat, i, mean_x, mean_y, first, shear, last)
         alpha = min(_alpha(u, v, peak), f32(MOST_ALPHA))
         alpha = alpha if alpha >= f32(LEAST_ALPHA) else f32(0)
-        light = buffer[i + LIGHT]
+        light = flat[_at(LIGHT, i)]
         after = light * (f32(1) - alpha)
         done = after < f32(LEAST_TRANSMITTANCE)
         weight = f32(0) if done else alpha * light
-        buffer[i + STOP] = min(buffer[i + STOP], member) if done else buffer[i + STOP]
-        buffer[i + LEFT] = buffer[i + LEFT] if done else after
-        buffer[i + LIGHT] = f32(0) if done else after
-        buffer[i + OPACITY] += weight
-        buffer[i + FEATURES] += weight * f0
-        buffer[i + FEATURES + PIXELS] += weight * f1
-        buffer[i + FEATURES + 2 * PIXELS] += weight * f2
-        buffer[i + FEATURES + 3 * PIXELS] += weight * f3
+        flat[_at(STOP, i)] = min(flat[_at(STOP, i)], member) if done else flat[_at(STOP, i)]
+        flat[_at(LEFT, i)] = flat[_at(LEFT, i)] if done else after
+        flat[_at(LIGHT, i)] = f32(0) if done else after
+        flat[_at(OPACITY, i)] += weight
+        flat[_at(F0, i)] += weight * f0
+        flat[_at(F1, i)] += weight * f1
+        flat[_at(F2, i)] += weight * f2
+        flat[_at(F3, i)] += weight * f3
 
 
 @njit(parallel=True, **COMPILE)
@@ -515,58 +524,57 @@ def blend(geometry, features, owners, members, starts, columns, image, opacity, 
     count = len(starts) - 1
     for step in prange(count):
         tile = _scattered(step, count)
-        buffer = np.empty(BUFFER, f32)
+        buffer = np.empty((PLANES, PIXELS), f32)
+        flat = buffer.reshape(-1)
         for group in range(0, channels, GROUP):
             top, left = _open(buffer, tile, columns)
             for position in range(starts[tile], starts[tile + 1]):
                 m = owners[members[position]]
-                begin, end = _rows(geometry[m], top)
+                begin, end = _rows(geometry, m, top)
                 member = f32(position - starts[tile])
-                _blend_one(
-                    buffer, begin, end, member, geometry[m], features[m, group : group + GROUP]
-                )
+                _blend_one(flat, begin, end, member, geometry, features, m, group)
                 if (position - starts[tile]) % 32 == 31:
                     brightest = f32(0)
                     for i in range(PIXELS):
-                        brightest = max(brightest, buffer[i + LIGHT])
+                        brightest = max(brightest, buffer[LIGHT, i])
                     if brightest == 0:
                         break
             for row in range(min(TILE_HEIGHT, height - top)):
                 for column in range(min(TILE_WIDTH, width - left)):
                     i = row * TILE_WIDTH + column
                     for channel in range(GROUP):
-                        image[top + row, left + column, group + channel] = buffer[
-                            i + FEATURES + channel * PIXELS
-                        ]
-                    opacity[top + row, left + column] = buffer[i + OPACITY]
+                        image[top + row, left + column, group + channel] = buffer[F0 + channel, i]
+                    opacity[top + row, left + column] = buffer[OPACITY, i]
         for i in range(PIXELS):
-            state[tile, 0, i], state[tile, 1, i] = buffer[i + LEFT], buffer[i + STOP]
+            state[tile, 0, i], state[tile, 1, i] = buffer[LEFT, i], buffer[STOP, i]
 
 
 @njit(**SUMS)
-def _blend_one_backward(buffer, begin, end, member, g, features, sums):
+def _blend_one_backward(flat, begin, end, member, geometry, features, m, group, sums):
     """Adds to ``sums``: moments of the gradient of alpha times alpha, and gradients of features."""
-    mean_x, mean_y, first, shear, last, peak = g[0], g[1], g[2], g[3], g[4], g[5]
-    f0, f1, f2, f3 = features[0], features[1], features[2], features[3]
+    mean_x, mean_y, peak = geometry[m, 0], geometry[m, 1], geometry[m, 5]
+    first, shear, last = geometry[m, 2], geometry[m, 3], geometry[m, 4]
+    f0, f1 = features[m, group], features[m, group + 1]
+    f2, f3 = features[m, group + 2], features[m, group + 3]
     s, su, suu, suy, sy, syy = f32(0), f32(0), f32(0), f32(0), f32(0), f32(0)
     d0, d1, d2, d3 = f32(0), f32(0), f32(0), f32(0)
-    for i in range(begin, end):
-        u, v, y = _offset(buffer, i, mean_x, mean_y, first, shear, last)
+    for i in range(np.uint64(begin), np.uint64(end)):
+        u, v, y = _offset(flat, i, mean_x, mean_y, first, shear, last)
         whole = _alpha(u, v, peak)
         alpha = min(whole, f32(MOST_ALPHA))
-        seen = alpha >= f32(LEAST_ALPHA) and member < buffer[i + STOP]
+        seen = alpha >= f32(LEAST_ALPHA) and member < flat[_at(STOP, i)]
         alpha = alpha if seen else f32(0)
         more = f32(1) / (f32(1) - alpha)
-        light = buffer[i + LEFT] * more
+        light = flat[_at(LEFT, i)] * more
         weight = alpha * light
-        g0, g1 = buffer[i + FEATURES], buffer[i + FEATURES + PIXELS]
-        g2, g3 = buffer[i + FEATURES + 2 * PIXELS], buffer[i + FEATURES + 3 * PIXELS]
+        g0, g1 = flat[_at(F0, i)], flat[_at(F1, i)]
+        g2, g3 = flat[_at(F2, i)], flat[_at(F3, i)]
         value = f0 * g0 + f1 * g1 + f2 * g2 + f3 * g3
         # What the pixel gains as this Gaussian thickens, less what those behind it lose.
-        slope = alpha * (light * value - more * buffer[i + BEHIND])
+        slope = alpha * (light * value - more * flat[_at(BEHIND, i)])
         slope = slope if whole <= f32(MOST_ALPHA) else f32(0)
-        buffer[i + LEFT] = light
-        buffer[i + BEHIND] += weight * value
+        flat[_at(LEFT, i)] = light
+        flat[_at(BEHIND, i)] += weight * value
         s += slope
         su += slope * u
         suu += slope * u * u
@@ -595,28 +603,27 @@ def blend_backward(
     count = len(starts) - 1
     for step in prange(count):
         tile = _scattered(step, count)
-        buffer, sums = np.empty(BUFFER, f32), np.empty(MOMENTS + GROUP, f32)
+        buffer, sums = np.empty((PLANES, PIXELS), f32), np.empty(MOMENTS + GROUP, f32)
         for position in range(starts[tile], starts[tile + 1]):
             for entry in range(MOMENTS):
                 partial[members[position], entry] = 0
+        flat = buffer.reshape(-1)
         for group in range(0, channels, GROUP):
             top, left = _open(buffer, tile, columns)
             last = f32(0)
             for i in range(PIXELS):
-                buffer[i + LEFT], buffer[i + STOP] = state[tile, 0, i], state[tile, 1, i]
-                buffer[i + BEHIND] = 0
-                last = max(last, buffer[i + STOP])
+                buffer[LEFT, i], buffer[STOP, i] = state[tile, 0, i], state[tile, 1, i]
+                buffer[BEHIND, i] = 0
+                last = max(last, buffer[STOP, i])
             for row in range(min(TILE_HEIGHT, height - top)):
                 for column in range(min(TILE_WIDTH, width - left)):
                     i = row * TILE_WIDTH + column
                     for channel in range(GROUP):
-                        buffer[i + FEATURES + channel * PIXELS] = d_image[
-                            top + row, left + column, group + channel
-                        ]
+                        buffer[F0 + channel, i] = d_image[top + row, left + column, group + channel]
                     if group == 0:
                         # Light of the background, which all Gaussians dim alike.
-                        left_over = d_opacity[top + row, left + column] * buffer[i + LEFT]
-                        buffer[i + BEHIND] = -left_over
+                        left_over = d_opacity[top + row, left + column] * buffer[LEFT, i]
+                        buffer[BEHIND, i] = -left_over
             for position in range(starts[tile + 1] - 1, starts[tile] - 1, -1):
                 slot = members[position]
                 m = owners[slot]
@@ -626,14 +633,16 @@ def blend_backward(
                 for entry in range(GROUP):
                     sums[MOMENTS + entry] = 0
                 if member < last:
-                    begin, end = _rows(geometry[m], top)
+                    begin, end = _rows(geometry, m, top)
                     _blend_one_backward(
-                        buffer,
+                        flat,
                         begin,
                         end,
                         member,
-                        geometry[m],
-                        features[m, group : group + GROUP],
+                        geometry,
+                        features,
+                        m,
+                        group,
                         sums,
                     )
                 for entry in range(MOMENTS):

@@ -6,12 +6,16 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, are_deterministic_algorithms_enabled
 from torch.autograd.function import once_differentiable
 
 from xplanes.backend import compiled, cpu_loops
+from xplanes.rendering.gaussians import cuda
 from xplanes.rendering.gaussians.camera import Camera
-from xplanes.rendering.gaussians.reference import Projection, blend, project
+from xplanes.rendering.gaussians.reference import blend, project
+
+MOST = 2**24
+"""Places in a list that float32 tells apart."""
 
 
 class GaussianError(ValueError):
@@ -69,21 +73,34 @@ def rasterise(
         antialiased: Lower the opacity of a Gaussian as the low-pass filter widens it, so that it
             stops as much light as before (Mip-Splatting, Yu et al. 2024).
 
+    On the CPU, float32 goes through compiled loops, which come to the same bits each time; on CUDA,
+    through `gsplat` (extra ``gaussians``), which does not. Where torch must be deterministic, CUDA
+    takes plain torch, as float64 does on the CPU.
+
     Raises:
-        GaussianError: If shapes disagree, or a number is not finite.
+        GaussianError: If shapes disagree, a number is not finite, or there are too many.
+        MissingExtraError: If the tensors lie on CUDA and gsplat is not installed.
     """
     given = {
         **{"means": means, "quaternions": quaternions, "scales": scales},
         **{"opacities": opacities, "colours": colours},
     }
     _check(given, background)
-    draw = _draw if cpu_loops(means) and means.dtype == torch.float32 else _draw_reference
-    projection, image, opacity = draw(*given.values(), camera, antialiased)
+    dtype = torch.float64 if means.dtype == torch.float64 else torch.float32
+    draw = _draw_reference
+    if cpu_loops(means) and dtype == torch.float32:
+        draw = _draw
+    elif means.is_cuda and dtype == torch.float32 and not are_deterministic_algorithms_enabled():
+        draw = cuda.draw
+    means2d, radii, image, opacity = draw(
+        *(means.to(dtype), quaternions.to(dtype), scales.to(dtype)),
+        *(opacities.to(dtype), colours.to(dtype), camera, antialiased),
+    )
     colour, depth = image[..., :-1], image[..., -1]
     if background is not None:
         colour = colour + (1 - opacity)[..., None] * background.to(colour)
     depth = depth / opacity.clamp(min=1e-10)
-    return RasterisedImage(colour, opacity, depth, projection.radii, projection.means)
+    return RasterisedImage(colour, opacity, depth, radii, means2d)
 
 
 def _draw_reference(
@@ -94,11 +111,11 @@ def _draw_reference(
     colours: Tensor,
     camera: Camera,
     antialiased: bool,
-) -> tuple[Projection, Tensor, Tensor]:
-    """The projection, and sums of colours and depths and the opacity of its pixels."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Projected means and radii, sums of colours and depths, and opacity, in plain torch."""
     projection = project(means, quaternions, scales, opacities, camera, antialiased=antialiased)
     features = torch.cat([colours, projection.depths[:, None]], dim=1)
-    return projection, *blend(projection, features, camera)
+    return projection.means, projection.radii, *blend(projection, features, camera)
 
 
 def _draw(
@@ -109,12 +126,12 @@ def _draw(
     colours: Tensor,
     camera: Camera,
     antialiased: bool,
-) -> tuple[Projection, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The same in compiled loops."""
     parts = _Project.apply(means, quaternions, scales, opacities, camera, antialiased)
-    projection = Projection(*parts)  # type: ignore[misc]
-    features = torch.cat([colours, projection.depths[:, None]], dim=1)
-    return projection, *_Blend.apply(*parts, features, camera)  # type: ignore[misc]
+    means2d, _, depths, _, radii = parts  # type: ignore[misc]
+    features = torch.cat([colours, depths[:, None]], dim=1)
+    return means2d, radii, *_Blend.apply(*parts, features, camera)  # type: ignore[misc]
 
 
 class _Project(torch.autograd.Function):
@@ -191,6 +208,11 @@ class _Blend(torch.autograd.Function):
         slots = np.zeros(len(order) + 1, np.int64)
         cpu.count_tiles(geometry, columns, rows, slots[1:])
         slots.cumsum(out=slots)
+        if max(len(order), slots[-1] >> 7) >= MOST:
+            raise GaussianError(
+                f"{len(order)} Gaussians reach {slots[-1]} tiles: must be less than {MOST} and "
+                f"{MOST << 7}. Prune them, or render a smaller image"
+            )
         tiles, owners = np.empty((2, slots[-1]), np.int32)
         cpu.list_tiles(geometry, columns, rows, slots, tiles, owners)
         members, starts = cpu.bin_tiles(tiles, columns * rows)

@@ -3,7 +3,7 @@
 Zwicker et al. 2002 (EWA splatting), Kerbl et al. 2023 (3D Gaussian splatting).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -60,12 +60,29 @@ def project(
     *,
     antialiased: bool,
 ) -> Projection:
-    """Project Gaussians by the linearised perspective of EWA splatting; arguments of `rasterise`."""
+    """Project Gaussians by the linearised perspective of EWA; arguments as in `rasterise`."""
+    parts = (means, quaternions, scales, opacities)
+    with torch.no_grad():
+        radii = _project(*parts, camera, antialiased, means.new_ones(len(means)).bool()).radii
+    # Those that are not drawn are replaced: what overflows there must not reach the gradients.
+    return replace(_project(*parts, camera, antialiased, radii > 0), radii=radii)
+
+
+def _project(
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    camera: Camera,
+    antialiased: bool,
+    wanted: Tensor,
+) -> Projection:
+    """The same; of those that are not wanted, a Gaussian in front of the camera."""
     world_to_camera = camera.world_to_camera.to(means)
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     x, y, z = (means @ rotation.T + translation).unbind(-1)
-    valid = (z > camera.near) & (z < camera.far)
-    z = torch.where(valid, z, 1.0)  # Keeps what is behind the camera out of the gradients.
+    x, y, z = torch.where(wanted, x, 0), torch.where(wanted, y, 0), torch.where(wanted, z, 1)
+    scales = torch.where(wanted[:, None], scales, 1)
     left, right, top, bottom = camera.slant
     slant_x, slant_y = (x / z).clamp(left, right), (y / z).clamp(top, bottom)
     zero = torch.zeros_like(z)
@@ -86,12 +103,12 @@ def project(
     if antialiased:
         opacities = opacities * area / determinant.sqrt()
     with torch.no_grad():
-        finite = projected.isfinite().all(-1) & whitening.isfinite().all(-1)
-        positive = (whitening[:, ::2] > 0).all(-1)
+        finite = torch.cat([projected, whitening], dim=1).isfinite().all(-1)
         extent = extents(whitening, opacities)
         size = extent.new_tensor([camera.width, camera.height])
         touches = ((projected + extent > 0) & (projected - extent < size)).all(-1)
-        drawn = valid & finite & positive & touches & (opacities >= LEAST_ALPHA)
+        drawn = finite & touches & (whitening[:, 0] > 0) & (opacities >= LEAST_ALPHA)
+        drawn &= (z > camera.near) & (z < camera.far)
         longest = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
         radii = torch.where(drawn, (3 * longest.sqrt()).ceil().clamp(max=1e9), 0).long()
     return Projection(projected, whitening, z, opacities, radii)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor, are_deterministic_algorithms_enabled
+from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from xplanes.backend import compiled, cpu_loops
@@ -74,8 +74,7 @@ def rasterise(
             stops as much light as before (Mip-Splatting, Yu et al. 2024).
 
     Float32 goes through compiled loops on the CPU, which come to the same bits each time, and
-    through gsplat (extra ``gaussians``) on CUDA, which does not. Plain torch takes float64, and
-    CUDA where torch must be deterministic.
+    through gsplat (extra ``gaussians``) on CUDA, which does not. Plain torch takes float64.
 
     Raises:
         GaussianError: If shapes disagree, a number is not finite, or there are too many.
@@ -91,10 +90,17 @@ def rasterise(
     if means.dtype == torch.float32:
         if cpu_loops(means):
             draw = _draw
-        elif means.is_cuda and not are_deterministic_algorithms_enabled():
+        elif means.is_cuda:
             draw = cuda.draw
-    others = (t.to(means.dtype) for t in (quaternions, scales, opacities, colours))
-    means2d, radii, image, opacity = draw(means, *others, camera, antialiased)
+    means2d, radii, image, opacity = draw(
+        means,
+        quaternions.to(means.dtype),
+        scales.to(means.dtype),
+        opacities.to(means.dtype),
+        colours.to(means.dtype),
+        camera,
+        antialiased,
+    )
     colour, depth = image[..., :-1], image[..., -1]
     if background is not None:
         colour = colour + (1 - opacity)[..., None] * background.to(colour)

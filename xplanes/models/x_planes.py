@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from xplanes.decomposition.sparse_loss import SparseProduct
-from xplanes.fields.background import Background
 from xplanes.fields.decoder import Decoder
 from xplanes.fields.regularisers import (
     add_distance_gradient,
@@ -24,6 +23,7 @@ from xplanes.fields.regularisers import (
     total_variation,
 )
 from xplanes.fields.xplanes import XPlanes, random_planes
+from xplanes.models.background import BackgroundSettings
 from xplanes.models.base import (
     InitialValues,
     Model,
@@ -37,7 +37,7 @@ from xplanes.rendering.base import Rendering
 from xplanes.rendering.sampler import Group, Site
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
-from xplanes.streams import Stream, TrainingState, initial_values, step_generator
+from xplanes.streams import Stream, TrainingState, step_generator
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,16 +54,6 @@ class DecoderSettings(Settings):
     colour_bias: float
     colour_margin: Weight  # Margin by which colours may exceed [0, 1].
     freeze: bool  # Do not train the decoder.
-
-
-@dataclass(frozen=True, kw_only=True)
-class BackgroundSettings(Settings):
-    """A static world behind the field's cube, for opaque images of a scene in a world."""
-
-    resolution: Count  # Texels along each side of its planes, over contracted space.
-    channels: Count  # Channels of each plane.
-    samples: Steps  # Samples of a ray behind the cube; 0: its colour depends on direction alone.
-    width: Count  # Neurons of the decoder's hidden layer.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +111,7 @@ class XPlanesSettings(ModelSettings):
     def build_field(self, site: Site, initial: InitialValues | None = None) -> XPlanes:
         """The field: planes and decoder from what is given, the rest of it random."""
         plane_set = self.plane_set if site.moves else "three"
-        background = self._background(site)
+        background = None if self.background is None else self.background.build(site)
         generator = step_generator(site.seed, 0, Stream.INITIAL_FIELD)
         planes: Mapping[str, Tensor]
         if initial is not None:
@@ -158,20 +148,6 @@ class XPlanesSettings(ModelSettings):
                     decoder.layers[-1].bias[1:] += options.colour_bias  # type: ignore[index]
         decoder.requires_grad_(not options.freeze)
         return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set, background=background)
-
-    def _background(self, site: Site) -> Background | None:
-        """What lies behind the cube; None for a plain colour."""
-        if self.background is None or not site.surrounded:
-            return None
-        options = self.background
-        with initial_values(site.seed, Stream.BACKGROUND):
-            return Background(
-                options.channels,
-                options.resolution,
-                width=options.width,
-                samples=options.samples,
-                precision="bf16" if site.precision == "bf16" else "32",
-            )
 
 
 class XPlanesModel(Model):
@@ -226,12 +202,8 @@ class XPlanesModel(Model):
         decoder = [p for p in field.decoder.parameters() if p.requires_grad]
         if decoder:
             groups.append({"params": decoder, "lr": settings.decoder_lr, "name": "decoder"})
-        if (world := field.background) is not None:
-            decoder = list(world.decoder.parameters())
-            groups += [
-                {"params": [world.planes], "lr": settings.plane_lr, "name": "background"},
-                {"params": decoder, "lr": settings.decoder_lr, "name": "background_decoder"},
-            ]
+        if field.background is not None and settings.background is not None:
+            groups += settings.background.groups(field.background)
         return groups
 
     def losses(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
@@ -253,6 +225,8 @@ class XPlanesModel(Model):
         every, field, weights = self.weights.every, self._field, self.weights
         if state.step % every or field.space.grad is None:
             return
+        if field.background is not None and self.settings.background is not None:
+            self.settings.background.regularise(field.background, every)
         fading = self._fading(state.step)
         if not fading:
             self._initial, self.product = [], None  # Large, and of no more use.
@@ -292,6 +266,9 @@ class XPlanesModel(Model):
                 ),
             )
         }
+        if (world := field.background) is not None and (options := self.settings.background):
+            variation = options.total_variation
+            terms["background"] = (variation, lambda: total_variation(world.planes, (1, 2)))
         if self._initial:
             terms["initialisation"] = (fading * self.initial_weight, self._distance)
         if (time := field.time) is not None:

@@ -10,7 +10,7 @@ import threading
 from abc import ABC
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import time as now
 from typing import Any, ClassVar
@@ -27,6 +27,7 @@ from xplanes.scenes.demo.suite import suite_scene
 from xplanes.scenes.demo.world import World
 from xplanes.scenes.dnerf import read_scene
 from xplanes.scenes.errors import SceneError
+from xplanes.scenes.images import load_images
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene
 from xplanes.settings import Count, Steps
@@ -34,7 +35,7 @@ from xplanes.settings import Count, Steps
 VERSION = 2
 """Version of the renderer; increase it whenever the images of a scene change."""
 
-SUITE_VERSION = 1
+SUITE_VERSION = 2
 """The same for the scenes of the suite."""
 
 RECORD = "demo.json"
@@ -314,7 +315,7 @@ class ProceduralSettings(SceneSettings, ABC):
     def load(self, splits: Sequence[str]) -> Scene:
         folder = self.folder
         try:
-            return read_scene(
+            scene = read_scene(
                 folder,
                 resolution=self.resolution,
                 splits=splits,
@@ -322,10 +323,22 @@ class ProceduralSettings(SceneSettings, ABC):
                 eval_views=self.eval_views,
                 cache=self.image_cache,
             )
+            return _with_masks(scene, folder / MASKS)
         except SceneError as problem:
             raise SceneError(
                 f"{problem} This is a demo scene: delete {folder} to render it again"
             ) from problem
+
+
+def _with_masks(scene: Scene, folder: Path) -> Scene:
+    """The scene with the masks of its thing, if it stands in a world."""
+    if not folder.is_dir():
+        return scene
+    splits = {}
+    for split, views in scene.splits.items():
+        masks = load_images([folder / file for file in views.files], None)
+        splits[split] = replace(views, thing=masks[..., 0])
+    return replace(scene, splits=splits)
 
 
 @dataclass(frozen=True, kw_only=True)

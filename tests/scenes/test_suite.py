@@ -324,6 +324,29 @@ def test_captures_have_a_world_behind_and_masks_of_the_thing(name, tmp_path):
         assert 0.03 < (mask > 127).mean() < 0.5
 
 
+def test_masks_of_a_thing_cut_it_out_where_that_is_asked_for(tmp_path):
+    folder = ("data=suite", f"data.root={tmp_path}", f"data.resolution={SIDE}",
+              "data.train_views=2", "data.val_views=1", "data.test_views=1")  # fmt: skip
+
+    def scene(name, use):
+        given = compose_plain("train", [*folder, f"data.scene={name}", f"data.mask_use={use}"])
+        return build(given["data"], SceneSettings, "data").read()
+
+    whole, alpha, lrm = (scene("phone", use) for use in ("score", "alpha", "lrm"))
+    masks = whole.splits["train"].thing
+    assert whole.cut is None
+    assert alpha.cut is None
+    assert torch.equal(alpha.splits["train"].images[..., 3], masks)
+    assert alpha.splits["test"].is_opaque
+    assert torch.equal(lrm.cut.images, alpha.splits["train"].images)
+    assert torch.equal(lrm.splits["train"].images, whole.splits["train"].images)
+    shown = masks == 255
+    assert torch.equal(lrm.cut.images[shown], whole.splits["train"].images[shown])
+    assert not lrm.cut.images[masks == 0].any()
+    words = "data.mask_use=alpha: dark stands in no world.*score"
+    assert_refused(SceneError, words, lambda: scene("dark", "alpha"), "dark")
+
+
 def test_layers_are_composited_from_front_to_back():
     """Through a ball of jelly in a box of glass, against the formula."""
     jelly = Translucent(Plain((0.0, 1.0, 0.0)), density=2.0)

@@ -202,7 +202,8 @@ class Views:
             )
         if self.thing is not None and self.thing.shape != (count, height, width):
             raise ValueError(
-                f"views.thing is {list(self.thing.shape)}, but views.images {[count, height, width]}"
+                f"views.thing is {list(self.thing.shape)}, but views.images are "
+                f"{[count, height, width]}"
             )
 
     def __len__(self) -> int:
@@ -452,6 +453,8 @@ class Scene:
         static_reason: Why the scene is known to be static; empty if it may move.
         points: Points on surfaces, as structure from motion finds them, in the world; None where
             there are none. float32 [N, 3]
+        cut: The training views with all but the thing cut out, for LRMs, where those of ``splits``
+            are whole; None where masks are in the alpha of ``splits``, or there are none.
     """
 
     name: str
@@ -460,6 +463,7 @@ class Scene:
     background: Tensor = field(default_factory=lambda: torch.ones(3))
     static_reason: str = ""
     points: Tensor | None = None
+    cut: Views | None = None
 
     @cached_property
     def is_surrounded(self) -> bool:

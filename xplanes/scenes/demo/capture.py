@@ -184,7 +184,6 @@ class Array(Rig):
         for split, taken in whole.shots.items():
             cameras = self.fixed if split == "train" else len(taken) / len(times)
             shots[split] = [
-                (self.end * times[int(i / cameras)], camera)
-                for i, (_, camera) in enumerate(taken)
+                (self.end * times[int(i / cameras)], camera) for i, (_, camera) in enumerate(taken)
             ]
         return replace(whole, shots=shots)

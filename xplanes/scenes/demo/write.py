@@ -13,9 +13,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import time as now
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
+import torch
 from PIL import Image
+from torch import Tensor
 
 from xplanes.backend import threads
 from xplanes.scenes.demo.assembly import Assembly
@@ -29,7 +31,7 @@ from xplanes.scenes.dnerf import read_scene
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.images import load_images
 from xplanes.scenes.source import SceneSettings
-from xplanes.scenes.views import Scene
+from xplanes.scenes.views import Scene, Views
 from xplanes.settings import Count, Steps
 
 VERSION = 2
@@ -353,3 +355,29 @@ class SuiteSettings(ProceduralSettings):
     """A scene of the suite, rendered on first use."""
 
     ensure = staticmethod(ensure_suite_scene)
+
+    # Masks of a thing in a world: for scores alone, alpha of the training images, or for LRMs, too.
+    mask_use: Literal["score", "alpha", "lrm"]
+
+    def load(self, splits: Sequence[str]) -> Scene:
+        scene = super().load(splits)
+        train = scene.splits.get("train")
+        if self.mask_use == "score" or train is None:
+            return scene
+        if train.thing is None:
+            raise SceneError(
+                f"data.mask_use={self.mask_use}: {self.scene} stands in no world, so it has no "
+                "masks. Set it to score."
+            )
+        cut = cut_out(train, train.thing)
+        if self.mask_use == "lrm":
+            return replace(scene, cut=cut)
+        return replace(scene, splits=scene.splits | {"train": cut})
+
+
+def cut_out(views: Views, thing: Tensor) -> Views:
+    """Opaque views with the share of each pixel that shows the thing as alpha. uint8 [V, H, W]"""
+    images = views.in_memory().clone()
+    images[..., :3] = (images[..., :3].float() * thing[..., None] / 255).round().to(torch.uint8)
+    images[..., 3] = thing
+    return replace(views, images=images)

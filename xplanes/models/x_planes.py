@@ -63,6 +63,7 @@ class XPlanesLoss(Settings):
     opacity: Weight  # Weight of the opacity's squared error against the images' alpha.
     floaters: Weight  # Weight of the mean opacity of rays at pixels with alpha 0.
     total_variation: Weight  # Weight of total variation.
+    world_variation: Weight  # The same in front of a background, in place of it.
     time_smoothness: Weight  # Weight of time smoothness (squared second differences).
     time_magnitude: Weight  # Weight of the squared values of time planes.
     sparse_weight: Weight  # Weight of L_r (X-Planes, Eq. 17).
@@ -172,6 +173,9 @@ class XPlanesModel(Model):
         steps = self.weights.initial_steps
         self.fade = None if steps is None else steps / views
         self.opacity = self.weights.opacity
+        self.total_variation = self.weights.total_variation
+        if field.background is not None:
+            self.total_variation = self.weights.world_variation
         self._opaque = site.views is not None and site.views.is_opaque
         self.product: SparseProduct | None = None
         self.initial_weight, self._initial = 0.0, []
@@ -237,7 +241,7 @@ class XPlanesModel(Model):
             for plane, initial in zip(self._planes, self._initial, strict=True):
                 if plane.grad is not None:
                     add_distance_gradient(plane.grad, plane, initial, weight)
-        if weight := weights.total_variation * every:
+        if weight := self.total_variation * every:
             add_total_variation_gradient(field.space.grad, field.space, (1, 2), weight)
         if field.time is None or field.time.grad is None:
             return
@@ -259,7 +263,7 @@ class XPlanesModel(Model):
         weights, field, fading = self.weights, self._field, self._fading(state.step)
         terms: dict[str, tuple[float, Callable[[], Any]]] = {
             "total_variation": (
-                weights.total_variation,
+                self.total_variation,
                 lambda: (
                     total_variation(field.space, (1, 2))
                     + (0.0 if field.time is None else total_variation(field.time, (2,)))

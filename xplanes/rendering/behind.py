@@ -82,8 +82,8 @@ def look(
     steps = torch.arange(count, device=origins.device)
     within = 0.5 if jitter is None else jitter[:, None]
     horizon = RADIUS * directions[:, None]
-    ends = _at(origins, directions, first / (1 - steps / count))
-    lengths = torch.cat([ends, horizon], dim=1).diff(dim=1).norm(dim=-1)
+    edges = _at(origins, directions, first / (1 - steps / count))
+    lengths = torch.cat([edges, horizon], dim=1).diff(dim=1).norm(dim=-1)
     points = _at(origins, directions, first / (1 - (steps + within) / count))
     points = torch.cat([points, horizon], dim=1)
     colour, density = background(points.flatten(0, 1))

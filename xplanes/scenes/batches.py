@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from xplanes.scenes.changes import changing
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.silhouettes import foreground
 from xplanes.scenes.store import LIT, TILE, StoredImages, count_in_tiles
@@ -69,10 +70,13 @@ class RayBatches:
         self.background = settings.background
         widths = views.intrinsics.size[:, 1].tolist()
         margins = [max(1, round(NEAR_SILHOUETTE * width)) for width in widths]
+        changes = None
         if isinstance(views.images, StoredImages):
             self.near, self.far = _tile_pools(views, views.images, margins)
         else:
-            near = foreground(views, margins)
+            if settings.skip_background and views.is_opaque:
+                changes = changing(views, margins)
+            near = foreground(views, margins) if changes is None else changes
             far = ~near
             if views.is_cut:
                 valid = views.valid()
@@ -82,7 +86,7 @@ class RayBatches:
         natural = len(self.far) / (len(self.near) + len(self.far))
         skip = settings.skip_background and 0 < natural < 1
         self.far_share = min(settings.background_share, natural) if skip else natural
-        jitter = skip and not views.is_static
+        jitter = skip and not views.is_static and changes is None
         self.background_jitter = settings.background_jitter if jitter else 0.0
         self.skipped = max(0.0, 1 - self.far_share / natural) * natural if skip else 0.0
         """Share of all pixels that uniform drawing would have shown and this one leaves out."""

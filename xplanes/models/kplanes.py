@@ -40,7 +40,7 @@ class KPlanesSettings(ModelSettings):
     half_side: Positive | None  # Half the side of a cube at the origin; null: the scene's cube.
     resolution: Count  # Texels along each space axis at the first scale.
     scales: list[Count]  # Factors on the space resolution.
-    time_resolution: Count | None  # Rows of time; null: half the training views.
+    time_resolution: Count | None  # Rows of time; null: half the distinct times, all if seen often.
     channels: Count  # Channels of each plane and scale.
     space_low: float  # Lower bound of the uniform initialisation of space planes.
     space_high: float  # Upper bound. Time planes are initialised to 1.

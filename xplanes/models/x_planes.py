@@ -83,7 +83,7 @@ class XPlanesSettings(ModelSettings):
 
     plane_set: Literal["six", "nine", "three"]
     resolution: Count  # Texels along each space axis.
-    time_resolution: Count | None  # Rows of time; null: half the number of distinct times.
+    time_resolution: Count | None  # Rows of time; null: half the distinct times, all if seen often.
     channels: Count  # Channels of each plane.
     space_scale: Weight  # Standard deviation of randomly initialised space planes.
     time_scale: Weight  # Standard deviation of randomly initialised time planes.

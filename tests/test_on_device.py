@@ -1,0 +1,151 @@
+"""Off the CPU: training, images, scores and preparation on a device that refuses what a GPU would.
+
+The budgets are what is reached today. A change that lowers a number lowers it here, too.
+"""
+
+import functools
+from pathlib import Path
+
+import lightning
+import pytest
+import torch
+
+from tests import fake_device
+from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX, baseline_config
+from tests.lrm.reduced import SIDES
+from tests.preparation.sequences import moving_sequence
+from tests.preparation.test_encode import frames_of, model_of
+from tests.synthetic import ball_scene
+from tests.training.runs import small_config
+from xplanes import RadianceModule, SceneDataModule
+from xplanes.decomposition import decompose, space_planes, time_planes, unexplained_energy
+from xplanes.fields.xplanes import PLANE_SETS
+from xplanes.lrm.images import square_crop
+from xplanes.preparation.cache import StageCache
+from xplanes.preparation.encode import encode
+from xplanes.training.evaluation import score_view
+
+NOWHERE = Path("nowhere")
+"""Folder of a scene that is handed over instead."""
+
+CONFIGS = {
+    "six": lambda *more: small_config(NOWHERE, *more),
+    "nine": lambda *more: small_config(NOWHERE, "model=nine_planes", *more),
+    "kplanes": lambda *more: baseline_config(NOWHERE, "model=kplanes", *KPLANES, *PROPOSAL, *more),
+    "tineuvox": lambda *more: baseline_config(NOWHERE, "model=tineuvox_s", *TINEUVOX, *more),
+    "tensor4d": lambda *more: baseline_config(NOWHERE, "model=tensor4d", *TENSOR4D, *NEUS, *more),
+}
+
+
+@pytest.fixture
+def device(monkeypatch):
+    fake_device.register()
+    monkeypatch.setattr(torch, "Generator", fake_device.FakeGenerator)
+    return torch.device(fake_device.NAME, 0)
+
+
+def trained(name, steps, *more, trainer=fake_device.trainer, scene=None):
+    """A module after some steps, its data, and the counts of each step."""
+    module = RadianceModule(CONFIGS[name](*more))
+    data = SceneDataModule.of(scene or ball_scene(6, 16))
+    counts = fake_device.StepCounts()
+    trainer(max_steps=steps, callbacks=[counts], limit_val_batches=0).fit(module, data)
+    return module, data, counts.steps
+
+
+on_the_cpu = functools.partial(
+    lightning.Trainer,
+    accelerator="cpu",
+    logger=False,
+    enable_checkpointing=False,
+    enable_progress_bar=False,
+    enable_model_summary=False,
+)
+
+
+def test_the_device_refuses_what_a_gpu_refuses_and_counts_what_it_is_asked(device):
+    with fake_device.counted() as counts:
+        there = torch.arange(6, device=device).float()
+        assert counts.totals == (2, 0, 0)
+        assert (there + torch.tensor(1.0)).device == device  # A single number is passed along.
+        moved = torch.ones(2).to(device)
+        assert counts.totals == (3, 0, 1)
+        assert (there[there > 2] + 1).tolist() == [4.0, 5.0, 6.0]
+        assert counts.waits == {"index": 1, "to the CPU": 1}
+        assert float(there.sum()) == 15
+        assert counts.waits.total() == 3
+    with pytest.raises(RuntimeError, match="two devices, fake and cpu"):
+        moved + torch.ones(2)
+    with pytest.raises(RuntimeError, match="generator of the CPU"):
+        torch.rand(2, device=device, generator=torch.Generator())
+    own = torch.Generator(device).manual_seed(0)
+    with fake_device.counted() as after:
+        assert torch.rand(2, device=device, generator=own).device == device
+    assert after.totals == (1, 0, 0)
+    assert counts.operations.total() < 12  # Nothing was added since.
+
+
+@pytest.mark.parametrize("name", SIDES)
+def test_an_lrm_encodes_there(device, tmp_path, name):
+    frames = frames_of(3)
+    crop = square_crop(*frames.shape[1:3])
+    places = torch.device("cpu"), device
+    found = [
+        encode(model_of(name), "key", frames, crop, StageCache(None), place, batch=2)
+        for place in places
+    ]
+    torch.testing.assert_close(found[1].triplanes, found[0].triplanes)
+
+
+@pytest.mark.filterwarnings("ignore:robust PCA stopped")
+def test_triplanes_become_planes_there(device):
+    def planes(place):
+        parts = decompose(moving_sequence(6, 4, 12).to(place), max_iterations=20)
+        found = [space_planes(parts.low_rank, static="mean", resolution=16).cpu()]
+        for plane_set in ("six", "nine"):
+            generator = torch.Generator().manual_seed(0)
+            sizes = {"resolution": 16, "time_resolution": 4, "noise": 0.01}
+            time = time_planes(parts.sparse, plane_set=plane_set, generator=generator, **sizes)
+            left = unexplained_energy(time, parts.sparse, rows=PLANE_SETS[plane_set])
+            found += [time.cpu(), torch.tensor(left)]
+        return found
+
+    for there, here in zip(planes(device), planes("cpu"), strict=True):
+        torch.testing.assert_close(there, here, atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["six", "nine"])
+def test_training_there_comes_to_the_numbers_of_plain_torch(device, monkeypatch, name):
+    monkeypatch.setenv("XPLANES_CPU_LOOPS", "0")
+    # Thinning draws from a generator of the device.
+    options = "model.sampler.thinning=0", "model.precision=32"
+    there, _, _ = trained(name, 18, *options)
+    here, _, _ = trained(name, 18, *options, trainer=on_the_cpu)
+    assert there.counts == here.counts
+    for ours, theirs in zip(there.parameters(), here.parameters(), strict=True):
+        torch.testing.assert_close(ours.cpu(), theirs, atol=1e-4, rtol=1e-4)
+
+
+BUDGETS = {
+    "six": {2: (400, 8, 7), 8: (540, 11, 11)},
+    "nine": {2: (440, 8, 7), 8: (580, 11, 11)},
+    "kplanes": {2: (975, 3, 7)},
+    "tineuvox": {2: (625, 11, 7)},
+    "tensor4d": {2: (3470, 16, 7)},
+}
+"""Operations at most, waits and copies of a normal step, and of one that maintains the grid."""
+
+
+@pytest.mark.parametrize("name", BUDGETS)
+def test_steps_keep_to_their_budget_and_views_are_scored(device, name):
+    module, data, steps = trained(name, max(BUDGETS[name]) + 1)
+    for step, (most, waits, copies) in BUDGETS[name].items():
+        counts = steps[step]
+        assert counts.operations.total() <= most, counts.operations
+        assert (counts.waits.total(), counts.copies.total()) == (waits, copies), counts
+    assert all(p.isfinite().all() for p in module.parameters())
+    module.to(device)
+    views, background = data.scene.splits["test"], data.scene.background
+    score, images = score_view(module.field, module.renderer, module.frame, views, 0, background)
+    assert 0 < score.psnr < 60
+    assert images.colour.device.type == "cpu"

@@ -247,6 +247,10 @@ class _Module:
         return 0
 
     @staticmethod
+    def synchronize() -> None:
+        count("waits", "synchronize")
+
+    @staticmethod
     def get_amp_supported_dtype() -> list[torch.dtype]:
         return [torch.bfloat16]
 
@@ -354,10 +358,11 @@ class StepCounts(Callback):
         self._end()
 
 
-def trainer(**options: Any) -> lightning.Trainer:
+def trainer(callbacks: Any = (), more: Any = (), **options: Any) -> lightning.Trainer:
     """A Trainer on the device, without logs and files."""
     quiet_lightning()
     return lightning.Trainer(
+        callbacks=[*callbacks, *more],
         strategy=SingleDeviceStrategy(torch.device(NAME, 0), accelerator=FakeAccelerator()),
         logger=False,
         enable_checkpointing=False,

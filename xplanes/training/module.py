@@ -1,5 +1,6 @@
 """The LightningModule: one field, trained on rays."""
 
+import copy
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -285,6 +286,21 @@ class RadianceModule(LightningModule):
         self._log_terms(terms, state)
         if self.between_updates:
             self._update(optimizer, state, rendering)
+
+    def rehearse(self, rays: Batch) -> None:
+        """Do all that a step does on a copy of the field, so that its kernels are compiled."""
+        model, sampler = copy.deepcopy(self._parts)
+        state = self.state
+        optimizer = model.optimizer([*model.groups(), *sampler.groups()])
+        rendering = sampler.render(model.field, rays, state)
+        terms = model.losses(rendering, rays, state) | sampler.losses(rendering)
+        torch.stack(list(terms.values())).sum().backward()
+        sampler.pass_on(rendering, state)
+        sampler.observe(rendering)
+        model.regularise(state)
+        sampler.regularise()
+        optimizer.step()
+        sampler.update(model.field, state)
 
     def _terms(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
         """All terms of the loss that need the rays, weighted, by name."""

@@ -4,6 +4,7 @@ import functools
 import importlib
 import importlib.util
 import logging
+import math
 import os
 import sys
 import time
@@ -174,6 +175,11 @@ def _require_alive(device: torch.device, what: str, reason: str) -> None:
             f"{device}: the GPU stopped answering in a trial of the Triton kernels for {what} "
             f"({reason}). Start again with XPLANES_GPU_KERNELS=0, which leaves them out"
         ) from error
+
+
+def memory_left(device: torch.device) -> float:
+    """Bytes that a GPU has left; no limit is known for other devices."""
+    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else math.inf
 
 
 def fast_bf16(device: torch.device) -> bool:

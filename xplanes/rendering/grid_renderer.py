@@ -22,7 +22,10 @@ from xplanes.rendering.thinning import Cut
 from xplanes.rendering.warming import render_one_ray
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Range, Share, Steps, Weight
-from xplanes.streams import Stream, TrainingState, step_generator
+from xplanes.streams import Stream, TrainingState, counted_uniform, step_generator
+
+SPARE = 1.25
+"""Places for the samples of a batch, over their average."""
 
 DIAGONAL = 2 * math.sqrt(3)
 """Longest way through the field's cube."""
@@ -38,7 +41,9 @@ class GridRenderer(RayRenderer):
         skip_empty: Skip samples in empty cells.
         occlusion: Skip samples behind surfaces that leave less light than this; 0 skips none.
         thinning: Where gradients are wanted, samples whose own is below this times the mean may be
-            left out, see `Cut.pass_on`; 0 leaves none out.
+            left out, see `Cut.pass_on`; 0 leaves none out. On the CPU alone: elsewhere choosing
+            costs more than what it saves.
+        room: Places for samples where nothing may wait for their number, see `march`.
     """
 
     grid: OccupancyGrid
@@ -46,6 +51,7 @@ class GridRenderer(RayRenderer):
     skip_empty: bool = True
     occlusion: float = 0.001
     thinning: float = 0.0
+    room: int | None = None
 
     @property
     def device(self) -> torch.device:
@@ -88,15 +94,18 @@ class GridRenderer(RayRenderer):
             step=self.step,
             skip_empty=self.skip_empty,
             occlusion=self.occlusion,
+            room=self.room,
         )
 
         def ask(chosen: Tensor | slice) -> tuple[Tensor, Tensor]:
             points, ray = samples.points[chosen], samples.ray[chosen]
             return shade(field, points, times, directions, ray)
 
-        thin = self.thinning > 0 and torch.is_grad_enabled()
+        thin = self.thinning > 0 and torch.is_grad_enabled() and origins.device.type == "cpu"
         cut = Cut.of(ask, self.thinning) if thin else None
         colour, density = (cut.colour, cut.density) if cut else ask(slice(None))
+        if samples.live is not None:
+            density = torch.where(samples.live, density, 0)
         total, _ = composite(
             density * self.step, colour, samples.distances, samples.ray, samples.starts
         )
@@ -168,7 +177,10 @@ class OccupancySettings(SamplerSettings):
                 carve(grid, site.views, site.frame)
             if site.initialised and self.fill:
                 _fill(renderer, field, site)
-        return OccupancySampler(renderer, self)
+        room = site.samples_per_batch
+        # A batch may hold more than the average, and a ray at least must find room.
+        most = None if room is None else max(math.ceil(SPARE * room), 2 * self.samples)
+        return OccupancySampler(renderer, self, most)
 
     def for_video(self) -> "OccupancySettings":
         return replace(self, render_samples=self.samples)
@@ -193,11 +205,14 @@ class OccupancySampler(Sampler):
     Args:
         renderer: Its grid is changed in place.
         settings: Upkeep of the grid.
+        room: Places for the samples of a batch on a GPU; None takes as many as there are.
     """
 
-    def __init__(self, renderer: GridRenderer, settings: OccupancySettings) -> None:
+    def __init__(
+        self, renderer: GridRenderer, settings: OccupancySettings, room: int | None = None
+    ) -> None:
         self.settings, self.grid = settings, renderer.grid
-        self._training = replace(renderer, thinning=settings.thinning)
+        self._training = replace(renderer, thinning=settings.thinning, room=room)
         self._coarse = replace(self._training, samples=math.ceil(renderer.samples / 2))
         self._images = replace(renderer, samples=settings.render_samples)
 
@@ -231,13 +246,14 @@ class OccupancySampler(Sampler):
             rays["jitter"],
         )
 
-    def pass_on(self, rendering: Rendering, state: TrainingState) -> int:
+    def pass_on(self, rendering: Rendering, state: TrainingState) -> int | Tensor:
         if rendering.cut is None:
-            return len(rendering.samples)
+            return rendering.samples.count
         return rendering.cut.pass_on(state.generator(rendering.density.device, Stream.THINNING))
 
     def observe(self, rendering: Rendering) -> None:
-        self.grid.observe(rendering.samples.cells, rendering.density)
+        samples = rendering.samples
+        self.grid.observe(samples.cells, rendering.density, samples.live)
 
     def update(self, field: Any, state: TrainingState) -> None:
         step, settings = state.step, self.settings
@@ -248,6 +264,10 @@ class OccupancySampler(Sampler):
         generator = step_generator(state.seed, step, Stream.GRID)
         if sweeping:
             self.grid.sweep(field, generator)
+        elif (device := self.grid.density.device).type != "cpu":
+            shape = (settings.update_cells, 8)
+            uniform = counted_uniform(state.seed, step, Stream.GRID, shape, device)
+            self.grid.update_by(field, uniform)
         else:
             self.grid.update(field, settings.update_cells, generator)
 

@@ -27,6 +27,9 @@ from xplanes.streams import Stream, TrainingState, counted_uniform, step_generat
 SPARE = 1.25
 """Places for the samples of a batch, over their average."""
 
+STEP_OF_ROOM = 1024
+"""Their number is a multiple of this."""
+
 DIAGONAL = 2 * math.sqrt(3)
 """Longest way through the field's cube."""
 
@@ -177,10 +180,7 @@ class OccupancySettings(SamplerSettings):
                 carve(grid, site.views, site.frame)
             if site.initialised and self.fill:
                 _fill(renderer, field, site)
-        room = site.samples_per_batch
-        # A batch may hold more than the average, and a ray at least must find room.
-        most = None if room is None else max(math.ceil(SPARE * room), 2 * self.samples)
-        return OccupancySampler(renderer, self, most)
+        return OccupancySampler(renderer, self, site.samples_per_batch)
 
     def for_video(self) -> "OccupancySettings":
         return replace(self, render_samples=self.samples)
@@ -205,16 +205,18 @@ class OccupancySampler(Sampler):
     Args:
         renderer: Its grid is changed in place.
         settings: Upkeep of the grid.
-        room: Places for the samples of a batch on a GPU; None takes as many as there are.
+        samples: Samples of a batch on average at most; None if not known.
     """
 
     def __init__(
-        self, renderer: GridRenderer, settings: OccupancySettings, room: int | None = None
+        self, renderer: GridRenderer, settings: OccupancySettings, samples: int | None = None
     ) -> None:
-        self.settings, self.grid = settings, renderer.grid
+        self.settings, self.grid, self.samples = settings, renderer.grid, samples
+        room = None if samples is None else self._room(samples)
         self._training = replace(renderer, thinning=settings.thinning, room=room)
         self._coarse = replace(self._training, samples=math.ceil(renderer.samples / 2))
         self._images = replace(renderer, samples=settings.render_samples)
+        self._coarse_images = replace(self._coarse, room=None)
 
     @property
     def renderer(self) -> GridRenderer:
@@ -233,7 +235,7 @@ class OccupancySampler(Sampler):
 
     def renderer_at(self, step: int) -> GridRenderer:
         # At first the grid hides little, and images of all samples would take longer than steps.
-        return self._coarse if step < self.settings.coarse_steps else self._images
+        return self._coarse_images if step < self.settings.coarse_steps else self._images
 
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
         coarse = state.step < self.settings.coarse_steps
@@ -276,6 +278,19 @@ class OccupancySampler(Sampler):
         if distributed.is_available() and distributed.is_initialized():
             for part in (self.grid.density, self.grid.least, self.grid.occupied):
                 distributed.broadcast(part, src=0)
+
+    def expect(self, samples: float) -> None:
+        if self.samples is not None:
+            room = self._room(min(samples, self.samples))
+            self._training = replace(self._training, room=room)
+            self._coarse = replace(self._coarse, room=room)
+
+    def _room(self, samples: float) -> int:
+        """Places for batches of so many samples on average: some hold more."""
+        # A ray must find room, and few sizes let memory be used again.
+        return STEP_OF_ROOM * math.ceil(
+            max(SPARE * samples, 2 * self.settings.samples) / STEP_OF_ROOM
+        )
 
     def scalars(self) -> dict[str, float]:
         return {"sampler/occupied": self.grid.occupied_fraction}

@@ -133,6 +133,10 @@ class Sampler(ABC):
         """Do what is due after an optimiser step."""
         return
 
+    def expect(self, samples: float) -> None:
+        """Make ready for batches of so many samples on average."""
+        return
+
     def scalars(self) -> dict[str, float]:
         """Values for the logger."""
         return {}

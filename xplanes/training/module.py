@@ -372,7 +372,9 @@ class RadianceModule(LightningModule):
         self.counts["passed"] += int(found.pop("passed"))
         rays = int(found.pop("rays"))
         self.counts["no_room"] += int(found.pop("all rays")) - rays
-        self._count({name: int(value) for name, value in found.items()}, rays, batches)
+        self._count({name: int(value) for name, value in found.items()}, rays)
+        # Of batches of as many rays as the next one has.
+        self._parts[1].expect(found["samples"] * self.rays / max(1, rays))
         self.unusable += skipped
         whole = skipped and skipped >= batches // self.ray_settings.accumulate
         self.unusable_in_a_row = self.unusable_in_a_row + skipped if whole else 0
@@ -445,7 +447,7 @@ class RadianceModule(LightningModule):
             entries["time/train_s"] = seconds
         self.log_dict(entries | sampler.scalars() | model.scalars(), batch_size=1)
 
-    def _count(self, shown: Mapping[str, int], rays: int, batches: int = 1) -> None:
+    def _count(self, shown: Mapping[str, int], rays: int) -> None:
         """Take in numbers of samples, by name, and of rays, of some batches."""
         for name, value in shown.items():
             self.counts[name] += value

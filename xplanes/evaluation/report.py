@@ -133,6 +133,7 @@ def summary(
         "skipped": {
             "empty": counts["empty"] / candidates,
             "occluded": counts["occluded"] / candidates,
+            "no_room": counts["no_room"] / max(1, counts["rays"] + counts["no_room"]),
             "gradients": 1 - counts["passed"] / max(1, counts["samples"]),
             "background": background_skipped,
             "static": float(not module.field.moves),

@@ -35,6 +35,9 @@ class TiNeuVox(ViewDependentField):
         precision: Of the matrix products.
         background: What lies behind the grid's box; None for a plain colour.
 
+    Attributes:
+        count: Number of cells of the grid as it is now.
+
     Source: TiNeuVox, released code.
     """
 
@@ -67,7 +70,8 @@ class TiNeuVox(ViewDependentField):
         self.shift = math.log(1 / (1 - alpha) - 1)
         self.register_buffer("box", box)
         self.register_buffer("voxels", torch.tensor(resolution**3 // 2**halvings))
-        self.grid = nn.Parameter(torch.zeros(1, channels, *self._size(int(self.voxels))))
+        self._read_buffers()
+        self.grid = nn.Parameter(torch.zeros(1, channels, *self._size(self.count)))
         points, times, directions, features = (1 + 2 * count for count in octaves)
         time_features = PER_CHANNEL * channels
         self.time = layers([times, width, time_features])
@@ -79,6 +83,12 @@ class TiNeuVox(ViewDependentField):
         self.colours = layers([width + 3 * directions, width // 2, 3])
         self.background = background
         self.register_load_state_dict_pre_hook(_fit_grid)
+        self.register_load_state_dict_post_hook(lambda field, _: field._read_buffers())
+
+    def _read_buffers(self) -> None:
+        """Keep on the host what each step asks for: a GPU would be waited for."""
+        self.count = int(self.voxels)
+        self._corners = self.box.double().cpu()
 
     @property
     def planes(self) -> Mapping[str, Tensor]:
@@ -108,7 +118,7 @@ class TiNeuVox(ViewDependentField):
     @property
     def cell(self) -> float:
         """Side of a cell in units of the frame."""
-        return self._cell(int(self.voxels)) / self.unit
+        return self._cell(self.count) / self.unit
 
     def bounds(self) -> Tensor:
         """Least and largest corner of the grid in the field's frame. [2, 3]"""
@@ -122,6 +132,7 @@ class TiNeuVox(ViewDependentField):
             self.grid.data, size=size, mode="trilinear", align_corners=True
         )
         self.voxels.fill_(voxels)
+        self.count = voxels
 
     def read(self, places: Tensor) -> Tensor:
         """The grid at three spacings, zero outside. World positions [N, 3] -> [N, 3 C]"""
@@ -162,11 +173,11 @@ class TiNeuVox(ViewDependentField):
         return torch.autocast(values.device.type, torch.bfloat16, enabled=self._precision == "bf16")
 
     def _cell(self, voxels: int) -> float:
-        low, high = self.box.double()
+        low, high = self._corners
         return float(((high - low).prod() / voxels) ** (1 / 3))
 
     def _size(self, voxels: int) -> list[int]:
-        low, high = self.box.double()
+        low, high = self._corners
         # Whole cells, but a rounding error must not cost one.
         sides = (high - low) / self._cell(voxels) + 1e-4
         return [max(2, int(side)) for side in sides.tolist()]

@@ -153,7 +153,7 @@ class TiNeuVoxModel(Model):
 
     def before_step(self, state: TrainingState, optimizer: torch.optim.Optimizer) -> None:
         voxels = self.voxels(state.step)
-        if int(self._field.voxels) != voxels:
+        if self._field.count != voxels:
             self._field.resize(voxels)
             optimizer.state.clear()
 
@@ -174,7 +174,7 @@ class TiNeuVoxModel(Model):
         return terms
 
     def scalars(self) -> dict[str, float]:
-        return {"grid/cells": float(self._field.voxels)}
+        return {"grid/cells": float(self._field.count)}
 
 
 def frusta_box(views: Views, near: float, far: float, margin: float) -> Tensor:
@@ -262,6 +262,16 @@ class MaskedAdam(torch.optim.Optimizer):
             mean.lerp_(gradient, 1 - first)
             square.mul_(second).addcmul_(gradient, gradient, value=1 - second)
             parameter.addcdiv_(mean, square.sqrt().add_(group["eps"]), value=-size * group["lr"])
+            return
+        if parameter.device.type != "cpu":
+            # A list of what is reached would be waited for.
+            still = gradient == 0
+            new_mean = torch.where(still, mean, mean.lerp(gradient, 1 - first))
+            new_square = (square * second).addcmul_(gradient, gradient, value=1 - second)
+            mean.copy_(new_mean)
+            square.copy_(torch.where(still, square, new_square))
+            change = mean / square.sqrt().add_(group["eps"])
+            parameter.sub_(change.masked_fill_(still, 0), alpha=size * group["lr"])
             return
         reached = gradient.flatten().nonzero()[:, 0]
         flat = gradient.flatten()[reached]

@@ -47,7 +47,11 @@ def behind(
     background: Background | None = getattr(field, "background", None)
     if background is None:
         return plain
-    seen = (opacity.detach() < 1 - DARK).nonzero()[:, 0]
+    clear = opacity.detach() < 1 - DARK
+    if clear.device.type != "cpu":
+        # Looking for those few would be waited for.
+        return torch.where(clear[:, None], look(background, origins, directions, jitter), 0)
+    seen = clear.nonzero()[:, 0]
     place = None if jitter is None else jitter[seen]
     colour = look(background, origins[seen], directions[seen], place, ends)
     black = torch.zeros_like(directions, dtype=colour.dtype)

@@ -1,5 +1,6 @@
 """Ray batches drawn without memory: the step alone decides what is in them."""
 
+import copy
 from dataclasses import dataclass
 from typing import Literal
 
@@ -7,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from xplanes.backend import memory_left
 from xplanes.scenes.changes import changing
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.silhouettes import foreground
@@ -21,7 +23,7 @@ from xplanes.scenes.store import (
 )
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Settings, Share
-from xplanes.streams import step_generator
+from xplanes.streams import counted_uniform, step_generator
 
 Batch = dict[str, Tensor]
 
@@ -36,6 +38,9 @@ PER_TILE = 32
 
 LEAST_TILES = 32
 """Tiles of a batch at least, if it has as many rays."""
+
+LARGEST_SHARE = 0.25
+"""Share of a GPU's free memory that images may take."""
 
 AHEAD = 8
 """Batches whose tiles the system is told to read in advance."""
@@ -120,10 +125,6 @@ class RayBatches:
             drawn = self._from_tiles(self.views.images, uniform, generator)
         else:
             drawn = self._from_memory(self.views.images, uniform)
-        far, view, row, column, colour = drawn
-        origins, directions = self.views.pixel_rays(view, row.float(), column.float())
-        origins, directions = self.frame.rays(origins, directions)
-        colour = colour.float() / 255
         shape = (self.rays, 3)
         if self.background == "random":
             background = torch.rand(shape, generator=generator)
@@ -131,14 +132,27 @@ class RayBatches:
             background = torch.rand(3, generator=generator).expand(shape)
         else:
             background = torch.ones(shape)
+        move = None
+        if self.background_jitter:
+            move = torch.rand(self.rays, generator=generator)
+        return self._served(drawn, background, move, uniform[:, 2].float())
+
+    def _served(
+        self, drawn: tuple[Tensor, ...], background: Tensor, move: Tensor | None, jitter: Tensor
+    ) -> Batch:
+        """A batch of pixels, what lies behind them, and random numbers from 0 to 1."""
+        far, view, row, column, colour = drawn
+        origins, directions = self.views.pixel_rays(view, row.float(), column.float())
+        origins, directions = self.frame.rays(origins, directions)
+        colour = colour.float() / 255
         return {
             "origins": origins,
             "directions": directions,
-            "times": self._times(view, far, generator),
+            "times": self._times(view, far, move),
             "target": colour[:, :3] + (1 - colour[:, 3:]) * background,
             "background": background,
             "alpha": colour[:, 3],
-            "jitter": uniform[:, 2].float(),
+            "jitter": jitter,
         }
 
     def _choose(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
@@ -216,13 +230,57 @@ class RayBatches:
             self.views.images.prefetch(*place[:, :2].unbind(dim=1))
         self._prefetched = step + AHEAD
 
-    def _times(self, view: Tensor, far: Tensor, generator: torch.Generator) -> Tensor:
-        """Times of rays, those far from silhouettes moved. int64 [R], bool [R] -> [R]"""
+    def _times(self, view: Tensor, far: Tensor, move: Tensor | None) -> Tensor:
+        """Times of rays, those far from silhouettes moved. int64 [R], bool [R], [R] -> [R]"""
         times = self.views.times[view]
-        if not self.background_jitter:
+        if move is None:
             return times
-        move = self.background_jitter * (2 * torch.rand(self.rays, generator=generator) - 1)
+        move = self.background_jitter * (2 * move - 1)
         return torch.where(far, (times + move).clamp(0, 1), times)
+
+
+class DeviceBatches(RayBatches):
+    """Batches drawn where the images lie, on a GPU: nothing is copied there, and nothing waits.
+
+    Like those of `RayBatches` they are a function of (seed, step, rank), of the same distribution;
+    the random numbers are others, each made from its own place (`counted_uniform`), so that they
+    are the same on every device.
+
+    Args:
+        batches: What to draw, from pinhole images in memory.
+        device: Where.
+    """
+
+    def __init__(self, batches: RayBatches, device: torch.device) -> None:
+        self.__dict__.update(batches.__dict__)
+        self.device = device
+        self.views = batches.views.to(device)
+        self.frame = batches.frame.to(device)
+        self.near, self.far = (
+            pool.to(device) if isinstance(pool, _PixelPool) else pool
+            for pool in (batches.near, batches.far)
+        )
+
+    @staticmethod
+    def can_serve(batches: RayBatches, device: torch.device) -> bool:
+        """Whether these rays can be drawn on a device, and their images have room there."""
+        views = batches.views
+        if device.type == "cpu" or views.is_stored or views.intrinsics.lenses is not None:
+            return False
+        return views.nbytes < LARGEST_SHARE * memory_left(device)
+
+    def draw(self, step: int) -> Batch:
+        shape = (self.rays, 7)
+        uniform = counted_uniform(self.seed, step, self.rank, shape, self.device)
+        assert isinstance(self.views.images, Tensor)
+        drawn = self._from_memory(self.views.images, uniform)
+        background = uniform[:, 3:6].float()
+        if self.background == "one":
+            background = background[:1].expand(self.rays, 3)
+        elif self.background == "white":
+            background = torch.ones_like(background)
+        move = uniform[:, 6].float() if self.background_jitter else None
+        return self._served(drawn, background, move, uniform[:, 2].float())
 
 
 class _PixelPool:
@@ -242,6 +300,12 @@ class _PixelPool:
 
     def __len__(self) -> int:
         return self.count
+
+    def to(self, device: torch.device) -> "_PixelPool":
+        """The same on another device."""
+        moved = copy.copy(self)
+        moved.pixels = None if self.pixels is None else self.pixels.to(device)
+        return moved
 
     def pick(self, uniform: Tensor) -> Tensor:
         """Pixels at places given by numbers from 0 to 1. [K] -> [K, 1]"""

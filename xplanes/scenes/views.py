@@ -326,6 +326,22 @@ class Views:
                 found[index, : has_ray.shape[0], : has_ray.shape[1]] &= has_ray
         return found
 
+    def to(self, device: torch.device) -> "Views":
+        """Views in memory, without lenses, on another device."""
+        intrinsics = self.intrinsics
+        assert isinstance(self.images, Tensor)
+        assert intrinsics.lenses is None
+        focal, centre, size = (
+            number.to(device) for number in (intrinsics.focal, intrinsics.centre, intrinsics.size)
+        )
+        return Views(
+            self.images.to(device),
+            self.camera_to_world.to(device),
+            self.times.to(device),
+            Intrinsics(focal, centre, size),
+            self.files,
+        )
+
     def subset(self, indices: Tensor) -> "Views":
         """The views at ``indices``, in that order. [K]"""
         intrinsics = self.intrinsics.subset(indices)

@@ -133,7 +133,7 @@ def summary(
         "skipped": {
             "empty": counts["empty"] / candidates,
             "occluded": counts["occluded"] / candidates,
-            "gradients": 1 - counts["passed"] / max(1, counts["samples"]),
+            "gradients": 1 - counts["passed"] / counts["samples"] if counts["samples"] else 0.0,
             "background": background_skipped,
             "static": float(not module.field.moves),
             "budget": 0.0 if ending is None else max(0.0, 1 - spent(trainer)),

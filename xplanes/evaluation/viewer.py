@@ -12,7 +12,7 @@ from xplanes.evaluation.render import orbit_poses
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.optional import require
 from xplanes.rendering.pictures import depth_picture, to_bytes
-from xplanes.scenes.views import camera_rays
+from xplanes.scenes.views import PosedCamera
 
 HOST = "127.0.0.1"
 SIZES = ("64", "96", "128", "200", "320", "480", "720")
@@ -67,19 +67,16 @@ def draw(
     """
     width = max(1, round(height * aspect))
     focal = 0.5 * height / math.tan(0.5 * fov)
-    device = trained.module.device
-    origins, directions = trained.frame.rays(*camera_rays(pose, focal, height, width))
-    image = trained.module.renderer.image(
+    image = trained.module.renderer.view(
         trained.module.field,
-        origins.to(device),
-        directions.to(device),
+        trained.frame,
+        PosedCamera(pose, focal, height, width),
         timestep,
-        trained.scene.background.to(device),
+        trained.scene.background,
     )
     if what == "depth":
-        shape = (height, width)
-        return to_bytes(depth_picture(image["depth"].view(shape), image["opacity"].view(shape)))
-    return to_bytes(image["colour"].view(height, width, 3))
+        return to_bytes(depth_picture(image["depth"], image["opacity"]))
+    return to_bytes(image["colour"])
 
 
 class Viewer:

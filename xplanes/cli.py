@@ -321,14 +321,16 @@ def _view(options: argparse.Namespace) -> None:
 
 def _add_export(commands: "argparse._SubParsersAction") -> None:
     parser = commands.add_parser(
-        "export", help="write meshes, point clouds or planes for other programs (extra: export)"
+        "export",
+        help="write meshes, points, planes or Gaussians for other programs (extra: export)",
     )
     _add_run(parser)
     parser.add_argument(
         "--what",
-        choices=["mesh", "points", "planes"],
+        choices=["mesh", "points", "planes", "gaussians"],
         default="mesh",
-        help="what to write; planes of X-Planes alone; default: %(default)s",
+        help="what to write; planes of X-Planes alone, Gaussians of models with such alone; "
+        "default: %(default)s",
     )
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="empty or new; default: RUN/export/WHAT"

@@ -33,7 +33,8 @@ def hull_points(views: Views, frame: Frame, count: int) -> tuple[Tensor, Tensor]
     Args:
         views: Training views. Without alpha the points are random.
         frame: The field's frame.
-        count: Number of points; places are drawn with torch's generator.
+        count: Number of points; places are drawn with torch's generator. They lie where half of the
+            views look at least.
 
     Returns:
         Places in the field's frame and colours from 0 to 1: the mean over views of the pixels that
@@ -46,9 +47,7 @@ def hull_points(views: Views, frame: Frame, count: int) -> tuple[Tensor, Tensor]
     axis = (torch.arange(CELLS) + 0.5) * (2 / CELLS) - 1
     centres = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).view(-1, 3)
     world, radius = frame.to_world(centres), 0.5 / CELLS / frame.scale
-    share = torch.cat(
-        [may_hold(views, part, radius=radius).float().mean(dim=0) for part in world.split(CHUNK)]
-    )
+    share = torch.cat([_agreement(views, part, radius) for part in world.split(CHUNK)])
     solid = (share >= AGREEMENT * share.max()).view(1, 1, CELLS, CELLS, CELLS)
     # A cell lies inside if all 26 around it do; beyond the cube there is nothing.
     around = F.max_pool3d(F.pad((~solid).float(), [1] * 6, value=1.0), 3, stride=1) > 0
@@ -58,22 +57,34 @@ def hull_points(views: Views, frame: Frame, count: int) -> tuple[Tensor, Tensor]
     return points, _mean_colours(views, frame.to_world(points))
 
 
+def _agreement(views: Views, points: Tensor, radius: float) -> Tensor:
+    """Share of the views that see world points whose silhouettes hold them; 0 if few do. [N]"""
+    held = may_hold(views, points, radius=radius)
+    seen = torch.stack([_pixels(views, index, points)[2] for index in range(len(views))])
+    count = seen.sum(dim=0)
+    return (held & seen).sum(dim=0) / count.clamp(min=1) * (2 * count >= len(views))
+
+
+def _pixels(views: Views, index: int, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows and columns of a view's pixels that show world points, and which are in it. [N] each"""
+    (height, width), intrinsics = views.size(index), views.intrinsics
+    column, row, seen = project(
+        views.camera_to_world[index],
+        points,
+        focal=intrinsics.focal[index],
+        centre=intrinsics.centre[index],
+        lenses=intrinsics.lens(index),
+    )
+    seen = seen & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return row, column, seen
+
+
 def _mean_colours(views: Views, points: Tensor) -> Tensor:
     """Mean colour of the pixels with alpha that show world points; grey where none does. [N, 3]"""
     total, weight = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
-    for index, pose in enumerate(views.camera_to_world):
-        height, width = views.size(index)
-        intrinsics = views.intrinsics
-        column, row, seen = project(
-            pose,
-            points,
-            focal=intrinsics.focal[index],
-            centre=intrinsics.centre[index],
-            lenses=intrinsics.lens(index),
-        )
-        seen = seen & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        places = row[seen].long() * width + column[seen].long()
-        pixels = views.image(index).reshape(-1, 4)[places].float() / 255
+    for index in range(len(views)):
+        row, column, seen = _pixels(views, index, points)
+        pixels = views.image(index)[row[seen].long(), column[seen].long()].float() / 255
         total[seen] += pixels[:, :3]
         weight[seen] += pixels[:, 3:]
     return torch.where(weight > 0, total / weight.clamp(min=1e-6), 0.5).clamp(0, 1)

@@ -44,8 +44,8 @@ class SceneDataModule(LightningDataModule):
     the seed, the number of batches before it and the rank, so that a resumed run draws the very
     rays of an uninterrupted one. Rays or whole views, how many rays and which, the LightningModule
     says as ``ray_settings`` and ``frame``; without these it gets 1024 rays over all pixels, in the
-    frame of the scene's cube. The batches
-    are endless; an epoch is as many as the training views have pixels.
+    frame of the scene's cube. The batches are endless; an epoch is as many as the training views
+    have pixels.
 
     A batch of `val_dataloader`, `test_dataloader` and `predict_dataloader` is one whole view of its
     own size:

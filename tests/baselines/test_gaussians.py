@@ -343,7 +343,7 @@ def test_gradients_of_the_planes_terms_are_those_of_their_values():
     total.backward()
     for plane, gradient in zip(wide, found, strict=True):
         torch.testing.assert_close(gradient, 2 * plane.grad.float(), rtol=1e-4, atol=1e-9)
-    assert sum(model.regularisers(state).values()) == pytest.approx(float(total), rel=1e-5)
+    assert sum(model.regularisers(state).values()) == pytest.approx(float(total.detach()), rel=1e-5)
     model.regularise(TrainingState(0, 5, 5, 0))
     assert all(torch.equal(a, p.grad) for a, p in zip(found, planes, strict=True))
 
@@ -447,6 +447,7 @@ def test_what_does_not_fit_is_refused(tmp_path, scenes):
             Method.read(baseline_config(scenes, *overrides))
     for override, words in (
         ("degree=4", r"degree=4: must be 0 to 3"),
+        ("precision=bf16", r"precision=bf16: .* set 32 or auto"),
         ("scales=[]", r"scales=\[\]: must be one or more"),
         ("final_lr=0", r"final_lr=0\.0: the decay is exponential"),
         ("count=900000", r"count=900000: must not be above densify\.most=20000"),

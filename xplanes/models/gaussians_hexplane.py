@@ -66,6 +66,8 @@ class HexPlaneGaussiansSettings(ModelSettings):
     loss: HexPlaneLoss
 
     def check(self) -> None:
+        if self.precision == "bf16":
+            raise ConfigError("precision=bf16: Gaussians are computed in float32; set 32 or auto")
         if not self.scales:
             raise ConfigError("scales=[]: must be one or more numbers above 0")
         if self.degree > MAX_DEGREE:

@@ -16,7 +16,7 @@ from xplanes.errors import ConfigError
 from xplanes.evaluation.export import ExportOptions, export, write_gaussians
 from xplanes.fields.gaussians import Gaussians, HexPlaneGaussians, neighbour_distance
 from xplanes.fields.products import PlaneProducts
-from xplanes.models.densification import densify, forget, reset_opacity, select_rows
+from xplanes.models.densification import densify, reset_opacity, select_rows
 from xplanes.models.gaussians_hexplane import camera_extent
 from xplanes.models.hull import hull_points
 from xplanes.models.initialisation import Method
@@ -211,8 +211,6 @@ def test_resets_and_large_ones():
     assert float(field.opacities.detach().max()) <= 0.01 + 1e-7
     assert not optimizer.state[field.logits]["exp_avg"].any()
     assert optimizer.state[field.means]["exp_avg"].all()
-    forget(optimizer, [field.means])
-    assert not optimizer.state[field.means]["exp_avg_sq"].any()
 
 
 def test_nothing_left_and_numbers_that_are_not_finite_are_named():

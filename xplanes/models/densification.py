@@ -1,10 +1,9 @@
 """Adaptive density control: Gaussians are cloned, split and removed as training goes on."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from xplanes.fields.gaussians import Gaussians
 from xplanes.rendering.gaussians.rasteriser import GaussianError
@@ -118,12 +117,6 @@ def reset_opacity(field: Gaussians, optimizer: torch.optim.Optimizer) -> None:
     """Lower all opacities to `RESET_OPACITY` at most, with moments of 0."""
     most = torch.tensor(RESET_OPACITY).logit()
     field.logits.data.clamp_(max=float(most))
-    forget(optimizer, [field.logits])
-
-
-def forget(optimizer: torch.optim.Optimizer, parameters: Sequence[nn.Parameter]) -> None:
-    """Set the moments of parameters to 0."""
-    for parameter in parameters:
-        for name, moments in optimizer.state.get(parameter, {}).items():
-            if name != "step":
-                moments.zero_()
+    for name, moments in optimizer.state.get(field.logits, {}).items():
+        if name != "step":
+            moments.zero_()

@@ -12,7 +12,7 @@ from xplanes.fields.products import PlaneProducts
 from xplanes.fields.regularisers import add_time_smoothness_gradient, time_smoothness
 from xplanes.metrics import dissimilarity
 from xplanes.models.base import InitialValues, Model, ModelSettings
-from xplanes.models.densification import DensifySettings, densify, forget, reset_opacity
+from xplanes.models.densification import DensifySettings, densify, reset_opacity
 from xplanes.models.hull import hull_points, random_points
 from xplanes.rendering.gaussians.harmonics import MAX_DEGREE
 from xplanes.rendering.gaussians.renderer import RasterisedRendering
@@ -160,7 +160,7 @@ class HexPlaneGaussiansModel(Model):
         field.degree.fill_(min(settings.degree, step // settings.degree_every))
         if field.moves and not field.deforms and state.progress >= settings.static_share:
             field.deforms.fill_(True)
-            forget(optimizer, [p for group in optimizer.param_groups for p in group["params"]])
+            optimizer.state.clear()
             field.slopes.zero_()
             field.seen.zero_()
         control = settings.densify

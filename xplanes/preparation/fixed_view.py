@@ -96,7 +96,7 @@ def fixed_view(
             "(transforms_video.json); set preparation.fixed_view=train"
         )
     times = scene.splits["train"].times
-    count = 1 if scene.splits["train"].is_static else options.frames
+    count = 1 if scene.splits["train"].is_static else options.frames or len(times.unique())
     # A video without alpha shows a world around the thing, which LRMs would take for a part of it.
     whole = scene.video is not None and scene.is_surrounded and scene.video.is_opaque
     if scene.video is not None and (
@@ -105,10 +105,13 @@ def fixed_view(
         check_camera(scene.video)
         views = pick_frames(scene.video, torch.linspace(0, 1, count) if count > 1 else times[:1])
         return FixedView(views, frame.centre, 0.0, f"{len(views)} frames of the scene's video")
-    if scene.is_surrounded:
+    if scene.cut is not None:
+        place = replace(place, scene=replace(scene, splits=scene.splits | {"train": scene.cut}))
+    elif scene.is_surrounded:
         place.say(
             f"fixed view: the images of {scene.name} have no silhouettes, so the LRM is shown all "
-            "that is found in the cube, the ground included; masks would show it the thing alone"
+            "that is found in the cube, the ground included; masks would show it the thing alone "
+            "(data.mask_use=lrm)"
         )
     return _rendered(method, place, view, size, count, cache)
 
@@ -257,7 +260,8 @@ def _rendered(
 
 def _budget(options: PreparationSettings) -> str:
     """How long the field that renders the video is trained, in words."""
-    return f"up to {options.fixed_view_steps} steps or {options.fixed_view_seconds:g} s"
+    steps, seconds = options.fixed_view_steps, options.fixed_view_seconds
+    return f"{steps} steps" if seconds is None else f"up to {steps} steps or {seconds:g} s"
 
 
 def _intrinsics_key(intrinsics: Intrinsics) -> list[Tensor]:

@@ -52,6 +52,8 @@ SLACK = 1.001
 X, Y, LIGHT, LEFT, STOP, OPACITY, F0, F1, F2, F3 = range(10)
 BEHIND = LIGHT
 PLANES = 10
+AT = tuple(np.uint64(plane * PIXELS) for plane in range(PLANES))
+"""Where the planes begin; unsigned, since numba would look for indices that count from the end."""
 
 f32 = np.float32
 
@@ -159,7 +161,7 @@ def project(
         whitening[n, 0], whitening[n, 1], whitening[n, 2] = first, shear, last
         if peaks[n] < LEAST_ALPHA:
             continue
-        reach = np.sqrt(2 * np.log(peak / LEAST_ALPHA))
+        reach = np.sqrt(2 * np.log(max(peak / LEAST_ALPHA, 1.0)))
         extent_x, extent_y = reach * np.sqrt(xx), reach * np.sqrt(yy)
         if (
             right + extent_x > 0
@@ -448,16 +450,10 @@ def _alpha(u, v, peak):
 
 
 @njit(**EXACT)
-def _at(plane, pixel):
-    """Place of a pixel in a flat buffer."""
-    return np.uint64(plane * PIXELS) + np.uint64(pixel)
-
-
-@njit(**EXACT)
 def _offset(flat, i, mean_x, mean_y, first, shear, last):
     """Offset of a pixel from a mean, whitened, and along y in pixels."""
-    y = flat[_at(Y, i)] - mean_y
-    return first * (flat[_at(X, i)] - mean_x) + shear * y, last * y, y
+    y = flat[i + AT[Y]] - mean_y
+    return first * (flat[i + AT[X]] - mean_x) + shear * y, last * y, y
 
 
 @njit(**EXACT)
@@ -465,7 +461,7 @@ def _rows(geometry, m, top):
     """Pixels of the tile's rows that a Gaussian reaches."""
     middle, extent = geometry[m, 1] - top, geometry[m, 8]
     first, last = _span(middle - extent, middle + extent, 1, TILE_HEIGHT)
-    return first * TILE_WIDTH, last * TILE_WIDTH
+    return np.uint64(first * TILE_WIDTH), np.uint64(last * TILE_WIDTH)
 
 
 @njit(**EXACT)
@@ -503,18 +499,18 @@ def _blend_one(flat, begin, end, member, geometry, features, m, group):
         u, v, _ = _offset(flat, i, mean_x, mean_y, first, shear, last)
         alpha = min(_alpha(u, v, peak), f32(MOST_ALPHA))
         alpha = alpha if alpha >= f32(LEAST_ALPHA) else f32(0)
-        light = flat[_at(LIGHT, i)]
+        light = flat[i + AT[LIGHT]]
         after = light * (f32(1) - alpha)
         done = after < f32(LEAST_TRANSMITTANCE)
         weight = f32(0) if done else alpha * light
-        flat[_at(STOP, i)] = min(flat[_at(STOP, i)], member) if done else flat[_at(STOP, i)]
-        flat[_at(LEFT, i)] = flat[_at(LEFT, i)] if done else after
-        flat[_at(LIGHT, i)] = f32(0) if done else after
-        flat[_at(OPACITY, i)] += weight
-        flat[_at(F0, i)] += weight * f0
-        flat[_at(F1, i)] += weight * f1
-        flat[_at(F2, i)] += weight * f2
-        flat[_at(F3, i)] += weight * f3
+        flat[i + AT[STOP]] = min(flat[i + AT[STOP]], member) if done else flat[i + AT[STOP]]
+        flat[i + AT[LEFT]] = flat[i + AT[LEFT]] if done else after
+        flat[i + AT[LIGHT]] = f32(0) if done else after
+        flat[i + AT[OPACITY]] += weight
+        flat[i + AT[F0]] += weight * f0
+        flat[i + AT[F1]] += weight * f1
+        flat[i + AT[F2]] += weight * f2
+        flat[i + AT[F3]] += weight * f3
 
 
 @njit(parallel=True, **COMPILE)
@@ -558,23 +554,23 @@ def _blend_one_backward(flat, begin, end, member, geometry, features, m, group, 
     f2, f3 = features[m, group + 2], features[m, group + 3]
     s, su, suu, suy, sy, syy = f32(0), f32(0), f32(0), f32(0), f32(0), f32(0)
     d0, d1, d2, d3 = f32(0), f32(0), f32(0), f32(0)
-    for i in range(np.uint64(begin), np.uint64(end)):
+    for i in range(begin, end):
         u, v, y = _offset(flat, i, mean_x, mean_y, first, shear, last)
         whole = _alpha(u, v, peak)
         alpha = min(whole, f32(MOST_ALPHA))
-        seen = alpha >= f32(LEAST_ALPHA) and member < flat[_at(STOP, i)]
+        seen = alpha >= f32(LEAST_ALPHA) and member < flat[i + AT[STOP]]
         alpha = alpha if seen else f32(0)
         more = f32(1) / (f32(1) - alpha)
-        light = flat[_at(LEFT, i)] * more
+        light = flat[i + AT[LEFT]] * more
         weight = alpha * light
-        g0, g1 = flat[_at(F0, i)], flat[_at(F1, i)]
-        g2, g3 = flat[_at(F2, i)], flat[_at(F3, i)]
+        g0, g1 = flat[i + AT[F0]], flat[i + AT[F1]]
+        g2, g3 = flat[i + AT[F2]], flat[i + AT[F3]]
         value = f0 * g0 + f1 * g1 + f2 * g2 + f3 * g3
         # What the pixel gains as this Gaussian thickens, less what those behind it lose.
-        slope = alpha * (light * value - more * flat[_at(BEHIND, i)])
+        slope = alpha * (light * value - more * flat[i + AT[BEHIND]])
         slope = slope if whole <= f32(MOST_ALPHA) else f32(0)
-        flat[_at(LEFT, i)] = light
-        flat[_at(BEHIND, i)] += weight * value
+        flat[i + AT[LEFT]] = light
+        flat[i + AT[BEHIND]] += weight * value
         s += slope
         su += slope * u
         suu += slope * u * u

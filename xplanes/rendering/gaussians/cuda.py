@@ -44,13 +44,15 @@ def draw(
         render_mode="RGB+D",
         rasterize_mode="antialiased" if antialiased else "classic",
     )
-    means2d = details["means2d"].detach()[0].requires_grad_()
+    attached = details["means2d"]
+    means2d = attached.detach()[0]
 
     def keep(gradient: Tensor) -> None:
         means2d.grad = gradient[0] if means2d.grad is None else means2d.grad + gradient[0]
 
-    if details["means2d"].requires_grad:
-        details["means2d"].register_hook(keep)
+    if attached.requires_grad:
+        means2d.requires_grad_()
+        attached.register_hook(keep)
     xx, xy, yy = details["conics"].detach()[0].double().unbind(-1)
     # Eigenvalues of the inverse covariance: the longest axis has the smaller one.
     larger = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor, are_deterministic_algorithms_enabled
+from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from xplanes.backend import compiled, cpu_loops
@@ -73,9 +73,8 @@ def rasterise(
         antialiased: Lower the opacity of a Gaussian as the low-pass filter widens it, so that it
             stops as much light as before (Mip-Splatting, Yu et al. 2024).
 
-    On the CPU, float32 goes through compiled loops, which come to the same bits each time; on CUDA,
-    through `gsplat` (extra ``gaussians``), which does not. Where torch must be deterministic, CUDA
-    takes plain torch, as float64 does on the CPU.
+    Float32 goes through compiled loops on the CPU, which come to the same bits each time, and
+    through gsplat (extra ``gaussians``) on CUDA, which does not. Plain torch takes float64.
 
     Raises:
         GaussianError: If shapes disagree, a number is not finite, or there are too many.
@@ -86,15 +85,21 @@ def rasterise(
         **{"opacities": opacities, "colours": colours},
     }
     _check(given, background)
-    dtype = torch.float64 if means.dtype == torch.float64 else torch.float32
+    means = means if means.dtype == torch.float64 else means.float()
     draw = _draw_reference
-    if cpu_loops(means) and dtype == torch.float32:
-        draw = _draw
-    elif means.is_cuda and dtype == torch.float32 and not are_deterministic_algorithms_enabled():
-        draw = cuda.draw
+    if means.dtype == torch.float32:
+        if cpu_loops(means):
+            draw = _draw
+        elif means.is_cuda:
+            draw = cuda.draw
     means2d, radii, image, opacity = draw(
-        *(means.to(dtype), quaternions.to(dtype), scales.to(dtype)),
-        *(opacities.to(dtype), colours.to(dtype), camera, antialiased),
+        means,
+        quaternions.to(means.dtype),
+        scales.to(means.dtype),
+        opacities.to(means.dtype),
+        colours.to(means.dtype),
+        camera,
+        antialiased,
     )
     colour, depth = image[..., :-1], image[..., -1]
     if background is not None:
@@ -261,6 +266,15 @@ def _check(given: dict[str, Tensor], background: Tensor | None) -> None:
                 f"{name} of Gaussian {row} of {count} are {tensor[row].tolist()}: must be finite. "
                 "Drop such Gaussians, or lower the learning rate that made them"
             )
+    scales, opacities = given["scales"], given["opacities"]
+    for name, wrong, allowed in (
+        ("scales", (scales < 0).any(-1), "0 or more"),
+        ("opacities", (opacities < 0) | (opacities > 1), "from 0 to 1"),
+    ):
+        if wrong.any():
+            row = int(wrong.nonzero()[0])
+            value = given[name][row].tolist()
+            raise GaussianError(f"{name} of Gaussian {row} are {value}: must be {allowed}")
     if background is not None and background.shape != given["colours"].shape[1:]:
         raise GaussianError(
             f"background is {list(background.shape)}, but must be "

@@ -325,15 +325,16 @@ def _view(options: argparse.Namespace) -> None:
 
 def _add_export(commands: "argparse._SubParsersAction") -> None:
     parser = commands.add_parser(
-        "export", help="write meshes, point clouds, planes or camera paths for other programs"
+        "export",
+        help="write meshes, point clouds, planes, Gaussians or camera paths for other programs",
     )
     _add_run(parser)
     parser.add_argument(
         "--what",
-        choices=["mesh", "points", "planes", "path"],
+        choices=["mesh", "points", "planes", "gaussians", "path"],
         default="mesh",
-        help="what to write: mesh and points (extra: export), planes of X-Planes alone, or a path "
-        "of the training cameras; default: %(default)s",
+        help="what to write: mesh and points (extra: export), planes of X-Planes alone, Gaussians "
+        "of models that have such, or a path of the training cameras; default: %(default)s",
     )
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="empty or new; default: RUN/export/WHAT"

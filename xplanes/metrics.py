@@ -19,11 +19,22 @@ def ssim(prediction: Tensor, truth: Tensor) -> float:
 
     Images below 11 pixels a side have no window to slide and score NaN.
     """
-    from torchmetrics.functional.image import structural_similarity_index_measure
-
     if min(truth.shape[:2]) < 11:
         return float("nan")
-    first, second = (t.clamp(0, 1).float().permute(2, 0, 1)[None] for t in (prediction, truth))
+    return float(_similarity(prediction.clamp(0, 1), truth.clamp(0, 1)))
+
+
+def dissimilarity(prediction: Tensor, truth: Tensor) -> Tensor:
+    """1 - SSIM as a term of a loss, differentiable; 0 for images below 11 pixels a side. []"""
+    if min(truth.shape[:2]) < 11:
+        return prediction.new_zeros(())
+    return 1 - _similarity(prediction, truth)
+
+
+def _similarity(prediction: Tensor, truth: Tensor) -> Tensor:
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    first, second = (t.float().permute(2, 0, 1)[None] for t in (prediction, truth))
     score = structural_similarity_index_measure(first, second, data_range=1.0)
     assert isinstance(score, Tensor)
-    return float(score)
+    return score

@@ -36,6 +36,7 @@ from xplanes.lrm import LRMError
 from xplanes.models.initialisation import Initialisation, Place
 from xplanes.optional import MissingExtraError
 from xplanes.process import train_command
+from xplanes.rendering.gaussians.rasteriser import GaussianError
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame
@@ -56,6 +57,7 @@ KNOWN_ERRORS = (
     SceneError,
     LRMError,
     TrainingError,
+    GaussianError,
     MissingExtraError,
     StorageError,
     MisconfigurationException,
@@ -162,7 +164,7 @@ def _recorded(experiment: Experiment, folder: Path, overrides: list[str], *, res
             # On a full disk the record stays "running", as after a power cut; resume= takes both.
             with suppress(StorageError):
                 record.end("failed", f"{type(error).__name__}: {error}")
-            if isinstance(error, OSError | TrainingError):
+            if isinstance(error, OSError | TrainingError | GaussianError):
                 say(f"\nstopped. Once that is fixed: {train_command()} resume={folder}")
             raise
     return metrics["test"]["psnr"]

@@ -43,6 +43,10 @@ class Stream(IntEnum):
     """Noise of time planes that are initialised from an LRM."""
     BACKGROUND = 1_000_289
     """Initial values of what lies behind the field's cube."""
+    VIEWS = 1_000_303
+    """Order of the training views, where a batch is a whole view."""
+    SPLITTING = 1_000_333
+    """Where the halves of split Gaussians go."""
 
 
 def step_generator(seed: int, step: int, stream: int = 0) -> torch.Generator:
@@ -116,12 +120,14 @@ class TrainingState:
         step: Optimiser steps done.
         batch: Batches drawn before this one.
         rank: Number of this process among those that split the rays.
+        progress: Share of the budget that is spent.
     """
 
     seed: int
     step: int
     batch: int
     rank: int
+    progress: float = 0.0
 
     def generator(self, device: torch.device, stream: Stream = Stream.JITTER) -> torch.Generator:
         """Random numbers of this batch, rank and stream, and of nothing else."""

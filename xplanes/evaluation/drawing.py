@@ -8,12 +8,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from xplanes.rendering.base import RayRenderer
+from xplanes.fields.gaussians import PosedGaussians
+from xplanes.rendering.base import RayRenderer, Renderer
 from xplanes.rendering.grid_renderer import GridRenderer
 from xplanes.rendering.pictures import depth_picture
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.silhouettes import may_hold
-from xplanes.scenes.views import Views, camera_rays
+from xplanes.scenes.views import PosedCamera, Views
 from xplanes.training.evaluation import VISIBLE, spread
 
 MODES = ("colour", "depth", "opacity", "floaters")
@@ -57,10 +58,15 @@ class Shot:
         """Columns."""
         return max(1, round(self.height * self.aspect))
 
+    @property
+    def camera(self) -> PosedCamera:
+        """The camera, where the world is the field's frame."""
+        focal = 0.5 * self.height / math.tan(0.5 * self.fov)
+        return PosedCamera(self.pose, focal, self.height, self.width)
+
     def rays(self) -> tuple[Tensor, Tensor]:
         """Rays through all pixels, row by row. [H W, 3], [H W, 3]"""
-        focal = 0.5 * self.height / math.tan(0.5 * self.fov)
-        return camera_rays(self.pose, focal, self.height, self.width)
+        return self.camera.rays()
 
 
 @dataclass(frozen=True)
@@ -106,10 +112,15 @@ class Masked:
         distance, *others = self._field.distance_and_slope(points, times)
         return torch.where(self._keep(points), distance, OUTSIDE), *others
 
+    def at(self, time: float) -> PosedGaussians:
+        """As `Gaussians.at`; a Gaussian is where its mean is."""
+        posed = self._field.at(time)
+        return replace(posed, opacities=posed.opacities * self._keep(posed.means))
+
 
 def draw(
     field: Any,
-    renderer: RayRenderer,
+    renderer: Renderer,
     shot: Shot,
     *,
     views: Views,
@@ -127,7 +138,7 @@ def draw(
         views: Training views, whose silhouettes tell floaters.
         frame: The field's frame.
         background: Colour behind the scene. [3]
-        at_once: Rays after which ``stop`` is asked.
+        at_once: Rays after which ``stop`` is asked, where single rays are rendered.
         stop: Whether the picture is no longer wanted.
 
     Returns:
@@ -146,17 +157,18 @@ def draw(
         outside = Masked(shown, ruled_out(views, frame, shot.time))
     origins, directions = shot.rays()
     moved = shift(renderer, shot.pose[:3, 3], views, frame)
+    at_once = at_once if isinstance(renderer, RayRenderer) else len(origins)
     parts: list[Tensor] = []
     for rays in zip(
         (origins + moved * directions).split(at_once), directions.split(at_once), strict=True
     ):
         if stop():
             return None
-        given = rays[0].to(device), rays[1].to(device), shot.time, background
-        seen = (solid if box is not None else renderer).image(shown, *given)
+        given = rays[0].to(device), rays[1].to(device), shot, background
+        seen = _seen(solid if box is not None else renderer, shown, *given)
         columns = [seen["colour"], seen["opacity"][:, None], seen["depth"][:, None]]
         if outside is not None:
-            columns.append(solid.image(outside, *given)["opacity"][:, None])
+            columns.append(_seen(solid, outside, *given)["opacity"][:, None])
         parts.append(torch.cat(columns, dim=1).float().cpu())
     image = torch.cat(parts).view(shot.height, shot.width, -1)
     colours, opacity, depth = image[..., :3], image[..., 3], image[..., 4] + moved
@@ -171,7 +183,23 @@ def draw(
     return Picture(colours.clamp(0, 1), nearest)
 
 
-def shift(renderer: RayRenderer, position: Tensor, views: Views, frame: Frame) -> float:
+def _seen(
+    renderer: Renderer,
+    field: Any,
+    origins: Tensor,
+    directions: Tensor,
+    shot: Shot,
+    background: Tensor,
+) -> dict[str, Tensor]:
+    """What rays of a shot see, which are all of them where a renderer takes no single rays."""
+    if isinstance(renderer, RayRenderer):
+        return renderer.image(field, origins, directions, shot.time, background)
+    frame = Frame(1.0, torch.eye(3), torch.zeros(3))
+    image = renderer.view(field, frame, shot.camera, shot.time, background)
+    return {name: value.flatten(0, 1) for name, value in image.items()}
+
+
+def shift(renderer: Renderer, position: Tensor, views: Views, frame: Frame) -> float:
     """How far along its rays a camera must be moved for a renderer with near and far bounds.
 
     These bounds hold for cameras as far from the scene as the training cameras; from elsewhere they

@@ -1,4 +1,4 @@
-"""Meshes, point clouds, planes and camera paths for other programs: `xplanes export`."""
+"""Meshes, points, planes, Gaussians and camera paths for other programs: `xplanes export`."""
 
 import json
 import math
@@ -18,15 +18,17 @@ from xplanes.evaluation.progress import progress
 from xplanes.evaluation.render import FPS
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.fields.base import ViewDependentField
+from xplanes.fields.gaussians import Gaussians
 from xplanes.fields.tensor4d import Tensor4D
 from xplanes.fields.tineuvox import TiNeuVox
 from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES, XPlanes
 from xplanes.files import replacing, require_writable, write_json
 from xplanes.optional import require
+from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.box import ray_box
 from xplanes.rendering.grid_renderer import GridRenderer
 
-KINDS = ("mesh", "points", "planes", "path")
+KINDS = ("mesh", "points", "planes", "gaussians", "path")
 FORMATS = ("ply", "glb")
 
 TIMES = 10
@@ -50,7 +52,7 @@ class ExportOptions:
     """What to export.
 
     Attributes:
-        what: ``mesh``, ``points``, ``planes`` or ``path``.
+        what: ``mesh``, ``points``, ``planes``, ``gaussians`` or ``path``.
         times: A number of times spread evenly from 0 to 1, or times separated by commas; None for
             10, or for 1 in a static scene.
         resolution: Grid points along each side of the field's cube.
@@ -119,7 +121,7 @@ def export(
     *,
     say: Callable[[str], None],
 ) -> Path:
-    """Write meshes, points, planes or cameras of a run, and ``export.json``, which lists them.
+    """Write what other programs read of a run, and ``export.json``, which lists the files.
 
     Args:
         trained: The run.
@@ -152,6 +154,17 @@ def export(
         facts["left_out"] = "what lies behind the field's cube"
         say(f"left out    {facts['left_out']}, which has no surface; --what planes has it")
     times = export_times(options.times or str(1 if trained.is_static else TIMES))
+    if options.what == "gaussians":
+        names = [f"gaussians_{number:04d}.ply" for number in range(len(times))]
+        for name, time in zip(names, times, strict=True):
+            write_gaussians(folder / name, trained, time)
+        write_json(folder / "export.json", {**facts, "files": names, "times": times})
+        return folder
+    if not isinstance(trained.module.renderer, RayRenderer):
+        raise ConfigError(
+            f"--what {options.what}: {trained.experiment.method.model.name} has Gaussians and no "
+            "density; set --what gaussians"
+        )
     threshold = options.threshold
     if isinstance(trained.module.field, Tensor4D):
         if threshold is not None:
@@ -347,6 +360,7 @@ def find_threshold(trained: TrainedRun, resolution: int, time: float) -> float:
     """
     volume = solidity(trained, time, resolution)[0]
     views, renderer = trained.scene.splits["train"], trained.module.renderer
+    assert isinstance(renderer, RayRenderer)
     shown, peaks = [], []
     for index in range(0, len(views), -(-len(views) // CAMERAS)):
         origins, directions = trained.frame.rays(*views.image_rays(index))
@@ -415,6 +429,55 @@ def surface_colours(trained: TrainedRun, points: Tensor, normals: Tensor, time: 
     return torch.cat(colours)
 
 
+@torch.no_grad()
+def write_gaussians(path: Path, trained: TrainedRun, time: float) -> None:
+    """Write the Gaussians of one timestep, in the world, as 3DGS and its viewers lay out a PLY.
+
+    Opacities are written before the sigmoid, scales as logarithms, colours as coefficients of
+    spherical harmonics, those of degree 1 and higher channel by channel.
+
+    Args:
+        path: The file.
+        trained: The run.
+        time: From 0 to 1.
+
+    Raises:
+        ConfigError: If the run's field is another one, or its frame is turned.
+
+    Source: Kerbl et al. 2023, released code.
+    """
+    field, frame = trained.module.field, trained.frame
+    if not isinstance(field, Gaussians):
+        raise ConfigError(
+            f"--what gaussians: {trained.experiment.method.model.name} has none; mesh and points "
+            "work with every radiance field"
+        )
+    if not torch.equal(frame.rotation, torch.eye(3)):
+        raise ConfigError(
+            "--what gaussians: the field's frame is turned against the world; train without a "
+            "frame of your own"
+        )
+    posed = field.at(time)
+    means, harmonics = frame.to_world(posed.means.cpu()), posed.harmonics
+    columns = {
+        "x y z": means,
+        "nx ny nz": torch.zeros_like(means),
+        "f_dc_0 f_dc_1 f_dc_2": harmonics[:, 0],
+        " ".join(f"f_rest_{n}" for n in range(3 * (harmonics.shape[1] - 1))): harmonics[:, 1:]
+        .transpose(1, 2)
+        .flatten(1),
+        "opacity": posed.opacities.logit()[:, None],
+        "scale_0 scale_1 scale_2": posed.scales.log() - math.log(frame.scale),
+        "rot_0 rot_1 rot_2 rot_3": F.normalize(posed.quaternions, dim=1),
+    }
+    names = " ".join(columns).split()
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(means)}"]
+    header += [*(f"property float {name}" for name in names), "end_header", ""]
+    table = torch.cat([part.cpu().float() for part in columns.values()], dim=1).numpy()
+    with replacing(path) as temporary:
+        temporary.write_bytes("\n".join(header).encode() + table.astype("<f4").tobytes())
+
+
 def write_paths(folder: Path, trained: TrainedRun) -> list[str]:
     """Write the training cameras in the order of their times as camera paths.
 
@@ -452,7 +515,7 @@ def write_planes(folder: Path, trained: TrainedRun) -> list[str]:
     if not isinstance(field, XPlanes):
         raise ConfigError(
             f"--what planes: {trained.experiment.method.model.name} has no planes that X-Planes' "
-            "layout describes; mesh and points work with every model"
+            "layout describes; mesh and points work with every radiance field"
         )
     tensors = {f"planes.{name}": plane for name, plane in field.planes.items()}
     tensors |= {f"decoder.{name}": value for name, value in field.decoder.state_dict().items()}

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import torch
 from PIL import Image
@@ -17,13 +18,12 @@ from xplanes.evaluation.progress import progress
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.files import replacing, require_writable
 from xplanes.optional import require
-from xplanes.rendering.base import RayRenderer
-from xplanes.rendering.box import Field
+from xplanes.rendering.base import Renderer
 from xplanes.rendering.pictures import colour_map, to_bytes
 from xplanes.scenes.cameras import orbit
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.lenses import Lenses
-from xplanes.scenes.views import Views, camera_rays
+from xplanes.scenes.views import PosedCamera, Views
 
 ELEVATION = 20.0
 """Height angle of the turning camera, in degrees."""
@@ -42,8 +42,8 @@ def video_times(frames: int) -> Tensor:
 
 
 def render_path(
-    field: Field,
-    renderer: RayRenderer,
+    field: Any,
+    renderer: Renderer,
     frame: Frame,
     poses: Tensor,
     times: Tensor,
@@ -58,7 +58,7 @@ def render_path(
     """Render frames along a path of cameras and times, one at a time.
 
     Args:
-        field: The field.
+        field: What the renderer takes as a field.
         renderer: Renders it.
         frame: The field's frame.
         poses: Camera-to-world matrices. [F, 4, 4]
@@ -74,27 +74,25 @@ def render_path(
     Yields:
         Pictures. uint8 [rows, columns, 3]
     """
-    device = renderer.device
     rows, columns = (size, size) if isinstance(size, int) else size
     focals = torch.as_tensor(focal).expand(len(poses), 2)
     for pose, each, time in zip(poses, focals, times.tolist(), strict=True):
-        origins, directions = frame.rays(*camera_rays(pose, each, rows, columns, centre, lens))
-        rays = origins.to(device), directions.to(device)
-        image = renderer.image(field, *rays, time, background.to(device))
+        camera = PosedCamera(pose, each, rows, columns, centre, lens)
+        image = renderer.view(field, frame, camera, time, background)
         picture = image["colour"]
         if what == "depth":
-            picture = _depth(image, float(origins[0].norm()))
-        yield to_bytes(picture.view(rows, columns, 3))
+            picture = _depth(image, float(frame.points(pose[:3, 3]).norm()))
+        yield to_bytes(picture)
 
 
 def _depth(image: dict[str, Tensor], distance: float) -> Tensor:
-    """Depth as colours, near is light; white where there is nothing. [R, 3]
+    """Depth as colours, near is light; white where there is nothing. [H, W, 3]
 
     The scale is that of the field's cube seen from ``distance``. A scale of each frame's own would
     make a video flicker.
     """
     colours = colour_map(0.5 + 0.5 * (distance - image["depth"]))
-    return torch.lerp(torch.ones_like(colours), colours, image["opacity"][:, None])
+    return torch.lerp(torch.ones_like(colours), colours, image["opacity"][..., None])
 
 
 def check_video(path: Path, *, frames: int, folder: bool = False) -> None:

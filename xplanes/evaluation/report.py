@@ -134,7 +134,7 @@ def summary(
             "empty": counts["empty"] / candidates,
             "occluded": counts["occluded"] / candidates,
             "no_room": counts["no_room"] / max(1, counts["rays"] + counts["no_room"]),
-            "gradients": 1 - counts["passed"] / max(1, counts["samples"]),
+            "gradients": 1 - counts["passed"] / counts["samples"] if counts["samples"] else 0.0,
             "background": background_skipped,
             "static": float(not module.field.moves),
             "budget": 0.0 if ending is None else max(0.0, 1 - spent(trainer)),
@@ -221,6 +221,13 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             "dB): this run shows nothing yet"
         )
     curves = [f"tensorboard --logdir {run}"] if any(run.rglob("events.out.tfevents.*")) else []
+    skips = (
+        f"skipped  {100 * skipped['empty']:.0f}% of samples in empty space, "
+        f"{100 * skipped['occluded']:.0f}% behind surfaces, "
+        f"{100 * skipped['background']:.0f}% of pixels as background; "
+        f"{metrics['samples_per_ray']:.1f} samples a ray remained, gradients of "
+        f"{100 * (1 - skipped['gradients']):.0f}% of them{plateau}"
+    )
     warm_up = f"compiling {seconds['warm_up']:.1f} s · " if seconds["warm_up"] >= 1 else ""
     return "\n".join(
         [
@@ -232,11 +239,7 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             f"time     prepare {prepare:.1f} s + train {seconds['train']:.1f} s · {warm_up}scoring "
             f"{seconds['evaluate']:.1f} s · {seconds['total']:.1f} s in all · "
             f"{metrics['rays_per_second'] / 1000:.1f}k rays/s",
-            f"skipped  {100 * skipped['empty']:.0f}% of samples in empty space, "
-            f"{100 * skipped['occluded']:.0f}% behind surfaces, "
-            f"{100 * skipped['background']:.0f}% of pixels as background; "
-            f"{metrics['samples_per_ray']:.1f} samples a ray remained, gradients of "
-            f"{100 * (1 - skipped['gradients']):.0f}% of them{plateau}",
+            *([skips] if metrics["samples_per_ray"] else []),
             f"memory   {metrics['peak_memory_bytes'] / 2**30:.1f} GB at its peak",
             f"wrote    {run}",
             f"         metrics.json  curve.csv  checkpoints/last.ckpt  {metrics.get('media', '')}",

@@ -18,7 +18,7 @@ from xplanes.errors import ConfigError
 from xplanes.evaluation.drawing import MODES, Picture, Shot, camera_outlines, draw
 from xplanes.evaluation.render import orbit_poses
 from xplanes.optional import require
-from xplanes.rendering.base import RayRenderer
+from xplanes.rendering.base import Renderer
 from xplanes.rendering.pictures import colour_map, to_bytes
 from xplanes.scenes.views import Scene
 from xplanes.training.module import RadianceModule
@@ -129,7 +129,7 @@ class Viewer:
         self,
         module: RadianceModule,
         scene: Scene,
-        renderer: Callable[[], RayRenderer],
+        renderer: Callable[[], Renderer],
         *,
         host: str = HOST,
         port: int = PORT,

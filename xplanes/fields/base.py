@@ -6,16 +6,11 @@ from collections.abc import Mapping
 from torch import Tensor, nn
 
 
-class RadianceField(nn.Module, ABC):
-    """From points and times, and directions where it looks at them, to colour and density.
+class Representation(nn.Module, ABC):
+    """What is trained: a scene in time that a renderer turns into images.
 
-    A field lives in the cube [-1, 1]^3 of its frame; its density is per unit length of that frame.
-
-    Attributes:
-        view_dependent: Whether ``forward`` takes directions as its third argument.
+    It lives in the cube [-1, 1]^3 of its frame.
     """
-
-    view_dependent = False
 
     @property
     @abstractmethod
@@ -36,6 +31,18 @@ class RadianceField(nn.Module, ABC):
     @abstractmethod
     def outline(self) -> str:
         """Its size in a few words."""
+
+
+class RadianceField(Representation):
+    """From points and times, and directions where it looks at them, to colour and density.
+
+    Its density is per unit length of its frame.
+
+    Attributes:
+        view_dependent: Whether ``forward`` takes directions as its third argument.
+    """
+
+    view_dependent = False
 
 
 class ViewDependentField(RadianceField):

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
-from xplanes.fields.base import RadianceField
+from xplanes.fields.base import Representation
 from xplanes.rendering.base import Rendering
 from xplanes.rendering.sampler import Group, SamplerSettings, Site, scene_cube
 from xplanes.scenes.batches import Batch, RaySettings
@@ -46,7 +46,7 @@ class Model(ABC):
 
     @property
     @abstractmethod
-    def field(self) -> RadianceField:
+    def field(self) -> Representation:
         """What is trained."""
 
     @abstractmethod
@@ -65,6 +65,10 @@ class Model(ABC):
             step: Optimiser steps done.
             progress: Share of the budget that is spent.
         """
+
+    def rate_of(self, group: str, step: int, progress: float) -> float:
+        """The same for the learning rate of one group, by its name."""
+        return self.rate(step, progress)
 
     def losses(self, rendering: Any, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
         """Weighted terms of the loss that need the rays, by name; their sum is minimised."""
@@ -95,7 +99,7 @@ class ModelSettings(Settings, ABC):
     """Whether an LRM can initialise the field."""
     devices: ClassVar[int | None] = 1
     """Devices that it can be trained on at most; None for any number."""
-    field_class: ClassVar[type[RadianceField] | None] = None
+    field_class: ClassVar[type[Representation] | None] = None
     """What is built, so that samplers can refuse it early; None leaves that to them."""
 
     name: str  # Name in run directories and tables.
@@ -142,7 +146,7 @@ class LossTerm(Settings, ABC):
 
     @abstractmethod
     def value(
-        self, field: RadianceField, rendering: Any, rays: Batch, state: TrainingState
+        self, field: Representation, rendering: Any, rays: Batch, state: TrainingState
     ) -> Tensor:
         """The term without its weight, differentiable. []
 

@@ -213,6 +213,7 @@ class Method:
                 "lrm=none, or model=six_planes or model=nine_planes"
             )
         if model.field_class is not None:
+            model.sampler.require_kind(model.field_class)
             model.sampler.require(model.field_class)
         losses = config.get("losses") or {}
         return cls(

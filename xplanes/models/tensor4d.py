@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from xplanes.errors import ConfigError
-from xplanes.fields.base import RadianceField
+from xplanes.fields.base import Representation
 from xplanes.fields.hierarchy import DYNAMIC, STATIC, Groups, HierarchicalPlanes, Level
 from xplanes.fields.tensor4d import Tensor4D, Tensor4DDensity
 from xplanes.fields.xplanes import XPlanes
@@ -215,7 +215,7 @@ class FeatureSmoothness(LossTerm):
     distance: Positive  # Distance in the field's frame.
 
     def value(
-        self, field: RadianceField, rendering: Any, rays: Batch, state: TrainingState
+        self, field: Representation, rendering: Any, rays: Batch, state: TrainingState
     ) -> Tensor:
         if not isinstance(field, XPlanes) or not isinstance(rendering, ProposalRendering):
             raise ConfigError(

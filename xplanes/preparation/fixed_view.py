@@ -13,10 +13,13 @@ import torch
 from torch import Tensor
 
 from xplanes.config import compose_plain
+from xplanes.errors import ConfigError
+from xplanes.fields.base import RadianceField
 from xplanes.fields.xplanes import XPlanes
 from xplanes.lrm.canonical import CanonicalView
 from xplanes.models.initialisation import Method, Place, PreparationSettings
 from xplanes.preparation.cache import StageCache
+from xplanes.rendering.base import RayRenderer
 from xplanes.scenes.cameras import camera_around
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, frame_content
@@ -42,6 +45,11 @@ def rendering_method(method: Method) -> Method:
     """
     name = method.preparation.fixed_view_model
     found = Method.read(compose_plain("train", [f"model={name}", "lrm=none"]))
+    if found.model.sampler.kind is not RadianceField:
+        raise ConfigError(
+            f"preparation.fixed_view_model={name}: its renderer takes no single rays; name a model "
+            "of a radiance field, such as six_planes"
+        )
     model = replace(
         found.model, sampler=found.model.sampler.for_video(), precision=method.model.precision
     )
@@ -293,7 +301,9 @@ def _render(
     back: float,
 ) -> Tensor:
     """Frames at evenly spaced timesteps, premultiplied. uint8 [T, side, side, 4]"""
-    device = module.renderer.device
+    renderer = module.renderer
+    assert isinstance(renderer, RayRenderer)
+    device = renderer.device
     if isinstance(module.field, XPlanes):
         module.field.background = None  # What is in the cube is cut out of the world behind it.
     origins, directions = camera_rays(pose, focal, side, side)
@@ -302,7 +312,7 @@ def _render(
     frames = []
     for time in torch.linspace(0, 1, count).tolist():
         # Rendering on black gives premultiplied colours.
-        image = module.renderer.image(module.field, *rays, time, torch.zeros(3, device=device))
+        image = renderer.image(module.field, *rays, time, torch.zeros(3, device=device))
         whole = torch.cat([image["colour"], image["opacity"][:, None]], dim=-1).clamp(0, 1)
         frames.append((whole * 255).round().to(torch.uint8).view(side, side, 4).cpu())
     return torch.stack(frames)

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from xplanes.rendering.marching import Samples
 from xplanes.rendering.thinning import Cut
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.views import PosedCamera
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,34 @@ class Rendering:
     cut: Cut | None = field(default=None, kw_only=True)
 
 
-class RayRenderer(ABC):
+class Renderer(ABC):
+    """Renders what cameras see of a scene."""
+
+    @property
+    @abstractmethod
+    def device(self) -> torch.device:
+        """Where images are rendered."""
+
+    @abstractmethod
+    def view(
+        self, field: Any, frame: Frame, camera: PosedCamera, time: float, background: Tensor
+    ) -> dict[str, Tensor]:
+        """Render what a camera sees at one time.
+
+        Args:
+            field: What the renderer takes as a field.
+            frame: The field's frame.
+            camera: A camera in the world.
+            time: From 0 to 1.
+            background: Colour behind the scene. [3]
+
+        Returns:
+            ``colour`` [H, W, 3], ``opacity`` [H, W], and ``depth`` along the rays in units of the
+            field's frame [H, W], on the renderer's device.
+        """
+
+
+class RayRenderer(Renderer):
     """Renders rays through a field, in a way of its own.
 
     Attributes:
@@ -41,10 +70,13 @@ class RayRenderer(ABC):
 
     rays_at_once = 8192
 
-    @property
-    @abstractmethod
-    def device(self) -> torch.device:
-        """Where rays must lie."""
+    def view(
+        self, field: Any, frame: Frame, camera: PosedCamera, time: float, background: Tensor
+    ) -> dict[str, Tensor]:
+        device, shape = self.device, (camera.height, camera.width)
+        origins, directions = (ray.to(device) for ray in frame.rays(*camera.rays()))
+        image = self.image(field, origins, directions, time, background.to(device))
+        return {name: value.view(*shape, *value.shape[1:]) for name, value in image.items()}
 
     @abstractmethod
     def render(

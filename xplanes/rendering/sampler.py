@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from xplanes.errors import ConfigError
-from xplanes.fields.base import RadianceField
-from xplanes.rendering.base import RayRenderer, Rendering
+from xplanes.fields.base import RadianceField, Representation
+from xplanes.rendering.base import Renderer, Rendering
 from xplanes.scenes.batches import Batch
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, cube_frame, scene_frame
@@ -91,7 +91,7 @@ class Sampler(ABC):
 
     @property
     @abstractmethod
-    def renderer(self) -> RayRenderer:
+    def renderer(self) -> Renderer:
         """Renders images."""
 
     @property
@@ -112,7 +112,7 @@ class Sampler(ABC):
         """Rays of the first batch, of ``most`` at most."""
         return most
 
-    def renderer_at(self, step: int) -> RayRenderer:
+    def renderer_at(self, step: int) -> Renderer:
         """Renders images when so many steps are done."""
         return self.renderer
 
@@ -160,17 +160,33 @@ class SamplerSettings(Settings, ABC):
     devices: ClassVar[int | None] = None
     """Devices that it can train on at most; None for any number."""
 
+    kind: ClassVar[type[Representation]] = RadianceField
+    """What it takes: a class from which that of the field must be derived."""
+
     name: str  # Name in tables.
 
-    def require(self, field: RadianceField | type[RadianceField]) -> None:
-        """Refuse a field, or a class of fields, that cannot be sampled so.
+    def require_kind(self, field: type[Representation]) -> None:
+        """Refuse a class of fields that is not of the sampler's `kind`.
+
+        Raises:
+            ConfigError: With the way out.
+        """
+        if not issubclass(field, self.kind):
+            takes = "radiance fields" if self.kind is RadianceField else "Gaussians"
+            raise ConfigError(
+                f"model.sampler.name={self.name}: takes {takes}, and the model's are of another "
+                "kind; leave model/sampler out"
+            )
+
+    def require(self, field: Any) -> None:
+        """Refuse a field, or a class of fields, of its `kind` that cannot be sampled so.
 
         Raises:
             ConfigError: With the samplers that can.
         """
 
     @abstractmethod
-    def build(self, field: RadianceField, site: Site) -> Sampler:
+    def build(self, field: Any, site: Site) -> Sampler:
         """The sampler for a field.
 
         Raises:

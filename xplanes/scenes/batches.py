@@ -1,8 +1,9 @@
 """Ray batches drawn without memory: the step alone decides what is in them."""
 
 import copy
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -23,9 +24,10 @@ from xplanes.scenes.store import (
 )
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Settings, Share
-from xplanes.streams import counted_uniform, step_generator
+from xplanes.streams import Stream, counted_uniform, step_generator
 
-Batch = dict[str, Tensor]
+Batch = dict[str, Any]
+"""Tensors by name, one row for each ray; whole views have a ``camera`` besides."""
 
 NEAR_SILHOUETTE = 0.02
 """Share of the image's side around silhouettes that counts as near."""
@@ -46,20 +48,157 @@ AHEAD = 8
 """Batches whose tiles the system is told to read in advance."""
 
 
+class Batches(ABC):
+    """Training batches as a function of (seed, step, rank).
+
+    Attributes:
+        views: Training views.
+        rays: Rays of a batch.
+        skipped: Share of all pixels that uniform drawing would have shown and this one leaves out.
+    """
+
+    views: Views
+    rays: int
+    skipped: float
+
+    @abstractmethod
+    def draw(self, step: int) -> Batch:
+        """The batch of a step."""
+
+
 @dataclass(frozen=True, kw_only=True)
-class RaySettings(Settings):
+class BatchSettings(Settings, ABC):
+    """What a training step gets to see."""
+
+    accumulate: Count  # Batches per optimiser step.
+
+    @property
+    @abstractmethod
+    def most(self) -> int:
+        """Rays of a batch at most; 0 where that is those of a view."""
+
+    @property
+    @abstractmethod
+    def most_samples(self) -> int | None:
+        """Samples of a batch at most, on average; None where rays have none."""
+
+    @abstractmethod
+    def batches(self, views: Views, frame: Frame, *, seed: int, rank: int) -> Batches:
+        """The batches of a process.
+
+        Args:
+            views: Training views.
+            frame: The field's frame.
+            seed: The run's seed.
+            rank: Number of the process among those that split the rays.
+        """
+
+    @abstractmethod
+    def part(self, batch: Batch, rays: int) -> Batch:
+        """The first rays of a batch, or the whole of it where it cannot be cut."""
+
+    @abstractmethod
+    def fitting(self, rays: int, samples: int) -> int:
+        """Rays of the next batch, after one of so many rays that took so many samples."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RaySettings(BatchSettings):
     """Which rays a training step gets."""
 
     per_batch: Count  # Maximum number of rays per batch.
     samples_per_batch: Count  # Maximum number of samples per batch, on average.
-    accumulate: Count  # Batches per optimiser step.
     background: Literal["white", "random", "one"]  # random: per ray; one: random per batch.
     skip_background: bool  # Sample rays near silhouettes, and where something changes, more often.
     background_share: Share  # Share of rays far from the silhouettes.
     background_jitter: Share  # Maximum random offset of the times of these rays.
 
+    @property
+    def most(self) -> int:
+        return self.per_batch
 
-class RayBatches:
+    @property
+    def most_samples(self) -> int:
+        return self.samples_per_batch
+
+    def batches(self, views: Views, frame: Frame, *, seed: int, rank: int) -> "RayBatches":
+        return RayBatches(views, frame, self, seed=seed, rank=rank)
+
+    def part(self, batch: Batch, rays: int) -> Batch:
+        return {name: value[:rays] for name, value in batch.items()}
+
+    def fitting(self, rays: int, samples: int) -> int:
+        """As many as keep the samples near their maximum."""
+        room = self.samples_per_batch * rays / max(1, samples)
+        return max(64, min(self.per_batch, int(room)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewSettings(BatchSettings):
+    """Whole training views, one per batch."""
+
+    background: Literal["white", "one"]  # one: random per batch.
+
+    @property
+    def most(self) -> int:
+        return 0
+
+    @property
+    def most_samples(self) -> int | None:
+        return None
+
+    def batches(self, views: Views, frame: Frame, *, seed: int, rank: int) -> "ViewBatches":
+        return ViewBatches(views, self, seed=seed, rank=rank)
+
+    def part(self, batch: Batch, rays: int) -> Batch:
+        return batch
+
+    def fitting(self, rays: int, samples: int) -> int:
+        return rays
+
+
+class ViewBatches(Batches):
+    """Draws whole training views; each comes once before any comes again.
+
+    Args:
+        views: Training views.
+        settings: What lies behind them.
+        seed: The run's seed.
+        rank: Number of this process among those that share the run.
+    """
+
+    skipped = 0.0
+
+    def __init__(self, views: Views, settings: ViewSettings, *, seed: int, rank: int = 0) -> None:
+        self.views, self.seed, self.stream = views, seed, Stream.VIEWS + rank
+        self.background = settings.background
+        self.rays = max(1, views.pixels // len(views))
+
+    def draw(self, step: int) -> Batch:
+        """The view of a step.
+
+        Returns:
+            Its ``camera``, and for each pixel, row by row: ``times`` [R], ``target`` colour before
+            ``background`` [R, 3] each, and ``alpha`` [R].
+        """
+        turn, place = divmod(step, len(self.views))
+        generator = step_generator(self.seed, turn, self.stream)
+        index = int(torch.randperm(len(self.views), generator=generator)[place])
+        background = torch.ones(3)
+        if self.background == "one":
+            generator = step_generator(self.seed, step, self.stream)
+            background = torch.rand(3, generator=generator)
+        alpha = self.views.image(index)[..., 3].flatten().float() / 255
+        return {
+            "camera": self.views.camera(index),
+            "times": self.views.times[index].expand(len(alpha)),
+            "target": self.views.composite(index, background).flatten(0, 1),
+            "background": background.expand(len(alpha), 3),
+            "alpha": alpha,
+        }
+
+
+class RayBatches(Batches):
     """Draws training rays as a function of (seed, step, rank).
 
     With ``skip_background`` rays far from the silhouettes are drawn at ``background_share`` instead
@@ -108,7 +247,6 @@ class RayBatches:
         jitter = skip and not views.is_static and changes is None
         self.background_jitter = settings.background_jitter if jitter else 0.0
         self.skipped = max(0.0, 1 - self.far_share / natural) * natural if skip else 0.0
-        """Share of all pixels that uniform drawing would have shown and this one leaves out."""
 
     def draw(self, step: int) -> Batch:
         """The batch of a step.
@@ -252,7 +390,7 @@ class DeviceBatches(RayBatches):
     """
 
     def __init__(self, batches: RayBatches, device: torch.device) -> None:
-        self.__dict__.update(batches.__dict__)
+        vars(self).update(vars(batches))
         self.device = device
         self.views = batches.views.to(device)
         self.frame = batches.frame.to(device)

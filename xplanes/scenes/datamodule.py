@@ -16,7 +16,7 @@ from xplanes.components import build, plugins
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.files import read_json
-from xplanes.scenes.batches import Batch, DeviceBatches, RayBatches, RaySettings
+from xplanes.scenes.batches import Batch, Batches, DeviceBatches, RayBatches, RaySettings
 from xplanes.scenes.errors import MissingSplitError
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.source import SceneSettings
@@ -40,16 +40,18 @@ UNIFORM = RaySettings(
 class SceneDataModule(LightningDataModule):
     """Reads a scene, checks it, and serves rays to train on and views to score.
 
-    A training batch is what `RayBatches.draw` returns. It is a function of the seed, the number of
-    batches before it and the rank, so that a resumed run draws the very rays of an uninterrupted
-    one. How many rays, and which, the LightningModule says as ``ray_settings`` and ``frame``;
-    without these it gets 1024 rays over all pixels, in the frame of the scene's cube. The batches
-    are endless; an epoch is as many as the training views have pixels.
+    A training batch is what `RayBatches.draw` returns, or `ViewBatches.draw`. It is a function of
+    the seed, the number of batches before it and the rank, so that a resumed run draws the very
+    rays of an uninterrupted one. Rays or whole views, how many rays and which, the LightningModule
+    says as ``ray_settings`` and ``frame``; without these it gets 1024 rays over all pixels, in the
+    frame of the scene's cube. The batches are endless; an epoch is as many as the training views
+    have pixels.
 
     A batch of `val_dataloader`, `test_dataloader` and `predict_dataloader` is one whole view of its
     own size:
-    ``origins`` and unit ``directions`` in the world [H W, 3], ``time`` [], ``target`` in front of
-    the scene's background [H, W, 3], ``background`` [3] and its number ``index``.
+    ``origins`` and unit ``directions`` in the world [H W, 3], the ``camera`` that they come from,
+    ``time`` [], ``target`` in front of the scene's background [H, W, 3], ``background`` [3] and its
+    number ``index``.
 
     Args:
         scene: Settings of the scene, or the group ``data`` of a configuration.
@@ -79,7 +81,7 @@ class SceneDataModule(LightningDataModule):
         self.held_out = 0
         """Training views that serve for validation, because the scene has no split for it."""
         self._scene: Scene | None = None
-        self._batches: dict[int, RayBatches] = {}
+        self._batches: dict[int, Batches] = {}
 
     @classmethod
     def of(cls, scene: Scene, *, seed: int = 0) -> "SceneDataModule":
@@ -187,24 +189,24 @@ class SceneDataModule(LightningDataModule):
         self._batches = {}  # Those before held all of them.
         self.held_out = len(parts["val"])
 
-    def batches(self, rank: int) -> RayBatches:
+    def batches(self, rank: int) -> Batches:
         """The batches of a process, for the module that is being trained, drawn on its device."""
         if self.trainer is None:
             return self.batches_for(None, rank)
         batches = self.batches_for(self.trainer.lightning_module, rank)
         device = self.trainer.strategy.root_device
-        if not DeviceBatches.can_serve(batches, device):
-            return batches
-        return DeviceBatches(batches, device)
+        if isinstance(batches, RayBatches) and DeviceBatches.can_serve(batches, device):
+            return DeviceBatches(batches, device)
+        return batches
 
-    def batches_for(self, module: Any, rank: int) -> RayBatches:
+    def batches_for(self, module: Any, rank: int) -> Batches:
         """The batches of a process for a LightningModule, or for none that says anything."""
         if rank not in self._batches:
             views = self.scene.splits["train"]
             frame = getattr(module, "frame", None)
             frame = frame or scene_frame(views, self.settings.half_side, self.scene.points)
             settings = getattr(module, "ray_settings", UNIFORM)
-            self._batches[rank] = RayBatches(views, frame, settings, seed=self.seed, rank=rank)
+            self._batches[rank] = settings.batches(views, frame, seed=self.seed, rank=rank)
         return self._batches[rank]
 
     def train_dataloader(self) -> DataLoader:
@@ -238,7 +240,7 @@ class SceneDataModule(LightningDataModule):
 class _Endless(IterableDataset):
     """Batches from where training is, for ever; its length is that of an epoch."""
 
-    def __init__(self, batches: RayBatches, data: SceneDataModule) -> None:
+    def __init__(self, batches: Batches, data: SceneDataModule) -> None:
         self.batches, self.data = batches, data
 
     def __len__(self) -> int:
@@ -265,6 +267,7 @@ class _WholeViews(Dataset):
         return {
             "origins": origins,
             "directions": directions,
+            "camera": self.views.camera(index),
             "time": self.views.times[index],
             "target": self.views.composite(index, self.background),
             "background": self.background,

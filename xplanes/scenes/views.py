@@ -377,12 +377,16 @@ class Views:
         edge[rim : height - rim, rim : width - rim] = False
         return float(pale[edge].float().mean()) if edge.any() else 0.0
 
-    def image_rays(self, index: int) -> tuple[Tensor, Tensor]:
-        """Rays through every pixel of image ``index``, row by row. [h w, 3], [h w, 3]"""
+    def camera(self, index: int) -> "PosedCamera":
+        """The camera of image ``index``."""
         height, width = self.size(index)
         focal, centre = self.intrinsics.focal[index], self.intrinsics.centre[index]
         lens = self.intrinsics.lens(index)
-        return camera_rays(self.camera_to_world[index], focal, height, width, centre, lens)
+        return PosedCamera(self.camera_to_world[index], focal, height, width, centre, lens)
+
+    def image_rays(self, index: int) -> tuple[Tensor, Tensor]:
+        """Rays through every pixel of image ``index``, row by row. [h w, 3], [h w, 3]"""
+        return self.camera(index).rays()
 
     def outline_rays(self, index: int) -> tuple[Tensor, Tensor]:
         """Rays through the outline of what image ``index`` shows with alpha above 0.
@@ -494,6 +498,36 @@ class Scene:
         chosen = range(0, len(views), -(-len(views) // MOST_EDGES))
         plain = [views.edge_share_of(index, self.background) > PALE_EDGE for index in chosen]
         return 2 * sum(plain) <= len(plain)
+
+
+@dataclass(frozen=True)
+class PosedCamera:
+    """A camera somewhere in the world, and the size of its image; arguments of `camera_rays`.
+
+    Attributes:
+        camera_to_world: Its pose. [4, 4]
+        focal: Focal length in pixels, or those along x and y. [2]
+        height: Rows.
+        width: Columns.
+        centre: Principal point, x from the left and y from the top; the middle when None. [2]
+        lens: Its lens; a pinhole when None.
+    """
+
+    camera_to_world: Tensor
+    focal: float | Tensor
+    height: int
+    width: int
+    centre: Tensor | None = None
+    lens: Lenses | None = None
+
+    def rays(self) -> tuple[Tensor, Tensor]:
+        """Rays through every pixel, row by row, in the world. [H W, 3], [H W, 3]"""
+        size = (self.height, self.width)
+        return camera_rays(self.camera_to_world, self.focal, *size, self.centre, self.lens)
+
+    def to(self, device: torch.device) -> "PosedCamera":
+        """The same: cameras stay on the CPU when Lightning moves a batch."""
+        return self
 
 
 def camera_rays(

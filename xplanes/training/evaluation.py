@@ -15,10 +15,10 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
 from xplanes.errors import ConfigError
+from xplanes.fields.base import Representation
 from xplanes.files import read_rows, write_rows
 from xplanes.metrics import psnr, ssim
-from xplanes.rendering.base import RayRenderer
-from xplanes.rendering.box import Field
+from xplanes.rendering.base import Renderer
 from xplanes.rendering.pictures import plane_sheet, strip, write_png
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
@@ -85,20 +85,17 @@ class ViewImages:
 
 
 def render_view(
-    field: Field,
-    renderer: RayRenderer,
+    field: Representation,
+    renderer: Renderer,
     frame: Frame,
     views: Views,
     index: int,
     background: Tensor,
 ) -> dict[str, Tensor]:
     """Render one view whole: ``colour`` [h, w, 3], ``opacity`` and ``depth`` [h, w], on the CPU."""
-    device = renderer.device
-    origins, directions = (ray.to(device) for ray in frame.rays(*views.image_rays(index)))
     time = float(views.times[index])
-    image = renderer.image(field, origins, directions, time, background.to(device))
-    shape = views.size(index)
-    found = {name: value.cpu().view(*shape, *value.shape[1:]) for name, value in image.items()}
+    image = renderer.view(field, frame, views.camera(index), time, background)
+    found = {name: value.cpu() for name, value in image.items()}
     if (has_ray := views.intrinsics.has_ray(index)) is not None:
         for name, value in found.items():
             value[~has_ray] = background.cpu() if name == "colour" else 0
@@ -106,8 +103,8 @@ def render_view(
 
 
 def score_view(
-    field: Field,
-    renderer: RayRenderer,
+    field: Representation,
+    renderer: Renderer,
     frame: Frame,
     views: Views,
     index: int,
@@ -277,7 +274,7 @@ class Evaluation(Callback):
         if self.step != trainer.global_step or coarse:
             self.score(trainer, pl_module, pl_module.renderer)
 
-    def score(self, trainer: Trainer, module: RadianceModule, renderer: RayRenderer) -> None:
+    def score(self, trainer: Trainer, module: RadianceModule, renderer: Renderer) -> None:
         """Score the views now; only the first process does."""
         self.step = trainer.global_step
         with off_clock(trainer):
@@ -286,7 +283,7 @@ class Evaluation(Callback):
             if trainer.world_size > 1:
                 trainer.strategy.barrier()  # The others wait off the clock.
 
-    def _score(self, trainer: Trainer, module: RadianceModule, renderer: RayRenderer) -> None:
+    def _score(self, trainer: Trainer, module: RadianceModule, renderer: Renderer) -> None:
         data: Any = trainer.datamodule  # type: ignore[attr-defined]
         split = data.validation_split or data.test_split
         views, step, run = data.scene.splits[split], trainer.global_step, _folder(trainer)
@@ -328,13 +325,15 @@ class Evaluation(Callback):
         scores: Mapping[str, float],
         pictures: Mapping[str, Tensor],
     ) -> None:
-        step, sheet = trainer.global_step, plane_sheet(module.field.planes)
-        write_png(run / "media" / "planes.png", sheet)
+        step, planes = trainer.global_step, module.field.planes
+        if planes:
+            sheet = plane_sheet(planes)
+            write_png(run / "media" / "planes.png", sheet)
+            log_image(trainer, "planes", sheet, step)
         for file, picture in pictures.items():
             name = f"{split}_{file.replace('/', '_').removesuffix('.png')}"
             write_png(run / "media" / f"step{step:06d}" / f"{name}.png", picture)
             log_image(trainer, f"{split}/{file}", picture, step)
-        log_image(trainer, "planes", sheet, step)
         for log in trainer.loggers:
             log.log_metrics({**scores, "time/train_s": training_seconds(trainer)}, step)
 

@@ -16,7 +16,9 @@ from lightning.pytorch.strategies import DDPStrategy
 
 from xplanes.backend import cpu_loops, synchronize
 from xplanes.errors import ConfigError
+from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.warming import warming_up
+from xplanes.scenes.batches import Batch
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Scene
 from xplanes.settings import Count, Positive, Steps
@@ -195,7 +197,7 @@ def warm_up(module: RadianceModule, data: SceneDataModule, device: torch.device)
         return
     assert module.sampler is not None
     batches = data.batches_for(module, 0)
-    rays = {name: value[:8].to(device) for name, value in batches.draw(0).items()}
+    rays = _moved(module.ray_settings.part(batches.draw(0), 8), device)
     with warming_up():
         if device.type != "cpu":
             module.rehearse(rays)
@@ -231,7 +233,7 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
     assert module.frame is not None
     device = next(module.field.parameters()).device
     batch = data.batches_for(module, 0).draw(0)
-    rays = {name: value[: module.rays].to(device) for name, value in batch.items()}
+    rays = _moved(module.ray_settings.part(batch, module.rays), device)
     seconds = []
     for _ in range(2):
         began = time.perf_counter()
@@ -241,20 +243,25 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
         module.zero_grad(set_to_none=True)
         synchronize(device)
         seconds.append(time.perf_counter() - began)
-    views = data.scene.splits[data.test_split]
-    ends = module.frame.rays(*views.image_rays(0))
+    views, renderer = data.scene.splits[data.test_split], module.renderer_now
+    moment, background = float(views.times[0]), data.scene.background.to(device)
+    camera = views.camera(0)
+    if not isinstance(renderer, RayRenderer):
+        began = time.perf_counter()
+        renderer.view(module.field, module.frame, camera, moment, background)
+        pixels = camera.height * camera.width
+        return Estimate(min(seconds), pixels / (time.perf_counter() - began))
+    ends = module.frame.rays(*camera.rays())
     chosen = torch.linspace(0, len(ends[0]) - 1, min(2048, len(ends[0]))).long()
     began = time.perf_counter()
     origins, directions = (part[chosen].to(device) for part in ends)
-    module.renderer_now.image(
-        module.field,
-        origins,
-        directions,
-        float(views.times[0]),
-        data.scene.background.to(device),
-    )
+    renderer.image(module.field, origins, directions, moment, background)
     synchronize(device)
     return Estimate(min(seconds), len(chosen) / (time.perf_counter() - began))
+
+
+def _moved(batch: Batch, device: torch.device) -> Batch:
+    return {name: value.to(device) for name, value in batch.items()}
 
 
 def quiet_lightning() -> None:

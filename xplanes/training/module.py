@@ -15,13 +15,13 @@ from xplanes.backend import fast_bf16
 from xplanes.components import build, plugins
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
-from xplanes.fields.base import RadianceField
+from xplanes.fields.base import Representation
 from xplanes.metrics import psnr, ssim
 from xplanes.models.base import Model, ModelSettings, colour_error
 from xplanes.models.initialisation import Initialisation, Method, Place
-from xplanes.rendering.base import RayRenderer, Rendering
+from xplanes.rendering.base import Renderer, Rendering
 from xplanes.rendering.sampler import Sampler, Site
-from xplanes.scenes.batches import Batch, RaySettings
+from xplanes.scenes.batches import Batch, BatchSettings
 from xplanes.scenes.frame import Frame, frame_content, read_frame
 from xplanes.scenes.views import Scene
 from xplanes.streams import TrainingState
@@ -68,7 +68,7 @@ class RadianceModule(LightningModule):
         ConfigError: If a setting cannot work.
     """
 
-    field: RadianceField
+    field: Representation
 
     def __init__(self, config: Mapping[str, Any], plugins: Sequence[str] = ()) -> None:
         super().__init__()
@@ -180,7 +180,7 @@ class RadianceModule(LightningModule):
             initialised=found.values is not None,
             surrounded=scene.is_surrounded,
             device=device,
-            samples_per_batch=found.model.rays.samples_per_batch,
+            samples_per_batch=found.model.rays.most_samples,
         )
         self.initialisation = found
         self._assemble(found.model, site)
@@ -189,11 +189,12 @@ class RadianceModule(LightningModule):
         values = None if self.initialisation is None else self.initialisation.values
         self.model = settings.build(site, values)
         self.field = self.model.field
+        settings.sampler.require_kind(type(self.field))
         self.sampler = settings.sampler.build(self.field, site)
         for name, part in self.sampler.parts.items():
             self.add_module(name, part)
         self.site, self._settings = site, settings
-        self.rays = self.sampler.first_rays(settings.rays.per_batch)
+        self.rays = self.sampler.first_rays(settings.rays.most)
 
     @property
     def frame(self) -> Frame | None:
@@ -201,17 +202,17 @@ class RadianceModule(LightningModule):
         return None if self.site is None else self.site.frame
 
     @property
-    def ray_settings(self) -> RaySettings:
-        """Which rays a training step gets."""
+    def ray_settings(self) -> BatchSettings:
+        """What a training step gets to see."""
         return self.method.model.rays
 
     @property
-    def renderer(self) -> RayRenderer:
+    def renderer(self) -> Renderer:
         """Renders images of the field."""
         return self._parts[1].renderer
 
     @property
-    def renderer_now(self) -> RayRenderer:
+    def renderer_now(self) -> Renderer:
         """The same for the field as far as it is trained."""
         return self._parts[1].renderer_at(max(self.global_step, self._loaded_step))
 
@@ -239,7 +240,8 @@ class RadianceModule(LightningModule):
     @property
     def state(self) -> TrainingState:
         """How far training is."""
-        return TrainingState(self.method.seed, self.global_step, self.batches, self.global_rank)
+        done = (self.global_step, self.batches, self.global_rank)
+        return TrainingState(self.method.seed, *done, progress=self.progress)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         model, sampler = self._parts
@@ -258,17 +260,17 @@ class RadianceModule(LightningModule):
         self.method.require_devices(trainer.world_size)
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        factor = self._parts[0].rate(self.global_step, self.progress)
+        model, step, progress = self._parts[0], self.global_step, self.progress
         groups = cast(LightningOptimizer, self.optimizers()).param_groups
         for group, peak in zip(groups, self._peaks, strict=True):
-            group["lr"] = factor * peak
+            group["lr"] = model.rate_of(group["name"], step, progress) * peak
 
     def training_step(self, batch: Batch, batch_idx: int) -> None:
         model, sampler = self._parts
         optimizer = cast(LightningOptimizer, self.optimizers())
         state = self.state
         model.before_step(state, optimizer.optimizer)
-        rays = {name: value[: self.rays] for name, value in batch.items()}
+        rays = self.ray_settings.part(batch, self.rays)
         rendering = sampler.render(self.field, rays, state)
         terms = self._terms(rendering, rays, state)
         loss = sum(terms.values())
@@ -452,10 +454,7 @@ class RadianceModule(LightningModule):
         for name, value in shown.items():
             self.counts[name] += value
         self.counts["rays"] += rays
-        # Rays of the next batch: as many as keep its samples near the target.
-        settings = self.ray_settings
-        room = settings.samples_per_batch * rays / max(1, shown["samples"])
-        self.rays = max(64, min(settings.per_batch, int(room)))
+        self.rays = self.ray_settings.fitting(rays, shown["samples"])
 
     def _refuse(self, what: str, broken: list[str], rendering: Rendering) -> None:
         """Leave a step out, and give up after `PATIENCE` of them in a row."""
@@ -550,17 +549,8 @@ class RadianceModule(LightningModule):
     @torch.no_grad()
     def _view(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         assert self.frame is not None
-        height, width = batch["target"].shape[:2]
-        frame = Frame(
-            self.frame.scale,
-            self.frame.rotation.to(batch["origins"]),
-            self.frame.centre.to(batch["origins"]),
-        )
-        origins, directions = frame.rays(batch["origins"], batch["directions"])
-        image = self.renderer_now.image(
-            self.field, origins, directions, float(batch["time"]), batch["background"]
-        )
-        return {name: value.view(height, width, *value.shape[1:]) for name, value in image.items()}
+        seen = (batch["camera"], float(batch["time"]), batch["background"])
+        return self.renderer_now.view(self.field, self.frame, *seen)
 
     # Checkpoints
 
@@ -617,7 +607,7 @@ class RadianceModule(LightningModule):
             precision=_precision(settings, torch.device("cpu")),
             bounds=content["bounds"],
             surrounded=content.get("surrounded", False),  # Not in older checkpoints.
-            samples_per_batch=settings.rays.samples_per_batch,
+            samples_per_batch=settings.rays.most_samples,
         )
         self._assemble(settings, site)
 

@@ -1,0 +1,463 @@
+"""Gaussians that planes deform: what is added and removed, what is drawn, what is written."""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.baselines.runs import baseline_config
+from tests.synthetic import ball_scene, ball_views
+from xplanes.config import compose_plain
+from xplanes.errors import ConfigError
+from xplanes.evaluation.export import ExportOptions, export, write_gaussians
+from xplanes.fields.gaussians import Gaussians, HexPlaneGaussians, neighbour_distance
+from xplanes.fields.products import PlaneProducts
+from xplanes.models.densification import densify, reset_opacity, select_rows
+from xplanes.models.gaussians_hexplane import camera_extent
+from xplanes.models.hull import hull_points
+from xplanes.models.initialisation import Method
+from xplanes.preparation.fixed_view import rendering_method
+from xplanes.rendering.gaussians.camera import Camera
+from xplanes.rendering.gaussians.harmonics import spherical_harmonics
+from xplanes.rendering.gaussians.rasteriser import GaussianError, rasterise
+from xplanes.rendering.gaussians.renderer import GaussianRenderer, camera_in
+from xplanes.rendering.sampler import Site
+from xplanes.scenes.batches import ViewBatches, ViewSettings
+from xplanes.scenes.cameras import project
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.lenses import Lenses
+from xplanes.streams import TrainingState
+
+FRAME = Frame(0.6, torch.eye(3), torch.tensor([0.3, -0.2, 0.1]))
+TURN = torch.linalg.qr(torch.tensor([[1.0, 0.5, 0.2], [-0.3, 1.0, 0.4], [0.1, -0.6, 1.0]]))[0]
+TURNED = replace(FRAME, rotation=TURN * torch.linalg.det(TURN).sign())
+
+
+def gaussians(count: int, *, degree: int = 1, moves: bool = True) -> HexPlaneGaussians:
+    """Gaussians with numbers of their own in every row."""
+    torch.manual_seed(0)
+    planes = PlaneProducts(4, 6, [1, 2], 5, low=0.1, high=0.5) if moves else None
+    field = HexPlaneGaussians(
+        torch.rand(count, 3) - 0.5,
+        torch.rand(count, 3),
+        degree=degree,
+        extent=2.0,
+        planes=planes,
+        width=8,
+    )
+    with torch.no_grad():
+        for name in field.PARAMETERS[1:]:
+            getattr(field, name).add_(0.3 * torch.randn_like(getattr(field, name)))
+        for parameter in field.network.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    field.deforms.fill_(True)
+    field.degree.fill_(degree)
+    return field
+
+
+def stepped(field: Gaussians, steps: int = 3) -> torch.optim.Adam:
+    """An optimiser of the Gaussians with moments."""
+    optimizer = torch.optim.Adam([getattr(field, n) for n in field.PARAMETERS], lr=1e-3, fused=True)
+    for _ in range(steps):
+        for group in optimizer.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = torch.randn_like(parameter)
+        optimizer.step()
+    optimizer.zero_grad()
+    return optimizer
+
+
+def settings(*overrides: str) -> Any:
+    names = ["model=gaussians_hexplane", *(f"model.{text}" for text in overrides)]
+    return Method.read(compose_plain("train", names)).model
+
+
+def control(**changes: Any) -> Any:
+    return replace(settings().densify, **changes)
+
+
+def test_rows_are_doubled_split_and_removed_with_their_moments():
+    field = gaussians(60)
+    optimizer = stepped(field)
+    with torch.no_grad():
+        field.logits[::7] = -8.0  # Too faint.
+        field.log_scales[::2] = math.log(0.05)
+        field.log_scales[1::2] = math.log(0.005)
+        field.seen.copy_(torch.arange(60) % 5)
+        field.slopes.copy_(torch.rand(60) * 0.002)
+    before = {name: tensor.detach().clone() for name, tensor in field.rows.items()}
+    moments = {
+        name: {key: value.clone() for key, value in optimizer.state[getattr(field, name)].items()}
+        for name in field.PARAMETERS
+    }
+    rules = control(threshold=0.0005, large=0.01)
+    densify(field, optimizer, rules, torch.Generator().manual_seed(1), remove_large=False)
+
+    stay, clones, halves = [], [], []
+    for row in range(60):
+        if row % 7 == 0:
+            continue
+        slope = float(before["slopes"][row]) / max(1, row % 5)
+        if slope < 0.0005:
+            stay.append(row)
+        elif row % 2 == 0:  # 0.05 is above 0.01 of the extent, which is 2.
+            halves.append(row)
+        else:
+            stay.append(row)
+            clones.append(row)
+    assert len(clones) > 5
+    assert len(halves) > 5
+    source = [*stay, *clones, *halves, *halves]
+    assert len(field) == len(source)
+    for name in field.PARAMETERS:
+        now, old = getattr(field, name).detach(), before[name]
+        expected = torch.stack([old[row] for row in source])
+        if name == "log_scales":
+            expected[-2 * len(halves) :] -= math.log(1.6)
+        exact = len(source) - (2 * len(halves) if name == "means" else 0)
+        torch.testing.assert_close(now[:exact], expected[:exact])
+        state = optimizer.state[getattr(field, name)]
+        for key in ("exp_avg", "exp_avg_sq"):
+            kept = torch.stack([moments[name][key][row] for row in stay])
+            assert torch.equal(state[key][: len(stay)], kept)
+            assert not state[key][len(stay) :].any()
+        assert state["step"] == moments[name]["step"]
+    assert not field.slopes.any()
+    assert not field.seen.any()
+    assert len(field.slopes) == len(field.seen) == len(source)
+
+
+def test_halves_are_drawn_from_the_gaussian_that_is_split():
+    field = gaussians(1)
+    scales = torch.tensor([0.5, 0.2, 0.1])
+    with torch.no_grad():
+        select_rows(
+            field,
+            torch.optim.Adam([field.means]),
+            torch.zeros(4000, dtype=torch.int64),
+            torch.zeros(4000, dtype=torch.bool),
+        )
+        field.log_scales.copy_(scales.log().expand(4000, 3))
+        centre, quaternion = field.means[0].clone(), field.quaternions[0].clone()
+    field.seen.fill_(1)
+    field.slopes.fill_(1)
+    rules = control(most=100_000)
+    densify(field, stepped(field), rules, torch.Generator().manual_seed(2), remove_large=False)
+    assert len(field) == 8000
+    # By quaternion products, as Hamilton has them.
+    w, *axis = torch.nn.functional.normalize(quaternion, dim=0).double()
+    axis = torch.stack(axis)
+    turned = []
+    for unit in torch.eye(3, dtype=torch.float64):
+        cross = 2 * torch.linalg.cross(axis, unit)
+        turned.append(unit + w * cross + torch.linalg.cross(axis, cross))
+    offsets = (field.means.detach() - centre).double()
+    along = offsets @ torch.stack(turned).T / scales
+    assert along.mean(dim=0).abs().max() < 0.05
+    assert (along.std(dim=0) - 1).abs().max() < 0.05
+    assert (torch.corrcoef(along.T) - torch.eye(3)).abs().max() < 0.05
+
+
+def test_optimiser_goes_on_as_if_rows_had_not_moved():
+    """The same gradients, one optimiser before and one after rows were reordered."""
+    plain, moved = gaussians(20), gaussians(20)
+    torch.manual_seed(3)
+    first = stepped(plain)
+    torch.manual_seed(3)
+    second = stepped(moved)
+    order = torch.randperm(20)
+    select_rows(moved, second, order, torch.zeros(20, dtype=torch.bool))
+    for _ in range(3):
+        for name in plain.PARAMETERS:
+            gradient = torch.randn_like(getattr(plain, name))
+            getattr(plain, name).grad, getattr(moved, name).grad = gradient, gradient[order]
+        first.step()
+        second.step()
+    for name in plain.PARAMETERS:
+        assert torch.equal(getattr(plain, name)[order], getattr(moved, name)), name
+
+
+def test_no_more_than_the_most_and_those_with_the_largest_gradients():
+    field = gaussians(30)
+    field.seen.fill_(1)
+    field.slopes.copy_(torch.arange(1, 31))
+    with torch.no_grad():
+        field.log_scales.fill_(-9)
+    last = field.means[-4:].detach().clone()
+    rules = control(most=34)
+    densify(field, stepped(field, 0), rules, torch.Generator(), remove_large=False)
+    assert len(field) == 34
+    assert torch.equal(field.means[30:].sort(dim=0).values, last.sort(dim=0).values)
+    field.slopes.fill_(1)
+    densify(field, stepped(field, 0), rules, torch.Generator(), remove_large=False)
+    assert len(field) == 34
+
+
+def test_resets_and_large_ones():
+    field = gaussians(10)
+    with torch.no_grad():
+        field.log_scales[:4] = math.log(0.3)  # The extent is 2.
+        field.log_scales[4:] = math.log(0.1)
+    optimizer = stepped(field, 0)
+    densify(field, optimizer, control(), torch.Generator(), remove_large=True)
+    assert len(field) == 6
+    optimizer = stepped(field)
+    reset_opacity(field, optimizer)
+    assert float(field.opacities.detach().max()) <= 0.01 + 1e-7
+    assert not optimizer.state[field.logits]["exp_avg"].any()
+    assert optimizer.state[field.means]["exp_avg"].all()
+
+
+def test_nothing_left_and_numbers_that_are_not_finite_are_named():
+    field = gaussians(10)
+    with torch.no_grad():
+        field.logits.fill_(-20)
+    words = r"all 10 Gaussians are fainter than model\.densify\.least_opacity=0\.005"
+    with pytest.raises(GaussianError, match=words):
+        densify(field, stepped(field, 0), control(), torch.Generator(), remove_large=False)
+    with torch.no_grad():
+        field.log_scales[3, 1] = math.nan
+    view = ball_views(1, 0.6).camera(0)
+    renderer = GaussianRenderer(field, antialiased=False)
+    with pytest.raises(GaussianError, match=r"scales of Gaussian 3 of 10 are .*learning rate"):
+        renderer.view(field, FRAME, view, 0.5, torch.ones(3))
+
+
+def test_a_state_of_another_number_of_gaussians_is_loaded():
+    field, other = gaussians(12), gaussians(5)
+    other.load_state_dict(field.state_dict())
+    assert len(other) == 12
+    assert len(other.slopes) == 12
+    for (name, mine), theirs in zip(
+        field.state_dict().items(), other.state_dict().values(), strict=True
+    ):
+        assert torch.equal(mine, theirs), name
+    with pytest.raises(RuntimeError, match="size mismatch for detail"):
+        gaussians(5, degree=2).load_state_dict(field.state_dict())
+
+
+@pytest.mark.parametrize("frame", [FRAME, TURNED], ids=["world axes", "turned"])
+def test_a_gaussian_is_seen_where_its_point_is(frame):
+    views = ball_views(3, 0.6, size=48)
+    point = torch.tensor([[0.35, -0.25, 0.4]])
+    field = HexPlaneGaussians(
+        *(frame.points(point), torch.tensor([[0.2, 0.4, 0.9]])),
+        degree=0, extent=1.0, planes=None, width=8,
+    )  # fmt: skip
+    with torch.no_grad():
+        field.log_scales.fill_(math.log(0.02))
+        field.logits.fill_(9.0)
+    renderer = GaussianRenderer(field, antialiased=False)
+    for index in range(3):
+        image = renderer.view(field, frame, views.camera(index), 0.0, torch.ones(3))
+        pose, intrinsics = views.camera_to_world[index], views.intrinsics
+        column, row, _ = project(
+            pose, point, focal=intrinsics.focal[index], centre=intrinsics.centre[index]
+        )
+        weight = image["opacity"]
+        rows, columns = (torch.arange(48) + 0.5).expand(2, 48)
+        found = [
+            float((weight.sum(d) * g).sum() / weight.sum()) for d, g in ((0, columns), (1, rows))
+        ]
+        assert found == pytest.approx([float(column), float(row)], abs=0.05)
+        best = divmod(int(weight.argmax()), 48)
+        distance = float((point - pose[:3, 3]).norm()) * frame.scale
+        assert float(image["depth"][best]) == pytest.approx(distance, rel=2e-3)
+        colour = (image["colour"][best] - 1 + weight[best]) / weight[best]
+        torch.testing.assert_close(colour, torch.tensor([0.2, 0.4, 0.9]), atol=2e-3, rtol=0)
+
+
+def test_points_on_the_hull_of_a_ball():
+    views = ball_views(40, 0.6, size=64)
+    torch.manual_seed(0)
+    points, colours = hull_points(views, FRAME, 500)
+    away = FRAME.to_world(points).norm(dim=1)
+    cell = 2 / 48 / FRAME.scale
+    assert away.max() < 0.6 + 3 * cell
+    assert away.quantile(0.1) > 0.6 - 3 * cell
+    expected = torch.tensor([200.0, 100.0, 50.0]) / 255
+    assert (colours - expected).abs().max() < 0.02
+    assert away.std() > 0
+    opaque = replace(views, images=views.in_memory().index_fill(3, torch.tensor(3), 255))
+    anywhere, grey = hull_points(opaque, FRAME, 500)
+    assert float(anywhere.abs().max()) > 0.9
+    assert (grey == 0.5).all()
+
+
+def test_first_scales_are_the_distances_to_neighbours():
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
+    distance = (points[:, None].double() - points.double()).norm(dim=-1).sort(dim=1).values
+    expected = distance[:, 1:4].square().mean(dim=1).sqrt().float()
+    torch.testing.assert_close(neighbour_distance(points), expected, rtol=1e-3, atol=1e-5)
+    assert neighbour_distance(points[:1]) == 0.1
+
+
+def test_learning_rates_decay_in_each_stage():
+    model = settings().build(Site(FRAME, torch.tensor([0.0, 1.0]), 0, "32"))
+    peaks = {group["name"]: group["lr"] for group in model.groups()}
+    assert peaks["detail"] == pytest.approx(peaks["base"] / 20)
+    static = model.settings.static_share
+    assert model.rate_of("means", 0, 0.0) == 1
+    # 3000 of 20,000 steps, and from the start.
+    assert model.rate_of("means", 0, static - 1e-9) == pytest.approx(0.01 ** (3 / 20), rel=0.01)
+    assert model.rate_of("planes", 0, static) == 1
+    assert model.rate_of("network", 0, 1.0) == pytest.approx(0.01)
+    assert model.rate_of("logits", 0, 1.0) == 1
+    views = ball_views(9, 0.6, distance=4.0)
+    places = views.camera_to_world[:, :3, 3].numpy()
+    farthest = max(np.linalg.norm(place - places.mean(axis=0)) for place in places)
+    assert camera_extent(views) == pytest.approx(1.1 * farthest, rel=1e-5)
+
+
+def test_gradients_of_the_planes_terms_are_those_of_their_values():
+    model = settings("channels=4", "resolution=6", "loss.every=2").build(
+        Site(FRAME, torch.linspace(0, 1, 9), 0, "32")
+    )
+    field = model.field
+    field.deforms.fill_(True)
+    planes = [plane for _, plane in field.products.planes()]
+    with torch.no_grad():
+        for plane in planes:
+            plane.add_(0.3 * torch.randn_like(plane))
+    for plane in planes:
+        plane.grad = torch.zeros_like(plane)
+    state = TrainingState(0, 4, 4, 0)
+    model.regularise(state)
+    found = [plane.grad.clone() for plane in planes]
+    weights, total = model.settings.loss, torch.zeros((), dtype=torch.float64)
+    wide = [plane.detach().double().requires_grad_() for plane in planes]
+    names = [name for name, _ in field.products.planes()]
+    for name, plane in zip(names, wide, strict=True):
+        bend = plane[:, :, 2:] - 2 * plane[:, :, 1:-1] + plane[:, :, :-2]
+        weight = weights.time_smoothness if "t" in name else weights.space_smoothness
+        total = total + weight * bend.square().mean()
+        if "t" in name:
+            total = total + weights.time_identity * (1 - plane).abs().mean()
+    total.backward()
+    for plane, gradient in zip(wide, found, strict=True):
+        torch.testing.assert_close(gradient, 2 * plane.grad.float(), rtol=1e-4, atol=1e-9)
+    assert sum(model.regularisers(state).values()) == pytest.approx(float(total.detach()), rel=1e-5)
+    model.regularise(TrainingState(0, 5, 5, 0))
+    assert all(torch.equal(a, p.grad) for a, p in zip(found, planes, strict=True))
+
+
+def test_batches_are_whole_views_each_once_in_a_turn():
+    views = replace(ball_views(5, 0.6, size=12), files=tuple("abcde"))
+    batches = ViewBatches(views, ViewSettings(accumulate=1, background="white"), seed=3)
+    seen = []
+    for step in range(10):
+        batch = batches.draw(step)
+        (index,) = [
+            i for i in range(5) if batch["camera"].camera_to_world is not None
+            and torch.equal(batch["camera"].camera_to_world, views.camera_to_world[i])
+        ]  # fmt: skip
+        seen.append(index)
+        assert torch.equal(batch["target"].view(12, 12, 3), views.composite(index, torch.ones(3)))
+        assert (batch["times"] == views.times[index]).all()
+        assert torch.equal(batch["alpha"].view(12, 12), views.image(index)[..., 3] / 255)
+    assert sorted(seen[:5]) == sorted(seen[5:]) == list(range(5))
+    assert seen[:5] != seen[5:]
+    again = ViewBatches(views, ViewSettings(accumulate=1, background="white"), seed=3)
+    assert torch.equal(again.draw(7)["target"], batches.draw(7)["target"])
+    coloured = ViewBatches(views, ViewSettings(accumulate=1, background="one"), seed=3).draw(7)
+    away = coloured["alpha"] == 0
+    assert (coloured["target"][away] == coloured["background"][away]).all()
+    assert len(coloured["background"].unique(dim=0)) == 1
+
+
+def trained(field: Any, frame: Frame = FRAME) -> Any:
+    """Enough of a run for exports."""
+    scene = ball_scene()
+    renderer = GaussianRenderer(field, antialiased=False)
+    model = SimpleNamespace(model=SimpleNamespace(name="gaussians_hexplane"))
+    return SimpleNamespace(
+        module=SimpleNamespace(field=field, renderer=renderer),
+        experiment=SimpleNamespace(method=model),
+        frame=frame, scene=scene, is_static=False, path=None, checkpoint="last", step=1,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_a_ply_of_a_timestep_shows_what_the_renderer_shows(tmp_path, degree):
+    """Read by a library, decoded here, and drawn in the world."""
+    trimesh = pytest.importorskip("trimesh")
+    field = gaussians(40, degree=degree)
+    run = trained(field)
+    folder = export(run, ExportOptions("gaussians", times="0.25,0.75"), tmp_path / "out", say=print)
+    files = sorted(path.name for path in folder.iterdir())
+    assert files == ["export.json", "gaussians_0000.ply", "gaussians_0001.ply"]
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2".split()
+    names += [f"f_rest_{n}" for n in range(rest)]
+    names += "opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+    camera = ball_views(3, 0.6, size=40).camera(2)
+    for number, time in enumerate((0.25, 0.75)):
+        cloud = trimesh.load(folder / f"gaussians_{number:04d}.ply")
+        assert len(cloud.vertices) == 40
+        data = cloud.metadata["_ply_raw"]["vertex"]["data"]
+        assert list(data.dtype.names) == names
+        raw = {name: torch.from_numpy(np.array(data[name]).reshape(-1)) for name in names}
+        means = torch.stack([raw[n] for n in "xyz"], dim=1)
+        base = torch.stack([raw[f"f_dc_{n}"] for n in range(3)], dim=1)[:, None]
+        detail = torch.stack([raw[f"f_rest_{n}"] for n in range(rest)], dim=1) if rest else None
+        harmonics = base
+        if detail is not None:
+            harmonics = torch.cat([base, detail.view(40, 3, -1).transpose(1, 2)], dim=1)
+        eye = camera.camera_to_world[:3, 3]
+        colours = (0.5 + spherical_harmonics(degree, harmonics, means - eye)).clamp(min=0)
+        image = rasterise(
+            means,
+            torch.stack([raw[f"rot_{n}"] for n in range(4)], dim=1),
+            torch.stack([raw[f"scale_{n}"] for n in range(3)], dim=1).exp(),
+            raw["opacity"].sigmoid(),
+            colours,
+            Camera.from_pose(
+                camera.camera_to_world,
+                focal=camera.focal,
+                centre=camera.centre,
+                width=40,
+                height=40,
+            ),
+            torch.ones(3),
+        )
+        shown = run.module.renderer.view(field, FRAME, camera, time, torch.ones(3))
+        torch.testing.assert_close(image.colour, shown["colour"], atol=2e-4, rtol=0)
+        assert float(shown["opacity"].max()) > 0.3
+
+
+def test_what_does_not_fit_is_refused(tmp_path, scenes):
+    field = gaussians(3)
+    with pytest.raises(ConfigError, match=r"--what mesh: .* set --what gaussians"):
+        export(trained(field), ExportOptions("mesh", times="2"), tmp_path / "a", say=print)
+    with pytest.raises(ConfigError, match="frame is turned"):
+        write_gaussians(tmp_path / "b.ply", trained(field, TURNED), 0.0)
+    with pytest.raises(ConfigError, match=r"--what gaussians: gaussians_hexplane has none"):
+        write_gaussians(tmp_path / "b.ply", trained(torch.nn.Linear(1, 1)), 0.0)
+    assert not (tmp_path / "b.ply").exists()
+    for model, sampler in (("gaussians_hexplane", "occupancy"), ("six_planes", "rasteriser")):
+        overrides = [f"model={model}", f"model/sampler={sampler}", "lrm=none"]
+        with pytest.raises(ConfigError, match=rf"sampler\.name={sampler}: .* leave model/sampler"):
+            Method.read(baseline_config(scenes, *overrides))
+    for override, words in (
+        ("degree=4", r"degree=4: must be 0 to 3"),
+        ("precision=bf16", r"precision=bf16: .* set 32 or auto"),
+        ("scales=[]", r"scales=\[\]: must be one or more"),
+        ("final_lr=0", r"final_lr=0\.0: the decay is exponential"),
+        ("count=900000", r"count=900000: must not be above densify\.most=20000"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            settings(override)
+    method = Method.read(
+        compose_plain("train", ["preparation.fixed_view_model=gaussians_hexplane"])
+    )
+    with pytest.raises(ConfigError, match=r"fixed_view_model=gaussians_hexplane: .* six_planes"):
+        rendering_method(method)
+    camera = ball_views(1, 0.6).camera(0)
+    lens = Lenses.pinholes(1)
+    with pytest.raises(SceneError, match="undistort the images"):
+        camera_in(FRAME, replace(camera, lens=lens))

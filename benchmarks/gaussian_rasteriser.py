@@ -167,6 +167,9 @@ def plot(rows: list[list[Any]]) -> None:
         for position, name in ((3, "clock"), (4, "all cores")):
             values = [float(row[position]) for row in chosen]
             axis.loglog([row[column] for row in chosen], values, "o-", label=name)
+        places = [row[column] for row in chosen]
+        axis.set_xticks(places, [f"{place:,}" for place in places])
+        axis.tick_params(axis="x", which="minor", bottom=False, labelbottom=False)
         axis.set(xlabel=label, title=title)
         axis.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("ms, forward and back")

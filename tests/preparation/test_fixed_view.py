@@ -75,6 +75,17 @@ def test_the_field_that_renders_has_its_models_default_settings(tmp_path: Path):
     assert rendering.losses == {}
 
 
+def test_all_timesteps_are_rendered_and_steps_alone_may_limit_training(tmp_path, monkeypatch):
+    asked = {}
+    monkeypatch.setattr(module, "fit_quietly", lambda *_, **options: asked.update(options))
+    open_ones = ("preparation.frames=null", "preparation.fixed_view_seconds=null")
+    made, said = video_of(settings(tmp_path, *open_ones), ball_scene(7), tmp_path / "cache", size=4)
+    assert (asked["max_steps"], asked["max_seconds"]) == (60, None)
+    assert made.views.times.tolist() == pytest.approx([step / 6 for step in range(7)])
+    assert "training six_planes for 60 steps to render 7 frames" in said[0]
+    assert made.words == "7 frames rendered by six_planes trained for 60 steps"
+
+
 def test_it_trains_on_the_runs_device_within_the_preparations_budget(tmp_path: Path, monkeypatch):
     asked = {}
     monkeypatch.setattr(module, "fit_quietly", lambda *_, **options: asked.update(options))

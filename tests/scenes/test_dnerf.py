@@ -382,7 +382,7 @@ def test_file_path_that_is_no_name(scene):
     for name in (3, "", None, "train/r_1\0"):
         scene.frame(1)["file_path"] = name
         scene.write()
-        assert "file_path must be text" in scene.error(repr(name)), name
+        assert "it must be text" in scene.error(repr(name)), name
 
 
 def test_damaged_or_missing_image(scene):
@@ -658,7 +658,7 @@ def test_masks_that_do_not_fit(scene):
         ("low.png", "12x9 pixels.*r_1.png, whose mask it is, has 12x12"),
         ("none.png", "frame 1.*no image"),
         ("../low.png", "mask_path leaves the scene's folder"),
-        (3, "mask_path must be text"),
+        (3, "it must be text"),
     ):
         scene.frame(1)["mask_path"] = name
         scene.write()

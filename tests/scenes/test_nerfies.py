@@ -3,6 +3,7 @@
 import json
 import shutil
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import torch
 from tests.captures import HEIGHT, WIDTH, NerfiesFolder, picture, save, settings
 from tests.lens_oracle import direction
 from tests.refusals import assert_refused
+from xplanes.scenes.cameras import project
 from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.nerfies import NerfiesSettings
 
@@ -260,3 +262,37 @@ def test_points_that_cannot_be(capture):
     refused(capture, r"points\.npy cannot be read")
     np.save(path, np.full((2, 3), np.nan))
     refused(capture, r"points\.npy holds an array \[2, 3\]; it must be finite")
+
+
+def test_real_cameras_see_what_their_capture_says_they_look_at(tmp_path):
+    """The conventions are those of real files: tests/data/dycheck."""
+    real = Path(__file__).parents[1] / "data" / "dycheck" / "paper-windmill"
+    folder = tmp_path / real.name
+    shutil.copytree(real, folder)
+    names = sorted(path.stem for path in (real / "camera").iterdir())
+    assert len(names) == 3
+    metadata = {
+        name: {"warp_id": int(name[2:]), "appearance_id": int(name[2:]), "camera_id": 0}
+        for name in names
+    }
+    (folder / "dataset.json").write_text(json.dumps({"ids": names, "train_ids": names}))
+    (folder / "metadata.json").write_text(json.dumps(metadata))
+    for index, name in enumerate(names):
+        save(folder / "rgb" / "4x" / f"{name}.png", picture(index, 240, 180))
+    made = settings(NerfiesSettings, "nerfies", folder, orient=False, resolution=180)
+    views = made.load(["train"]).splits["train"]
+    scene, extra = (json.loads((real / f"{name}.json").read_text()) for name in ("scene", "extra"))
+    target, up = torch.tensor(extra["lookat"]), torch.tensor(extra["up"])
+    for pose, focal, centre in zip(
+        views.camera_to_world, views.intrinsics.focal, views.intrinsics.centre, strict=True
+    ):
+        column, row, seen = project(pose, target[None], focal=focal, centre=centre)
+        assert seen.all()
+        assert 0.3 * 180 < float(column) < 0.7 * 180
+        assert 0.3 * 240 < float(row) < 0.7 * 240
+        assert scene["near"] < float((pose[:3, 3] - target).norm()) < scene["far"]
+        assert float(pose[:3, 1] @ up) > 0.95
+    assert views.intrinsics.focal[0].tolist() == pytest.approx([719.9471435546875 / 4] * 2)
+    assert views.intrinsics.centre[0].tolist() == pytest.approx(
+        [358.8895263671875 / 4, 484.92236328125 / 4]
+    )

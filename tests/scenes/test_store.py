@@ -106,13 +106,32 @@ def test_reduced_images_are_the_same_too(tmp_path: Path, small) -> None:
     assert torch.equal(images.image(1), expected[1])
 
 
-def test_flags_say_what_the_alpha_of_a_tile_shows() -> None:
+def test_a_file_says_what_the_alpha_of_cells_and_tiles_shows() -> None:
     image = torch.zeros(70, 130, 4, dtype=torch.uint8)
     image[:, 64:, 3] = 255
     image[0, 64, 3] = 0
-    (found,) = (StoredImages.all_of(TileFile.of([image])).flags(0),)
+    image[9, 17, 3] = 1
+    images = StoredImages.all_of(TileFile.of([torch.zeros_like(image), image]))
+    lit = torch.zeros(9, 17, dtype=torch.bool)
+    lit[:, 8:] = lit[1, 2] = True
+    assert torch.equal(images.lit(1), lit)
     # The padding of the tiles at the edges is neither lit nor transparent.
-    assert found.tolist() == [[0, 1, 3], [0, 3, 3]]
+    assert images.solid(1).tolist() == [[False, False, True], [False, True, True]]
+    assert not images.lit(0).any()
+    assert not images.solid(0).any()
+
+
+def test_pixels_are_drawn_from_their_cells_alone() -> None:
+    """Silhouettes in tiles are as fine as cells: what is drawn as near is near."""
+    views = ball_views(2, 0.15, size=400)
+    settings = replace(RAYS, skip_background=True, background_share=0.0)
+    batches = RayBatches(stored(views), FRAME, settings, seed=0)
+    exact = RayBatches(views, FRAME, settings, seed=0)
+    # The margin of 8 pixels is rounded up to a cell, and so are the silhouettes.
+    assert len(exact.near) < len(batches.near) < 1.6 * len(exact.near)
+    shown = float((views.images[..., 3] > 0).sum()) / len(batches.near)
+    lit = sum(float((batches.draw(step)["alpha"] > 0).float().mean()) for step in range(20)) / 20
+    assert lit == pytest.approx(shown, rel=0.1)
 
 
 def test_views_in_tiles_tell_the_same_as_views_in_memory() -> None:

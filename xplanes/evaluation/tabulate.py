@@ -15,6 +15,8 @@ UNLISTED = (
     "callbacks.evaluation.views",
     "media",
     "trainer.log_every_n_steps",
+    "published",
+    "sheet",
 )
 """Settings that say nothing about a result."""
 
@@ -149,6 +151,42 @@ def seed_table(
             line += [shown, std] if exact else [f"{shown} ± {std}" if std else shown]
         lines.append(line)
     return header, lines
+
+
+def decomposition_table(
+    rows: Sequence[RunRow], names: Sequence[str]
+) -> tuple[list[str], list[list[str]]] | None:
+    """Header and one line per run with a decomposition; None if there is no such run.
+
+    Ranks are those of xy, xz and yz; drift and energies are means over the three.
+    """
+    chosen = [row for row in rows if row.parts]
+    if not chosen:
+        return None
+    lines = []
+    for row in chosen:
+        parts = list(row.parts.values())
+        numbers = [
+            f"{_mean_of(parts, 'drift'):.3f}",
+            *(f"{100 * _mean_of(parts, f'{name}_energy'):.2f}" for name in ("low_rank", "sparse")),
+        ]
+        ranks = "/".join(str(part.get("rank")) for part in parts)
+        settings = [_text(row.settings[n]) if n in row.settings else "" for n in names]
+        converged = _text(all(part.get("converged") for part in parts))
+        lines.append([row.name, *settings, ranks, *numbers, converged])
+    header = ["run", *(_label(name, False) for name in names), "rank", "drift"]
+    return [*header, "energy of L, %", "energy of S, %", "converged"], lines
+
+
+def _mean_of(parts: Sequence[dict[str, Any]], name: str) -> float:
+    values = [part.get(name) for part in parts]
+    known = [float(value) for value in values if isinstance(value, int | float)]
+    return math.fsum(known) / len(known) if known else math.nan
+
+
+def mean_rank(rows: Sequence[RunRow]) -> float:
+    """Mean rank of the low-rank parts of all runs and orientations; NaN without any."""
+    return _mean_of([part for row in rows for part in row.parts.values()], "rank")
 
 
 def _deviation(values: Sequence[float]) -> float | None:

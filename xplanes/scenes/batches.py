@@ -10,7 +10,15 @@ from torch import Tensor
 from xplanes.scenes.changes import changing
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.silhouettes import foreground
-from xplanes.scenes.store import LIT, TILE, StoredImages, count_in_tiles
+from xplanes.scenes.store import (
+    CELL,
+    TILE,
+    StoredImages,
+    by_tile,
+    count_in_squares,
+    packed,
+    unpacked,
+)
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Settings, Share
 from xplanes.streams import step_generator
@@ -23,7 +31,7 @@ NEAR_SILHOUETTE = 0.02
 STILL_SHARE = 0.5
 """Share of rays at pixels of fixed cameras where nothing changes."""
 
-PER_TILE = 16
+PER_TILE = 32
 """Rays from one tile, of images in a file of tiles."""
 
 LEAST_TILES = 32
@@ -56,8 +64,8 @@ class RayBatches:
     `STILL_SHARE`, at their own times.
 
     Of images in a file of tiles each batch takes `PER_TILE` pixels of each of some tiles, so that
-    it reads few places of the disk; every pixel is still as likely as any other. The tiles near the
-    silhouettes are those that they reach, with all of their pixels.
+    it reads few places of the disk; every pixel is still as likely as any other. Near and far are
+    told apart by cells of `CELL` pixels there.
 
     Args:
         views: Training views.
@@ -155,36 +163,42 @@ class RayBatches:
         """Far, view, row, column and colour of rays, some through each of few tiles."""
         per_tile = self._per_tile
         far, place = self._choose(uniform[::per_tile])
-        view, tile = place.unbind(dim=1)
+        view, tile = place[:, :2].unbind(dim=1)
+        cells = unpacked(place[:, 2:].byte().numpy())
         size = self.views.intrinsics.size[view]
         columns = (size[:, 1] + TILE - 1) // TILE
         top, left = tile // columns * TILE, tile % columns * TILE
-        height, width = (size[:, 0] - top).clamp(max=TILE), (size[:, 1] - left).clamp(max=TILE)
         inside = torch.rand(len(tile), per_tile, generator=generator, dtype=torch.float64)
         if self.views.intrinsics.sights is None:
-            pixels = (height * width)[:, None]
-            pixel = torch.minimum((inside * pixels).long(), pixels - 1)
+            row, column = _in_cells(cells, size[:, 0] - top, size[:, 1] - left, inside)
         else:
-            pixel = self._with_rays(view, top, left, inside)
-        row, column = pixel // width[:, None], pixel % width[:, None]
+            row, column = self._with_rays(view, top, left, cells, inside)
         colour = images.pixels(view, tile, row * TILE + column)
         rays = slice(0, self.rays)  # The last tile may have to give fewer.
         far, view = (of_tile.repeat_interleave(per_tile)[rays] for of_tile in (far, view))
         row, column = (top[:, None] + row).flatten()[rays], (left[:, None] + column).flatten()[rays]
         return far, view, row, column, colour.flatten(0, 1)[rays]
 
-    def _with_rays(self, view: Tensor, top: Tensor, left: Tensor, inside: Tensor) -> Tensor:
-        """Pixels of tiles among those that their lenses map a direction to. [K, P] -> [K, P]"""
+    def _with_rays(
+        self, view: Tensor, top: Tensor, left: Tensor, cells: Tensor, inside: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """As `_in_cells`, among the pixels that the tiles' lenses map a direction to."""
         found = []
-        for index, row, column, uniform in zip(
-            view.tolist(), top.tolist(), left.tolist(), inside, strict=True
+        side = TILE // CELL
+        tiles = cells.view(-1, side, side).repeat_interleave(CELL, 1).repeat_interleave(CELL, 2)
+        for index, row, column, tile, uniform in zip(
+            view.tolist(), top.tolist(), left.tolist(), tiles, inside, strict=True
         ):
+            height, width = self.views.size(index)
+            chosen = torch.zeros(TILE, TILE, dtype=torch.bool)
+            chosen[: height - row, : width - column] = True
             shown = self.views.intrinsics.has_ray(index)
-            if shown is None:
-                shown = torch.ones(self.views.size(index), dtype=torch.bool)
-            tile = _PixelPool(shown[row : row + TILE, column : column + TILE])
-            found.append(tile.pick(uniform)[:, 0])
-        return torch.stack(found)
+            if shown is not None:
+                shown = shown[row : row + TILE, column : column + TILE]
+                chosen[: shown.shape[0], : shown.shape[1]] = shown
+            found.append(_PixelPool(chosen & tile).pick(uniform)[:, 0])
+        pixel = torch.stack(found)
+        return pixel // TILE, pixel % TILE
 
     @property
     def _per_tile(self) -> int:
@@ -199,7 +213,7 @@ class RayBatches:
             generator = step_generator(self.seed, later, self.rank)
             uniform = torch.rand(self.rays, 3, generator=generator, dtype=torch.float64)
             _, place = self._choose(uniform[:: self._per_tile])
-            self.views.images.prefetch(*place.unbind(dim=1))
+            self.views.images.prefetch(*place[:, :2].unbind(dim=1))
         self._prefetched = step + AHEAD
 
     def _times(self, view: Tensor, far: Tensor, generator: torch.Generator) -> Tensor:
@@ -240,41 +254,79 @@ class _TilePool:
 
     Args:
         places: The view of each tile, and the tile's number in it. int32 [K, 2]
-        pixels: Its pixels without padding. int64 [K]
+        cells: Which of its cells belong to the pool, as bits. uint8 [K, B]
+        pixels: The pixels of these cells, without padding. int64 [K]
     """
 
-    def __init__(self, places: Tensor, pixels: Tensor) -> None:
-        self.places, self.ends = places, pixels.cumsum(dim=0)
+    def __init__(self, places: Tensor, cells: Tensor, pixels: Tensor) -> None:
+        self.places, self.cells, self.ends = places, cells, pixels.cumsum(dim=0)
 
     def __len__(self) -> int:
         return int(self.ends[-1]) if len(self.ends) else 0
 
     def pick(self, uniform: Tensor) -> Tensor:
-        """Views and tiles at places given by numbers from 0 to 1. [K] -> int64 [K, 2]"""
+        """Views, tiles and their cells at places given by numbers from 0 to 1. [K] -> [K, 2 + B]"""
         place = (uniform * len(self)).long().clamp_(max=len(self) - 1)
-        return self.places[torch.searchsorted(self.ends, place, right=True)].long()
+        found = torch.searchsorted(self.ends, place, right=True)
+        return torch.cat([self.places[found].long(), self.cells[found].long()], dim=1)
 
 
 def _tile_pools(
     views: Views, images: StoredImages, margins: list[int]
 ) -> tuple[_TilePool, _TilePool]:
-    """Tiles within some pixels of the silhouettes, and all others."""
-    places, pixels, near = [], [], []
+    """The cells of tiles within some pixels of the silhouettes, and all others."""
+    places, cells, pixels = [], ([], []), ([], [])
     for index, margin in enumerate(margins):
-        lit = (images.flags(index) & LIT).float()[None]
-        reach = -(-margin // TILE)
-        near.append(F.max_pool2d(lit, 2 * reach + 1, stride=1, padding=reach).flatten() > 0)
-        height, width = (_lengths(side) for side in images.sizes[index].tolist())
+        reach = -(-margin // CELL)
+        lit = images.lit(index).float()[None]
+        near = F.max_pool2d(lit, 2 * reach + 1, stride=1, padding=reach)[0] > 0
         shown = views.intrinsics.has_ray(index)
-        count = height[:, None] * width if shown is None else count_in_tiles(shown)
-        pixels.append(count.flatten())
-        number = torch.arange(len(pixels[-1]), dtype=torch.int32)
+        if shown is None:
+            height, width = (_lengths(side) for side in images.sizes[index].tolist())
+            count = height[:, None] * width
+        else:
+            count = count_in_squares(shown, CELL)
+        for chosen, bits, counts in zip((near, ~near), cells, pixels, strict=True):
+            bits.append(torch.from_numpy(packed(by_tile(chosen))))
+            counts.append(by_tile(count * chosen).sum(dim=1))
+        number = torch.arange(len(pixels[0][-1]), dtype=torch.int32)
         places.append(torch.stack([torch.full_like(number, index), number], dim=1))
-    place, counts, chosen = torch.cat(places), torch.cat(pixels), torch.cat(near)
-    first, second = (_TilePool(place[part], counts[part]) for part in (chosen, ~chosen))
-    return first, second
+    place, pools = torch.cat(places), []
+    for bits, counts in zip(cells, pixels, strict=True):
+        count = torch.cat(counts)
+        pools.append(_TilePool(place[count > 0], torch.cat(bits)[count > 0], count[count > 0]))
+    near_pool, far_pool = pools
+    return near_pool, far_pool
+
+
+def _in_cells(
+    cells: Tensor, height: Tensor, width: Tensor, uniform: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Pixels of tiles, each in any of some cells as likely as any other.
+
+    Args:
+        cells: The cells of each tile to draw from. bool [K, (TILE / CELL)**2]
+        height: Rows from each tile's first to the end of its image. int64 [K]
+        width: Columns, likewise. int64 [K]
+        uniform: Numbers from 0 to 1. [K, P]
+
+    Returns:
+        Rows and columns in the tiles. int64 [K, P] each
+    """
+    side = TILE // CELL
+    first = CELL * torch.arange(side)
+    rows, columns = ((size[:, None] - first).clamp(0, CELL) for size in (height, width))
+    pixels = (rows[:, :, None] * columns[:, None, :]).flatten(1) * cells
+    ends = pixels.cumsum(dim=1)
+    total = ends[:, -1:]
+    place = torch.minimum((uniform * total).long(), total - 1)
+    cell = torch.searchsorted(ends, place, right=True)
+    place -= (ends - pixels).gather(1, cell)
+    across = columns.gather(1, cell % side)
+    row = cell // side * CELL + place // across
+    return row, cell % side * CELL + place % across
 
 
 def _lengths(side: int) -> Tensor:
-    """Rows, or columns, of the tiles along a side of an image."""
-    return (side - torch.arange(0, side, TILE)).clamp(max=TILE)
+    """Rows, or columns, of the cells along a side of an image."""
+    return (side - torch.arange(0, side, CELL)).clamp(max=CELL)

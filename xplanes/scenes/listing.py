@@ -3,7 +3,7 @@
 import json
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PureWindowsPath
 from typing import Any, Literal, TypeGuard
@@ -440,27 +440,44 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
     Raises:
         SceneError: If it is no name, leaves the folder, or there is no such file.
     """
+    for image in paths_inside(label, folder, name, key, "./train/r_000"):
+        if image.is_file():
+            return image
+    raise SceneError(
+        f"{label}: no image {folder / name}, nor with {', '.join(SUFFIXES[1:])} added. "
+        f"Add the file or take the frame out of the list."
+    )
+
+
+def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) -> Iterator[Path]:
+    """What a name may stand for, as it is and with the suffix of an image, inside ``folder``.
+
+    Args:
+        label: The file and frame that name it, for messages.
+        folder: The scene's folder, with its links resolved.
+        name: Name relative to ``folder``.
+        key: The key that holds the name.
+        example: Such a name, for messages.
+
+    Raises:
+        SceneError: If it is no name, or leaves the folder.
+    """
     if not isinstance(name, str) or not name or "\0" in name:
-        raise SceneError(f"{label}: {key} must be text such as ./train/r_000.")
+        raise SceneError(f"{label}: {key} is {short(name)}; it must be text such as {example}.")
     # Blender on Windows writes backslashes.
     relative = Path(name.replace("\\", "/"))
     if relative.is_absolute() or PureWindowsPath(name).anchor:
         raise SceneError(
-            f"{label}: {key} is absolute. Write it relative to {folder}, as in ./train/r_000."
+            f"{label}: {key} is absolute. Write it relative to {folder}, as in {example}."
         )
     for suffix in SUFFIXES:
-        image = (folder / f"{relative}{suffix}").resolve()
-        if not image.is_relative_to(folder):
+        path = (folder / f"{relative}{suffix}").resolve()
+        if not path.is_relative_to(folder):
             raise SceneError(
-                f"{label}: {key} leaves the scene's folder {folder} (it leads to {image}). "
-                f"Put the image inside the folder and correct {key}."
+                f"{label}: {key} leaves the scene's folder {folder} (it leads to {path}). Put its "
+                f"files inside the folder and correct {key}."
             )
-        if image.is_file():
-            return image
-    raise SceneError(
-        f"{label}: no image {folder / relative}, nor with {', '.join(SUFFIXES[1:])} added. "
-        f"Add the file or take the frame out of the list."
-    )
+        yield path
 
 
 def mask_files(

@@ -11,7 +11,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -39,10 +39,10 @@ from xplanes.scenes.listing import (
     checked_pose,
     final_intrinsics,
     is_positive,
+    paths_inside,
     require_precision,
     require_rays,
     require_shape,
-    short,
     some,
     thinned,
 )
@@ -371,27 +371,14 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
 
 def _source(label: str, folder: Path, name: Any) -> Path:
     """The video or the folder of images that a frame names."""
-    if not isinstance(name, str) or not name or "\0" in name:
-        raise SceneError(f"{label}: file_path is {short(name)}; it must be text such as cam00.mp4.")
-    relative = Path(name.replace("\\", "/"))
-    if relative.is_absolute() or PureWindowsPath(name).anchor:
-        raise SceneError(
-            f"{label}: file_path is absolute. Write it relative to {folder}, as in cam00.mp4."
-        )
-    for suffix in SUFFIXES:
-        source = (folder / f"{relative}{suffix}").resolve()
-        if not source.is_relative_to(folder):
-            raise SceneError(
-                f"{label}: file_path leaves the scene's folder {folder} (it leads to {source}). "
-                "Put the camera's files inside the folder and correct file_path."
-            )
+    for source in paths_inside(label, folder, name, "file_path", "cam00.mp4"):
         if source.is_dir() or (source.is_file() and source.suffix.lower() in videos.SUFFIXES):
             break
         if source.is_file() and source.parent != folder:
             return source.parent
     else:
         raise SceneError(
-            f"{label}: {folder / relative} is no video ({', '.join(videos.SUFFIXES)}), no folder "
+            f"{label}: {folder / name} is no video ({', '.join(videos.SUFFIXES)}), no folder "
             "of images and no image in a folder of the camera's own. Add it, or take the frame "
             "out of the list."
         )

@@ -1,10 +1,11 @@
 """Decoded images that need not fit in memory: files of tiles, written once and read in pieces.
 
-A file holds the tiles of all images one after the other, each image's row by row, then one byte a
-tile that says what its alpha shows (`LIT`, `SOLID`); images without alpha have three channels and
-no such bytes. Its name is a hash of the sources and of how they were decoded, so it needs no
-header: a file of that name and of the right length is the right one. Its time of change is when it
-was used last.
+A file holds the tiles of all images one after the other, each image's row by row, then
+`FLAG_BYTES` a tile that say what its alpha shows: a bit for each of its cells that has any pixel
+above 0, row by row, and a byte that is 1 if all of its pixels are; images without alpha have three
+channels and no such bytes. Its name is a hash of the sources and of how they were decoded, so it
+needs no header: a file of that name and of the right length is the right one. Its time of change is
+when it was used last.
 
 Tiles are read, not mapped: pages of a mapping count as the process's own memory, those that reading
 leaves in the system's cache do not.
@@ -46,7 +47,13 @@ IN_MEMORY = 2**30
 TILE = 64
 """Rows and columns of a tile: 12 kB without alpha, 16 kB with it, whole pages either way."""
 
-VERSION = 1
+CELL = 8
+"""Rows and columns of the cells in which the silhouettes are known."""
+
+FLAG_BYTES = (TILE // CELL) ** 2 // 8 + 1
+"""Bytes that say what a tile's alpha shows."""
+
+VERSION = 2
 """Version of the files; increase it whenever images are decoded to other bytes."""
 
 SPARE = 2**28
@@ -54,9 +61,6 @@ SPARE = 2**28
 
 UNUSED_DAYS = 30
 """Days after which a file of the user's cache that no run has used is removed."""
-
-LIT, SOLID = 1, 2
-"""What a tile's byte says: some pixel has alpha above 0; all pixels have."""
 
 NAME = re.compile(r"[0-9a-f]{32}\.tiles")
 """Names of the files."""
@@ -111,10 +115,15 @@ class StoredImages:
         file, image = self._of_view[index]
         return self.files[file].image(image)
 
-    def flags(self, index: int) -> Tensor:
-        """`LIT` and `SOLID` of a view's tiles. uint8 [rows, columns]"""
+    def lit(self, index: int) -> Tensor:
+        """Which cells of a view have alpha above 0 somewhere. bool [h / CELL, w / CELL] (ceiled)"""
         file, image = self._of_view[index]
-        return self.files[file].flags(image)
+        return self.files[file].lit(image)
+
+    def solid(self, index: int) -> Tensor:
+        """Which tiles of a view have alpha above 0 everywhere. bool [rows, columns]"""
+        file, image = self._of_view[index]
+        return self.files[file].solid(image)
 
     def pixels(self, views: Tensor, tiles: Tensor, inside: Tensor) -> Tensor:
         """Pixels of some tiles.
@@ -161,7 +170,7 @@ class TileFile:
         key: Hash of what the images come from.
         sizes: Height and width of each image.
         channels: 3 for images without alpha, else 4.
-        flags: What the tiles' alpha shows; None for images without. uint8 [tiles]
+        flags: What the tiles' alpha shows; None for images without. uint8 [tiles, FLAG_BYTES]
     """
 
     def __init__(
@@ -178,7 +187,9 @@ class TileFile:
         if channels == 4 and flags is None:
             assert isinstance(source, Path)
             total = self.first[-1]
-            flags = np.fromfile(source, np.uint8, total, offset=total * TILE**2 * channels)
+            end = total * TILE**2 * channels
+            flags = np.fromfile(source, np.uint8, total * FLAG_BYTES, offset=end)
+            flags = flags.reshape(total, FLAG_BYTES)
         self._flags = flags
 
     def __reduce__(self) -> Any:
@@ -202,13 +213,22 @@ class TileFile:
         whole.reshape(rows, TILE, columns, TILE, 4)[..., :channels] = tiles.swapaxes(1, 2)
         return torch.from_numpy(whole)[:height, :width]
 
-    def flags(self, index: int) -> Tensor:
-        """`LIT` and `SOLID` of an image's tiles. uint8 [rows, columns]"""
+    def lit(self, index: int) -> Tensor:
+        """Which cells of an image have alpha above 0 somewhere. bool, as in `StoredImages.lit`"""
+        height, width = self.sizes[index]
+        cells = -(-height // CELL), -(-width // CELL)
+        if self._flags is None:
+            return torch.ones(cells, dtype=torch.bool)
+        part = self._flags[self.first[index] : self.first[index + 1], :-1]
+        return _from_tiles(unpacked(part), _grid(height, width))[: cells[0], : cells[1]]
+
+    def solid(self, index: int) -> Tensor:
+        """Which tiles of an image have alpha above 0 everywhere. bool [rows, columns]"""
         grid = _grid(*self.sizes[index])
         if self._flags is None:
-            return torch.full(grid, LIT | SOLID, dtype=torch.uint8)
-        part = self._flags[self.first[index] : self.first[index + 1]]
-        return torch.from_numpy(part.reshape(grid))
+            return torch.ones(grid, dtype=torch.bool)
+        part = self._flags[self.first[index] : self.first[index + 1], -1]
+        return torch.from_numpy(part > 0).view(grid)
 
     def tiles(self, index: int, tile: int, count: int) -> np.ndarray:
         """Tiles of an image, ``tile`` the first. uint8 [count, TILE**2, C]; of 1 [TILE**2, C]"""
@@ -317,7 +337,7 @@ def decoded(
     key = hashlib.sha256(content.encode()).hexdigest()
     path = folder / f"{key[:32]}.tiles"
     total = _firsts(sizes)[-1]
-    length = total * (TILE**2 * channels + (channels == 4))
+    length = total * (TILE**2 * channels + (FLAG_BYTES if channels == 4 else 0))
 
     def found() -> StoredImages | None:
         try:
@@ -394,7 +414,7 @@ def _write(
     from tqdm import tqdm
 
     first = _firsts(sizes)
-    flags = np.zeros(first[-1], np.uint8)
+    flags = np.zeros((first[-1], FLAG_BYTES), np.uint8)
     written = np.zeros(len(sizes), bool)
     turn = threading.Lock()
     with path.open("r+b", buffering=0) as file:
@@ -480,21 +500,62 @@ def to_tiles(pixels: np.ndarray) -> np.ndarray:
     return tiles.reshape(rows * columns, TILE**2, channels)
 
 
-def count_in_tiles(mask: Tensor) -> Tensor:
-    """How many pixels of each tile a mask holds. bool [h, w] -> int64 [rows, columns]"""
+def count_in_squares(mask: Tensor, side: int) -> Tensor:
+    """How many pixels a mask holds in each square of an image.
+
+    Args:
+        mask: Pixels. bool [h, w]
+        side: Rows and columns of a square.
+
+    Returns:
+        Their numbers. int64 [h / side, w / side], rounded up
+    """
     height, width = mask.shape
-    rows, columns = _grid(height, width)
-    padded = F.pad(mask, (0, columns * TILE - width, 0, rows * TILE - height))
-    return padded.view(rows, TILE, columns, TILE).sum(dim=(1, 3))
+    padded = F.pad(mask, (0, -width % side, 0, -height % side))
+    return padded.view(-(-height // side), side, -(-width // side), side).sum(dim=(1, 3))
+
+
+def by_tile(cells: Tensor) -> Tensor:
+    """What is known of an image's cells, tile by tile, zeros beyond its edges.
+
+    Args:
+        cells: One value a cell. [h / CELL, w / CELL], rounded up
+
+    Returns:
+        The same. [tiles, (TILE / CELL)**2]
+    """
+    side = TILE // CELL
+    height, width = cells.shape
+    padded = F.pad(cells, (0, -width % side, 0, -height % side))
+    tiles = padded.view(-(-height // side), side, -(-width // side), side).transpose(1, 2)
+    return tiles.reshape(-1, side**2)
+
+
+def packed(cells: Tensor) -> np.ndarray:
+    """Flags of the cells of tiles as bits. bool [K, (TILE / CELL)**2] -> uint8 [K, B]"""
+    return np.packbits(cells.numpy(), axis=1)
+
+
+def unpacked(bits: np.ndarray) -> Tensor:
+    """The flags that `packed` made bits of. uint8 [K, B] -> bool [K, (TILE / CELL)**2]"""
+    return torch.from_numpy(np.unpackbits(bits, axis=1)).bool()
+
+
+def _from_tiles(cells: Tensor, grid: tuple[int, int]) -> Tensor:
+    """The inverse of `by_tile`, with what lies beyond the edges."""
+    side = TILE // CELL
+    rows, columns = grid
+    whole = cells.view(rows, columns, side, side).transpose(1, 2)
+    return whole.reshape(rows * side, columns * side)
 
 
 def _alpha_flags(pixels: np.ndarray) -> np.ndarray:
-    """`LIT` and `SOLID` of an image's tiles. uint8 [h, w, 4] -> uint8 [tiles]"""
-    seen = torch.from_numpy(np.ascontiguousarray(pixels[..., 3] > 0)).float()[None]
-    # At the edges the pool takes the pixels that there are: padding is neither lit nor bare.
-    lit = F.max_pool2d(seen, TILE, ceil_mode=True)
-    bare = F.max_pool2d(1 - seen, TILE, ceil_mode=True)
-    return (LIT * (lit > 0) + SOLID * (bare == 0)).flatten().byte().numpy()
+    """What the alpha of an image's tiles shows. uint8 [h, w, 4] -> uint8 [tiles, FLAG_BYTES]"""
+    seen = torch.from_numpy(np.ascontiguousarray(pixels[..., 3] > 0))
+    lit = packed(by_tile(count_in_squares(seen, CELL) > 0))
+    # The padding of the tiles at the edges is neither lit nor bare.
+    solid = (count_in_squares(~seen, TILE) == 0).flatten().byte().numpy()
+    return np.concatenate([lit, solid[:, None]], axis=1)
 
 
 def _largest(sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:

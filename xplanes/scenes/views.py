@@ -11,7 +11,7 @@ from torch import Tensor
 
 from xplanes.scenes.cameras import cast_rays
 from xplanes.scenes.lenses import Lenses, Sight, sight
-from xplanes.scenes.store import LIT, SOLID, TILE, StoredImages, TileFile, count_in_tiles
+from xplanes.scenes.store import CELL, TILE, StoredImages, TileFile, count_in_squares
 
 PALE_STEPS, PALE_EDGE = 16, 0.9
 """Pixels so far from the background look like it; share of an image's edge that ends in it then."""
@@ -235,14 +235,15 @@ class Views:
         sights = self.intrinsics.sights or []
         return self.is_padded or any(each.has_ray is not None for each in sights)
 
-    @property
+    @cached_property
     def is_opaque(self) -> bool:
         """Whether no pixel lets the background through whole: alpha says nothing then."""
         for index in range(len(self)):
             has_ray = self.intrinsics.has_ray(index)
             if isinstance(self.images, StoredImages):
-                shown = (self.images.flags(index) & SOLID) > 0
-                has_ray = None if has_ray is None else count_in_tiles(has_ray) == TILE**2
+                shown = self.images.solid(index)
+                if has_ray is not None:
+                    has_ray = count_in_squares(has_ray, TILE) == TILE**2
             else:
                 shown = self.image(index)[..., 3] > 0
             if not (shown if has_ray is None else shown[has_ray]).all():
@@ -307,11 +308,11 @@ class Views:
         """Where image ``index`` has alpha above 0, in square cells.
 
         Returns:
-            Whether any pixel of a cell has, and the cells' side in pixels: 1, but `TILE` for images
+            Whether any pixel of a cell has, and the cells' side in pixels: 1, but `CELL` for images
             in a file of tiles, of which nothing is read. bool [rows, columns]
         """
         if isinstance(self.images, StoredImages):
-            return (self.images.flags(index) & LIT) > 0, TILE
+            return self.images.lit(index), CELL
         return self.image(index)[..., 3] > 0, 1
 
     def valid(self) -> Tensor:

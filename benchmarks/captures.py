@@ -4,7 +4,7 @@
         [--steps 1000 | --seconds 120] [--variants NAMES] [--seeds 1] [--together 1]
         [--name captures] [--work FOLDER] [KEY=VALUE ...]
 
-Writes results/NAME.md and NAME.csv beside this file. The scenes are procedural captures of the
+Writes docs/results/NAME.md and NAME.csv. The scenes are procedural captures of the
 suite, whose masks of the thing are known: scores are those of whole pictures, and of the pixels
 that show the thing. Variants of X-Planes with six planes:
 
@@ -20,8 +20,8 @@ that show the thing. Variants of X-Planes with six planes:
 
 `kplanes` and `tineuvox_s` are the baselines, with a world of their own and as many rays a step as
 X-Planes; K-Planes has one scale, few samples and a short warm-up, as it learns nothing in a minute
-of a CPU otherwise. Each run is a process of its own with one thread; ``--together`` so many run
-side by side.
+of a CPU otherwise. Each run is a process of its own with one thread, and seconds are those of its
+CPU time (cpu_clock.py); ``--together`` so many run side by side.
 """
 
 import argparse
@@ -31,7 +31,7 @@ import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from runner import RESULTS, Measured, command, machine, markdown, run_apart
+from runner import CPU_CLOCK, RESULTS, Measured, command, machine, markdown, run_apart
 
 from xplanes.files import write_rows, write_text
 from xplanes.scenes.demo.suite import SUITE_SCENES
@@ -119,7 +119,8 @@ def main() -> None:
         work = args.work or Path(scratch)
 
         def measure(job: tuple[str, str, int]) -> Measured:
-            return run_apart(overrides(*job, args), work / "_".join(map(str, job)))
+            folder = work / "_".join(map(str, job))
+            return run_apart(overrides(*job, args), folder, CPU_CLOCK)
 
         found: dict[tuple[str, str], list[Measured]] = {}
         for (scene, variant, _), run in zip(jobs, pool.map(measure, jobs), strict=True):
@@ -140,8 +141,8 @@ def main() -> None:
         "",
         markdown(COLUMNS, rows),
         "",
-        "Seconds are those of training, without the preparation of `_tiny`. Memory is the peak of "
-        "a whole run.",
+        "Seconds are the CPU time of training with one thread, without the preparation of `_tiny`. "
+        "Memory is the peak of a whole run.",
     ]
     write_text(RESULTS / f"{args.name}.md", "\n".join(text) + "\n")
 

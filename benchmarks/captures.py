@@ -4,7 +4,7 @@
         [--steps 1000 | --seconds 120] [--variants NAMES] [--seeds 1] [--together 1]
         [--name captures] [--work FOLDER] [KEY=VALUE ...]
 
-Writes results/NAME.md and NAME.csv beside this file. The scenes are procedural captures of the
+Writes docs/results/NAME.md and NAME.csv. The scenes are procedural captures of the
 suite, whose masks of the thing are known: scores are those of whole pictures, and of the pixels
 that show the thing. Variants of X-Planes with six planes:
 
@@ -13,10 +13,15 @@ that show the thing. Variants of X-Planes with six planes:
 * `world`: the default;
 * `masks`: told by silhouettes what is the thing, before white;
 * `world_tiny`, `masks_tiny`: the same, initialised from the LRM that is bundled;
-* `cut_tiny`: as `world_tiny`, but the LRM is shown the thing alone, cut out by masks.
+* `cut_tiny`: as `world_tiny`, but the LRM is shown the thing alone, cut out by masks;
+* `rough_world`, `rough_field`: `world` without smoothness of the background, or of the field;
+* `thin_fog`: `world` with all cells sampled that elsewhere are;
+* `even_rays`: `world` with all pixels drawn alike.
 
-`kplanes` and `tineuvox_s` are the baselines, with a world of their own. Each run is a process of
-its own with one thread; ``--together`` so many run side by side.
+`kplanes` and `tineuvox_s` are the baselines, with a world of their own and as many rays a step as
+X-Planes; K-Planes has one scale, few samples and a short warm-up, as it learns nothing in a minute
+of a CPU otherwise. Each run is a process of its own with one thread, and seconds are those of its
+CPU time (cpu_clock.py); ``--together`` so many run side by side.
 """
 
 import argparse
@@ -26,7 +31,7 @@ import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from runner import RESULTS, Measured, command, machine, markdown, run_apart
+from runner import CPU_CLOCK, RESULTS, Measured, command, machine, markdown, run_apart
 
 from xplanes.files import write_rows, write_text
 from xplanes.scenes.demo.suite import SUITE_SCENES
@@ -39,8 +44,16 @@ VARIANTS = {
     "world_tiny": ["lrm=tiny"],
     "cut_tiny": ["lrm=tiny", "data.mask_use=lrm"],
     "masks_tiny": ["lrm=tiny", "data.mask_use=alpha"],
-    "kplanes": ["model=kplanes"],
-    "tineuvox_s": ["model=tineuvox_s"],
+    "rough_world": ["lrm=none", "model.background.total_variation=0"],
+    "rough_field": ["lrm=none", "model.loss.world_variation=0"],
+    "thin_fog": ["lrm=none", "model.sampler.world_threshold=0.001"],
+    "even_rays": ["lrm=none", "model.rays.skip_background=false"],
+    "kplanes": [
+        *("model=kplanes", "model.scales=[2]", "model.warmup_steps=50"),
+        *("model.rays.per_batch=1024", "model.sampler.proposal_samples=[64,48]"),
+        *("model.sampler.samples=32", "model.sampler.anneal_steps=100"),
+    ],
+    "tineuvox_s": ["model=tineuvox_s", "model.rays.per_batch=1024"],
 }
 VIEWS = {"phone": 60, "rig": 96}
 COLUMNS = (
@@ -56,7 +69,7 @@ def overrides(scene: str, variant: str, seed: int, args: argparse.Namespace) -> 
         *("data=suite", f"data.scene={scene}", f"data.resolution={args.resolution}"),
         *(f"data.root={args.root}", f"data.train_views={VIEWS[scene.removesuffix('_test')]}"),
         *VARIANTS[variant],
-        *(f"trainer.max_steps={steps or 'null'}", f"trainer.max_seconds={seconds or 'null'}"),
+        *(f"trainer.max_steps={steps or -1}", f"trainer.max_seconds={seconds or 'null'}"),
         *("callbacks.evaluation.at=[]", "callbacks.evaluation.views=1", "logger=none"),
         *("media=false", f"seed={seed}", *args.overrides),
     ]
@@ -106,7 +119,8 @@ def main() -> None:
         work = args.work or Path(scratch)
 
         def measure(job: tuple[str, str, int]) -> Measured:
-            return run_apart(overrides(*job, args), work / "_".join(map(str, job)))
+            folder = work / "_".join(map(str, job))
+            return run_apart(overrides(*job, args), folder, CPU_CLOCK)
 
         found: dict[tuple[str, str], list[Measured]] = {}
         for (scene, variant, _), run in zip(jobs, pool.map(measure, jobs), strict=True):
@@ -127,8 +141,8 @@ def main() -> None:
         "",
         markdown(COLUMNS, rows),
         "",
-        "Seconds are those of training, without the preparation of `_tiny`. Memory is the peak of "
-        "a whole run.",
+        "Seconds are the CPU time of training with one thread, without the preparation of `_tiny`. "
+        "Memory is the peak of a whole run.",
     ]
     write_text(RESULTS / f"{args.name}.md", "\n".join(text) + "\n")
 

@@ -18,6 +18,7 @@ from xplanes.files import read_rows
 from xplanes.pipeline import run
 
 RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"
+TRAIN, CPU_CLOCK = CONF.parent / "train.py", Path(__file__).resolve().parent / "cpu_clock.py"
 
 
 @dataclass(frozen=True)
@@ -78,12 +79,13 @@ def lego(folder: Path) -> list[str]:
     ]
 
 
-def run_apart(overrides: list[str], folder: Path) -> Measured:
+def run_apart(overrides: list[str], folder: Path, script: Path = TRAIN) -> Measured:
     """Train in a process of its own, so that memory is the run's; a finished run is not repeated.
 
     Args:
         overrides: As on the command line.
         folder: The run directory; one that was begun goes on where it stopped.
+        script: train.py, or one that does the same.
 
     Raises:
         RuntimeError: If the run fails, or the folder holds another one.
@@ -98,7 +100,7 @@ def run_apart(overrides: list[str], folder: Path) -> Measured:
         begun = (folder / "run.json").is_file()
         lines = [f"resume={folder}"] if begun else [*overrides, f"hydra.run.dir={folder}"]
         done = subprocess.run(
-            [sys.executable, str(CONF.parent / "train.py"), *lines],
+            [sys.executable, str(script), *lines],
             capture_output=True,
             text=True,
             check=False,

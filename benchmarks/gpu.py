@@ -395,8 +395,8 @@ def measure_step(
     """Where the time of a step goes, by what runs on the device."""
     device = device or found_device()
     large = LARGE if device.type == "cuda" else ()
-    overrides = [*part.overrides, *large, "data=demo", "data.resolution=64"]
-    config = compose_plain("train", [*overrides, f"data.root={args.work / 'demo'}"])
+    where = ("data=demo", f"data.root={args.work / 'demo'}", "data.resolution=64")
+    config = compose_plain("train", [*where, *large, *part.overrides])
     settled, seen = (200, 20) if device.type == "cuda" else (5, 5)
     profiler = StepProfile(settled, seen, device)
     module, data = RadianceModule(config), SceneDataModule(config["data"])
@@ -413,11 +413,10 @@ def measure_step(
     trainer.fit(module, data)
     spent, events = profiler.seconds / seen, profiler.events()
     busy = sum(event.time for event in events)
-    record.add("step", "whole", {"calls a step": (sum(e.calls for e in events), "calls"),
-                                 "time a step": (1e6 * spent, "us"), "share": (100, "%")})  # fmt: skip
-    record.add("step", "what runs on the device", {"time a step": (busy, "us"),
-                                                   "share": (busy / spent / 1e4, "%")})  # fmt: skip
-    for event in sorted(events, key=lambda event: -event.time)[:KERNELS]:
+    calls = sum(event.calls for event in events)
+    longest = sorted(events, key=lambda event: -event.time)[:KERNELS]
+    rows = [Event("whole", calls, 1e6 * spent), Event("in kernels", calls, busy), *longest]
+    for event in rows:
         cells = {
             "calls a step": (event.calls, "calls"),
             "time a step": (event.time, "us"),

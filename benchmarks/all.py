@@ -3,7 +3,7 @@
     python benchmarks/all.py [--lego FOLDER] [--only NAME ...]
 
 Needs the extra `dev` and D-NeRF's lego (`xplanes download dnerf`). Each script writes
-its own page anew, in benchmarks/results or docs/results; one that fails does not stop the others.
+its own page below docs/results anew; one that fails does not stop the others.
 Nothing else should run.
 """
 
@@ -27,6 +27,7 @@ def scripts(folder: Path) -> dict[str, list[list[str]]]:
         "skips": [given],
         "rendering": [given],
         "ray_drawing": [[]],
+        "gaussian_rasteriser": [[]],
         "captures": [[]],
         "stages": [[]],
         "pareto": [given],
@@ -34,6 +35,7 @@ def scripts(folder: Path) -> dict[str, list[list[str]]]:
         "decomposition_speed": [[]],
         "decomposition_stress": [[]],
         "conversion_options": [[]],
+        "rank_curve": [[]],
         "stability": [[]],
         "faults": [[]],
     }

@@ -27,7 +27,7 @@ from xplanes.decomposition import (
 )
 from xplanes.fields.xplanes import PLANE_SETS
 
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(__file__).parent.parent / "docs" / "results"
 FRAMES, CHANNELS, SIZE = 50, 32, 64
 AXES = ((0, 1), (0, 2), (1, 2))
 Path3D = Callable[[float], tuple[float, float, float]]

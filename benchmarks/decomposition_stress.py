@@ -23,7 +23,7 @@ from torch import Tensor
 from xplanes.decomposition import robust_pca
 from xplanes.files import replacing, write_text
 
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(__file__).parent.parent / "docs" / "results"
 ROWS = 1000
 
 

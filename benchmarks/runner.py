@@ -17,7 +17,7 @@ from xplanes.config import CONF, compose_plain
 from xplanes.files import read_rows
 from xplanes.pipeline import run
 
-RESULTS = Path(__file__).resolve().parent / "results"
+RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"
 
 
 @dataclass(frozen=True)

@@ -222,7 +222,7 @@ through the model, as it equals another.
 {markdown(("video", "seconds", "frames"), prepared)}
 
 Singular directions: [robust PCA](decomposition_speed.md). Static cells of a moving scene are not
-skipped: [concepts](../../docs/concepts.md) say why.
+skipped: [concepts](../concepts.md) say why.
 """
     write_text(RESULTS / f"{args.name}.md", page)
 

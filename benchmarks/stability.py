@@ -44,7 +44,7 @@ threads) as a share of the largest expected value; each test states what it allo
 {markdown(COLUMNS, rows)}
 {others}
 Robust PCA at its extremes:
-[a table of its own](../../benchmarks/results/decomposition_stress.md).
+[a table of its own](decomposition_stress.md).
 """
 
 

@@ -1,5 +1,10 @@
-"""Write docs/configuration.md from conf/ and the classes it names: `python docs/generate.py`."""
+"""Write the pages that follow from the code: `python docs/generate.py`.
 
+docs/configuration.md comes from conf/ and the classes it names, docs/command_line.md from the
+parser of the command line.
+"""
+
+import argparse
 import importlib
 import inspect
 import re
@@ -10,12 +15,12 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import yaml
 
+from xplanes.cli import build_parser
 from xplanes.pretraining.settings import PretrainingSettings
 from xplanes.settings import Settings
 
 ROOT = Path(__file__).resolve().parent.parent
 CONF = ROOT / "conf"
-TARGET = ROOT / "docs" / "configuration.md"
 
 GROUPS = ("data", "model", "model/sampler", "lrm", "preparation", "decomposition")
 """Groups of settings classes, in the order of the page."""
@@ -265,6 +270,8 @@ NODES = {
 """Groups of components that have names of their own."""
 
 SETS = {
+    "recipe": "A way to train; see [the method and the paper](paper.md).",
+    "scale": "How large an experiment is.",
     "experiment": "Settings for a purpose; most are sweeps.",
     "entry": "One model with its initialisation, as a row of a table: "
     "`entry=six_planes_tiny,kplanes`.",
@@ -287,5 +294,49 @@ def head(path: Path) -> str:
     return first.split(". ")[0].rstrip(".") + "."
 
 
+def command_line() -> str:
+    """The page of all commands and their options."""
+    commands = next(
+        action
+        for action in build_parser()._actions
+        if isinstance(action, argparse._SubParsersAction)
+    )
+    lines = [
+        "# Command line",
+        "",
+        "`xplanes COMMAND`, or `python -m xplanes COMMAND`. Written by `python docs/generate.py`.",
+    ]
+    words = {choice.dest: choice.help or "" for choice in commands._choices_actions}
+    for name, parser in commands.choices.items():
+        lines += ["", f"## xplanes {name}", "", f"{words[name][:1].upper()}{words[name][1:]}."]
+        if name == "train":
+            same = (
+                "The same as `python train.py`; [configuration](configuration.md) lists its keys."
+            )
+            lines += ["", same]
+            continue
+        formatter = argparse.HelpFormatter(parser.prog)
+        lines += ["", "| argument | meaning |", "|---|---|"]
+        for action in parser._actions:
+            if "-h" in action.option_strings:
+                continue
+            if not action.option_strings:
+                shown = formatter._metavar_formatter(action, action.dest)(1)[0]
+            elif action.nargs == 0:
+                shown = action.option_strings[0]
+            else:
+                value = formatter._metavar_formatter(action, action.dest.upper())(1)[0]
+                shown = f"{action.option_strings[0]} {value}"
+            meaning = sentence(formatter._expand_help(action)) if action.help else ""
+            meaning = re.sub("^default: ", "Default: ", meaning)
+            lines.append(f"| `{shown}` | {meaning} |")
+    return "\n".join(lines) + "\n"
+
+
+PAGES = {"configuration.md": document, "command_line.md": command_line}
+"""The pages that are written, and what writes them."""
+
+
 if __name__ == "__main__":
-    TARGET.write_text(document(), encoding="utf-8")
+    for name, write in PAGES.items():
+        (ROOT / "docs" / name).write_text(write(), encoding="utf-8")

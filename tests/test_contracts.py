@@ -50,6 +50,7 @@ OPTIONS = sorted(
     (path.parent.relative_to(CONF).as_posix(), path.stem)
     for path in CONF.rglob("*.yaml")
     if path.parent != CONF and not {"hydra", "pretrain"} & set(path.relative_to(CONF).parts)
+    if path.parent.parent not in (CONF / "recipe", CONF / "scale")  # Chosen by two groups together.
 )
 """Every option of every group that train.py knows; tests/pretraining looks after the other."""
 
@@ -64,6 +65,17 @@ KINDS = {
 """Groups of settings, and what their options are derived from."""
 
 MODELS = [name for group, name in OPTIONS if group == "model"]
+
+
+def names(group, *, paper):
+    """Options of a group, of those that are for X-Planes alone or of the others."""
+    for option, name in OPTIONS:
+        if option == group:
+            text = (CONF / group / f"{name}.yaml").read_text()
+            own = "recipe: paper" in text or "_planes" in name or name.startswith("ablation")
+            if own == paper:
+                yield f"{group}={name}"
+
 
 COMPOSITIONS = [
     # The groups that go with all others, as many options of them at once as there are.
@@ -81,13 +93,14 @@ COMPOSITIONS = [
     ["data=multicamera", "model=tensor4d", "model/sampler=neus"],
     ["data=colmap", "model=tensor4d_density"],
     ["data=nerfies", "model=kplanes_explicit"],
+    ["recipe=paper", "preparation=paper"],
+    ["recipe=fair", "scale=demo"],
     ["model=tineuvox_b"],
     *(
-        [f"{group}={name}" for group, name in both if name is not None]
+        [choice for choice in both if choice is not None]
+        for paper in (True, False)
         for both in itertools.zip_longest(
-            (option for option in OPTIONS if option[0] == "entry"),
-            (option for option in OPTIONS if option[0] == "experiment"),
-            fillvalue=(None, None),
+            names("entry", paper=paper), names("experiment", paper=paper)
         )
     ),
 ]
@@ -146,7 +159,16 @@ def built(plain, scene):
 
 def test_there_is_something_to_test():
     groups = {group for group, _ in OPTIONS}
-    assert groups == {*KINDS, "trainer", "callbacks", "logger", "entry", "experiment"}
+    assert groups == {
+        *KINDS,
+        "trainer",
+        "callbacks",
+        "logger",
+        "recipe",
+        "scale",
+        "entry",
+        "experiment",
+    }
 
 
 def test_every_option_is_composed():

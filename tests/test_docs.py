@@ -1,9 +1,16 @@
 """Pages that are generated are up to date, and the pages' commands and keys are real."""
 
+import os
+import pkgutil
 import re
 import runpy
 import shlex
+import subprocess
+import sys
+from importlib.util import find_spec
 from pathlib import Path
+
+import pytest
 
 from xplanes.cli import build_parser
 from xplanes.config import compose_plain, near_names
@@ -13,10 +20,30 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
-def test_configuration_page_is_what_the_generator_writes() -> None:
-    generator = runpy.run_path(str(ROOT / "docs" / "generate.py"))
-    page = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
-    assert page == generator["document"](), "run: python docs/generate.py"
+def test_generated_pages_are_what_the_generator_writes() -> None:
+    pages = runpy.run_path(str(ROOT / "docs" / "generate.py"))["PAGES"]
+    assert set(pages) == {"configuration.md", "command_line.md"}
+    for name, write in pages.items():
+        page = (ROOT / "docs" / name).read_text(encoding="utf-8")
+        assert page == write(), "run: python docs/generate.py"
+
+
+@pytest.mark.skipif(not find_spec("mkdocs"), reason="the site needs the extra docs")
+def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    silent = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    built = subprocess.run(
+        command, cwd=ROOT, env=silent, capture_output=True, text=True, check=False
+    )
+    assert built.returncode == 0, built.stderr
+    api = (tmp_path / "api" / "index.html").read_text(encoding="utf-8")
+    for name in (
+        "training.module.RadianceModule",
+        "scenes.datamodule.SceneDataModule",
+        "decomposition.rpca.robust_pca",
+        "lrm.model.LRM.encode",
+    ):
+        assert f'id="xplanes.{name}"' in api, name
 
 
 def test_the_configuration_page_says_what_every_setting_means() -> None:
@@ -29,8 +56,7 @@ def test_the_configuration_page_says_what_every_setting_means() -> None:
 
 
 def test_links_between_pages_lead_somewhere() -> None:
-    results = (ROOT / "benchmarks" / "results").rglob("*.md")
-    for page in [*PAGES, ROOT / "CONTRIBUTING.md", *results]:
+    for page in PAGES:
         for link in re.findall(r"\]\((?!https?:)([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
             assert (page.parent / link).exists(), f"{page.name}: {link}"
 
@@ -48,6 +74,7 @@ def commands() -> list[list[str]]:
     return [
         [*(["train"] if call["train"] else []), *shlex.split(call["rest"] or "", comments=True)]
         for page in PAGES
+        if page.name != "CONTRIBUTING.md"  # Its commands name components that the reader adds.
         for call in CALL.finditer(page.read_text(encoding="utf-8"))
     ]
 
@@ -89,7 +116,7 @@ def test_keys_in_the_text_of_the_pages_exist() -> None:
     known |= {key.rpartition(".")[0] for key in known}
     named = [
         (page.name, key)
-        for page in [*PAGES, ROOT / "CONTRIBUTING.md"]
+        for page in PAGES
         for key in KEY.findall(page.read_text(encoding="utf-8"))
         if Path(key).suffix not in FILES
     ]
@@ -98,3 +125,15 @@ def test_keys_in_the_text_of_the_pages_exist() -> None:
         if key.rpartition(".")[2].isupper() or "NAME" in key:
             continue
         assert key in known, f"{page}: {key}{near_names(f'{key!r} is no Key')}"
+
+
+CODE = re.compile(r"`(xplanes(?:\.\w+)+)`")
+"""A module, class or function in the text of a page."""
+
+
+def test_code_named_in_the_text_of_the_pages_exists() -> None:
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    named = sorted(set(CODE.findall(text)))
+    assert len(named) > 12
+    for name in named:
+        assert pkgutil.resolve_name(name), name

@@ -74,7 +74,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     commands.add_parser("train", help="train a field: key=value ..., and the options of Hydra")
     verbs = (_add_download, _add_inspect, _add_triplanes, _add_evaluate, _add_render, _add_view)
-    for add in (*verbs, _add_export, _add_table, _add_pretrain, _add_score):
+    for add in (*verbs, _add_export, _add_table, _add_sheet, _add_pretrain, _add_score):
         add(commands)
     return parser
 
@@ -293,20 +293,24 @@ def _add_view(commands: "argparse._SubParsersAction") -> None:
     parser = commands.add_parser("view", help="interactive viewer in the browser (extra: viewer)")
     _add_run(parser)
     parser.add_argument(
-        "--port", type=int, default=8080, help="port of the viewer; default: %(default)s"
+        "--port", type=int, default=8080, help="port; 0: any free one; default: %(default)s"
+    )
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address that is served; default: %(default)s"
     )
     parser.set_defaults(command=_view)
 
 
 def _view(options: argparse.Namespace) -> None:
-    from xplanes.errors import ConfigError
-    from xplanes.evaluation.viewer import Viewer
-    from xplanes.optional import require
+    from xplanes.evaluation.viewer import Viewer, check_address
 
-    if not 1 <= options.port <= 65535:
-        raise ConfigError(f"--port {options.port}: must lie between 1 and 65535")
-    require("viser", extra="viewer")
-    viewer = Viewer(_load(options), options.port)
+    check_address(options.host, options.port, key="--{} ")
+    trained = _load(options)
+    module = trained.module
+    viewer = Viewer(
+        module, trained.scene, lambda: module.renderer, host=options.host, port=options.port
+    )
+    viewer.tell(f"**{trained.path.name}**  \nstep {trained.step}, {trained.checkpoint}.ckpt")
     port = viewer.port
     _say(f"\nopen        http://localhost:{port}")
     _say(f"remotely    ssh -L {port}:localhost:{port} USER@THIS_MACHINE, then the same address")
@@ -321,14 +325,15 @@ def _view(options: argparse.Namespace) -> None:
 
 def _add_export(commands: "argparse._SubParsersAction") -> None:
     parser = commands.add_parser(
-        "export", help="write meshes, point clouds or planes for other programs (extra: export)"
+        "export", help="write meshes, point clouds, planes or camera paths for other programs"
     )
     _add_run(parser)
     parser.add_argument(
         "--what",
-        choices=["mesh", "points", "planes"],
+        choices=["mesh", "points", "planes", "path"],
         default="mesh",
-        help="what to write; planes of X-Planes alone; default: %(default)s",
+        help="what to write: mesh and points (extra: export), planes of X-Planes alone, or a path "
+        "of the training cameras; default: %(default)s",
     )
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="empty or new; default: RUN/export/WHAT"
@@ -398,6 +403,52 @@ def _table(options: argparse.Namespace) -> None:
     from xplanes.evaluation.table import write_tables
 
     print(write_tables(options.folder, options.out), end="")
+
+
+def _add_sheet(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser(
+        "sheet", help="put pictures of runs side by side: the same view over runs or steps"
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="a run, or a folder of runs")
+    parser.add_argument(
+        "--what",
+        choices=["runs", "steps", "parts"],
+        default="runs",
+        help="a column per run, a column per step, or the low-rank and sparse parts of the LRM's "
+        "triplanes; default: %(default)s",
+    )
+    parser.add_argument(
+        "--show",
+        choices=["colour", "error", "depth"],
+        default="colour",
+        help="what is shown of a view; default: %(default)s",
+    )
+    parser.add_argument("--view", help="a view, as named in RUN/media; default: one that all show")
+    parser.add_argument("--steps", help="steps, separated by commas; default: all, or the last")
+    parser.add_argument(
+        "--size", type=int, default=160, help="pixels of a picture; default: %(default)s"
+    )
+    parser.add_argument("--out", type=Path, metavar="FILE.png", help="default: sheet.png in FOLDER")
+    parser.set_defaults(command=_sheet)
+
+
+def _sheet(options: argparse.Namespace) -> None:
+    from xplanes.errors import ConfigError
+    from xplanes.evaluation.sheet import write_sheet
+
+    words = [] if options.steps is None else options.steps.split(",")
+    if not all(word.strip().isdecimal() for word in words):
+        raise ConfigError(f"--steps {options.steps}: must be numbers separated by commas")
+    path = write_sheet(
+        options.folder,
+        options.out,
+        what=options.what,
+        show=options.show,
+        view=options.view,
+        steps=[int(word) for word in words] or None,
+        size=options.size,
+    )
+    _say(f"wrote {path}")
 
 
 def _add_pretrain(commands: "argparse._SubParsersAction") -> None:

@@ -17,9 +17,11 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from xplanes.backend import warm_up
 from xplanes.errors import ConfigError, DeviceError
 from xplanes.evaluation.findings import camera_findings
+from xplanes.evaluation.published import check_published
 from xplanes.evaluation.render import orbit_poses, render_path, video_times, write_video
 from xplanes.evaluation.report import closing, header, log_hparams, summary, write_pictures
 from xplanes.evaluation.runs import read_config
+from xplanes.evaluation.sheet import check_what
 from xplanes.experiment import Experiment
 from xplanes.files import (
     StorageError,
@@ -109,6 +111,8 @@ def check(config: dict[str, Any], folder: Path) -> Experiment:
         ConfigError: If settings are missing, out of range, or contradict one another.
     """
     experiment = Experiment.read(config)
+    check_published(config.get("published", []))
+    check_what(config.get("sheet"))
     experiment.check_trainer(folder)
     return experiment
 

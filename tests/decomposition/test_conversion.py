@@ -131,7 +131,7 @@ def test_refuses_options_out_of_range():
     for options, words in [
         ({"plane_set": "four"}, "six, nine"),
         ({"plane_set": "three"}, "six, nine"),
-        ({"plane_set": "six", "dynamic": "svd"}, "random, rank1"),
+        ({"plane_set": "six", "dynamic": "svd"}, "random, ones, rank1"),
         ({"plane_set": "six", "noise": -1.0}, "noise"),
         ({"plane_set": "six", "resolution": 0}, "resolution"),
         ({"plane_set": "six", "time_resolution": 0}, "time_resolution"),

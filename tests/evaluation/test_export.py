@@ -10,30 +10,43 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image, ImageDraw
 from torch import Tensor
 
 from tests.baselines.test_kplanes_field import products
 from tests.baselines.test_tensor4d_field import surface as tensor4d
 from tests.baselines.test_tineuvox_field import BOX
+from tests.training.runs import changed
 from xplanes.cli import main
 from xplanes.errors import ConfigError
 from xplanes.evaluation import export as module
+from xplanes.evaluation.camera_path import (
+    nerfstudio_content,
+    path_of,
+    read_camera_path,
+    transforms_content,
+)
 from xplanes.evaluation.export import ExportOptions, export, export_times
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.fields import Decoder, XPlanes
+from xplanes.fields.background import Background
 from xplanes.fields.base import ViewDependentField
 from xplanes.fields.kplanes import HybridDecoder, KPlanes
 from xplanes.fields.tineuvox import TiNeuVox
 from xplanes.fields.xplanes import random_planes
 from xplanes.optional import MissingExtraError
+from xplanes.pipeline import run
 from xplanes.rendering.base import RayRenderer
+from xplanes.rendering.behind import look
 from xplanes.rendering.fixed_step import FixedStepRenderer
 from xplanes.rendering.grid_renderer import GridRenderer
 from xplanes.rendering.neus import NeusRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.scenes.cameras import orbit
+from xplanes.rendering.pictures import to_bytes
+from xplanes.scenes.cameras import orbit, project
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.views import Views, camera_rays
+from xplanes.scenes.views import Intrinsics, Views, camera_rays
+from xplanes.training.evaluation import render_view
 
 trimesh: Any = pytest.importorskip("trimesh")
 pytest.importorskip("skimage")
@@ -149,6 +162,57 @@ def test_the_silhouette_of_a_mesh_is_that_of_the_field(
     assert agreement(covered, shown) > 0.95
 
 
+def covered_pixels(mesh: Any, views: Views, index: int, fine: int = 4) -> Tensor:
+    """Pixels whose centre a mesh covers in a view, by filling its triangles. bool [h, w]"""
+    height, width = views.size(index)
+    column, row, seen = project(
+        views.camera_to_world[index],
+        torch.tensor(np.asarray(mesh.vertices)).float(),
+        focal=views.intrinsics.focal[index],
+        centre=views.intrinsics.centre[index],
+    )
+    assert seen.all()
+    image = Image.new("1", (fine * width, fine * height))
+    canvas = ImageDraw.Draw(image)
+    corners = (fine * torch.stack([column, row], dim=1) - 0.5)[torch.tensor(np.array(mesh.faces))]
+    for triangle in corners.flatten(1).tolist():
+        canvas.polygon(triangle, fill=1)
+    filled = torch.tensor(np.array(image)).view(height, fine, width, fine)
+    return filled.float().mean(dim=(1, 3)) >= 0.5
+
+
+@pytest.mark.slow
+def test_the_silhouettes_of_a_demo_scene_are_those_of_its_field(trained_run: Path, tmp_path: Path):
+    config = changed(
+        (),
+        *("lrm=none", "trainer.accelerator=cpu", "trainer.max_seconds=null"),
+        f"data.root={trained_run.parents[1] / 'scenes'}",
+        *("data.resolution=100", "trainer.max_steps=600", "callbacks.evaluation.at=[1]"),
+        *("callbacks.evaluation.views=1", "media=false", "logger=none"),
+    )
+    run(config, tmp_path / "run", [], resume=False)
+    trained = load_run(tmp_path / "run")
+    views = trained.views
+    chosen = range(0, len(views), 3)
+    times = ",".join(f"{float(views.times[index]):.6f}" for index in chosen)
+    folder = export(trained, ExportOptions(times=times), say=quiet)
+    for number, index in enumerate(chosen):
+        mesh = trimesh.load(folder / f"mesh_{number:04d}.ply")
+        image = render_view(
+            trained.module.field,
+            trained.module.renderer,
+            trained.frame,
+            views,
+            index,
+            trained.scene.background,
+        )
+        shown = image["opacity"] >= 0.5
+        found = agreement(covered_pixels(mesh, views, index), shown)
+        print(f"view {index}: intersection over union {found:.4f}")
+        assert 0.1 < shown.float().mean() < 0.9
+        assert found > 0.95
+
+
 def test_colours_of_vertices_are_those_that_the_field_shows_along_normals(tmp_path: Path):
     trained = set_up(tmp_path, Ball())
     folder = export(trained, ExportOptions(times="0.5", resolution=32), say=quiet)
@@ -247,16 +311,17 @@ def test_a_field_of_signed_distances_gives_its_own_surface(tmp_path: Path):
         export(trained, ExportOptions(threshold=3), tmp_path / "other", say=quiet)
 
 
-def written_reader() -> Any:
-    """The class that docs/recipes.md prints."""
+def written_reader(name: str = "Planes") -> Any:
+    """A class that docs/recipes.md prints."""
     page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    found = re.search(r"^    import json\n.*?^    class Planes:.*?(?=^\S)", page, re.M | re.S)
-    assert found
-    code = re.sub(r"^    ", "", found[0], flags=re.M)
-    assert len(code.splitlines()) < 60
     names: dict[str, Any] = {}
-    exec(code, names)
-    return names["Planes"]
+    for first in (r"import json\n.*?^    class Planes:", r"class World\(Planes\):"):
+        found = re.search(rf"^    {first}.*?(?=^\S)", page, re.M | re.S)
+        assert found
+        code = re.sub(r"^    ", "", found[0], flags=re.M)
+        assert len(code.splitlines()) < 60
+        exec(code, names)
+    return names[name]
 
 
 @pytest.mark.parametrize("plane_set", ["three", "six", "nine"])
@@ -289,6 +354,100 @@ def test_the_documented_reader_gives_the_values_of_the_field(
     assert float(expected[0].std()) > 0.01
 
 
+@pytest.mark.parametrize("samples", [0, 7])
+def test_the_documented_reader_sees_the_background_of_the_field(tmp_path: Path, samples: int):
+    torch.manual_seed(0)
+    background = Background(4, 12, width=8, samples=samples)
+    with torch.no_grad():
+        background.planes.mul_(30)
+    made = random_planes(
+        "six",
+        channels=5,
+        resolution=9,
+        time_resolution=4,
+        space_scale=1,
+        time_scale=1,
+        generator=torch.Generator().manual_seed(0),
+    )
+    field = XPlanes(planes=made, decoder=Decoder(5), plane_set="six", background=background)
+    trained = set_up(tmp_path, field)
+    folder = export(trained, ExportOptions(what="planes"), say=quiet)
+    origins, aims = FRAME.to_world(torch.randn(2, 300, 3))
+    directions = torch.nn.functional.normalize(aims - origins, dim=1)
+    found = written_reader("World")(folder / "planes.safetensors").behind(origins, directions)
+    with torch.no_grad():
+        expected = look(background, *FRAME.rays(origins, directions))
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
+    assert float(expected.std()) > 0.05
+
+
+def test_exports_without_the_background_say_so(tmp_path: Path):
+    field: Any = Ball()
+    said: list[str] = []
+    for name, background in (("without", None), ("with", Background(4, 8, width=8))):
+        field.background = background
+        trained, folder = set_up(tmp_path, field), tmp_path / name
+        options = ExportOptions(what="points", times="0.5", resolution=24, count=9)
+        export(trained, options, folder, say=said.append)
+        listed = json.loads((folder / "export.json").read_text())
+        assert ("left_out" in listed) == (background is not None)
+    assert [text for text in said if "left out" in text] == [
+        "left out    what lies behind the field's cube, which has no surface; --what planes has it"
+    ]
+
+
+def test_the_training_cameras_are_a_path_that_is_rendered_again(trained_run: Path, tmp_path: Path):
+    out = tmp_path / "path"
+    assert main(["export", str(trained_run), "--what", "path", "--out", str(out)]) == 0
+    trained = load_run(trained_run)
+    views = trained.scene.splits["train"]
+    order = views.times.argsort(stable=True)
+    assert json.loads((out / "export.json").read_text())["files"] == [
+        "camera_path.json",
+        "transforms.json",
+    ]
+    for name in ("camera_path.json", "transforms.json"):
+        path = read_camera_path(out / name)
+        assert torch.equal(path.poses, views.camera_to_world[order])
+        assert torch.equal(path.times, views.times[order])
+        assert (path.height, path.width, path.fps) == (views.height, views.width, 16)
+        focal = views.intrinsics.focal[order, 1].float()
+        torch.testing.assert_close(path.focal(views.height, views.width), focal)
+        arguments = ["--path", str(out / name), "--out", f"{tmp_path}/{name}/"]
+        assert main(["render", str(trained_run), *arguments]) == 0
+        for number in (0, len(views) - 1):
+            expected = render_view(
+                trained.module.field,
+                trained.module.renderer,
+                trained.frame,
+                views,
+                int(order[number]),
+                trained.scene.background,
+            )
+            with Image.open(tmp_path / name / f"frame_{number:04d}.png") as frame:
+                found = torch.tensor(np.asarray(frame)).int()
+            assert (found - to_bytes(expected["colour"]).int()).abs().max() <= 1
+
+
+def test_a_path_keeps_the_field_of_view_of_each_camera(tmp_path: Path):
+    focal = torch.tensor([[30.0, 32.0], [40.0, 42.0]])
+    centre, size = torch.tensor([[20.0, 12.0]] * 2), torch.tensor([[24, 40]] * 2)
+    images = torch.zeros(2, 24, 40, 4, dtype=torch.uint8)
+    intrinsics = Intrinsics(focal, centre, size)
+    views = Views(
+        images, orbit(2, radius=4, elevation=0), torch.tensor([1.0, 0.0]), intrinsics, ("a", "b")
+    )
+    path = path_of(views, 9)
+    for content in (nerfstudio_content(path), transforms_content(path)):
+        file = tmp_path / "path.json"
+        file.write_text(json.dumps(content))
+        again = read_camera_path(file)
+        assert again.times.tolist() == [0, 1]
+        torch.testing.assert_close(again.poses, views.camera_to_world.flip(0))
+        torch.testing.assert_close(again.focal(24, 40), torch.tensor([42.0, 32.0]))
+        assert again.fps == 9
+
+
 def test_the_command_exports_a_run(trained_run: Path, tmp_path: Path, capsys):
     out = tmp_path / "meshes"
     arguments = ["--times", "2", "--resolution", "32", "--out", str(out)]
@@ -315,7 +474,7 @@ def test_times():
 
 def test_bad_options_are_refused(tmp_path: Path):
     for options, words in {
-        ExportOptions(what="video"): "--what video: must be mesh or points or planes",
+        ExportOptions(what="video"): "--what video: must be mesh or points or planes or path",
         ExportOptions(form="obj"): "--format obj",
         ExportOptions(resolution=4): "--resolution 4: must lie between 8 and",
         ExportOptions(count=0): "--points 0",

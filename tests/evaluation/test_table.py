@@ -14,7 +14,7 @@ from PIL import Image
 from xplanes.config import CONF
 from xplanes.errors import ConfigError
 from xplanes.evaluation.curves import _mean_curve
-from xplanes.evaluation.published import read_published
+from xplanes.evaluation.published import check_published, read_published
 from xplanes.evaluation.sweep import Point, read_rows
 from xplanes.evaluation.table import write_tables
 
@@ -79,6 +79,18 @@ def test_columns_are_the_settings_that_differ(tmp_path):
     assert "2 runs: 2 finished. Scores of the test split." in text
     assert (tmp_path / "table.md").read_text() == text
     assert table(tmp_path)[1]["psnr"] == "21.0"
+
+
+def test_a_score_of_the_thing_has_a_column_where_any_run_has_one(tmp_path):
+    for seed in (0, 1):
+        make(tmp_path / f"{seed}", seed=seed)
+    assert "psnr_thing" not in table(tmp_path)[0]
+    path = tmp_path / "1" / "metrics.json"
+    metrics = json.loads(path.read_text())
+    metrics["test"]["psnr_thing"] = 17.5
+    path.write_text(json.dumps(metrics))
+    assert [row["psnr_thing"] for row in table(tmp_path)] == ["", "17.5"]
+    assert "psnr thing" in (tmp_path / "table.md").read_text()
 
 
 CURVE = "seconds,step,split,psnr,ssim\n"
@@ -293,10 +305,110 @@ def test_means_stand_beside_what_was_published(tmp_path: Path) -> None:
     assert len(entries) >= 1
     assert [line[:5] for line in lines[:1]] == [["kplanes", "none", "proposal", "2", "25.50"]]
     for line, entry in zip(lines, entries, strict=False):
-        assert line[6:] == [entry[n] for n in ("psnr", "ssim", "minutes", "scenes", "source")]
+        assert line[7:-1] == [entry[n] for n in ("psnr", "ssim", "minutes", "scenes")]
+        assert line[-1] == f"{entry['table']}, {entry['source']}"
+    assert lines[0][6] == "1.0"  # Minutes: 2 s of preparation and 60.25 s of training.
     # There are no published figures for six planes with random initialisation.
     assert lines[-1][:5] == ["six_planes", "none", "occupancy", "1", "25.00"]
-    assert set(lines[-1][6:]) == {""}
+    assert set(lines[-1][7:]) == {""}
+
+
+def test_published_figures_stand_beside_equal_resolutions_and_all_views_alone(tmp_path) -> None:
+    for number, (resolution, views) in enumerate(((64, None), (128, None), (128, 10))):
+        run = dnerf(tmp_path / f"{number}", "lego", 30.0, model="nine_planes")
+        config = yaml.safe_load((run / "config.yaml").read_text())
+        config["model"]["resolution"], config["lrm"]["name"] = resolution, "xlarge"
+        config["data"]["views"] = views
+        (run / "config.yaml").write_text(yaml.safe_dump(config))
+    found = [(line[3], line[8], line[-1].split(",")[0]) for line in published_lines(tmp_path)]
+    at_64 = [e for e in read_published() if e["model"] == "nine_planes" and e["lrm"] == "xlarge"]
+    wanted = [(e["psnr"], e["table"]) for e in at_64 if e["resolution"] == "64"]
+    settings = "data.views=None model.resolution=64"
+    assert [f for f in found if f[0] == settings] == [(settings, *entry) for entry in wanted]
+    (at_128,) = [e["psnr"] for e in at_64 if e["resolution"] == "128"]
+    assert [f[1] for f in found if f[0] == "data.views=None model.resolution=128"] == [at_128]
+    assert [f[1] for f in found if f[0] == "data.views=10 model.resolution=128"] == [""]
+
+
+def named(run: Path, *tables: str) -> Path:
+    """A run whose settings name published tables."""
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config["published"] = list(tables)
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    return run
+
+
+def test_a_named_table_is_shown_whole_whatever_the_data(tmp_path: Path) -> None:
+    named(make(tmp_path / "a", model="kplanes"), "Table 1")
+    text = write_tables(tmp_path)
+    rows = [entry for entry in read_published() if entry["table"] == "Table 1"]
+    assert len(rows) == 8
+    for row in rows:
+        assert f"| {row['method']} " in text
+    assert "none of these runs has their settings" in text
+    assert "NerfAcc" not in text
+    # Of D-NeRF's data, K-Planes' own figures stand beside its own runs instead.
+    shutil.rmtree(tmp_path / "a")
+    named(dnerf(tmp_path / "a", "lego", 24.0), "Table 1")
+    assert "| K-Planes " not in write_tables(tmp_path)
+    assert "| 4D-GS " in write_tables(tmp_path)
+
+
+def test_an_unknown_table_is_refused() -> None:
+    for names in (["Table 9"], "Table 1", None):
+        with pytest.raises(ConfigError, match=r"^published=.*: must be a list of some of Table 1"):
+            check_published(names)
+
+
+def decomposed(folder: Path, ranks: tuple[int, int, int]) -> Path:
+    run = make(folder)
+    metrics = json.loads((run / "metrics.json").read_text())
+    report = {"drift": 0.125, "low_rank_energy": 0.9, "sparse_energy": 0.05, "converged": True}
+    metrics["decomposition"] = {
+        name: {**report, "rank": rank} for name, rank in zip(("xy", "xz", "yz"), ranks, strict=True)
+    } | {"unexplained": {"before": 1.0, "after": 0.5}}
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    return run
+
+
+def test_decompositions_and_their_mean_rank_stand_in_the_table(tmp_path: Path) -> None:
+    named(decomposed(tmp_path / "0", (1, 2, 3)), "Rank")
+    named(decomposed(tmp_path / "1", (4, 5, 9)), "Rank")
+    named(make(tmp_path / "2", model="kplanes"), "Rank")
+    text = write_tables(tmp_path)
+    lines = [line.split("|") for line in text.partition("Decomposition of")[2].splitlines()]
+    rows = [[cell.strip() for cell in line[1:-1]] for line in lines if len(line) > 3][2:]
+    assert rows == [
+        ["0", "six_planes", "1/2/3", "0.125", "90.00", "5.00", "true"],
+        ["1", "six_planes", "4/5/9", "0.125", "90.00", "5.00", "true"],
+    ]
+    (published,) = [entry["rank"] for entry in read_published() if entry["table"] == "Rank"]
+    assert f"Mean rank of the low-rank part: 4.00 over these 2 runs; published: {published}" in text
+
+
+def test_the_protocol_stands_above_the_table(tmp_path: Path) -> None:
+    run = dnerf(tmp_path / "a", "lego", 24.0)
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config["trainer"] = {"max_steps": 30000, "max_seconds": None}
+    config["model"]["rays"] = {"background": "one"}
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    record = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps(record | {"device": "RTX 3090", "cpus": 16}))
+    assert (
+        "Scores of the test split. Protocol: data: dnerf · width, px: 400 · background: one · "
+        "steps: 30000 · seconds: no limit · machine: RTX 3090, 16 CPU cores.\n"
+    ) in write_tables(tmp_path)
+
+
+def test_psnr_is_drawn_against_a_setting_of_several_numbers(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="needs the extra plots")
+    for number, (model, resolution) in enumerate(itertools.product("ab", (64, 32))):
+        make(tmp_path / f"{number}", model=model, resolution=resolution)
+    assert "against.png" not in write_tables(tmp_path)
+    make(tmp_path / "5", model="a", resolution=128)
+    assert "![PSNR at the end](against.png)" in write_tables(tmp_path)
+    with Image.open(tmp_path / "against.png") as picture:
+        assert min(picture.size) > 300
 
 
 def test_means_keep_runs_with_other_settings_apart(tmp_path: Path) -> None:
@@ -321,6 +433,7 @@ def test_published_figures_name_their_source_and_models_that_exist() -> None:
     models = {path.stem for path in (CONF / "model").glob("*.yaml")}
     for entry in read_published():
         assert entry["source"]
-        assert entry["model"] in models
-        assert 10 < float(entry["psnr"]) < 50
+        assert entry["model"] in {*models, ""}
+        assert bool(entry["psnr"]) != bool(entry["rank"])
+        assert 10 < float(entry["psnr"] or 20) < 50
         assert not entry["ssim"] or 0.5 < float(entry["ssim"]) < 1

@@ -1,18 +1,43 @@
-"""The viewer: camera conventions, and images sent to the browser."""
+"""The viewer: camera conventions, what browsers are sent and when, and a field that trains."""
 
+import math
+import socket
+import sys
+import threading
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from lightning.pytorch.callbacks import Callback
+from torch import Tensor
 
+from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX, baseline_config
+from tests.training.runs import small_config
+from tests.training.test_surroundings import scene
+from xplanes import RadianceModule, SceneDataModule
+from xplanes.cli import main
+from xplanes.errors import ConfigError
+from xplanes.evaluation import live
+from xplanes.evaluation import viewer as module
+from xplanes.evaluation.drawing import draw
+from xplanes.evaluation.live import LiveViewer
 from xplanes.evaluation.render import orbit_poses
 from xplanes.evaluation.runs import TrainedRun, load_run
-from xplanes.evaluation.viewer import HOST, Viewer, camera_pose, draw
+from xplanes.evaluation.viewer import HOST, Viewer, camera_pose, check_address
+from xplanes.optional import MissingExtraError
+from xplanes.pipeline import run
 from xplanes.rendering.pictures import to_bytes
+from xplanes.training.clock import TrainingClock, find_callback
 from xplanes.training.evaluation import render_view
+from xplanes.training.fit import Trainer
+from xplanes.training.interrupt import Interrupt
+
+pytest.importorskip("viser")
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +45,14 @@ def trained(trained_run: Path) -> TrainedRun:
     return load_run(trained_run)
 
 
-def quaternion(pose: torch.Tensor) -> torch.Tensor:
+@pytest.fixture
+def viewer(trained: TrainedRun) -> Iterator[Viewer]:
+    found = Viewer(trained.module, trained.scene, lambda: trained.module.renderer, port=18080)
+    yield found
+    found.close()
+
+
+def quaternion(pose: Tensor) -> Tensor:
     """The viser rotation of one of our cameras, wxyz: an eigenvector of Bar-Itzhack's matrix."""
     r = pose[:3, :3].double() * torch.tensor([1.0, -1.0, -1.0])
     k = torch.tensor(
@@ -35,60 +67,354 @@ def quaternion(pose: torch.Tensor) -> torch.Tensor:
     return torch.linalg.eigh(k)[1][:, -1]
 
 
+class Client:
+    """A browser as viser hands it over, with a camera in the field's frame."""
+
+    def __init__(self, pose: Tensor) -> None:
+        self.client_id = 1
+        self.shown: list[np.ndarray] = []
+        self.depths: list[np.ndarray | None] = []
+        self.moved: list[Callable[[Any], None]] = []
+        self.camera = SimpleNamespace(
+            wxyz=quaternion(pose).numpy(),
+            position=pose[:3, 3].double().numpy(),
+            fov=0.7,
+            aspect=1.5,
+            on_update=self.moved.append,
+        )
+        self.scene = SimpleNamespace(set_background_image=self.take)
+
+    def take(self, image: np.ndarray, depth: np.ndarray | None, **others: Any) -> None:
+        assert others["format"] == "jpeg"
+        self.shown.append(image)
+        self.depths.append(depth)
+
+    def move(self) -> None:
+        """As the mouse does."""
+        self.camera.position = self.camera.position * 1.01
+        for callback in self.moved:
+            callback(self.camera)
+
+    @property
+    def rows(self) -> list[int]:
+        """Rows of all pictures so far."""
+        return [len(image) for image in self.shown]
+
+
+def first_pose(trained: TrainedRun) -> Tensor:
+    """A training camera in the field's frame."""
+    pose = trained.scene.splits["train"].camera_to_world[0].clone()
+    pose[:3, :3] = trained.frame.rotation @ pose[:3, :3]
+    pose[:3, 3] = trained.frame.points(pose[:3, 3])
+    return pose
+
+
+@pytest.fixture
+def client(trained: TrainedRun, viewer: Viewer) -> Client:
+    found = Client(first_pose(trained))
+    viewer.size.value = "64"
+    viewer._connect(found)
+    return found
+
+
 def test_cameras_come_back_as_ours(trained: TrainedRun):
     for pose in orbit_poses(trained.views, trained.frame, 5, elevation=35):
         back = camera_pose(quaternion(pose), pose[:3, 3])
         assert torch.allclose(back, pose, atol=1e-5)
 
 
-def test_an_image_from_a_view_is_that_view(trained: TrainedRun):
-    views = trained.views
-    fov = 2 * float(torch.atan(0.5 * views.height / views.intrinsics.focal[0, 1]))
+def test_an_image_from_a_view_is_that_view(trained: TrainedRun, viewer: Viewer):
+    views, frame = trained.scene.splits["train"], trained.frame
+    camera = Client(first_pose(trained)).camera
+    camera.fov = 2 * float(torch.atan(0.5 * views.height / views.intrinsics.focal[0, 1]))
+    camera.aspect = 1.0
+    viewer.time.value = float(views.times[0])
+    field, renderer = trained.module.field, trained.module.renderer
+    white = torch.ones(3)
     picture = draw(
-        trained,
-        views.camera_to_world[2],
-        timestep=float(views.times[2]),
-        fov=fov,
-        height=views.height,
-        aspect=1.0,
+        field,
+        renderer,
+        viewer.shot(camera, views.height),
+        views=views,
+        frame=frame,
+        background=white,
     )
-    expected = render_view(
-        trained.module.field, trained.module.renderer, trained.frame, views, 2, torch.ones(3)
+    assert picture is not None
+    expected = render_view(field, renderer, frame, views, 0, white)
+    found = to_bytes(picture.colours).int() - to_bytes(expected["colour"]).int()
+    assert found.abs().max() <= 1
+    assert float(expected["colour"].std()) > 0.05
+
+
+def test_pictures_are_small_while_something_changes_and_full_at_rest(
+    viewer: Viewer, client: Client, monkeypatch
+):
+    monkeypatch.setattr(module, "MOVING_SECONDS", 0.0)
+    for change in (lambda: None, client.move, lambda: setattr(viewer.time, "value", 0.3)):
+        before = len(client.rows)
+        change()
+        viewer.catch_up()
+        assert client.rows[before:] == [module.FEWEST]
+        assert client.shown[-1].shape == (16, 24, 3)
+        time.sleep(module.SETTLE_SECONDS + 0.01)
+        viewer.catch_up()
+        assert client.rows[before:] == [module.FEWEST, 64]
+        assert client.shown[-1].shape == (64, 96, 3)
+        viewer.catch_up()
+        assert len(client.rows) == before + 2
+
+
+def test_a_full_picture_is_given_up_when_the_camera_moves(
+    viewer: Viewer, client: Client, monkeypatch
+):
+    monkeypatch.setattr(module, "MOVING_SECONDS", 0.0)
+    viewer.catch_up()
+    time.sleep(module.SETTLE_SECONDS + 0.01)
+    renderer, slow = viewer.renderer, []
+
+    def moving() -> Any:
+        slow.append(1)
+        if len(slow) == 1:
+            client.move()
+        return renderer()
+
+    monkeypatch.setattr(viewer, "renderer", moving)
+    viewer.catch_up()
+    assert len(slow) == 2  # The full one was begun.
+    assert client.rows == [module.FEWEST] * 2
+
+
+def test_controls_change_the_picture(viewer: Viewer, client: Client):
+    def picture() -> np.ndarray:
+        viewer.catch_up()
+        time.sleep(module.SETTLE_SECONDS + 0.01)
+        viewer.catch_up()
+        return client.shown[-1].astype(int)
+
+    shown = {"colour": picture()}
+    for mode in ("depth", "opacity", "floaters"):
+        viewer.mode.value = mode
+        shown[mode] = picture()
+    viewer.mode.value = "colour"
+    viewer.crop[0].value = (-1.0, 0.0)
+    shown["cropped"] = picture()
+    assert viewer.outline.visible
+    assert viewer.outline.scale == (1, 2, 2)
+    assert viewer.outline.position.tolist() == [-0.5, 0, 0]
+    for name, image in shown.items():
+        assert all(
+            np.abs(image - other).mean() > 1 for key, other in shown.items() if key != name
+        ), name
+    viewer._uncrop()
+    assert np.array_equal(picture(), shown["colour"])
+    assert not viewer.outline.visible
+    assert client.depths[-1] is not None
+    viewer.cameras.value = False
+    picture()
+    assert not viewer.frusta.visible
+    assert client.depths[-1] is None
+
+
+def test_time_passes_while_it_plays(viewer: Viewer, client: Client):
+    viewer.speed.value = "2"
+    viewer._toggle_play()
+    times, end = [], time.monotonic() + 0.6
+    while time.monotonic() < end:
+        viewer.catch_up(0)
+        times.append(viewer.time.value)
+    passed = times[-1] * module.LOOP_SECONDS / 2
+    assert passed == pytest.approx(0.6, abs=0.2)
+    assert len(client.rows) > 2
+    viewer._toggle_play()
+    stopped = viewer.time.value
+    viewer.catch_up(0)
+    assert viewer.time.value == stopped
+
+
+def test_nobody_is_drawn_for_once_the_browser_has_left(viewer: Viewer, client: Client):
+    viewer.catch_up()
+    count = len(client.rows)
+    assert viewer.is_watched
+    viewer._disconnect(client)
+    client.move()
+    viewer.catch_up()
+    assert not viewer.is_watched
+    assert len(client.rows) == count
+
+
+def test_addresses_that_cannot_be_served_are_refused(trained_run: Path, monkeypatch, capsys):
+    with socket.socket() as taken:
+        taken.bind((HOST, 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ConfigError, match=rf"port={port}: .*viewer\.port=0 for any free"):
+            LiveViewer(port=port)
+        assert main(["view", str(trained_run), "--port", str(port)]) == 1
+        assert f"--port {port}: it cannot be served" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="port 70000: must lie between 0 and 65535"):
+        check_address(HOST, 70000, key="{} ")
+    with pytest.raises(ConfigError, match=r"viewer\.host=nowhere\.invalid: no such"):
+        LiveViewer(host="nowhere.invalid")
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(MissingExtraError, match=r'-e "\.\[viewer\]"'):
+        LiveViewer()
+    LiveViewer(enabled=False)
+
+
+def test_several_devices_are_refused():
+    with pytest.raises(ConfigError, match=r"viewer=true with trainer\.devices=2"):
+        LiveViewer(port=0).setup(SimpleNamespace(world_size=2), None, "fit")  # type: ignore[arg-type]
+
+
+class Watched(Viewer):
+    """A viewer with a browser whose camera never rests."""
+
+    made: "list[Watched]" = []  # noqa: RUF012
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        pose = torch.eye(4)
+        pose[2, 3] = 4.0
+        self.client = Client(pose)
+        self._connect(self.client)
+        self.steps: list[int] = []
+        self.served = self.port
+        Watched.made.append(self)
+
+    def catch_up(self, seconds: float = math.inf) -> None:
+        self.client.move()
+        super().catch_up(seconds)
+        self.steps.append(self.step)
+
+
+@pytest.fixture
+def watched(monkeypatch) -> list[Watched]:
+    monkeypatch.setattr(Watched, "made", [])
+    monkeypatch.setattr(live, "Viewer", Watched)
+    return Watched.made
+
+
+FIELDS = {
+    "six_planes": (small_config, "alpha", ()),
+    "six_planes with a background": (small_config, "world", ("model.rays.per_batch=512",)),
+    "kplanes": (baseline_config, "alpha", ("model=kplanes", *KPLANES, *PROPOSAL)),
+    "tineuvox": (baseline_config, "alpha", ("model=tineuvox_s", *TINEUVOX)),
+    "tensor4d": (baseline_config, "alpha", ("model=tensor4d", *TENSOR4D, *NEUS)),
+}
+
+
+def fitted(name: str, folder: Path, *callbacks: Callback, steps: int = 12) -> RadianceModule:
+    """A small field of a ball, trained for some steps."""
+    config, kind, overrides = FIELDS[name]
+    found = RadianceModule(config(Path(), *overrides))
+    found.build(scene(kind))
+    trainer = Trainer(
+        accelerator="cpu",
+        max_steps=steps,
+        callbacks=callbacks,
+        default_root_dir=folder,
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        enable_checkpointing=False,
+        limit_val_batches=0,
     )
-    assert (picture.int() - to_bytes(expected["colour"]).int()).abs().max() <= 1
+    trainer.train(found, SceneDataModule.of(scene(kind)))
+    return found
 
 
-def test_a_browser_gets_an_image_and_more_while_time_plays(trained: TrainedRun):
-    pytest.importorskip("viser")
-    viewer = Viewer(trained, 18080)
-    try:
-        assert viewer.server.get_host() == HOST == "127.0.0.1"
-        pose = trained.views.camera_to_world[0]
-        shown: list[np.ndarray] = []
-        client = SimpleNamespace(
-            client_id=1,
-            camera=SimpleNamespace(
-                wxyz=quaternion(pose).numpy(),
-                position=pose[:3, 3].double().numpy(),
-                fov=0.7,
-                aspect=1.5,
-                on_update=lambda callback: callback,
-            ),
-            scene=SimpleNamespace(set_background_image=lambda image, format: shown.append(image)),
-        )
-        viewer.size.value = "64"
-        viewer._connect(client)
-        until(lambda: any(image.shape == (64, 96, 3) for image in shown))
-        count = len(shown)
-        viewer.what.value = "depth"
-        until(lambda: len(shown) > count)
-        viewer._disconnect(client)
-    finally:
-        viewer.close()
+@pytest.mark.parametrize("name", FIELDS)
+def test_training_is_the_same_with_a_viewer_to_the_last_bit(
+    name: str, tmp_path: Path, watched: list[Watched]
+):
+    plain = fitted(name, tmp_path)
+    assert not watched
+    seen = fitted(name, tmp_path, LiveViewer(port=0))
+    (viewer,) = watched
+    assert viewer.steps == list(range(12))
+    assert len(viewer.client.rows) >= 12
+    sizes = {len(image) for image in viewer.client.shown}
+    first, last = viewer.client.shown[0], viewer.client.shown[-1]
+    assert len(sizes) > 1 or np.abs(first.astype(int) - last).max() > 1
+    assert viewer.client.shown[-1].std() > 0
+    assert (getattr(seen.field, "background", None) is not None) == ("background" in name)
+    for key, value in plain.state_dict().items():
+        assert torch.equal(value, seen.state_dict()[key]), key
+    assert plain.counts == seen.counts
+    assert plain.last == pytest.approx(seen.last, abs=0, nan_ok=True)
 
 
-def until(condition, seconds: float = 10.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
+def test_a_run_has_a_viewer_when_asked_to(
+    trained_run: Path, tmp_path: Path, watched: list[Watched], capsys
+):
+    scenes = trained_run.parents[1] / "scenes"
+    short = ("trainer.max_steps=2", "callbacks.evaluation.at=[1]", "callbacks.viewer.port=0")
+    run(small_config(scenes, *short), tmp_path / "plain", [], resume=False)
+    assert not watched
+    run(small_config(scenes, *short, "viewer=true"), tmp_path / "seen", [], resume=False)
+    (viewer,) = watched
+    assert f"viewer      http://localhost:{viewer.served}" in capsys.readouterr().out
+    with socket.socket() as free:  # It is closed.
+        free.bind((HOST, viewer.served))
+
+
+def test_a_pause_stops_training_and_its_clock(tmp_path: Path, watched: list[Watched]):
+    class Pausing(LiveViewer):
+        """Someone pauses training for a second, some steps on."""
+
+        seconds = 0.0
+
+        def _serve(self, viewer: Viewer, trainer: Any, of: Any) -> None:
+            if trainer.global_step != 5:
+                super()._serve(viewer, trainer, of)
+                return
+            viewer._toggle_pause()
+            assert viewer.pause.label == "Continue training"
+            threading.Timer(1.0, viewer._toggle_pause).start()
+            began = time.monotonic()
+            super()._serve(viewer, trainer, of)
+            self.seconds = time.monotonic() - began
+
+        def on_train_end(self, trainer: Any, pl_module: Any) -> None:
+            clock = find_callback(trainer, TrainingClock)
+            assert clock is not None
+            self.counted = clock.seconds
+            super().on_train_end(trainer, pl_module)
+
+    pausing = Pausing(port=0)
+    began = time.monotonic()
+    fitted("six_planes", tmp_path, pausing)
+    assert pausing.seconds >= 1.0
+    assert 0 < pausing.counted < time.monotonic() - began - pausing.seconds
+    (viewer,) = watched
+    assert viewer.steps.count(5) > 2  # It goes on to draw.
+    assert viewer.pause.label == "Pause training"
+    assert "** of 12, " in viewer.status.content
+    assert " dB" in viewer.status.content
+
+
+def test_ctrl_c_ends_a_pause(tmp_path: Path, watched: list[Watched]):
+    class Stopping(LiveViewer):
+        def _serve(self, viewer: Viewer, trainer: Any, of: Any) -> None:
+            viewer._toggle_pause()
+            interrupt = find_callback(trainer, Interrupt)
+            assert interrupt is not None
+            interrupt.asked = True
+            super()._serve(viewer, trainer, of)
+
+    with pytest.raises(KeyboardInterrupt):
+        fitted("six_planes", tmp_path, Stopping(port=0))
+    assert not watched[0].is_watched
+
+
+def test_a_picture_that_fails_ends_the_viewer_and_not_training(
+    tmp_path: Path, watched: list[Watched], monkeypatch, caplog
+):
+    def broken(*_: Any, **__: Any) -> None:
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(module, "draw", broken)
+    found = fitted("six_planes", tmp_path, LiveViewer(port=0))
+    assert found.batches == 12
+    assert "the viewer is closed, training goes on: out of memory" in caplog.text
+    assert not watched[0].is_watched

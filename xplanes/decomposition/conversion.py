@@ -187,13 +187,13 @@ def _running_signs(*factors: Tensor) -> Tensor:
 
 
 STATIC = ("middle", "median", "mean")
-DYNAMIC = ("random", "rank1")
+DYNAMIC = ("random", "ones", "rank1")
 
 
 def space_planes(
     low_rank: Tensor, *, static: str = "median", resolution: int | None = None
 ) -> Tensor:
-    """Space planes from the low-rank part (X-Planes, Eq. 13; "middle" is the paper's choice).
+    """Space planes from the low-rank part (X-Planes, Eq. 16; "middle" is the paper's choice).
 
     Args:
         low_rank: The static part. [T, 3, C, H, W]
@@ -233,17 +233,18 @@ def time_planes(
     noise: float = 0.01,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """Space-time planes whose products approximate the sparse part (X-Planes, Eq. 14-16).
+    """Space-time planes whose products approximate the sparse part (X-Planes, Eq. 15 and 17).
 
     "rank1" minimises the product loss frame by frame on the triplanes' own grid: in closed form
-    where no two products share a plane, as in "nine", else by alternating least squares. "random"
-    is the paper's initialisation near zero. Noise is added to both, because a product of two zeros
-    has a zero gradient.
+    where no two products share a plane, as in "nine", else by alternating least squares. "ones" is
+    K-Planes' initialisation, on which the paper relies: its products are 1. "random" is near zero,
+    where the products leave the space planes as they are. Noise is added to "random" and "rank1",
+    because a product of two zeros has a zero gradient.
 
     Args:
         sparse: The dynamic part. [T, 3, C, H, W]
         plane_set: A plane set of the field with time planes, such as "six" or "nine".
-        dynamic: "rank1" or "random".
+        dynamic: "rank1", "random" or "ones".
         resolution: R in cells; None keeps that of the triplanes, which must then be square.
         time_resolution: Rt; None for T, one row per frame.
         noise: Standard deviation of the noise.
@@ -278,6 +279,8 @@ def time_planes(
         )
     shape = (len(names), count, size, channels)
     kind = sparse.dtype if sparse.dtype == torch.float64 else torch.float32
+    if dynamic == "ones":
+        return torch.ones(shape, dtype=kind, device=sparse.device)
     planes = noise * torch.randn(
         shape,
         dtype=kind,

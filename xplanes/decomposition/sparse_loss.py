@@ -9,6 +9,8 @@ from xplanes.decomposition.conversion import frame_profiles
 
 Rows = Sequence[tuple[int, int]]
 
+REDUCTIONS = ("mean", "sum")
+
 
 def sparse_product_loss(
     time_planes: Tensor, sparse: Tensor, frames: Tensor, *, rows: Rows
@@ -62,7 +64,7 @@ def unexplained_energy(time_planes: Tensor, sparse: Tensor, *, rows: Rows) -> fl
 
 
 class SparseProduct:
-    """The regulariser L_r, evaluated at a few random frames per step.
+    """The regulariser L_r, at a few random frames per step or at all of them.
 
     It is not a module: the sparse part is large, can be recomputed, and must not be written to
     checkpoints.
@@ -70,16 +72,25 @@ class SparseProduct:
     Args:
         sparse: The sparse part of all frames. [T, 3, C, H, W]
         rows: For xy, xz and yz: indices of their two time planes.
-        count: Frames per step.
+        count: Frames per step; None for all.
+        reduction: "mean" over all entries of the sparse part, or their "sum", as Eq. 17 has it.
+
+    Raises:
+        ValueError: For another reduction.
     """
 
-    def __init__(self, sparse: Tensor, rows: Rows, count: int) -> None:
+    def __init__(
+        self, sparse: Tensor, rows: Rows, count: int | None, *, reduction: str = "mean"
+    ) -> None:
+        if reduction not in REDUCTIONS:
+            raise ValueError(f"reduction is {reduction!r}: allowed are {', '.join(REDUCTIONS)}")
         self.sparse, self.rows, self.count = sparse, rows, count
+        self.factor = sparse.numel() if reduction == "sum" else 1
 
     def add_gradient(
         self, gradient: Tensor, planes: Tensor, weight: float, generator: torch.Generator
     ) -> None:
-        """Add ``weight`` times an unbiased estimate of the gradient, from random frames.
+        """Add ``weight`` times the gradient, or an unbiased estimate of it from random frames.
 
         Args:
             gradient: Changed in place. [P, Rt, R, C]
@@ -87,7 +98,9 @@ class SparseProduct:
             weight: Weight of the regulariser.
             generator: Generator that draws the frames, on the CPU.
         """
-        frames = torch.randint(len(self.sparse), (self.count,), generator=generator)
+        frames = torch.arange(len(self.sparse))
+        if self.count is not None:
+            frames = torch.randint(len(self.sparse), (self.count,), generator=generator)
         with torch.enable_grad():
             leaf = planes.detach().requires_grad_()
             loss = self._loss(leaf, frames)
@@ -95,13 +108,14 @@ class SparseProduct:
 
     @torch.no_grad()
     def value(self, planes: Tensor) -> float:
-        """The loss at evenly spaced frames; deterministic."""
-        return float(self._loss(planes, _spread(self.count, len(self.sparse))))
+        """The loss, estimated from ``count`` evenly spaced frames; deterministic."""
+        total = len(self.sparse)
+        return float(self._loss(planes, _spread(self.count or total, total)))
 
     def _loss(self, planes: Tensor, frames: Tensor) -> Tensor:
         if self.sparse.device != planes.device:
             self.sparse = self.sparse.to(planes.device)
-        return sparse_product_loss(planes, self.sparse, frames, rows=self.rows)
+        return self.factor * sparse_product_loss(planes, self.sparse, frames, rows=self.rows)
 
 
 def _spread(count: int, total: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""Camera paths from JSON files: nerfstudio's, and those of transforms files."""
+"""Camera paths from and to JSON files: nerfstudio's, and those of transforms files."""
 
 import math
 from collections.abc import Mapping
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.listing import checked_pose, is_number, is_positive, read_object, short
+from xplanes.scenes.views import Views
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ def read_camera_path(path: Path) -> CameraPath:
     ``camera_to_world`` (16 numbers, row by row), ``fov`` (vertical, in degrees) and optionally
     ``render_time`` or ``time``; ``render_height``, ``render_width``, and ``fps`` or ``seconds``.
     And transforms files: ``frames``, a list of ``transform_matrix`` [4, 4] and optionally ``time``;
-    ``camera_angle_x`` (horizontal, in radians); optionally ``w``, ``h`` and ``fps``.
+    ``camera_angle_x`` (horizontal, in radians), of all frames or in each; optionally ``w``, ``h``
+    and ``fps``.
 
     Times run from 0 to 1 over the path where the file has none.
 
@@ -67,20 +69,89 @@ def read_camera_path(path: Path) -> CameraPath:
     if "camera_path" in content:
         return _read_nerfstudio(path, content)
     entries = _entries(path, content, "frames")
-    angle = content.get("camera_angle_x")
-    if not is_positive(angle) or angle >= math.pi:
-        raise SceneError(
-            f"{path}: camera_angle_x is {short(angle)}; it must lie between 0 and pi radians"
-        )
+    tangents = []
+    for label, entry in entries.items():
+        holder, where = (entry, label) if "camera_angle_x" in entry else (content, path)
+        angle = holder.get("camera_angle_x")
+        if not is_positive(angle) or angle >= math.pi:
+            raise SceneError(
+                f"{where}: camera_angle_x is {short(angle)}; it must lie between 0 and pi radians"
+            )
+        tangents.append(math.tan(0.5 * angle))
     return CameraPath(
         poses=_poses(entries, "transform_matrix"),
         times=_times(path, entries, ("time",)),
-        tangents=torch.full((len(entries),), math.tan(0.5 * angle)),
+        tangents=torch.tensor(tangents),
         upright=False,
         height=_count(path, content, "h"),
         width=_count(path, content, "w"),
         fps=_count(path, content, "fps"),
     )
+
+
+def path_of(views: Views, fps: int) -> CameraPath:
+    """The cameras of views in the order of their times.
+
+    Cameras of a path are perspective and look through the middle of their images: lenses and
+    principal points are left out, the vertical field of view is that of each image.
+
+    Args:
+        views: The views.
+        fps: Frames per second.
+    """
+    order = views.times.argsort(stable=True)
+    heights, focal = views.intrinsics.size[order, 0], views.intrinsics.pinhole[order, 1]
+    return CameraPath(
+        poses=views.camera_to_world[order],
+        times=views.times[order],
+        tangents=0.5 * heights / focal,
+        upright=True,
+        height=views.height,
+        width=views.width,
+        fps=fps,
+    )
+
+
+def nerfstudio_content(path: CameraPath) -> dict[str, Any]:
+    """A path with size and rate as ``camera_path.json`` of nerfstudio, for `write_json`."""
+    assert path.height is not None
+    assert path.width is not None
+    assert path.fps is not None
+    fov = 2 * (0.5 * path.height / path.focal(path.height, path.width)).atan().rad2deg()
+    return {
+        "camera_type": "perspective",
+        "render_height": path.height,
+        "render_width": path.width,
+        "fps": path.fps,
+        "seconds": len(path) / path.fps,
+        "camera_path": [
+            {
+                "camera_to_world": pose.flatten().tolist(),
+                "fov": angle,
+                "aspect": path.width / path.height,
+                "render_time": time,
+            }
+            for pose, angle, time in zip(path.poses, fov.tolist(), path.times.tolist(), strict=True)
+        ],
+    }
+
+
+def transforms_content(path: CameraPath) -> dict[str, Any]:
+    """A path with size as a transforms file, for `write_json`."""
+    assert path.height is not None
+    assert path.width is not None
+    angles = 2 * (0.5 * path.width / path.focal(path.height, path.width)).atan()
+    return {
+        "w": path.width,
+        "h": path.height,
+        "fps": path.fps,
+        "frames": [
+            {"transform_matrix": pose.tolist(), "camera_angle_x": angle, "time": time}
+            for pose, angle, time in zip(
+                path.poses, angles.tolist(), path.times.tolist(), strict=True
+            )
+        ],
+    }
 
 
 Entries = dict[str, Mapping[str, Any]]

@@ -91,6 +91,63 @@ def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> boo
     return True
 
 
+def plot_against(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bool:
+    """Draw final PSNR against a setting that has three values or more, mean over scenes and seeds.
+
+    Args:
+        rows: Runs.
+        names: Settings in which they differ.
+        path: Picture to write, PNG.
+
+    Returns:
+        Whether there was one such setting, and matplotlib (extra ``plots``) to draw it with.
+    """
+    done = [row for row in rows if "psnr" in row.scores]
+    found = {name: sorted({_place(row, name) for row in done}) for name in names if name != SEED}
+    numeric = [
+        name
+        for name, places in found.items()
+        if len(places) > 2 and all(_is_number(row.settings.get(name)) for row in done)
+    ]
+    if len(numeric) != 1:
+        return False
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        return False
+    (name,) = numeric
+    scores: dict[str, dict[float, list[float]]] = {}
+    over = [n for n in names if n not in (SEED, SCENE, name)]
+    for row in done:
+        label = run_label(row, over)
+        scores.setdefault(label, {}).setdefault(_place(row, name), []).append(row.scores["psnr"])
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    panel = figure.subplots()
+    for label, values in scores.items():
+        places = sorted(values)
+        means = [math.fsum(values[place]) / len(values[place]) for place in places]
+        panel.plot([found[name].index(place) for place in places], means, marker=".", label=label)
+    ticks = ["all" if place == math.inf else f"{place:g}" for place in found[name]]
+    panel.set_xticks(range(len(ticks)), ticks)
+    panel.set_xlabel(name)
+    panel.set_ylabel("PSNR, dB")
+    panel.grid(alpha=0.3)
+    panel.legend(fontsize="small")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
+    return True
+
+
+def _is_number(value: Any) -> bool:
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+
+
+def _place(row: RunRow, name: str) -> float:
+    """A setting as a number; null, all of something, lies behind all others."""
+    value = row.settings.get(name)
+    return float(value) if isinstance(value, int | float) else math.inf
+
+
 def _lines(rows: Sequence[RunRow], names: Sequence[str]) -> list[Line]:
     over = [name for name in names if name not in (SEED, SCENE)]
     found: dict[tuple[str, str], Line] = {}
@@ -98,12 +155,17 @@ def _lines(rows: Sequence[RunRow], names: Sequence[str]) -> list[Line]:
         if len(row.curve) < 2:
             continue
         scene = str(row.settings.get(SCENE, ""))
-        settings = {name: row.settings.get(name) for name in over}
-        parts = [_short(name, value) for name, value in settings.items() if value is not None]
-        label = ", ".join(parts) or "run"
+        label = run_label(row, over)
         line = found.setdefault((scene, label), Line(scene, label, []))
         line.runs.append(row.curve)
     return list(found.values())
+
+
+def run_label(row: RunRow, names: Sequence[str]) -> str:
+    """A run by the settings in which it differs from others."""
+    settings = {name: row.settings.get(name) for name in names}
+    parts = [_short(name, value) for name, value in settings.items() if value is not None]
+    return ", ".join(parts) or "run"
 
 
 def _short(name: str, value: Any) -> str:

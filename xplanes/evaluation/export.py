@@ -1,4 +1,4 @@
-"""Meshes, point clouds and planes for other programs: `xplanes export`."""
+"""Meshes, point clouds, planes and camera paths for other programs: `xplanes export`."""
 
 import json
 import math
@@ -13,7 +13,9 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from xplanes.errors import ConfigError
+from xplanes.evaluation.camera_path import nerfstudio_content, path_of, transforms_content
 from xplanes.evaluation.progress import progress
+from xplanes.evaluation.render import FPS
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.fields.base import ViewDependentField
 from xplanes.fields.tensor4d import Tensor4D
@@ -24,7 +26,7 @@ from xplanes.optional import require
 from xplanes.rendering.box import ray_box
 from xplanes.rendering.grid_renderer import GridRenderer
 
-KINDS = ("mesh", "points", "planes")
+KINDS = ("mesh", "points", "planes", "path")
 FORMATS = ("ply", "glb")
 
 TIMES = 10
@@ -48,7 +50,7 @@ class ExportOptions:
     """What to export.
 
     Attributes:
-        what: ``mesh``, ``points`` or ``planes``.
+        what: ``mesh``, ``points``, ``planes`` or ``path``.
         times: A number of times spread evenly from 0 to 1, or times separated by commas; None for
             10, or for 1 in a static scene.
         resolution: Grid points along each side of the field's cube.
@@ -84,7 +86,7 @@ class ExportOptions:
             raise ConfigError(f"--threshold {self.threshold:g}: must be a finite number above 0")
         if self.times is not None:
             export_times(self.times)
-        if self.what != "planes":
+        if self.what in ("mesh", "points"):
             require("skimage.measure", extra="export")
             require("trimesh", extra="export")
 
@@ -117,7 +119,7 @@ def export(
     *,
     say: Callable[[str], None],
 ) -> Path:
-    """Write meshes, point clouds or planes of a run, and ``export.json``, which lists them.
+    """Write meshes, points, planes or cameras of a run, and ``export.json``, which lists them.
 
     Args:
         trained: The run.
@@ -142,10 +144,13 @@ def export(
         "checkpoint": trained.checkpoint,
         "step": trained.step,
     }
-    if options.what == "planes":
-        write_planes(folder / "planes.safetensors", trained)
-        write_json(folder / "export.json", {**facts, "files": ["planes.safetensors"]})
+    if options.what in ("planes", "path"):
+        write = write_planes if options.what == "planes" else write_paths
+        write_json(folder / "export.json", {**facts, "files": write(folder, trained)})
         return folder
+    if getattr(trained.module.field, "background", None) is not None:
+        facts["left_out"] = "what lies behind the field's cube"
+        say(f"left out    {facts['left_out']}, which has no surface; --what planes has it")
     times = export_times(options.times or str(1 if trained.is_static else TIMES))
     threshold = options.threshold
     if isinstance(trained.module.field, Tensor4D):
@@ -410,12 +415,35 @@ def surface_colours(trained: TrainedRun, points: Tensor, normals: Tensor, time: 
     return torch.cat(colours)
 
 
-def write_planes(path: Path, trained: TrainedRun) -> None:
+def write_paths(folder: Path, trained: TrainedRun) -> list[str]:
+    """Write the training cameras in the order of their times as camera paths.
+
+    Args:
+        folder: Where to.
+        trained: The run.
+
+    Returns:
+        The files' names: ``camera_path.json``, as nerfstudio has it, and ``transforms.json``.
+    """
+    path = path_of(trained.scene.splits["train"], FPS)
+    contents = {
+        "camera_path.json": nerfstudio_content(path),
+        "transforms.json": transforms_content(path),
+    }
+    for name, content in contents.items():
+        write_json(folder / name, content)
+    return list(contents)
+
+
+def write_planes(folder: Path, trained: TrainedRun) -> list[str]:
     """Write an X-Planes field as safetensors; docs/recipes.md describes the layout.
 
     Args:
-        path: The file.
+        folder: Where to.
         trained: The run.
+
+    Returns:
+        The files' names.
 
     Raises:
         ConfigError: If the run's field is another one.
@@ -431,12 +459,20 @@ def write_planes(path: Path, trained: TrainedRun) -> None:
     if isinstance(renderer, GridRenderer):
         grid = renderer.grid
         tensors["occupied"] = grid.occupied.view(grid.time_bins, *[grid.resolution] * 3)
+    behind: dict[str, Any] | None = None
+    if (background := field.background) is not None:
+        behind = {"decoder": background.decoder.options, "samples": background.samples}
+        for name, plane in zip(SPACE_PLANES, background.planes, strict=True):
+            tensors[f"background.planes.{name}"] = plane.permute(2, 0, 1)
+        for name, value in background.decoder.state_dict().items():
+            tensors[f"background.decoder.{name}"] = value
     names = TIME_PLANES[field.plane_set]
     pairs = [[names[plane] for plane in pair] for pair in PLANE_SETS[field.plane_set]]
     content = {
         "format": 1,
         "products": dict(zip(SPACE_PLANES, pairs or [[]] * 3, strict=True)),
         "decoder": field.decoder.options,
+        "background": behind,
         "frame": {
             "scale": frame.scale,
             "rotation": frame.rotation.tolist(),
@@ -444,5 +480,7 @@ def write_planes(path: Path, trained: TrainedRun) -> None:
         },
     }
     whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    with replacing(path) as temporary:
+    name = "planes.safetensors"
+    with replacing(folder / name) as temporary:
         save_file(whole, temporary, metadata={"xplanes": json.dumps(content)})
+    return [name]

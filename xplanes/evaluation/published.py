@@ -5,12 +5,13 @@ import math
 from collections.abc import Sequence
 from importlib import resources
 
+from xplanes.errors import ConfigError
 from xplanes.evaluation.sweep import RunRow
-from xplanes.evaluation.tabulate import differing, markdown
+from xplanes.evaluation.tabulate import differing, markdown, mean_rank
 
 FILE = "published.csv"
 KEYS = {"model": "model.name", "lrm": "lrm.name", "sampler": "model.sampler.name"}
-"""Columns of the file that a run must agree with, and its settings of that meaning."""
+"""Settings that runs are told apart by, and their columns in the file."""
 
 MEANT = ("data.scene", "seed", "entry")
 """Settings that the means go over."""
@@ -19,59 +20,134 @@ HEADER = [
     "runs",
     "psnr",
     "ssim",
+    "minutes",
     "published",
     "published ssim",
-    "minutes",
+    "published minutes",
     "over",
     "source",
 ]
 
+Entry = dict[str, str]
 
-def read_published() -> list[dict[str, str]]:
+
+def read_published() -> list[Entry]:
     """The published figures: D-NeRF's data, test split, 400 pixels."""
     with resources.files("xplanes.evaluation").joinpath(FILE).open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
+def check_published(names: object) -> list[str]:
+    """Names of published tables.
+
+    Raises:
+        ConfigError: If it is not a list of names in the file.
+    """
+    known = list(dict.fromkeys(entry["table"] for entry in read_published()))
+    if not isinstance(names, list) or any(name not in known for name in names):
+        raise ConfigError(f"published={names}: must be a list of some of {', '.join(known)}")
+    return names
+
+
 def beside(rows: Sequence[RunRow]) -> str | None:
-    """Means of a sweep's finished runs on D-NeRF's scenes beside what was published.
+    """Means of a sweep's finished runs beside what was published.
+
+    Figures are set beside runs on D-NeRF's scenes with all views that agree in model, LRM, sampler
+    and, where they name it, the planes' resolution. Where runs name tables (``published``), these
+    are shown whole, whatever the data.
 
     Args:
         rows: The sweep.
 
     Returns:
-        Words and a table in markdown; None where nothing was published of these models.
+        Words and tables in markdown; None where nothing was published of these models.
     """
+    named = [name for row in rows for name in row.settings.get("published") or ()]
+    tables = check_published(list(dict.fromkeys(named)))
+    entries = [e for e in read_published() if not tables or e["table"] in tables]
+    scored = [entry for entry in entries if entry["psnr"]]
+    parts = [_ranks(rows, entry) for entry in entries if tables and entry["rank"]]
+    if scored and (text := _scores(rows, scored, whole=bool(tables))) is not None:
+        parts.insert(0, text)
+    return "\n\n".join(parts) or None
+
+
+def _ranks(rows: Sequence[RunRow], entry: Entry) -> str:
+    own = mean_rank(rows)
+    count = sum(bool(row.parts) for row in rows)
+    found = (
+        f"{own:.2f} over these {count} runs" if math.isfinite(own) else "not known of these runs"
+    )
+    return (
+        f"Mean rank of the low-rank part: {found}; published: {entry['rank']} ({entry['source']})."
+    )
+
+
+def _scores(rows: Sequence[RunRow], entries: Sequence[Entry], *, whole: bool) -> str | None:
     groups: dict[tuple[str, ...], list[RunRow]] = {}
     others = [name for name in differing(rows) if name not in (*KEYS.values(), *MEANT)]
     for row in rows:
         done = row.status == "finished" and {"psnr", "ssim"} <= row.scores.keys()
-        if done and row.settings.get("data.name") == "dnerf":
+        if done and (whole or row.settings.get("data.name") == "dnerf"):
             rest = " ".join(f"{n}={row.settings[n]}" for n in others if n in row.settings)
             key = (*(str(row.settings.get(name)) for name in KEYS.values()), rest)
             groups.setdefault(key, []).append(row)
-    published: dict[tuple[str, ...], list[dict[str, str]]] = {}
-    for entry in read_published():
-        published.setdefault(tuple(entry[name] for name in KEYS), []).append(entry)
-    if not {key[:-1] for key in groups} & published.keys():
+    matched = {key: [e for e in entries if _agrees(runs[0], e)] for key, runs in groups.items()}
+    if not groups or not (whole or any(matched.values())):
         return None
     lines = []
-    for (*known, rest), runs in groups.items():
-        key = [*known, rest] if others else known
-        own = [*key, str(len(runs)), _mean(runs, "psnr", ".2f"), _mean(runs, "ssim", ".4f")]
-        for entry in published.get(tuple(known), [{}]):
-            names = ("psnr", "ssim", "minutes", "scenes", "source")
-            lines.append([*own, *(entry.get(name, "") for name in names)])
-            own = [*key, "", "", ""]
+    for key, runs in groups.items():
+        label = key if others else key[:-1]
+        minutes = [
+            (row.scores.get("prepare_seconds", 0.0) + row.scores["train_seconds"]) / 60
+            for row in runs
+            if "train_seconds" in row.scores
+        ]
+        own = [
+            *(*label, str(len(runs)), _mean(runs, "psnr", ".2f"), _mean(runs, "ssim", ".4f")),
+            format(math.fsum(minutes) / len(minutes), ".1f") if minutes else "",
+        ]
+        for entry in matched[key] or [{}]:
+            lines.append([*own, *_published(entry)])
+            own = [*label, "", "", "", ""]
     used = [row for runs in groups.values() for row in runs]
     scenes, split = _values(used, "data.scene"), ", ".join(sorted({row.split for row in used}))
     pixels, views = _values(used, "data.resolution", "native"), _values(used, "data.views", "all")
     scored = _values(used, "data.eval_views", "all")
     header = [*KEYS, *(["settings"] if others else []), *HEADER]
-    return (
+    text = (
         f"Means of these runs ({scenes}; {split} split, {pixels} px, views: {views}, scored: "
         f"{scored}) beside published figures (test split, 400 px, all views), comparable only "
-        f"where scenes, split, pixels, views and budget are the same:\n\n{markdown(header, lines)}"
+        "where scenes, split, pixels, views and budget are the same. Minutes are those of "
+        f"preparation and training:\n\n{markdown(header, lines)}"
+    )
+    rest = [e for e in entries if not any(e in found for found in matched.values())]
+    if whole and rest:
+        header = ["method", "lrm", "resolution", *HEADER[4:]]
+        lines = [[e["method"], e["lrm"], e["resolution"], *_published(e)] for e in rest]
+        text += (
+            "\n\nPublished with them, of D-NeRF's scenes; none of these runs has their settings:"
+            f"\n\n{markdown(header, lines)}"
+        )
+    return text
+
+
+def _published(entry: Entry) -> list[str]:
+    if not entry:
+        return [""] * 5
+    numbers = [entry[name] for name in ("psnr", "ssim", "minutes", "scenes")]
+    return [*numbers, f"{entry['table']}, {entry['source']}"]
+
+
+def _agrees(row: RunRow, entry: Entry) -> bool:
+    """Whether a run has the settings of a published figure, as far as that names them."""
+    settings = row.settings
+    if settings.get("data.name") != "dnerf" or settings.get("data.views") is not None:
+        return False
+    named = {**KEYS, "resolution": "model.resolution"}
+    return bool(entry["model"]) and all(
+        not entry[column] or entry[column] == str(settings.get(name))
+        for column, name in named.items()
     )
 
 

@@ -19,6 +19,7 @@ from xplanes.files import read_rows as read_csv
 SCORES = {
     "psnr": ("test", "psnr"),
     "ssim": ("test", "ssim"),
+    "psnr_thing": ("test", "psnr_thing"),
     "floaters": ("test", "floaters"),
     "steps": ("step",),
     "prepare_seconds": ("seconds", "prepare"),
@@ -31,6 +32,7 @@ SCORES = {
 MEASURES = (
     "psnr",
     "ssim",
+    "psnr_thing",
     "floaters",
     "start_psnr",
     "seconds_to_20",
@@ -75,6 +77,8 @@ class RunRow:
         status: How it ended, with the reason where it is not ``finished``.
         curve: PSNR on the way.
         split: The split that `scores` are of; empty where they do not say.
+        parts: Report of the decomposition of each orientation, "xy", "xz" and "yz".
+        machine: Device and processor count; empty where run.json does not say.
     """
 
     name: str
@@ -84,6 +88,8 @@ class RunRow:
     status: str = "finished"
     curve: tuple[Point, ...] = ()
     split: str = ""
+    parts: dict[str, dict[str, Any]] = field(default_factory=dict)
+    machine: str = ""
 
 
 def read_rows(folder: Path) -> list[RunRow]:
@@ -154,7 +160,20 @@ def read_run(run: Path, name: str) -> RunRow:
         status=status,
         curve=curve,
         split=str((metrics or {}).get("split", "")),
+        parts=_parts(metrics or {}),
+        machine=_machine(record or {}),
     )
+
+
+def _parts(metrics: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    found = metrics.get("decomposition")
+    found = found if isinstance(found, dict) else {}
+    return {name: found[name] for name in ("xy", "xz", "yz") if isinstance(found.get(name), dict)}
+
+
+def _machine(record: dict[str, Any]) -> str:
+    device, cpus = record.get("device"), record.get("cpus")
+    return "" if device is None else f"{device}, {cpus} CPU cores"
 
 
 def _curve(run: Path, prepare: float, problems: list[str]) -> tuple[Point, ...]:

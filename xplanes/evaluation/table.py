@@ -13,12 +13,14 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from xplanes.errors import ConfigError
-from xplanes.evaluation.curves import plot_curves
+from xplanes.evaluation.curves import plot_against, plot_curves
 from xplanes.evaluation.published import beside
+from xplanes.evaluation.sheet import write_sheet
 from xplanes.evaluation.sweep import RunRow, read_rows
 from xplanes.evaluation.tabulate import (
     SEED,
     align,
+    decomposition_table,
     differing,
     markdown,
     run_table,
@@ -49,7 +51,8 @@ def write_tables(folder: Path, out: Path | None = None) -> str:
         raise ConfigError(f"{folder}: no runs in it (folders with run.json)")
     out = out or folder
     names = differing(rows)
-    text = [f"# {folder.resolve().name}", counts(rows), markdown(*run_table(rows, names))]
+    text = [f"# {folder.resolve().name}", f"{counts(rows)} {protocol(rows)}".strip()]
+    text.append(markdown(*run_table(rows, names)))
     write_rows(out / "table.csv", *run_table(rows, names, exact=True))
     seeds = seed_groups(rows)
     if seeds:
@@ -60,8 +63,12 @@ def write_tables(folder: Path, out: Path | None = None) -> str:
         (out / "table_seeds.csv").unlink(missing_ok=True)
     if (published := beside(rows)) is not None:
         text.append(published)
+    if (parts := decomposition_table(rows, names)) is not None:
+        text += ["Decomposition of the LRM's triplanes (means over xy, xz, yz):", markdown(*parts)]
     if len(rows) > 1 and plot_curves(rows, names, out / "curves.png"):
         text.append("![PSNR against seconds and steps](curves.png)")
+    if plot_against(rows, names, out / "against.png"):
+        text.append("![PSNR at the end](against.png)")
     whole = "\n\n".join(text) + "\n"
     write_text(out / "table.md", whole)
     return whole
@@ -76,6 +83,34 @@ def counts(rows: Sequence[RunRow]) -> str:
     return f"{len(rows)} runs: {tally}.{scored}"
 
 
+PROTOCOL = {
+    "data": "data.name",
+    "width, px": "data.resolution",
+    "training views": "data.views",
+    "scored views": "data.eval_views",
+    "background": "model.rays.background",
+    "steps": "trainer.max_steps",
+    "seconds": "trainer.max_seconds",
+}
+"""Settings that say how runs were made and scored."""
+
+
+def protocol(rows: Sequence[RunRow]) -> str:
+    """How the runs were made and scored, as far as it is known: size, budget, machine."""
+    unset = {"data.views": "all", "data.eval_views": "all", "trainer.max_seconds": "no limit"}
+    known = [row for row in rows if row.settings and not row.status.startswith("missing")]
+    parts = []
+    for words, name in PROTOCOL.items():
+        values = [row.settings[name] for row in known if name in row.settings]
+        shown = dict.fromkeys(unset.get(name, "native") if v is None else str(v) for v in values)
+        if shown:
+            parts.append(f"{words}: {', '.join(shown)}")
+    machines = dict.fromkeys(row.machine for row in rows if row.machine)
+    if machines:
+        parts.append(f"machine: {'; '.join(machines)}")
+    return f"Protocol: {' · '.join(parts)}." if parts else ""
+
+
 class SweepTable(Callback):
     """Says how each job of a multirun ended, and writes and prints the table at its end.
 
@@ -85,9 +120,11 @@ class SweepTable(Callback):
 
     def __init__(self) -> None:
         self._folder: Path | None = None
+        self._sheet: str | None = None
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         self._folder = Path(config.hydra.sweep.dir).absolute()
+        self._sheet = getattr(config, "sheet", None)
         atexit.register(self._finish)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
@@ -127,6 +164,12 @@ class SweepTable(Callback):
             # The runs are there and whole; only their table is not.
             traceback.print_exc()
             _say(f"no table: xplanes table {folder}")
+        if self._sheet is None:
+            return
+        try:
+            _say(f"wrote {write_sheet(folder, what=self._sheet)}")
+        except ConfigError as error:
+            _say(f"no sheet: {error}")
 
 
 def choose_gpu(job: int, environment: MutableMapping[str, str]) -> str | None:

@@ -1,28 +1,51 @@
-"""Interactive viewer in the browser: free camera and time slider."""
+"""Interactive viewer in the browser, of a finished field or of one that is training."""
 
+import contextlib
+import io
 import math
+import socket
 import threading
 import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from xplanes.errors import ConfigError
+from xplanes.evaluation.drawing import MODES, Picture, Shot, camera_outlines, draw
 from xplanes.evaluation.render import orbit_poses
-from xplanes.evaluation.runs import TrainedRun
 from xplanes.optional import require
-from xplanes.rendering.pictures import depth_picture, to_bytes
-from xplanes.scenes.views import camera_rays
+from xplanes.rendering.base import RayRenderer
+from xplanes.rendering.pictures import colour_map, to_bytes
+from xplanes.scenes.views import Scene
+from xplanes.training.module import RadianceModule
 
-HOST = "127.0.0.1"
-SIZES = ("64", "96", "128", "200", "320", "480", "720")
+HOST, PORT = "127.0.0.1", 8080
+SIZES = ("64", "96", "128", "200", "320", "480", "720", "1080")
+SPEEDS = {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0, "4": 4.0}
 LOOP_SECONDS = 4.0
-"""Duration of one playback from time 0 to 1."""
+"""Duration of one playback from time 0 to 1, at speed 1."""
 TICK_SECONDS = 0.04
 SETTLE_SECONDS = 0.25
 """How long a camera must rest before the picture is drawn in full."""
-MOVING_SECONDS = 0.1
+MOVING_SECONDS = 0.08
 """What a picture may take while the camera moves or time plays."""
+FEWEST = 16
+"""Rows of a picture at least."""
+REFRESH_SECONDS, SHARE = 0.5, 3
+"""A picture at rest is drawn anew, of a field that trains, when so many seconds and so many times
+its own duration have passed since it was begun."""
+AWAY = 1.4
+"""The first camera's distance from the scene, as a share of the training cameras'."""
+FRUSTUM = 0.1
+"""Length of a camera's frustum, as a share of its distance from the scene."""
+LARGEST_DEPTH = 160.0
+"""What viser takes for depth ends a little farther away."""
+GREY = (120, 120, 120)
+ABOUT_CAMERAS = "Training cameras, from dark to light in the order of their times."
 
 
 def camera_pose(wxyz: Tensor, position: Tensor) -> Tensor:
@@ -41,76 +64,95 @@ def camera_pose(wxyz: Tensor, position: Tensor) -> Tensor:
     return pose
 
 
-def draw(
-    trained: TrainedRun,
-    pose: Tensor,
-    *,
-    timestep: float,
-    fov: float,
-    height: int,
-    aspect: float,
-    what: str = "colour",
-) -> Tensor:
-    """Render one picture.
+def check_address(host: str, port: int, *, key: str) -> None:
+    """Refuse an address that cannot be served.
 
     Args:
-        trained: The run.
-        pose: Camera-to-world matrix. [4, 4]
-        timestep: Time, from 0 to 1.
-        fov: Vertical field of view, in radians.
-        height: Rows.
-        aspect: Columns per row.
-        what: ``colour`` or ``depth``.
+        host: Name or address of this machine.
+        port: From 0 to 65535; 0 for any free one.
+        key: What messages call ``host`` and ``port``, which replace the braces.
 
-    Returns:
-        The picture. uint8 [height, width, 3]
+    Raises:
+        ConfigError: If the port is taken or out of range, or the host is not this machine.
+        MissingExtraError: Without the extra ``viewer``.
     """
-    width = max(1, round(height * aspect))
-    focal = 0.5 * height / math.tan(0.5 * fov)
-    device = trained.module.device
-    origins, directions = trained.frame.rays(*camera_rays(pose, focal, height, width))
-    image = trained.module.renderer.image(
-        trained.module.field,
-        origins.to(device),
-        directions.to(device),
-        timestep,
-        trained.scene.background.to(device),
-    )
-    if what == "depth":
-        shape = (height, width)
-        return to_bytes(depth_picture(image["depth"].view(shape), image["opacity"].view(shape)))
-    return to_bytes(image["colour"].view(height, width, 3))
+    require("viser", extra="viewer")
+    if not 0 <= port <= 65535:
+        raise ConfigError(f"{key.format('port')}{port}: must lie between 0 and 65535")
+    try:
+        family, kind, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as trial:
+            # Without it, a port that was served a moment ago would count as taken.
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            trial.bind(address)
+    except socket.gaierror as error:
+        raise ConfigError(f"{key.format('host')}{host}: no such machine ({error})") from error
+    except PermissionError as error:
+        raise ConfigError(
+            f"{key.format('port')}{port}: it takes more rights than yours; choose one from 1024 on"
+        ) from error
+    except OSError as error:
+        raise ConfigError(
+            f"{key.format('port')}{port}: it cannot be served at {host} ({error.strerror}); choose "
+            f"another, or {key.format('port')}0 for any free one"
+        ) from error
+
+
+def _silence() -> contextlib.AbstractContextManager[Any]:
+    return contextlib.redirect_stdout(io.StringIO())
 
 
 class Viewer:
-    """Serves one run; every browser has its own camera, time and size are shared.
+    """Serves one field; every browser has its own camera, the controls are shared.
+
+    Pictures are drawn by the thread that calls `catch_up`, never by the server's own: a field that
+    trains is drawn between its steps.
 
     Args:
-        trained: The run.
-        port: Port to listen on, on this machine alone; the next free one if it is taken.
+        module: The field, built.
+        scene: Its scene.
+        renderer: Gives the renderer for the next picture.
+        host: Address to listen on.
+        port: Port to listen on; the next free one if it is taken.
+        trains: Whether the field trains, and can be paused.
+
+    Attributes:
+        patience: Seconds that a picture at rest may take; larger ones become smaller.
+        step: Training step of the field; pictures are drawn anew once it changes.
+        paused: Whether someone paused training.
 
     Raises:
-        ImportError: Without the extra ``viewer``.
+        MissingExtraError: Without the extra ``viewer``.
     """
 
-    def __init__(self, trained: TrainedRun, port: int) -> None:
+    def __init__(
+        self,
+        module: RadianceModule,
+        scene: Scene,
+        renderer: Callable[[], RayRenderer],
+        *,
+        host: str = HOST,
+        port: int = PORT,
+        trains: bool = False,
+    ) -> None:
         viser: Any = require("viser", extra="viewer")
-        self.trained = trained
-        self.playing = False
-        self._busy = threading.Lock()
-        self._watchers: dict[int, _Watcher] = {}
-        self.server = viser.ViserServer(host=HOST, port=port, verbose=False)
+        assert module.frame is not None
+        self.module, self.scene, self.renderer = module, scene, renderer
+        self.frame, self.views = module.frame, scene.splits["train"]
+        self.patience, self.trains = math.inf, trains
+        self.step, self.paused, self.playing = 0, False, False
+        self._browsers: dict[int, _Browser] = {}
+        self._wake = threading.Event()
+        self._ticked = time.monotonic()
+        # A browser may leave while its picture is drawn.
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
+        with _silence():  # It prints an address of its own.
+            self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.server.gui.set_panel_label("X-Planes")
         self._place_camera()
-        gui = self.server.gui
-        static = trained.is_static
-        self.time = gui.add_slider("time", 0.0, 1.0, 0.005, 0.0, disabled=static)
-        self.play = gui.add_button("play", disabled=static)
-        size = min(SIZES, key=lambda text: abs(int(text) - trained.views.height))
-        self.size = gui.add_dropdown("resolution", SIZES, initial_value=size)
-        self.what = gui.add_dropdown("show", ("colour", "depth"))
-        self.play.on_click(lambda _: self._toggle())
-        for control in (self.time, self.size, self.what):
-            control.on_update(lambda _: self._refresh())
+        self._add_controls()
+        self._add_cameras()
         self.server.on_client_connect(self._connect)
         self.server.on_client_disconnect(self._disconnect)
 
@@ -119,104 +161,255 @@ class Viewer:
         """The port that is served."""
         return self.server.get_port()
 
+    @property
+    def is_watched(self) -> bool:
+        """Whether a browser is connected."""
+        return bool(self._browsers)
+
     def run(self) -> None:
-        """Let time pass while it plays, until interrupted."""
+        """Draw until interrupted."""
         while True:
-            time.sleep(TICK_SECONDS)
-            if self.playing:
-                self.time.value = round((self.time.value + TICK_SECONDS / LOOP_SECONDS) % 1.0, 3)
-                self._refresh()
+            self.catch_up()
+            self.wait()
+
+    def wait(self) -> None:
+        """Wait until a browser wants something, or for a moment."""
+        self._wake.wait(TICK_SECONDS)
+        self._wake.clear()
+
+    def catch_up(self, seconds: float = math.inf) -> None:
+        """Draw what browsers wait for; no further picture is begun after so many seconds."""
+        end = time.monotonic() + seconds
+        while True:
+            self._play()
+            now = time.monotonic()
+            waiting = sorted(self._browsers.values(), key=lambda browser: browser.began)
+            due = ((browser, browser.wanted(now)) for browser in waiting)
+            browser, height = next((found for found in due if found[1]), (None, 0))
+            if browser is None:
+                return
+            browser.draw(height, now)
+            if time.monotonic() >= end:
+                return
+
+    def tell(self, text: str) -> None:
+        """Show a line of text above the controls."""
+        if self.status.content != text:
+            self.status.content = text
 
     def close(self) -> None:
         """Stop serving."""
-        for watcher in list(self._watchers.values()):
-            watcher.stop()
-        self.server.stop()
+        self._browsers.clear()
+        with _silence():
+            self.server.stop()
 
-    def show(self, camera: Any, height: int) -> Tensor:
-        """What a viser camera sees now. uint8 [height, width, 3]"""
+    def shot(self, camera: Any, height: int) -> Shot:
+        """What a viser camera sees now, in so many rows."""
         pose = camera_pose(torch.from_numpy(camera.wxyz), torch.from_numpy(camera.position))
-        with self._busy:
-            return draw(
-                self.trained,
-                pose,
-                timestep=float(self.time.value),
-                fov=camera.fov,
-                height=height,
-                aspect=camera.aspect,
-                what=self.what.value,
-            )
+        return Shot(
+            pose,
+            time=float(self.time.value),
+            fov=camera.fov,
+            height=height,
+            aspect=camera.aspect,
+            mode=self.mode.value,
+            box=self.box,
+        )
+
+    @property
+    def box(self) -> Tensor | None:
+        """Least and largest corner of what is shown; None where that is the whole cube. [2, 3]"""
+        ends = torch.tensor([slider.value for slider in self.crop], dtype=torch.float32).T
+        return None if bool((ends.abs() == 1).all()) else ends
+
+    @property
+    def needs_depth(self) -> bool:
+        """Whether lines are drawn, which things may hide."""
+        return bool(self.cameras.value or self.outline.visible)
 
     def _place_camera(self) -> None:
-        views, frame = self.trained.scene.splits["train"], self.trained.frame
-        self.server.scene.set_up_direction("+z")
+        """Put browsers beside the training camera nearest to where videos begin."""
+        cameras = self.views.camera_to_world[:, :3, 3]
+        begin = orbit_poses(self.views, self.frame, 1)[0, :3, 3]
+        nearest = cameras[(cameras - begin).norm(dim=-1).argmin()]
+        self.server.scene.set_up_direction(tuple(self.frame.rotation[:, 2].tolist()))
         start = self.server.initial_camera
-        start.position = tuple(orbit_poses(views, frame, 1)[0, :3, 3].tolist())
-        start.look_at = tuple(frame.centre.tolist())
-        start.fov = views.intrinsics.fov_y
+        start.position = tuple((AWAY * self.frame.points(nearest)).tolist())
+        start.look_at = (0.0, 0.0, 0.0)
+        start.fov = self.views.intrinsics.fov_y
 
-    def _toggle(self) -> None:
+    def _add_controls(self) -> None:
+        gui, static = self.server.gui, not self.module.field.moves
+        self.status = gui.add_markdown("")
+        if self.trains:
+            self.pause = gui.add_button("Pause training")
+            self.pause.on_click(lambda _: self._toggle_pause())
+        with gui.add_folder("Time"):
+            self.time = gui.add_slider("time", 0.0, 1.0, 0.005, 0.0, disabled=static)
+            self.play = gui.add_button("Play", disabled=static)
+            self.speed = gui.add_dropdown("speed", tuple(SPEEDS), initial_value="1")
+        with gui.add_folder("Picture"):
+            # Where no pixel is transparent, the images rule nothing out.
+            modes = [mode for mode in MODES if mode != "floaters" or not self.views.is_opaque]
+            self.mode = gui.add_dropdown("show", tuple(modes))
+            size = min(SIZES, key=lambda text: abs(int(text) - self.views.height))
+            self.size = gui.add_dropdown("rows", SIZES, initial_value=size)
+            self.cameras = gui.add_checkbox("cameras", True, hint=ABOUT_CAMERAS)
+        with gui.add_folder("Crop"):
+            self.crop = [
+                gui.add_multi_slider(axis, -1.0, 1.0, 0.02, (-1.0, 1.0), min_range=0.02)
+                for axis in "xyz"
+            ]
+            self.uncrop = gui.add_button("Show everything")
+        self.play.on_click(lambda _: self._toggle_play())
+        self.uncrop.on_click(lambda _: self._uncrop())
+        for control in (self.time, self.mode, self.size):
+            control.on_update(lambda _: self._refresh())
+        for control in self.crop:
+            control.on_update(lambda _: self._show_box())
+        self.cameras.on_update(lambda _: self._show_cameras())
+
+    def _add_cameras(self) -> None:
+        away = self.frame.points(self.views.camera_to_world[:, :3, 3]).norm(dim=-1).median()
+        lines, times = camera_outlines(self.views, self.frame, FRUSTUM * float(away))
+        colours = to_bytes(colour_map(times))[:, None].expand_as(lines)
+        scene = self.server.scene
+        style: Any = {"thickness": 1.5, "thickness_units": "screen"}
+        self.frusta = scene.add_line_segments("/cameras", lines.numpy(), colours.numpy(), **style)
+        corners = torch.cartesian_prod(*3 * [torch.tensor([-0.5, 0.5])])
+        pairs = torch.combinations(torch.arange(8))
+        edges = corners[pairs[(corners[pairs].diff(dim=1)[:, 0] != 0).sum(dim=1) == 1]]
+        self.outline = scene.add_line_segments("/crop", edges.numpy(), GREY, visible=False, **style)
+
+    def _toggle_play(self) -> None:
         self.playing = not self.playing
-        self.play.label = "pause" if self.playing else "play"
+        self.play.label = "Stop" if self.playing else "Play"
+        self._ticked = time.monotonic()
+        self._wake.set()
+
+    def _toggle_pause(self) -> None:
+        self.paused = not self.paused
+        self.pause.label = "Continue training" if self.paused else "Pause training"
+        self._refresh()
+        self._wake.set()
+
+    def _play(self) -> None:
+        """Let time pass, where it plays."""
+        now = time.monotonic()
+        passed, self._ticked = now - self._ticked, now
+        if self.playing:
+            share = passed * SPEEDS[self.speed.value] / LOOP_SECONDS
+            self.time.value = round((self.time.value + share) % 1.0, 4)
+
+    def _uncrop(self) -> None:
+        for slider in self.crop:
+            slider.value = (-1.0, 1.0)
+
+    def _show_box(self) -> None:
+        if (box := self.box) is not None:
+            self.outline.scale = tuple((box[1] - box[0]).tolist())
+            self.outline.position = tuple(box.mean(dim=0).tolist())
+        self.outline.visible = box is not None
+        self._refresh()
+
+    def _show_cameras(self) -> None:
+        self.frusta.visible = self.cameras.value
+        self._refresh()
 
     def _refresh(self) -> None:
-        for watcher in list(self._watchers.values()):
-            watcher.wake()
+        for browser in list(self._browsers.values()):
+            browser.change()
 
     def _connect(self, client: Any) -> None:
-        watcher = _Watcher(self, client)
-        self._watchers[client.client_id] = watcher
-        client.camera.on_update(lambda _: watcher.wake())
-        watcher.start()
+        browser = _Browser(self, client)
+        self._browsers[client.client_id] = browser
+        client.camera.on_update(lambda _: browser.change())
+        browser.change()
 
     def _disconnect(self, client: Any) -> None:
-        watcher = self._watchers.pop(client.client_id, None)
-        if watcher is not None:
-            watcher.stop()
+        self._browsers.pop(client.client_id, None)
 
 
-class _Watcher(threading.Thread):
-    """Draws for one browser: small pictures while anything changes, a full one at rest."""
+@dataclass
+class _Browser:
+    """What one browser was sent, and what it waits for.
 
-    def __init__(self, viewer: Viewer, client: Any) -> None:
-        super().__init__(daemon=True)
-        self.viewer, self.client = viewer, client
-        self._changed = threading.Event()
-        self._changed.set()
-        self._stopped = False
-        self._pixels_per_second = 1e5
+    Attributes:
+        viewer: Serves it.
+        client: Viser's handle of it.
+        version: Counts changes of what it should show.
+        changed: When the last of them was.
+        drawn: ``version`` of its picture.
+        step: Training step of its picture.
+        sharp: Whether its picture is as large as it can be.
+        began: When its picture was begun.
+        again: When its picture is to be drawn anew, if the field has changed.
+        rate: Pixels that are drawn in a second.
+    """
 
-    def wake(self) -> None:
-        """Something has changed."""
-        self._changed.set()
+    viewer: Viewer
+    client: Any
+    version: int = 0
+    changed: float = 0.0
+    drawn: int = 0
+    step: int = 0
+    sharp: bool = False
+    began: float = 0.0
+    again: float = 0.0
+    rate: float = 1e4
 
-    def stop(self) -> None:
-        """End the thread after its present picture."""
-        self._stopped = True
-        self._changed.set()
+    def change(self) -> None:
+        """Something has changed; called by the server's threads."""
+        self.changed = time.monotonic()
+        self.version += 1
+        self.viewer._wake.set()
 
-    def run(self) -> None:
-        while True:
-            self._changed.wait()
-            if self._stopped:
-                return
-            self._changed.clear()
-            full = int(self.viewer.size.value)
-            small = self._affordable(full)
-            self._draw(small)
-            if small < full and not self._changed.wait(SETTLE_SECONDS):
-                self._draw(full)
+    def wanted(self, now: float) -> int:
+        """Rows of the picture that is due; 0 for none."""
+        if self.version != self.drawn:
+            return self._affordable(MOVING_SECONDS)
+        rested = not self.sharp and now - self.changed > SETTLE_SECONDS
+        if rested or (self.viewer.step != self.step and now >= self.again):
+            return self._affordable(self.viewer.patience)
+        return 0
 
-    def _affordable(self, full: int) -> int:
-        pixels = self._pixels_per_second * MOVING_SECONDS
-        height = int(math.sqrt(pixels / max(self.client.camera.aspect, 0.1)))
-        return max(24, min(full, height))
+    def _affordable(self, seconds: float) -> int:
+        """Rows of a picture that is drawn in so many seconds."""
+        full = int(self.viewer.size.value)
+        pixels = min(self.rate * seconds / max(self.client.camera.aspect, 0.1), full * full)
+        return max(FEWEST, min(full, int(math.sqrt(pixels))))
 
-    def _draw(self, height: int) -> None:
-        began = time.perf_counter()
-        picture = self.viewer.show(self.client.camera, height)
-        spent = time.perf_counter() - began
-        rate = picture.shape[0] * picture.shape[1] / max(spent, 1e-6)
-        self._pixels_per_second = 0.5 * (self._pixels_per_second + rate)
-        if not self._stopped:
-            self.client.scene.set_background_image(picture.numpy(), format="jpeg")
+    def draw(self, height: int, now: float) -> None:
+        """Draw and send a picture; one at rest is given up once something changes."""
+        viewer, version = self.viewer, self.version
+        resting = version == self.drawn
+        field, shot = viewer.module.field, viewer.shot(self.client.camera, height)
+        picture = draw(
+            field,
+            viewer.renderer(),
+            shot,
+            views=viewer.views,
+            frame=viewer.frame,
+            background=viewer.scene.background,
+            at_once=max(256, int(self.rate * MOVING_SECONDS / 2)),
+            stop=lambda: resting and self.version != version,
+        )
+        if picture is None:
+            return
+        self.drawn, self.step, self.began = version, viewer.step, now
+        self.sharp = resting or height >= int(viewer.size.value)
+        self._send(picture)
+        spent = max(time.monotonic() - now, 1e-6)
+        self.rate = 0.5 * (self.rate + shot.height * shot.width / spent)
+        self.again = now + max(REFRESH_SECONDS, SHARE * spent)
+
+    def _send(self, picture: Picture) -> None:
+        depth = None
+        if self.viewer.needs_depth:
+            depth = picture.depth.clamp_max(LARGEST_DEPTH).numpy()
+        self.client.scene.set_background_image(
+            to_bytes(picture.colours).numpy(),
+            format="jpeg",
+            jpeg_quality=92 if self.sharp else 75,
+            depth=depth,
+        )

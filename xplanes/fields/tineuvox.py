@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from xplanes.fields.background import Background
 from xplanes.fields.base import ViewDependentField
 from xplanes.fields.networks import layers, octaves
 
@@ -32,6 +33,7 @@ class TiNeuVox(ViewDependentField):
         moves: Whether points are moved to canonical space; False for a static scene.
         unit: World units per unit of the field's frame.
         precision: Of the matrix products.
+        background: What lies behind the grid's box; None for a plain colour.
 
     Attributes:
         count: Number of cells of the grid as it is now.
@@ -55,6 +57,7 @@ class TiNeuVox(ViewDependentField):
         moves: bool = True,
         unit: float = 1.0,
         precision: str = "32",
+        background: Background | None = None,
     ) -> None:
         super().__init__()
         self.resolution, self.channels, self.octaves, self.unit = (
@@ -78,6 +81,7 @@ class TiNeuVox(ViewDependentField):
         self.density = nn.Linear(width, 1)
         self.tint = nn.Linear(width, width)
         self.colours = layers([width + 3 * directions, width // 2, 3])
+        self.background = background
         self.register_load_state_dict_pre_hook(_fit_grid)
         self.register_load_state_dict_post_hook(lambda field, _: field._read_buffers())
 
@@ -108,7 +112,8 @@ class TiNeuVox(ViewDependentField):
     @property
     def outline(self) -> str:
         cells = " x ".join(str(size) for size in self._size(self.resolution**3))
-        return f"(grid of {cells} cells) · {self.channels} channels"
+        behind = "" if self.background is None else " · a background"
+        return f"(grid of {cells} cells) · {self.channels} channels{behind}"
 
     @property
     def cell(self) -> float:

@@ -125,10 +125,10 @@ class PreparationSettings(Settings):
     """What happens before training, for an initialisation that is not random."""
 
     cache: str | None  # Folder of cached stages; null disables the cache.
-    frames: Count  # Timesteps of the fixed-view video.
+    frames: Count | None  # Timesteps of the fixed-view video; null: as many as the views have.
     fixed_view: Literal["auto", "video", "train"]  # The scene's video, or one rendered by a field.
     fixed_view_model: str  # Model of that field: a file of conf/model.
-    fixed_view_seconds: Positive  # Training time of that field in seconds.
+    fixed_view_seconds: Positive | None  # Maximum training time of that field; null: no limit.
     fixed_view_steps: Count  # Maximum number of training steps of that field.
     azimuth: float | None  # Azimuth of the fixed view in degrees; null: a world axis.
     elevation: Annotated[float, Range(-90, 90)]  # Elevation of the fixed view in degrees.
@@ -153,7 +153,8 @@ class DecompositionSettings(Settings):
     tolerance: Positive  # Relative residual of convergence.
     max_iterations: Count  # Maximum number of iterations.
     static: Literal["middle", "median", "mean"]  # Space planes: frame T/2, median or mean.
-    dynamic: Literal["random", "rank1"]  # Time planes: rank1 fits the sparse part.
+    # Time planes: rank1 fits the sparse part, random is near 0, ones is 1 as in K-Planes.
+    dynamic: Literal["random", "ones", "rank1"]
     noise: Annotated[float, Range(0)]  # Standard deviation of the noise on time planes.
     cache: bool  # Cache both parts (twice the size of the triplanes).
 

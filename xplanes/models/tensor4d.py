@@ -1,17 +1,20 @@
 """Tensor4D (Shao et al., CVPR 2023) as in the released code: a surface and a flow; or a density."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from xplanes.errors import ConfigError
+from xplanes.fields.base import RadianceField
 from xplanes.fields.hierarchy import DYNAMIC, STATIC, Groups, HierarchicalPlanes, Level
 from xplanes.fields.tensor4d import Tensor4D, Tensor4DDensity
-from xplanes.models.base import InitialValues, Model, ModelSettings, warm_cosine
+from xplanes.fields.xplanes import XPlanes
+from xplanes.models.base import InitialValues, LossTerm, Model, ModelSettings, warm_cosine
 from xplanes.rendering.neus import NeusSettings, SurfaceRendering
+from xplanes.rendering.proposal import ProposalRendering
 from xplanes.rendering.sampler import Group, Site
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
@@ -194,14 +197,44 @@ class Tensor4DModel(Tensor4DDensityModel):
 
     def _change(self, rendering: SurfaceRendering, rays: int, state: TrainingState) -> Tensor:
         places = rendering.places
-        generator = state.generator(places.device, Stream.NEARBY)
-        aside = torch.randn(places.shape, generator=generator, device=places.device)
-        aside = F.normalize(aside, dim=1) * self.weights.smoothness_distance
-        here, nearby = self._field.features(places), self._field.features(places + aside)
-        return feature_change(here, nearby, rendering.weights, rays)
+        nearby = places + _aside(places, self.weights.smoothness_distance, state)
+        here, there = self._field.features(places), self._field.features(nearby)
+        return feature_change(here, there, rendering.weights, rays)
 
     def scalars(self) -> dict[str, float]:
         return {"surface/sharpness": float(self._field.sharpness.detach())}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureSmoothness(LossTerm):
+    """Change of an X-Planes field's features over a small distance, where rays see something.
+
+    Source: Tensor4D, released code.
+    """
+
+    distance: Positive  # Distance in the field's frame.
+
+    def value(
+        self, field: RadianceField, rendering: Any, rays: Batch, state: TrainingState
+    ) -> Tensor:
+        if not isinstance(field, XPlanes) or not isinstance(rendering, ProposalRendering):
+            raise ConfigError(
+                f"losses with {type(self).__name__}: it needs model=six_planes or nine_planes and "
+                "model/sampler=proposal; leave it out"
+            )
+        points, ray = rendering.samples.points, rendering.samples.ray
+        times = rays["times"][ray]
+        here = field.features(points, times)
+        there = field.features(points + _aside(points, self.distance, state), times)
+        weights = rendering.levels[-1].weights.flatten()
+        return feature_change(here, there, weights, len(rays["times"]))
+
+
+def _aside(places: Tensor, distance: float, state: TrainingState) -> Tensor:
+    """Steps of one length in random directions. [N, 3] -> [N, 3]"""
+    generator = state.generator(places.device, Stream.NEARBY)
+    steps = torch.randn(places.shape, generator=generator, device=places.device)
+    return F.normalize(steps, dim=1) * distance
 
 
 def masked_colour_error(colour: Tensor, target: Tensor, mask: Tensor) -> Tensor:

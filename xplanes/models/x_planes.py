@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from xplanes.decomposition.sparse_loss import SparseProduct
-from xplanes.fields.background import Background
 from xplanes.fields.decoder import Decoder
 from xplanes.fields.regularisers import (
     add_distance_gradient,
@@ -24,6 +23,7 @@ from xplanes.fields.regularisers import (
     total_variation,
 )
 from xplanes.fields.xplanes import XPlanes, random_planes
+from xplanes.models.background import BackgroundSettings
 from xplanes.models.base import (
     InitialValues,
     Model,
@@ -34,10 +34,10 @@ from xplanes.models.base import (
     warm_cosine,
 )
 from xplanes.rendering.base import Rendering
-from xplanes.rendering.sampler import Group, Site
+from xplanes.rendering.sampler import Group, Site, time_rows
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
-from xplanes.streams import Stream, TrainingState, initial_values, step_generator
+from xplanes.streams import Stream, TrainingState, step_generator
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,26 +57,22 @@ class DecoderSettings(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BackgroundSettings(Settings):
-    """A static world behind the field's cube, for opaque images of a scene in a world."""
-
-    resolution: Count  # Texels along each side of its planes, over contracted space.
-    channels: Count  # Channels of each plane.
-    samples: Steps  # Samples of a ray behind the cube; 0: its colour depends on direction alone.
-    width: Count  # Neurons of the decoder's hidden layer.
-
-
-@dataclass(frozen=True, kw_only=True)
 class XPlanesLoss(Settings):
     """Weights of the terms of the loss beyond the colour's mean squared error."""
 
     opacity: Weight  # Weight of the opacity's squared error against the images' alpha.
     floaters: Weight  # Weight of the mean opacity of rays at pixels with alpha 0.
+    # mean: differences along space, mean over planes. coded: as in K-Planes' released code, summed
+    # over planes, along time too.
+    variation: Literal["mean", "coded"]
     total_variation: Weight  # Weight of total variation.
+    world_variation: Weight  # The same in front of a background, in place of it.
     time_smoothness: Weight  # Weight of time smoothness (squared second differences).
     time_magnitude: Weight  # Weight of the squared values of time planes.
+    time_identity: Weight  # Weight of the time planes' mean distance from 1, as in K-Planes.
     sparse_weight: Weight  # Weight of L_r (X-Planes, Eq. 17).
-    sparse_frames: Count  # Random timesteps per evaluation of L_r.
+    sparse_reduction: Literal["mean", "sum"]  # Over entries: sum as in the paper.
+    sparse_frames: Count | None  # Random timesteps per evaluation of L_r; null: all.
     initial_weight: Weight  # Weight of the distance to the initial planes; divided by views^2.
     initial_steps: Count | None  # Steps times views over which both fade out; null: never.
     every: Count  # Steps between evaluations of these terms; weights are scaled to match.
@@ -92,7 +88,9 @@ class XPlanesSettings(ModelSettings):
 
     plane_set: Literal["six", "nine", "three"]
     resolution: Count  # Texels along each space axis.
-    time_resolution: Count | None  # Rows of time; null: half the number of distinct times.
+    # Rows of time. half: half the number of distinct times, as in K-Planes; null: the same, or all
+    # of them where each is seen often, and as many as the LRM has timesteps if these are more.
+    time_resolution: Count | Literal["half"] | None
     channels: Count  # Channels of each plane.
     space_scale: Weight  # Standard deviation of randomly initialised space planes.
     time_scale: Weight  # Standard deviation of randomly initialised time planes.
@@ -115,13 +113,24 @@ class XPlanesSettings(ModelSettings):
         decoder = replace(self.decoder, colour_bias=max(self.decoder.colour_bias, 2.0))
         return replace(self, loss=loss, decoder=decoder)
 
+    def rows_of_time(self, times: Tensor, frames: int = 0) -> int:
+        """Rows of the time planes.
+
+        Args:
+            times: Times of the training views. [V]
+            frames: Timesteps of the LRM's triplanes, if there are any.
+        """
+        if isinstance(self.time_resolution, int):
+            return self.time_resolution
+        return max(time_rows(times), frames if self.time_resolution is None else 0)
+
     def build(self, site: Site, initial: InitialValues | None = None) -> "XPlanesModel":
         return XPlanesModel(self, self.build_field(site, initial), site, initial)
 
     def build_field(self, site: Site, initial: InitialValues | None = None) -> XPlanes:
         """The field: planes and decoder from what is given, the rest of it random."""
         plane_set = self.plane_set if site.moves else "three"
-        background = self._background(site)
+        background = None if self.background is None else self.background.build(site)
         generator = step_generator(site.seed, 0, Stream.INITIAL_FIELD)
         planes: Mapping[str, Tensor]
         if initial is not None:
@@ -131,7 +140,7 @@ class XPlanesSettings(ModelSettings):
                 plane_set,
                 channels=self.channels,
                 resolution=self.resolution,
-                time_resolution=self.time_resolution or site.time_rows,
+                time_resolution=self.rows_of_time(site.times),
                 space_scale=self.space_scale,
                 time_scale=self.time_scale,
                 generator=generator,
@@ -159,20 +168,6 @@ class XPlanesSettings(ModelSettings):
         decoder.requires_grad_(not options.freeze)
         return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set, background=background)
 
-    def _background(self, site: Site) -> Background | None:
-        """What lies behind the cube; None for a plain colour."""
-        if self.background is None or not site.surrounded:
-            return None
-        options = self.background
-        with initial_values(site.seed, Stream.BACKGROUND):
-            return Background(
-                options.channels,
-                options.resolution,
-                width=options.width,
-                samples=options.samples,
-                precision="bf16" if site.precision == "bf16" else "32",
-            )
-
 
 class XPlanesModel(Model):
     """The colour's error, smooth planes, and products of time planes near what moves.
@@ -196,14 +191,21 @@ class XPlanesModel(Model):
         steps = self.weights.initial_steps
         self.fade = None if steps is None else steps / views
         self.opacity = self.weights.opacity
+        self.total_variation = self.weights.total_variation
+        if field.background is not None:
+            self.total_variation = self.weights.world_variation
         self._opaque = site.views is not None and site.views.is_opaque
         self.product: SparseProduct | None = None
         self.initial_weight, self._initial = 0.0, []
         if initial is not None:
             self.initial_weight = self.weights.initial_weight / views**2
             if initial.sparse is not None and field.time is not None and self.weights.sparse_weight:
-                frames = self.weights.sparse_frames
-                self.product = SparseProduct(initial.sparse, field.rows, frames)
+                self.product = SparseProduct(
+                    initial.sparse,
+                    field.rows,
+                    self.weights.sparse_frames,
+                    reduction=self.weights.sparse_reduction,
+                )
         if self.initial_weight:
             self._initial = [plane.detach().clone() for plane in self._planes]
         self.advice = (
@@ -226,12 +228,8 @@ class XPlanesModel(Model):
         decoder = [p for p in field.decoder.parameters() if p.requires_grad]
         if decoder:
             groups.append({"params": decoder, "lr": settings.decoder_lr, "name": "decoder"})
-        if (world := field.background) is not None:
-            decoder = list(world.decoder.parameters())
-            groups += [
-                {"params": [world.planes], "lr": settings.plane_lr, "name": "background"},
-                {"params": decoder, "lr": settings.decoder_lr, "name": "background_decoder"},
-            ]
+        if field.background is not None and settings.background is not None:
+            groups += settings.background.groups(field.background)
         return groups
 
     def losses(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
@@ -253,6 +251,8 @@ class XPlanesModel(Model):
         every, field, weights = self.weights.every, self._field, self.weights
         if state.step % every or field.space.grad is None:
             return
+        if field.background is not None and self.settings.background is not None:
+            self.settings.background.regularise(field.background, every)
         fading = self._fading(state.step)
         if not fading:
             self._initial, self.product = [], None  # Large, and of no more use.
@@ -263,17 +263,19 @@ class XPlanesModel(Model):
             for plane, initial in zip(self._planes, self._initial, strict=True):
                 if plane.grad is not None:
                     add_distance_gradient(plane.grad, plane, initial, weight)
-        if weight := weights.total_variation * every:
-            add_total_variation_gradient(field.space.grad, field.space, (1, 2), weight)
+        for plane, dims, factor in self._variation():
+            if (weight := factor * self.total_variation * every) and plane.grad is not None:
+                add_total_variation_gradient(plane.grad, plane, dims, weight)
         if field.time is None or field.time.grad is None:
             return
-        if weight:
-            add_total_variation_gradient(field.time.grad, field.time, (2,), weight)
         if weight := weights.time_smoothness * every:
             add_time_smoothness_gradient(field.time.grad, field.time, weight)
         if weight := weights.time_magnitude * every:
             scale = 2 * weight / field.time.numel()
             field.time.grad.add_(field.time.detach(), alpha=scale)
+        if weight := weights.time_identity * every:
+            away = (field.time.detach() - 1).sign()
+            field.time.grad.add_(away, alpha=weight / field.time.numel())
         if self.product is not None:
             # The same frames on all ranks: their planes must stay equal.
             generator = step_generator(state.seed, state.step, Stream.FRAMES)
@@ -285,21 +287,37 @@ class XPlanesModel(Model):
         weights, field, fading = self.weights, self._field, self._fading(state.step)
         terms: dict[str, tuple[float, Callable[[], Any]]] = {
             "total_variation": (
-                weights.total_variation,
-                lambda: (
-                    total_variation(field.space, (1, 2))
-                    + (0.0 if field.time is None else total_variation(field.time, (2,)))
+                self.total_variation,
+                lambda: sum(
+                    factor * total_variation(plane, dims)
+                    for plane, dims, factor in self._variation()
                 ),
             )
         }
+        if (world := field.background) is not None and (options := self.settings.background):
+            variation = options.total_variation
+            terms["background"] = (variation, lambda: total_variation(world.planes, (1, 2)))
         if self._initial:
             terms["initialisation"] = (fading * self.initial_weight, self._distance)
         if (time := field.time) is not None:
             terms["time_smoothness"] = (weights.time_smoothness, lambda: time_smoothness(time))
             terms["time_magnitude"] = (weights.time_magnitude, lambda: time.square().mean())
+            terms["time_identity"] = (weights.time_identity, lambda: (1 - time).abs().mean())
             if (product := self.product) is not None:
                 terms["l_r"] = (fading * weights.sparse_weight, lambda: product.value(time))
         return {name: weight * float(value()) for name, (weight, value) in terms.items() if weight}
+
+    def _variation(self) -> list[tuple[Tensor, tuple[int, ...], float]]:
+        """Stacks of planes, the axes along which they shall be smooth, and factors."""
+        space, time = self._field.space, self._field.time
+        coded = self.weights.variation == "coded"
+        # Coded: twice the sum over planes, in which space planes count twice (as `PlaneTerms`).
+        found: list[tuple[Tensor, tuple[int, ...], float]] = [
+            (space, (1, 2), 4.0 * len(space) if coded else 1.0)
+        ]
+        if time is not None:
+            found.append((time, (1, 2), 2.0 * len(time)) if coded else (time, (2,), 1.0))
+        return found
 
     def _distance(self) -> float:
         """Sum over the planes' stacks of the mean squared distance from their initial values."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from xplanes.config import compose_plain
 from xplanes.fields.xplanes import XPlanes
 from xplanes.lrm.canonical import CanonicalView
-from xplanes.models.initialisation import Method, Place
+from xplanes.models.initialisation import Method, Place, PreparationSettings
 from xplanes.preparation.cache import StageCache
 from xplanes.scenes.cameras import camera_around
 from xplanes.scenes.errors import SceneError
@@ -88,7 +88,7 @@ def fixed_view(
             "(transforms_video.json); set preparation.fixed_view=train"
         )
     times = scene.splits["train"].times
-    count = 1 if scene.splits["train"].is_static else options.frames
+    count = 1 if scene.splits["train"].is_static else options.frames or len(times.unique())
     # A video without alpha shows a world around the thing, which LRMs would take for a part of it.
     whole = scene.video is not None and scene.is_surrounded and scene.video.is_opaque
     if scene.video is not None and (
@@ -97,10 +97,13 @@ def fixed_view(
         check_camera(scene.video)
         views = pick_frames(scene.video, torch.linspace(0, 1, count) if count > 1 else times[:1])
         return FixedView(views, frame.centre, 0.0, f"{len(views)} frames of the scene's video")
-    if scene.is_surrounded:
+    if scene.cut is not None:
+        place = replace(place, scene=replace(scene, splits=scene.splits | {"train": scene.cut}))
+    elif scene.is_surrounded:
         place.say(
             f"fixed view: the images of {scene.name} have no silhouettes, so the LRM is shown all "
-            "that is found in the cube, the ground included; masks would show it the thing alone"
+            "that is found in the cube, the ground included; masks would show it the thing alone "
+            "(data.mask_use=lrm)"
         )
     return _rendered(method, place, view, size, count, cache)
 
@@ -228,9 +231,8 @@ def _rendered(
 
     def make() -> dict[str, Any]:
         place.say(
-            f"fixed view: training {options.fixed_view_model} for "
-            f"{options.fixed_view_seconds:g} s to render {count} frames from where the LRM's "
-            "camera stands"
+            f"fixed view: training {options.fixed_view_model} for {_budget(options)} to render "
+            f"{count} frames from where the LRM's camera stands"
         )
         with cache.workshop("fixed_view", inputs) as folder:
             module = _train(rendering, method, place, own_frame, folder)
@@ -244,11 +246,14 @@ def _rendered(
         Intrinsics.shared(focal, side, side, count),
         tuple(f"fixed_{number:03d}.png" for number in range(count)),
     )
-    words = (
-        f"{count} frames rendered by {options.fixed_view_model} "
-        f"trained for {options.fixed_view_seconds:g} s"
-    )
+    words = f"{count} frames rendered by {options.fixed_view_model} trained for {_budget(options)}"
     return FixedView(views, frame.centre, stage.seconds, words)
+
+
+def _budget(options: PreparationSettings) -> str:
+    """How long the field that renders the video is trained, in words."""
+    steps, seconds = options.fixed_view_steps, options.fixed_view_seconds
+    return f"{steps} steps" if seconds is None else f"up to {steps} steps or {seconds:g} s"
 
 
 def _intrinsics_key(intrinsics: Intrinsics) -> list[Tensor]:

@@ -25,7 +25,6 @@ from xplanes.preparation.cache import StageCache
 from xplanes.preparation.reconstruct import ImageLRMSettings, LoadedLRM, loaded, reconstruct
 from xplanes.preparation.sequence import TriplaneSequence, load_triplanes
 from xplanes.preparation.stages import Parts, convert_stage, decompose_stage
-from xplanes.rendering.sampler import time_rows
 from xplanes.scenes.views import Views
 from xplanes.settings import Count
 
@@ -225,8 +224,7 @@ def _settled(
         model = replace(model, plane_set="three")
     if model.plane_set != "three":
         # Frames of the video tell of more timesteps than few training views do.
-        rows = model.time_resolution or max(time_rows(views.times), frames)
-        model = replace(model, time_resolution=rows)
+        model = replace(model, time_resolution=model.rows_of_time(views.times, frames))
     if sequence.decoder_config is not None:
         try:
             decoder = replace(model.decoder, **dict(sequence.decoder_config))

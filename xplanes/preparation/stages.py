@@ -220,12 +220,14 @@ def convert_stage(
     sparse = parts.sparse if moving else None
 
     def begin(dynamic: str, moved: Tensor) -> Tensor:
+        rows = model.time_resolution
+        assert rows != "half", "the sequence settles it"
         return time_planes(
             moved,
             plane_set=model.plane_set,
             dynamic=dynamic,
             resolution=model.resolution,
-            time_resolution=model.time_resolution,
+            time_resolution=rows,
             noise=config.noise,
             generator=step_generator(seed, 0, Stream.NOISE),
         )

@@ -136,6 +136,7 @@ class OccupancySettings(SamplerSettings):
     grid_resolution: Count  # Cells of the occupancy grid along each side.
     time_bins: Count  # Bins of the occupancy grid along time.
     threshold: Fraction  # Opacity of one step below which a cell is empty.
+    world_threshold: Fraction  # The same in front of a background, in place of it.
     decay: Share  # Decay of the density of a cell at each update.
     skip_empty: bool  # Skip samples in empty cells.
     skip_occluded: bool  # Skip samples behind opaque surfaces.
@@ -162,11 +163,12 @@ class OccupancySettings(SamplerSettings):
             )
 
     def build(self, field: RadianceField, site: Site) -> "OccupancySampler":
+        plain = getattr(field, "background", None) is None
         grid = OccupancyGrid(
             self.grid_resolution,
             self.time_bins if site.moves else 1,
             step=DIAGONAL / self.samples,
-            threshold=self.threshold,
+            threshold=self.threshold if plain else self.world_threshold,
             decay=self.decay,
         )
         renderer = GridRenderer(

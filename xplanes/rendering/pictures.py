@@ -34,6 +34,10 @@ def depth_picture(depth: Tensor, opacity: Tensor) -> Tensor:
     return torch.where(seen[..., None], colours, 1.0)
 
 
+STRIP = ("truth", "colour", "error", "depth")
+"""Pictures of a `strip`, from left to right."""
+
+
 def strip(truth: Tensor, colour: Tensor, depth: Tensor, opacity: Tensor) -> Tensor:
     """Truth, prediction, error (x 4) and depth side by side.
 

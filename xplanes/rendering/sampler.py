@@ -21,6 +21,9 @@ from xplanes.streams import TrainingState
 
 logger = logging.getLogger(__name__)
 
+VIEWS_PER_ROW = 4
+"""Views of one timestep that a row of time for it alone needs."""
+
 Group = dict[str, Any]
 """Parameters of one learning rate: ``params``, ``lr`` and ``name``."""
 
@@ -71,8 +74,16 @@ class Site:
 
 
 def time_rows(times: Tensor) -> int:
-    """Rows of time where the settings leave them open: one for two distinct times. [V]"""
-    return max(2, math.ceil(len(times.unique()) / 2))
+    """Rows of time where the settings leave them open.
+
+    One for two distinct times; one for each where there are enough views of it to tell what it
+    shows without its neighbours.
+
+    Args:
+        times: Time of each training view. [V]
+    """
+    distinct = len(times.unique())
+    return max(2, math.ceil(distinct / 2), min(distinct, len(times) // VIEWS_PER_ROW))
 
 
 class Sampler(ABC):

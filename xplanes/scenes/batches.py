@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from xplanes.backend import memory_left
+from xplanes.scenes.changes import changing
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.silhouettes import foreground
 from xplanes.scenes.store import (
@@ -28,6 +29,9 @@ Batch = dict[str, Tensor]
 
 NEAR_SILHOUETTE = 0.02
 """Share of the image's side around silhouettes that counts as near."""
+
+STILL_SHARE = 0.5
+"""Share of rays at pixels of fixed cameras where nothing changes."""
 
 PER_TILE = 32
 """Rays from one tile, of images in a file of tiles."""
@@ -50,7 +54,7 @@ class RaySettings(Settings):
     samples_per_batch: Count  # Maximum number of samples per batch, on average.
     accumulate: Count  # Batches per optimiser step.
     background: Literal["white", "random", "one"]  # random: per ray; one: random per batch.
-    skip_background: bool  # Sample rays near the silhouettes more often.
+    skip_background: bool  # Sample rays near silhouettes, and where something changes, more often.
     background_share: Share  # Share of rays far from the silhouettes.
     background_jitter: Share  # Maximum random offset of the times of these rays.
 
@@ -60,7 +64,9 @@ class RayBatches:
 
     With ``skip_background`` rays far from the silhouettes are drawn at ``background_share`` instead
     of at their share of the pixels. They show nothing but background; a few keep the air clear of
-    floaters. Space far from a silhouette counts as empty shortly before and after, too.
+    floaters. Space far from a silhouette counts as empty shortly before and after, too. Opaque
+    images of fixed cameras have no silhouettes, but pixels that change: the others are drawn at
+    `STILL_SHARE`, at their own times.
 
     Of images in a file of tiles each batch takes `PER_TILE` pixels of each of some tiles, so that
     it reads few places of the disk; every pixel is still as likely as any other. Near and far are
@@ -82,10 +88,13 @@ class RayBatches:
         self.background = settings.background
         widths = views.intrinsics.size[:, 1].tolist()
         margins = [max(1, round(NEAR_SILHOUETTE * width)) for width in widths]
+        changes = None
         if isinstance(views.images, StoredImages):
             self.near, self.far = _tile_pools(views, views.images, margins)
         else:
-            near = foreground(views, margins)
+            if settings.skip_background and views.is_opaque:
+                changes = changing(views, margins)  # Large captures are drawn from evenly.
+            near = foreground(views, margins) if changes is None else changes
             far = ~near
             if views.is_cut:
                 valid = views.valid()
@@ -94,8 +103,9 @@ class RayBatches:
         self._prefetched = -1
         natural = len(self.far) / (len(self.near) + len(self.far))
         skip = settings.skip_background and 0 < natural < 1
-        self.far_share = min(settings.background_share, natural) if skip else natural
-        jitter = skip and not views.is_static
+        share = settings.background_share if changes is None else STILL_SHARE
+        self.far_share = min(share, natural) if skip else natural
+        jitter = skip and not views.is_static and changes is None
         self.background_jitter = settings.background_jitter if jitter else 0.0
         self.skipped = max(0.0, 1 - self.far_share / natural) * natural if skip else 0.0
         """Share of all pixels that uniform drawing would have shown and this one leaves out."""

@@ -154,7 +154,7 @@ def fit_quietly(
     *,
     device: torch.device,
     max_steps: int,
-    max_seconds: float,
+    max_seconds: float | None,
     checkpoint_every: int,
 ) -> None:
     """Train a field that is built on a scene, from its last checkpoint in a folder on.
@@ -165,7 +165,7 @@ def fit_quietly(
         folder: Where checkpoints lie.
         device: Where to train.
         max_steps: Steps at most.
-        max_seconds: Seconds at most.
+        max_seconds: Seconds at most; None for no limit.
         checkpoint_every: Steps between checkpoints.
     """
     trainer = Trainer(

@@ -1,0 +1,114 @@
+"""Contact sheets: tiles cut from the pictures of runs, and errors that name what is missing."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from tests.evaluation.test_table import make
+from xplanes.cli import main
+from xplanes.errors import ConfigError
+from xplanes.evaluation.sheet import check_what, write_sheet
+
+TRUE, ERROR, DEPTH = (255, 0, 0), (0, 0, 255), (255, 0, 255)
+SIDE = 20
+
+
+def green(step: int) -> tuple[int, int, int]:
+    """The colour that a run shows after some steps."""
+    return (0, 100 + step, 0)
+
+
+def pictured(
+    folder: Path, *, scene: str = "lego", model: str = "a", steps=(0, 50), views=("v0", "v1")
+) -> Path:
+    run = make(folder, model=model)
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config["data"]["scene"] = scene
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    for step in steps:
+        for view in views:
+            strip = np.concatenate(
+                [np.full((SIDE, SIDE, 3), c, "uint8") for c in (TRUE, green(step), ERROR, DEPTH)], 1
+            )
+            path = run / "media" / f"step{step:06d}" / f"{view}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(strip).save(path)
+    return run
+
+
+def areas(path: Path) -> dict[tuple[int, ...], int]:
+    """Pixels of each colour of a sheet; greys, of which text consists, left out."""
+    with Image.open(path) as picture:
+        pixels = np.asarray(picture.convert("RGB")).reshape(-1, 3)
+    colours, counts = np.unique(pixels, axis=0, return_counts=True)
+    return {
+        tuple(map(int, colour)): int(count)
+        for colour, count in zip(colours, counts, strict=True)
+        if len(set(colour)) > 1
+    }
+
+
+def test_runs_stand_side_by_side_a_row_per_scene(tmp_path: Path) -> None:
+    for number, (scene, model) in enumerate([("lego", "a"), ("lego", "b"), ("hook", "a")]):
+        pictured(tmp_path / f"{number}", scene=scene, model=model)
+    found = areas(write_sheet(tmp_path, size=40))
+    # The truth once per scene, the last step of each run.
+    assert found[TRUE] == 2 * 40 * 40
+    assert found[green(50)] == 3 * 40 * 40
+    assert not {ERROR, DEPTH, green(0)} & set(found)
+
+
+def test_steps_stand_side_by_side_a_row_per_run(tmp_path: Path) -> None:
+    for number, model in enumerate("ab"):
+        pictured(tmp_path / f"{number}", model=model, steps=(0, 20, 50))
+    path = write_sheet(tmp_path, tmp_path / "other.png", what="steps", size=40)
+    assert areas(path) == dict.fromkeys((TRUE, green(0), green(20), green(50)), 2 * 40 * 40)
+    path = write_sheet(tmp_path, what="steps", steps=[20], show="depth", size=40)
+    assert areas(path) == {TRUE: 2 * 40 * 40, DEPTH: 2 * 40 * 40}
+
+
+def test_parts_are_shown_whole(tmp_path: Path) -> None:
+    run = pictured(tmp_path / "0")
+    with pytest.raises(ConfigError, match=r"no run has media/decomposition\.png: only runs that"):
+        write_sheet(tmp_path, what="parts")
+    Image.new("RGB", (60, 30), (1, 2, 3)).save(run / "media" / "decomposition.png")
+    assert areas(write_sheet(tmp_path, what="parts")) == {(1, 2, 3): 60 * 30}
+
+
+def test_a_single_run_is_a_sheet_of_itself_and_the_command_writes_it(tmp_path: Path, capsys):
+    run = pictured(tmp_path / "run")
+    assert main(["sheet", str(run), "--what", "steps", "--steps", "0,50", "--view", "v1"]) == 0
+    assert capsys.readouterr().out == f"wrote {run / 'sheet.png'}\n"
+    assert set(areas(run / "sheet.png")) == {TRUE, green(0), green(50)}
+    assert main(["sheet", str(run), "--steps", "x"]) == 1
+    assert "--steps x: must be numbers" in capsys.readouterr().err
+
+
+def test_what_is_missing_is_named(tmp_path: Path) -> None:
+    pictured(tmp_path / "0")
+    pictured(tmp_path / "1", model="b", views=("v1",))
+    write_sheet(tmp_path, view="v1")
+    cases = [
+        ({"view": "v0"}, r"^view=v0: the runs of lego show v1$"),
+        ({"steps": [7]}, r"^steps=7: 0 has pictures of the steps 0, 50$"),
+        ({"show": "truth"}, r"^show=truth: must be one of colour, error, depth$"),
+        ({"what": "all"}, r"^sheet=all: must be null or one of runs, steps, parts$"),
+        ({"size": 3}, r"^size=3"),
+        ({"out": tmp_path / "x.jpg"}, r"x\.jpg: a contact sheet must end in \.png"),
+    ]
+    for options, words in cases:
+        with pytest.raises(ConfigError, match=words):
+            write_sheet(tmp_path, **options)
+    pictured(tmp_path / "2", model="c", views=("v9",))
+    with pytest.raises(ConfigError, match="the runs of lego have no view in common"):
+        write_sheet(tmp_path)
+    make(tmp_path / "bare" / "0")
+    with pytest.raises(ConfigError, match=r"no run has pictures of views"):
+        write_sheet(tmp_path / "bare")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match="no runs in it"):
+        write_sheet(tmp_path / "empty")
+    check_what(None)

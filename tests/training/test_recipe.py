@@ -1,0 +1,331 @@
+"""recipe=paper: its settings, and that what it computes is what its sources print."""
+
+import csv
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.baselines.runs import PROPOSAL
+from tests.preparation.sequences import moving_sequence
+from tests.synthetic import ball_scene
+from tests.training.runs import SMALL, changed
+from xplanes.config import compose_plain
+from xplanes.decomposition import decompose, time_planes
+from xplanes.decomposition.sparse_loss import SparseProduct
+from xplanes.errors import ConfigError
+from xplanes.experiment import Experiment
+from xplanes.fields.products import PlaneProducts
+from xplanes.fields.regularisers import PlaneTerms
+from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
+from xplanes.models.base import InitialValues
+from xplanes.models.initialisation import Initialisation
+from xplanes.models.tensor4d import FeatureSmoothness
+from xplanes.pipeline import run
+from xplanes.preparation import TriplaneSequence, save_triplanes
+from xplanes.preparation.cache import StageCache
+from xplanes.preparation.stages import convert_stage, decompose_stage
+from xplanes.streams import TrainingState
+from xplanes.training.module import RadianceModule
+
+LRMS = ("tiny", "mini", "small", "base", "large", "xlarge")
+
+METHOD = {
+    "static": "middle",
+    "dynamic": "ones",
+    "method": "admm",
+    "sparsity_weight": 0.009,
+    "penalty": 0.05,
+    "scale": "none",
+}
+FIXED_VIEW = {
+    "fixed_view": "train",
+    "fixed_view_model": "kplanes",
+    "fixed_view_steps": 30000,
+    "fixed_view_seconds": None,
+    "frames": None,
+}
+LOSS = {
+    "opacity": 0.0,
+    "floaters": 0.0,
+    "variation": "coded",
+    "time_magnitude": 0.0,
+    "sparse_weight": 1.0,
+    "sparse_reduction": "sum",
+    "sparse_frames": None,
+    "initial_weight": 0.0,
+    "initial_steps": None,
+    "every": 1,
+}
+OWN = {
+    "six_planes": {
+        "loss": {"total_variation": 1e-4, "time_smoothness": 3e-2, "time_identity": 3e-4},
+        "rates": (0.01, 0.01, 0.01),
+        "schedule": (512, 0.0),
+        "rays": (4096, "one"),
+        "losses": {},
+    },
+    "nine_planes": {
+        "loss": {"total_variation": 0.0, "time_smoothness": 0.0, "time_identity": 0.0},
+        "rates": (0.0025, 0.0025, 0.0005),
+        "schedule": (2000, 0.1),
+        "rays": (512, "white"),
+        "losses": {"smoothness": (FeatureSmoothness, 0.01)},
+    },
+}
+
+
+def test_every_setting_is_the_papers_or_its_references() -> None:
+    for (name, own), lrm in zip(itertools.cycle(OWN.items()), LRMS, strict=False):
+        case = f"model={name}", f"lrm={lrm}"
+        experiment = Experiment.read(compose_plain("train", ["recipe=paper", *case]))
+        method, model = experiment.method, experiment.method.model
+        assert (model.name, method.lrm.name) == (name, lrm)
+        for settings, wanted in (
+            (method.decomposition, METHOD),
+            (method.preparation, FIXED_VIEW),
+            (model.loss, LOSS | own["loss"]),
+        ):
+            assert {key: getattr(settings, key) for key in wanted} == wanted, case
+        assert (model.resolution, model.time_resolution) == (64, "half")
+        assert (model.plane_lr, model.time_lr, model.decoder_lr) == own["rates"], case
+        assert (model.warmup_steps, model.final_lr) == own["schedule"], case
+        assert (model.rays.per_batch, model.rays.background) == own["rays"], case
+        assert not model.rays.skip_background
+        assert not model.decoder.freeze
+        # The sampler has neither silhouettes nor an occupancy grid, and lies in the LRM's cube.
+        sampler = model.sampler
+        assert (sampler.name, sampler.near, sampler.far) == ("proposal", None, None)
+        assert (sampler.proposal_samples, sampler.samples) == ([256, 128], 48)
+        assert experiment.trainer["max_steps"] == 30000
+        assert experiment.trainer["max_seconds"] is None
+        assert experiment.callbacks["collapse"]["restarts"] == 0
+        found = {key: (type(term), term.weight) for key, term in method.losses.items()}
+        assert found == own["losses"], case
+
+
+def test_the_largest_lrm_is_its_own_and_others_can_be_chosen() -> None:
+    assert compose_plain("train", ["recipe=paper"])["lrm"]["name"] == "xlarge"
+    plain = compose_plain("train", ["recipe=paper", "entry=nine_planes_tiny", "seed=3"])
+    assert (plain["lrm"]["name"], plain["model"]["plane_lr"]) == ("tiny", 0.0025)
+    plain = compose_plain("train", ["recipe=paper", "lrm=none", "model.plane_lr=0.5"])
+    assert (plain["lrm"]["name"], plain["model"]["plane_lr"]) == ("none", 0.5)
+
+
+def test_baselines_refuse_it() -> None:
+    for name in ("kplanes", "tensor4d"):
+        plain = compose_plain("train", ["recipe=paper", f"model={name}", "lrm=none"])
+        with pytest.raises(ConfigError, match=r"model\.\S+: there is no such setting"):
+            Experiment.read(plain)
+
+
+# What it computes
+
+STATE = TrainingState(seed=0, step=3, batch=3, rank=0)
+
+TINY = (
+    *(text for text in SMALL if "sampler" not in text and "per_batch" not in text),
+    *PROPOSAL,
+    "model.rays.per_batch=64",
+    "model.resolution=8",
+)
+
+
+def small(*overrides: str) -> dict:
+    return changed(("recipe=paper", *TINY), *overrides)
+
+
+def module_of(*overrides: str) -> tuple[RadianceModule, torch.Tensor]:
+    """A field of the recipe with random initial planes, and the sparse part that L_r gets."""
+    generator = torch.Generator().manual_seed(1)
+    sparse = torch.randn(4, 3, 8, 6, 6, generator=generator)
+
+    def initialise(method, place):
+        plane_set = method.model.plane_set
+        planes = {name: torch.randn(8, 8, 8, generator=generator) for name in ("xy", "xz", "yz")}
+        for name in TIME_PLANES[plane_set]:
+            planes[name] = torch.randn(8, 3, 8, generator=generator)
+        values = InitialValues(planes, sparse=sparse)
+        return Initialisation(method.model, place.frame, values=values)
+
+    module = RadianceModule(small(*overrides))
+    module.build(ball_scene(), initialise=initialise)
+    return module, sparse
+
+
+def test_k_planes_terms_are_those_of_k_planes_on_the_same_planes() -> None:
+    module, _ = module_of("model=six_planes", "model.loss.sparse_weight=0")
+    field = module.field
+    products = PlaneProducts(8, 8, [1], 3, low=0.0, high=1.0)
+    named = dict(products.planes())
+    with torch.no_grad():
+        for name, plane in field.planes.items():
+            named[name][0].copy_(plane)
+    terms = PlaneTerms(1e-4, "coded", 1e-2, 1e-4)
+    wanted = {key: float(value.detach()) for key, value in terms.values(products).items()}
+    weights = {"total_variation": 1e-4, "time_smoothness": 1e-2, "time_identity": 1e-4}
+    found = module.model.regularisers(STATE)
+    assert found == pytest.approx({key: weights[key] * wanted[key] for key in weights}, rel=1e-5)
+
+    # Their gradients, against those of K-Planes' own code here.
+    for parameter in field.parameters():
+        parameter.grad = torch.zeros_like(parameter)
+    module.model.regularise(STATE)
+    terms.add_gradients(products)
+    stacks = {"space": field.space.grad, "time": field.time.grad}
+    names = {"space": ("xy", "xz", "yz"), "time": TIME_PLANES["six"]}
+    for stack, gradients in stacks.items():
+        for name, gradient in zip(names[stack], gradients, strict=True):
+            expected = named[name].grad[0].permute(1, 2, 0)
+            torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-9, msg=name)
+
+
+def test_l_r_is_the_sum_over_all_entries_in_every_step() -> None:
+    for name in OWN:
+        off = ("total_variation", "time_smoothness", "time_identity")
+        zero = [f"model.loss.{key}=0" for key in off]
+        module, sparse = module_of(f"model={name}", *zero)
+        planes = module.field.time.detach().double().requires_grad_()
+        total = torch.zeros((), dtype=torch.float64)
+        for frame in range(4):
+            # Rows of time lie at t (Rt - 1), texels at their centres.
+            place = frame / 3 * 2
+            low = min(int(place), 1)
+            rows = torch.lerp(planes[:, low], planes[:, low + 1], place - low)
+            at = ((torch.arange(6) + 0.5) / 6 * 8 - 0.5).double()
+            left, share = at.floor().long(), (at - at.floor())[:, None]
+            values = torch.lerp(rows[:, left], rows[:, left + 1], share)
+            for index, (first, second) in enumerate(PLANE_SETS[module.field.plane_set]):
+                product = torch.einsum("wc,hc->chw", values[first], values[second])
+                total = total + (sparse[frame, index].double() - product).square().sum()
+        total.backward()
+        assert module.model.regularisers(STATE) == pytest.approx({"l_r": total.item()}, rel=1e-5)
+        for step in range(3):
+            for parameter in module.field.parameters():
+                parameter.grad = torch.zeros_like(parameter)
+            module.model.regularise(TrainingState(seed=0, step=step, batch=step, rank=0))
+            torch.testing.assert_close(
+                module.field.time.grad.double(), planes.grad, rtol=1e-4, atol=1e-4
+            )
+            assert not module.field.space.grad.any()
+
+
+def test_a_sum_estimated_from_some_frames_is_unbiased() -> None:
+    _, sparse = module_of("model=six_planes")
+    planes = torch.randn(3, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    rows = PLANE_SETS["six"]
+    whole = SparseProduct(sparse, rows, None, reduction="sum")
+    some = SparseProduct(sparse, rows, 1, reduction="sum")
+    exact, mean = torch.zeros_like(planes), torch.zeros_like(planes)
+    whole.add_gradient(exact, planes, 1.0, torch.Generator())
+    for seed in range(400):
+        some.add_gradient(mean, planes, 1 / 400, torch.Generator().manual_seed(seed))
+    assert float((mean - exact).norm() / exact.norm()) < 0.1
+    with pytest.raises(ValueError, match="reduction is 'total': allowed are mean, sum"):
+        SparseProduct(sparse, rows, 1, reduction="total")
+
+
+def test_time_planes_begin_as_k_planes_do() -> None:
+    sparse = torch.randn(5, 3, 2, 6, 6)
+    for plane_set in ("six", "nine"):
+        planes = time_planes(sparse, plane_set=plane_set, dynamic="ones", time_resolution=3)
+        assert planes.shape == (len(TIME_PLANES[plane_set]), 3, 6, 2)
+        assert (planes == 1).all()
+
+
+def test_the_features_may_not_change_over_a_small_distance() -> None:
+    module, _ = module_of("model=nine_planes")
+    batch = {
+        "origins": torch.tensor([[0.0, 0.0, 2.0]]).expand(64, 3),
+        "directions": torch.nn.functional.normalize(
+            torch.cat([torch.linspace(-0.2, 0.2, 128).view(64, 2), -torch.ones(64, 1)], 1), dim=1
+        ),
+        "times": torch.linspace(0, 1, 64),
+        "background": torch.ones(64, 3),
+    }
+    rendering = module.sampler.render(module.field, batch, STATE)
+
+    def change(distance: float) -> float:
+        term = FeatureSmoothness(weight=1.0, distance=distance)
+        return float(term.value(module.field, rendering, batch, STATE).detach())
+
+    near, far = change(0.001), change(0.002)
+    assert far == pytest.approx(4 * near, rel=0.05)  # Squared, and linear over a texel.
+    with torch.no_grad():
+        module.field.space.fill_(0.3)
+        module.field.time.fill_(0.5)
+    # Planes fade to zero at the faces of the cube.
+    inner = replace(rendering.samples, points=0.5 * rendering.samples.points)
+    rendering = replace(rendering, samples=inner)
+    assert change(0.001) < 1e-9 * near
+    term = FeatureSmoothness(weight=1.0, distance=0.001)
+    with pytest.raises(ConfigError, match=r"model/sampler=proposal; leave it out"):
+        term.value(module.field, object(), batch, STATE)
+
+
+@pytest.mark.parametrize("model", ["six_planes", "nine_planes"])
+def test_a_run_logs_every_term_in_its_loss(model: str, scenes: Path, tmp_path: Path) -> None:
+    sequence = moving_sequence()
+    save_triplanes(tmp_path / "triplanes.pt", TriplaneSequence(sequence))
+    config = small(
+        f"model={model}",
+        "lrm=file",
+        "logger=csv",
+        f"lrm.triplanes={tmp_path}/triplanes.pt",
+        f"data.root={scenes}",
+        "preparation.cache=null",
+        "trainer.max_steps=3",
+        "trainer.log_every_n_steps=1",
+        "callbacks.evaluation.at=[]",
+    )
+    run(config, tmp_path / "run", [], resume=False)
+    (path,) = (tmp_path / "run").rglob("metrics.csv")
+    with path.open() as file:
+        rows = [row for row in csv.DictReader(file) if row["train/loss"]]
+    assert len(rows) == 3
+    own = {"six_planes": "time_identity", "nine_planes": "smoothness"}[model]
+    names = ("colour", "histogram", "l_r", own)
+    for row in rows:
+        terms = {
+            key: float(value)
+            for key, value in row.items()
+            if key.startswith("train/")
+            and value
+            and key not in ("train/loss", "train/psnr", "train/steps_skipped")
+        }
+        assert {f"train/{name}" for name in names} <= set(terms)
+        assert float(row["train/loss"]) == pytest.approx(sum(terms.values()), rel=1e-6)
+    assert (
+        float(rows[0]["train/l_r"])
+        > 1e-3
+        * decompose(sequence, method="admm", sparsity_weight=0.009, penalty=0.05)
+        .sparse.square()
+        .sum()
+        .item()
+    )
+
+
+def test_half_the_timesteps_are_rows_whatever_the_lrm_has() -> None:
+    model = Experiment.read(small("model=six_planes")).method.model
+    times = torch.linspace(0, 1, 10)
+    assert model.rows_of_time(times, frames=10) == 5
+    default = Experiment.read(compose_plain("train", [])).method.model
+    assert (default.rows_of_time(times, frames=16), default.rows_of_time(times)) == (16, 5)
+
+
+def test_its_conversion_keeps_the_middle_frame(tmp_path: Path) -> None:
+    method = Experiment.read(small("model=nine_planes", "model.time_resolution=4")).method
+    sequence, device = moving_sequence(), torch.device("cpu")
+    cache = StageCache(tmp_path)
+    parts = decompose_stage(sequence, method.decomposition, cache, device)
+    size = sequence.shape[-1]
+    model = compose_plain("train", ["recipe=paper", "model=nine_planes", "model.time_resolution=4"])
+    model["model"]["resolution"] = size
+    settings = Experiment.read(model).method.model
+    planes = convert_stage(parts, settings, method.decomposition, 0, cache, device).planes
+    middle = parts.low_rank[len(sequence) // 2]
+    for index, name in enumerate(("xy", "xz", "yz")):
+        torch.testing.assert_close(planes[name], middle[index], rtol=0, atol=0)
+    assert all((planes[name] == 1).all() for name in TIME_PLANES["nine"])

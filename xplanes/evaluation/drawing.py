@@ -1,0 +1,260 @@
+"""What the viewer shows: pictures of a field from any camera, cropped, and its floaters."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from xplanes.rendering.base import RayRenderer
+from xplanes.rendering.grid_renderer import GridRenderer
+from xplanes.rendering.pictures import depth_picture
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.silhouettes import may_hold
+from xplanes.scenes.views import Views, camera_rays
+from xplanes.training.evaluation import VISIBLE, spread
+
+MODES = ("colour", "depth", "opacity", "floaters")
+
+NEAREST = 4
+"""Training images, those nearest in time, that tell floaters."""
+
+SLACK = 0.02
+"""Distance from a silhouette, in the field's frame, at which something may still belong to it."""
+
+RED = (0.9, 0.1, 0.1)
+
+OUTSIDE = 1.0
+"""Signed distance of what is left out; far from the surface, where nothing is seen."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What a picture is to show.
+
+    Attributes:
+        pose: Camera-to-world matrix, where the world is the field's frame. [4, 4]
+        time: From 0 to 1.
+        fov: Vertical field of view, in radians.
+        height: Rows.
+        aspect: Columns per row.
+        mode: One of `MODES`.
+        box: Least and largest corner of what is shown, in the field's frame; None for all. [2, 3]
+    """
+
+    pose: Tensor
+    time: float
+    fov: float
+    height: int
+    aspect: float
+    mode: str = "colour"
+    box: Tensor | None = None
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return max(1, round(self.height * self.aspect))
+
+    def rays(self) -> tuple[Tensor, Tensor]:
+        """Rays through all pixels, row by row. [H W, 3], [H W, 3]"""
+        focal = 0.5 * self.height / math.tan(0.5 * self.fov)
+        return camera_rays(self.pose, focal, self.height, self.width)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture, and what lies in front of what in it.
+
+    Attributes:
+        colours: From 0 to 1. [H, W, 3]
+        depth: Distance along the optical axis of what stops at least half of the light; infinity
+            elsewhere. [H, W]
+    """
+
+    colours: Tensor
+    depth: Tensor
+
+
+class Masked:
+    """A field that is empty in some places; all else is the field's own.
+
+    Args:
+        field: Any field that a renderer takes.
+        keep: Tells of points [N, 3] which of them are not emptied. bool [N]
+    """
+
+    def __init__(self, field: Any, keep: Callable[[Tensor], Tensor]) -> None:
+        self._field, self._keep = field, keep
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._field, name)
+
+    def __call__(self, points: Tensor, times: Tensor, *directions: Tensor) -> tuple[Tensor, Tensor]:
+        """As `RadianceField.forward`."""
+        colour, density = self._field(points, times, *directions)
+        return colour, density * self._keep(points)
+
+    def geometry(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+        """As `ViewDependentField.geometry`."""
+        density, features = self._field.geometry(points, times)
+        return density * self._keep(points), features
+
+    def distance_and_slope(self, points: Tensor, times: Tensor) -> tuple[Tensor, ...]:
+        """As that of a field of signed distances."""
+        distance, *others = self._field.distance_and_slope(points, times)
+        return torch.where(self._keep(points), distance, OUTSIDE), *others
+
+
+def draw(
+    field: Any,
+    renderer: RayRenderer,
+    shot: Shot,
+    *,
+    views: Views,
+    frame: Frame,
+    background: Tensor,
+    at_once: int = 8192,
+    stop: Callable[[], bool] = lambda: False,
+) -> Picture | None:
+    """Render a picture.
+
+    Args:
+        field: The field.
+        renderer: Renders it.
+        shot: What to show.
+        views: Training views, whose silhouettes tell floaters.
+        frame: The field's frame.
+        background: Colour behind the scene. [3]
+        at_once: Rays after which ``stop`` is asked.
+        stop: Whether the picture is no longer wanted.
+
+    Returns:
+        The picture on the CPU; None once ``stop`` says so.
+    """
+    device, box = renderer.device, shot.box
+    background = background.to(device)
+    shown, solid = field, renderer
+    if box is not None or shot.mode == "floaters":
+        # What the grid knows to be opaque may be left out, and hides nothing then.
+        solid = replace(renderer, occlusion=0.0) if isinstance(renderer, GridRenderer) else renderer
+    if box is not None:
+        shown = Masked(field, in_box(box.to(device)))
+    outside = None
+    if shot.mode == "floaters":
+        outside = Masked(shown, ruled_out(views, frame, shot.time))
+    origins, directions = shot.rays()
+    moved = shift(renderer, shot.pose[:3, 3], views, frame)
+    parts: list[Tensor] = []
+    for rays in zip(
+        (origins + moved * directions).split(at_once), directions.split(at_once), strict=True
+    ):
+        if stop():
+            return None
+        given = rays[0].to(device), rays[1].to(device), shot.time, background
+        seen = (solid if box is not None else renderer).image(shown, *given)
+        columns = [seen["colour"], seen["opacity"][:, None], seen["depth"][:, None]]
+        if outside is not None:
+            columns.append(solid.image(outside, *given)["opacity"][:, None])
+        parts.append(torch.cat(columns, dim=1).float().cpu())
+    image = torch.cat(parts).view(shot.height, shot.width, -1)
+    colours, opacity, depth = image[..., :3], image[..., 3], image[..., 4] + moved
+    forward = (directions @ -shot.pose[:3, 2]).view_as(depth)
+    if shot.mode == "depth":
+        colours = depth_picture(depth, opacity)
+    elif shot.mode == "opacity":
+        colours = opacity[..., None].expand_as(colours)
+    elif outside is not None:
+        colours = mark(colours, image[..., 5])
+    nearest = torch.where(opacity >= 0.5, depth * forward, torch.inf)
+    return Picture(colours.clamp(0, 1), nearest)
+
+
+def shift(renderer: RayRenderer, position: Tensor, views: Views, frame: Frame) -> float:
+    """How far along its rays a camera must be moved for a renderer with near and far bounds.
+
+    These bounds hold for cameras as far from the scene as the training cameras; from elsewhere they
+    would cut it off. A camera among things stays where its near bound begins behind it.
+
+    Args:
+        renderer: Has ``near``, in the field's frame, if it has such bounds.
+        position: The camera's, in the field's frame. [3]
+        views: Training views.
+        frame: The field's frame.
+    """
+    near = getattr(renderer, "near", None)
+    if near is None:
+        return 0.0
+    usual = frame.points(views.camera_to_world[:, :3, 3]).norm(dim=-1).median()
+    return max(float(position.norm() - usual), -near)
+
+
+def mark(colours: Tensor, share: Tensor) -> Tensor:
+    """A pale grey picture with floaters in red, where they are visible at all.
+
+    Args:
+        colours: The picture. [H, W, 3]
+        share: Opacity of the floaters. [H, W]
+    """
+    grey = (0.4 + 0.6 * colours.mean(dim=-1, keepdim=True)).expand_as(colours)
+    strength = torch.where(share > VISIBLE, 0.5 + 0.5 * share, 0)[..., None]
+    return torch.lerp(grey, colours.new_tensor(RED).expand_as(colours), strength)
+
+
+def in_box(box: Tensor) -> Callable[[Tensor], Tensor]:
+    """Tells of points [N, 3] whether they lie in a box [2, 3]."""
+    return lambda points: ((points >= box[0]) & (points <= box[1])).all(dim=-1)
+
+
+def ruled_out(views: Views, frame: Frame, time: float) -> Callable[[Tensor], Tensor]:
+    """Tells of points of the field's frame [N, 3] whether training images show them to be empty.
+
+    These are the images nearest in time, of a static scene some from all over it. What lies out of
+    their sight, or within `SLACK` of a silhouette, is not ruled out.
+    """
+    if views.is_static:
+        chosen = torch.tensor(spread(NEAREST, len(views)))
+    else:
+        chosen = (views.times - time).abs().argsort(stable=True)[:NEAREST]
+    near, radius = views.subset(chosen), SLACK / frame.scale
+
+    def found(points: Tensor) -> Tensor:
+        held = may_hold(near, frame.to_world(points.cpu()), radius=radius).all(dim=0)
+        return ~held.to(points.device)
+
+    return found
+
+
+def camera_outlines(views: Views, frame: Frame, length: float) -> tuple[Tensor, Tensor]:
+    """Frustums of training cameras as lines; lenses that distort have curved borders.
+
+    Args:
+        views: Training views; at most `MOST_CAMERAS` of them are drawn, spread evenly.
+        frame: The field's frame.
+        length: Distance from a camera's centre to its image's corners, in the field's frame.
+
+    Returns:
+        Ends of line segments in the field's frame [L, 2, 3], and the time of each [L].
+    """
+    lines, times = [], []
+    for index in spread(MOST_CAMERAS, len(views)):
+        height, width = views.size(index)
+        steps = 1 if views.intrinsics.lens(index) is None else 8
+        share = torch.arange(steps) / steps
+        # Around the image: along the top, down the right side, and so on.
+        there, back, none, all_ = share, 1 - share, torch.zeros(steps), torch.ones(steps)
+        columns = torch.cat([there, all_, back, none]) * width - 0.5
+        rows = torch.cat([none, there, all_, back]) * height - 0.5
+        number = torch.full_like(rows, index, dtype=torch.long)
+        origins, directions = frame.rays(*views.pixel_rays(number, rows, columns))
+        border = origins + length * directions
+        around = torch.stack([border, border.roll(-1, dims=0)], dim=1)
+        corners = torch.stack([origins, border], dim=1)[::steps]
+        lines += [around, corners]
+        times.append(views.times[index].expand(len(around) + len(corners)))
+    return torch.cat(lines), torch.cat(times)
+
+
+MOST_CAMERAS = 100
+"""Training cameras that are drawn at most."""

@@ -1,0 +1,132 @@
+"""The viewer of a field that is training: `viewer=true`."""
+
+import logging
+import math
+import time
+from typing import Annotated, Any
+
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback
+
+from xplanes.errors import ConfigError
+from xplanes.evaluation.viewer import HOST, PORT, Viewer, check_address
+from xplanes.settings import Range
+from xplanes.training.clock import find_callback, off_clock, training_seconds
+from xplanes.training.interrupt import Interrupt
+from xplanes.training.module import RadianceModule
+
+logger = logging.getLogger(__name__)
+
+PATIENCE = 1.0
+"""Seconds that training waits for a picture at most, or as long as its last step took."""
+
+TOLD_SECONDS = 0.5
+"""From one line about training to the next."""
+
+
+class LiveViewer(Callback):
+    """Shows the field in the browser while it trains, where training can be paused.
+
+    Pictures are drawn between steps, off the training clock, and change nothing in what is trained.
+
+    Args:
+        enabled: Whether there is a viewer; `viewer=true` sets it.
+        host: Address that is served; 0.0.0.0 for all of this machine's.
+        port: Port that is served; 0 for any free one.
+
+    Attributes:
+        viewer: The viewer; None before training and after it.
+
+    Raises:
+        ConfigError: If the address cannot be served.
+        MissingExtraError: Without the extra ``viewer``.
+    """
+
+    def __init__(
+        self,
+        enabled: bool = True,
+        host: str = HOST,
+        port: Annotated[int, Range(0, 65535)] = PORT,
+    ) -> None:
+        if enabled:
+            check_address(host, port, key="callbacks.viewer.{}=")
+        self.enabled, self.host, self.port = enabled, host, port
+        self.viewer: Viewer | None = None
+        self._told = self._drawn = 0.0
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        if self.enabled and trainer.world_size > 1:
+            raise ConfigError(
+                f"viewer=true with trainer.devices={trainer.world_size}: a viewer shows a field "
+                "that one process trains; leave one of them out"
+            )
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not self.enabled:
+            return
+        assert isinstance(pl_module, RadianceModule)
+        data: Any = trainer.datamodule  # type: ignore[attr-defined]
+        self.viewer = Viewer(
+            pl_module,
+            data.scene,
+            lambda: pl_module.renderer_now,
+            host=self.host,
+            port=self.port,
+            trains=True,
+        )
+        self._drawn = time.monotonic()
+        print(f"viewer      http://localhost:{self.viewer.port}", flush=True)
+
+    def on_train_batch_start(
+        self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
+    ) -> None:
+        assert isinstance(pl_module, RadianceModule)
+        if self.viewer is None or not pl_module.between_updates:
+            return
+        with off_clock(trainer):
+            try:
+                self._serve(self.viewer, trainer, pl_module)
+            except RuntimeError as error:  # Such as a device without memory for a picture.
+                logger.warning("the viewer is closed, training goes on: %s", error)
+                self._close()
+        self._drawn = time.monotonic()
+
+    def _serve(self, viewer: Viewer, trainer: Trainer, module: RadianceModule) -> None:
+        viewer.step = trainer.global_step
+        if viewer.is_watched and time.monotonic() - self._told > TOLD_SECONDS:
+            viewer.tell(status(trainer, module))
+            self._told = time.monotonic()
+        # For as long as the step took: a camera need not wait for a step at each picture.
+        stepped = time.monotonic() - self._drawn
+        viewer.patience = max(PATIENCE, stepped)
+        viewer.catch_up(stepped)
+        interrupt = find_callback(trainer, Interrupt)
+        while viewer.paused and not (interrupt is not None and interrupt.asked):
+            viewer.patience = math.inf
+            viewer.catch_up(PATIENCE)
+            viewer.wait()
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._close()
+
+    def on_exception(
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
+    ) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        viewer, self.viewer = self.viewer, None
+        if viewer is not None:
+            viewer.close()
+
+
+def status(trainer: Trainer, module: RadianceModule) -> str:
+    """Step, seconds and PSNR, in Markdown."""
+    most = f" of {trainer.max_steps}" if trainer.max_steps > 0 else ""
+    parts = [f"**step {trainer.global_step}**{most}, {training_seconds(trainer):.0f} s"]
+    parts += [
+        f"{name.split('/')[0] if '/' in name else 'train'} {value:.2f} dB"
+        for name, value in module.last.items()
+        if name.rsplit("/", 1)[-1] == "psnr"
+    ]
+    return "  \n".join([parts[0], ", ".join(parts[1:])])

@@ -1,0 +1,247 @@
+"""Contact sheets of runs: one view as several runs show it, or as one run shows it step by step.
+
+Everything comes from the pictures that runs write while they train (``media/``).
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from PIL import Image, ImageDraw, ImageFont
+
+from xplanes.errors import ConfigError
+from xplanes.evaluation.curves import SCENE, run_label
+from xplanes.evaluation.sweep import RunRow, read_rows
+from xplanes.evaluation.tabulate import SEED, align, differing
+from xplanes.files import replacing
+from xplanes.metrics import psnr
+from xplanes.rendering.pictures import STRIP
+
+WHAT = ("runs", "steps", "parts")
+"""runs: a row per scene, a column per run. steps: a row per run, a column per step. parts: low-rank
+and sparse part of each run's triplanes."""
+
+LINE, GAP = 16, 4
+"""Pixels of a line of text, and between tiles."""
+
+_STEP = re.compile(r"step(\d+)")
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A picture of a sheet, with what is written below it."""
+
+    picture: Image.Image
+    caption: str
+
+
+def write_sheet(
+    folder: Path,
+    out: Path | None = None,
+    *,
+    what: str = "runs",
+    show: str = "colour",
+    view: str | None = None,
+    steps: Sequence[int] | None = None,
+    size: int = 160,
+) -> Path:
+    """Write a contact sheet of all runs in a folder.
+
+    Args:
+        folder: A run, a sweep, or any folder of runs.
+        out: The picture, a PNG; ``folder/sheet.png`` when None.
+        what: One of `WHAT`.
+        show: One of `xplanes.rendering.pictures.STRIP`: what is shown of a view.
+        view: Name of the view, as in ``media``; the middle one of those that all runs of a scene
+            show when None.
+        steps: Steps to show; all, or with "runs" the last, when None.
+        size: Pixels of a tile's longer side.
+
+    Raises:
+        ConfigError: If there are no runs or pictures, or no such view or step.
+    """
+    out = out or folder / "sheet.png"
+    check_what(what)
+    if out.suffix != ".png":
+        raise ConfigError(f"{out}: a contact sheet must end in .png")
+    if size < 16:
+        raise ConfigError(f"size={size}: a tile must have 16 pixels at least")
+    if not folder.is_dir():
+        raise ConfigError(f"{folder} is not a folder")
+    rows = align(read_rows(folder))
+    if not rows:
+        raise ConfigError(f"{folder}: no runs in it (folders with run.json)")
+    found = {_path(folder, row): row for row in rows}
+    over = [name for name in differing(rows) if name not in (SEED, SCENE)]
+    if what == "parts":
+        lines = _parts(found, over)
+    else:
+        lines = _views(found, over, what, show, view, steps, size)
+    with replacing(out) as temporary:
+        _assemble(lines).save(temporary, format="PNG", optimize=True)
+    return out
+
+
+def check_what(what: str | None) -> None:
+    """Refuse a kind of sheet that there is not.
+
+    Raises:
+        ConfigError: If it is neither None nor one of `WHAT`.
+    """
+    if what is not None and what not in WHAT:
+        raise ConfigError(f"sheet={what}: must be null or one of {', '.join(WHAT)}")
+
+
+def _path(folder: Path, row: RunRow) -> Path:
+    inside = folder / row.name
+    return inside if inside.is_dir() else folder
+
+
+def _parts(found: dict[Path, RunRow], over: Sequence[str]) -> list[tuple[str, list[Tile]]]:
+    lines = []
+    for path, row in found.items():
+        picture = path / "media" / "decomposition.png"
+        if picture.is_file():
+            caption = "/".join(str(part.get("rank")) for part in row.parts.values())
+            tile = Tile(Image.open(picture).convert("RGB"), f"rank of xy/xz/yz: {caption}")
+            lines.append((_title(row, over), [tile]))
+    if not lines:
+        raise ConfigError(
+            "no run has media/decomposition.png: only runs that an LRM initialises have one"
+        )
+    return lines
+
+
+def _title(row: RunRow, over: Sequence[str]) -> str:
+    label = run_label(row, over) if over else ""
+    return " · ".join(filter(None, (str(row.settings.get(SCENE, "")), label)))
+
+
+def _views(
+    found: dict[Path, RunRow],
+    over: Sequence[str],
+    what: str,
+    show: str,
+    view: str | None,
+    steps: Sequence[int] | None,
+    size: int,
+) -> list[tuple[str, list[Tile]]]:
+    if show not in STRIP[1:]:
+        raise ConfigError(f"show={show}: must be one of {', '.join(STRIP[1:])}")
+    pictures = {path: _pictures(path) for path in found}
+    pictures = {path: taken for path, taken in pictures.items() if taken}
+    if not pictures:
+        raise ConfigError(
+            "no run has pictures of views (media/step*/*.png): callbacks.evaluation writes them"
+        )
+    scenes: dict[str, list[Path]] = {}
+    for path in pictures:
+        scenes.setdefault(str(found[path].settings.get(SCENE, "")), []).append(path)
+    lines = []
+    for scene, paths in scenes.items():
+        name = _view(scene, [pictures[path] for path in paths], view)
+        cut = _cutter(size, STRIP.index(show))
+        truth = _cutter(size, 0)
+        tiles: list[Tile] = []
+        for path in paths:
+            shown = _steps(path, pictures[path], name, steps, last=what == "runs")
+            if what == "steps" or not tiles:
+                tiles = [Tile(truth(shown[max(shown)]), f"{name}, true")]
+            for step, strip in shown.items():
+                score = f"{_score(strip):.2f} dB"
+                words = f"step {step}" if what == "steps" else run_label(found[path], over)
+                tiles.append(Tile(cut(strip), f"{words}\n{score}"))
+            if what == "steps":
+                lines.append((_title(found[path], over), tiles))
+        if what == "runs":
+            lines.append((scene, tiles))
+    return lines
+
+
+def _pictures(run: Path) -> dict[int, dict[str, Path]]:
+    """Pictures of a run by step and name of the view."""
+    taken: dict[int, dict[str, Path]] = {}
+    for folder in sorted((run / "media").glob("step*")):
+        if (match := _STEP.fullmatch(folder.name)) is not None:
+            named = {path.stem: path for path in sorted(folder.glob("*.png"))}
+            if named:
+                taken[int(match[1])] = named
+    return taken
+
+
+def _view(scene: str, runs: Sequence[dict[int, dict[str, Path]]], wanted: str | None) -> str:
+    """The view that all runs show at all of their steps."""
+    common = set.intersection(*(set(named) for taken in runs for named in taken.values()))
+    if not common:
+        raise ConfigError(f"the runs of {scene} have no view in common: train them on equal data")
+    if wanted is not None and wanted not in common:
+        raise ConfigError(f"view={wanted}: the runs of {scene} show {', '.join(sorted(common))}")
+    return wanted or sorted(common)[len(common) // 2]
+
+
+def _steps(
+    run: Path,
+    taken: dict[int, dict[str, Path]],
+    name: str,
+    wanted: Sequence[int] | None,
+    *,
+    last: bool,
+) -> dict[int, Image.Image]:
+    chosen = wanted or ([max(taken)] if last else sorted(taken))
+    for step in chosen:
+        if step not in taken:
+            known = ", ".join(map(str, sorted(taken)))
+            raise ConfigError(f"steps={step}: {run.name} has pictures of the steps {known}")
+    return {step: Image.open(taken[step][name]).convert("RGB") for step in chosen}
+
+
+def _cutter(size: int, place: int) -> Callable[[Image.Image], Image.Image]:
+    """Cuts one picture out of a strip, and enlarges or reduces it."""
+
+    def cut(strip: Image.Image) -> Image.Image:
+        width = strip.width // len(STRIP)
+        tile = strip.crop((place * width, 0, (place + 1) * width, strip.height))
+        factor = size / max(tile.size)
+        shape = (max(1, round(tile.width * factor)), max(1, round(tile.height * factor)))
+        return tile.resize(shape, Image.Resampling.LANCZOS)
+
+    return cut
+
+
+def _score(strip: Image.Image) -> float:
+    """PSNR of the second picture of a strip against the first."""
+    width = strip.width // len(STRIP)
+    flat = torch.frombuffer(bytearray(strip.tobytes()), dtype=torch.uint8)
+    both = flat.view(strip.height, strip.width, 3).float() / 255
+    return psnr(both[:, width : 2 * width], both[:, :width])
+
+
+def _assemble(lines: Sequence[tuple[str, Sequence[Tile]]]) -> Image.Image:
+    """Titled rows of tiles with captions, on white."""
+    font = ImageFont.load_default(11)
+    boxes = []
+    for _, tiles in lines:
+        text = LINE * max(tile.caption.count("\n") + 1 for tile in tiles)
+        boxes.append((LINE, max(tile.picture.height for tile in tiles), text))
+    wide = [
+        max(tile.picture.width, max(font.getlength(line) for line in tile.caption.split("\n")))
+        for _, tiles in lines
+        for tile in tiles
+    ]
+    cell = int(max(wide)) + GAP
+    columns = max(len(tiles) for _, tiles in lines)
+    width = max(cell * columns, *(int(font.getlength(title)) + GAP for title, _ in lines)) + GAP
+    height = sum(map(sum, boxes)) + GAP * (2 * len(lines) + 1)
+    sheet = Image.new("RGB", (width, height), "white")
+    draw = ImageDraw.Draw(sheet)
+    top = GAP
+    for (title, tiles), (head, tall, text) in zip(lines, boxes, strict=True):
+        draw.text((GAP, top), title, fill="black", font=font)
+        for column, tile in enumerate(tiles):
+            left = GAP + column * cell
+            sheet.paste(tile.picture, (left, top + head))
+            draw.text((left, top + head + tall + 1), tile.caption, fill="black", font=font)
+        top += head + tall + text + 2 * GAP
+    return sheet

@@ -11,6 +11,25 @@ if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Make the device known before the first backward pass, which counts the devices."""
+    if any("fake_gpu" in getattr(item, "fixturenames", ()) for item in items):
+        from tests.fake_device import register
+
+        register()
+
+
+@pytest.fixture
+def fake_gpu(monkeypatch: pytest.MonkeyPatch) -> torch.device:
+    """A device that refuses what a GPU would, see `tests.fake_device`."""
+    from tests import fake_device
+
+    if fake_device.SETUP is None:
+        pytest.skip(f"torch {torch.__version__} takes no devices written in Python")
+    monkeypatch.setattr(torch, "Generator", fake_device.FakeGenerator)
+    return torch.device(fake_device.NAME, 0)
+
+
 @pytest.fixture(scope="session")
 def trained_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small finished run. Copy it before changing anything in it."""

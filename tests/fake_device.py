@@ -11,17 +11,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-import lightning
-import pytest
 import torch
-from lightning.pytorch.accelerators import Accelerator
-from lightning.pytorch.callbacks import Callback
-from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch import Tensor
 from torch.utils import backend_registration
 from torch.utils._pytree import tree_map_only
-
-from xplanes.training.fit import quiet_lightning
 
 aten = torch.ops.aten
 
@@ -228,7 +221,9 @@ class _Module:
     def is_initialized() -> bool:
         return True
 
-    is_available = is_initialized
+    @staticmethod
+    def is_available() -> bool:
+        return False  # Nobody else is to choose it.
 
     @staticmethod
     def _is_in_bad_fork() -> bool:
@@ -255,14 +250,15 @@ class _Module:
         return [torch.bfloat16]
 
 
+SETUP = getattr(backend_registration, "_setup_privateuseone_for_python_backend", None)
+"""None in versions of torch that take no devices written in Python."""
+
+
 def register() -> None:
-    """Make the device known to torch, once in a process."""
-    if _libraries:
+    """Make the device known to torch, once in a process, before its first backward pass."""
+    if _libraries or SETUP is None:
         return
-    setup = getattr(backend_registration, "_setup_privateuseone_for_python_backend", None)
-    if setup is None:
-        pytest.skip(f"torch {torch.__version__} takes no devices written in Python")
-    setup(NAME, backend_module=_Module())
+    SETUP(NAME, backend_module=_Module())
     library = torch.library.Library("aten", "IMPL")
 
     def empty(size: Any, *, dtype: Any = None, memory_format: Any = None, **_: Any) -> Tensor:
@@ -299,74 +295,3 @@ class FakeGenerator(torch.Generator):
             _seeds.add(seed)
         super().manual_seed(seed)
         return self
-
-
-class FakeAccelerator(Accelerator):
-    """What Lightning asks of a device."""
-
-    def setup_device(self, device: torch.device) -> None:
-        return
-
-    def teardown(self) -> None:
-        return
-
-    @staticmethod
-    def parse_devices(devices: Any) -> Any:
-        return devices
-
-    @staticmethod
-    def get_parallel_devices(devices: Any) -> list[torch.device]:
-        return [torch.device(NAME, 0)]
-
-    @staticmethod
-    def auto_device_count() -> int:
-        return 1
-
-    @staticmethod
-    def is_available() -> bool:
-        return True
-
-    @staticmethod
-    def name() -> str:
-        return NAME
-
-    def get_device_stats(self, device: Any) -> dict[str, Any]:
-        return {}
-
-
-class StepCounts(Callback):
-    """Counts of each batch, from the end of the one before: drawing and moving it included."""
-
-    def __init__(self) -> None:
-        self.steps: list[Counts] = []
-
-    def on_train_start(self, trainer: Any, pl_module: Any) -> None:
-        self._before: Counts | None = None
-        self._context = counted()
-        self._counts = self._context.__enter__()
-
-    def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
-        self._end()
-        self.steps.append(self._counts)
-        self._context = counted()
-        self._counts = self._context.__enter__()
-
-    def _end(self) -> None:
-        self._context.__exit__(None, None, None)
-
-    def on_train_end(self, trainer: Any, pl_module: Any) -> None:
-        self._end()
-
-
-def trainer(callbacks: Any = (), more: Any = (), **options: Any) -> lightning.Trainer:
-    """A Trainer on the device, without logs and files."""
-    quiet_lightning()
-    return lightning.Trainer(
-        callbacks=[*callbacks, *more],
-        strategy=SingleDeviceStrategy(torch.device(NAME, 0), accelerator=FakeAccelerator()),
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        **options,
-    )

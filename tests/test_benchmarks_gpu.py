@@ -2,6 +2,7 @@
 
 import csv
 import importlib
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,9 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from lightning.pytorch.strategies import SingleDeviceStrategy
+
+from tests import on_device
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 
@@ -48,6 +52,10 @@ def faked(gpu, monkeypatch):
                 cells = {"kernels": (10.0, "us"), "times faster": (gain, "times")}
                 row = f"{part.row}, {module.POINTS[-1]} points, {label}"
                 record.add("kernel time", row, cells)
+        elif part.section == "step":
+            record.add("step", "whole", {"time a step": (1500.0, "us"), "share": (100.0, "%")})
+        elif part.section == "preparation":
+            record.add("preparation", "LRM", {"time": (12.0, "ms")})
         else:
             psnr = state.psnr[part.row.split(", ")[1]] if part.section == "training" else 30.0
             known = {"PSNR": (psnr, "dB"), "SSIM": (0.9, ""), "steps/s": (50.0, "steps/s")}
@@ -125,6 +133,37 @@ def test_without_a_gpu_the_page_says_what_is_missing(gpu, faked, tmp_path):
     assert set(faked.begun) == begun
     assert "No CUDA GPU was found: training (random, GPU); " in page
     assert "Triton's interpreter" in page
+
+
+@pytest.mark.slow
+def test_steps_and_preparation_are_measured_where_they_run(gpu, fake_gpu, monkeypatch, tmp_path):
+    monkeypatch.setattr(
+        gpu,
+        "SingleDeviceStrategy",
+        lambda device: SingleDeviceStrategy(device, accelerator=on_device.FakeAccelerator()),
+    )
+    small = ("lrm=none", "data.resolution=16", "data.train_views=4", "data.test_views=1")
+    part = gpu.Part("step", "six planes", overrides=(*small, "data.val_views=1"))
+    record, args = gpu.Record(tmp_path / "record.json"), SimpleNamespace(work=tmp_path)
+    gpu.measure_step(record, part, args, fake_gpu)
+    gpu.measure_preparation(record, part, args, fake_gpu)
+    found = {(f.table, f.row, f.column): f.value for f in record.figures}
+    whole, inside = (found["step", row, "time a step"] for row in ("whole", "in kernels"))
+    assert 0 < inside <= whole
+    rows = [f for f in record.figures if f.table == "step" and f.column == "time a step"]
+    assert len(rows) == gpu.KERNELS + 2
+    times = [f.value for f in rows[2:]]
+    assert times == sorted(times, reverse=True)
+    prepared = {row: value for (part, row, _), value in found.items() if part == "preparation"}
+    assert [row.split(",")[0] for row in prepared] == ["LRM tiny", "LRM mini"] + 2 * ["robust PCA"]
+    assert [row.split(", ")[-1] for row in list(prepared)[2:]] == ["fake", "cpu"]
+    assert all(value > 0 for value in prepared.values())
+
+
+def test_seconds_to_a_goal(gpu):
+    curve = [{"seconds": f"{n}", "psnr": f"{20 + n}"} for n in (1, 4, 5, 6)]
+    assert gpu.first_at(curve, 24.5) == 5
+    assert math.isnan(gpu.first_at(curve, 30))
 
 
 def test_errors_of_kernels_are_seen(gpu, tmp_path):

@@ -15,7 +15,7 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import Callback
 
-from tests import fake_device
+from tests import fake_device, on_device
 from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX, baseline_config
 from tests.lrm.reduced import SIDES
 from tests.preparation.sequences import moving_sequence
@@ -50,19 +50,12 @@ CONFIGS = {
 }
 
 
-@pytest.fixture
-def device(monkeypatch):
-    fake_device.register()
-    monkeypatch.setattr(torch, "Generator", fake_device.FakeGenerator)
-    return torch.device(fake_device.NAME, 0)
-
-
-def trained(name, steps, *more, trainer=fake_device.trainer, losses=None):
+def trained(name, steps, *more, trainer=on_device.trainer, losses=None):
     """A module after some steps, its data, and the counts of each step."""
     module = RadianceModule(CONFIGS[name](*more))
     module.method = replace(module.method, losses=losses or {})
     data = SceneDataModule.of(ball_scene(6, 16))
-    counts = fake_device.StepCounts()
+    counts = on_device.StepCounts()
     trainer(max_steps=steps, callbacks=[counts], limit_val_batches=0).fit(module, data)
     return module, data, counts.steps
 
@@ -77,12 +70,12 @@ on_the_cpu = functools.partial(
 )
 
 
-def test_the_device_refuses_what_a_gpu_refuses_and_counts_what_it_is_asked(device):
+def test_the_device_refuses_what_a_gpu_refuses_and_counts_what_it_is_asked(fake_gpu):
     with fake_device.counted() as counts:
-        there = torch.arange(6, device=device).float()
+        there = torch.arange(6, device=fake_gpu).float()
         assert counts.totals == (2, 0, 0)
-        assert (there + torch.tensor(1.0)).device == device  # A single number is passed along.
-        moved = torch.ones(2).to(device)
+        assert (there + torch.tensor(1.0)).device == fake_gpu  # A single number is passed along.
+        moved = torch.ones(2).to(fake_gpu)
         assert counts.totals == (3, 0, 1)
         assert (there[there > 2] + 1).tolist() == [4.0, 5.0, 6.0]
         assert counts.waits == {"index": 1, "to the CPU": 1}
@@ -91,19 +84,19 @@ def test_the_device_refuses_what_a_gpu_refuses_and_counts_what_it_is_asked(devic
     with pytest.raises(RuntimeError, match="two devices, fake and cpu"):
         moved + torch.ones(2)
     with pytest.raises(RuntimeError, match="generator of the CPU"):
-        torch.rand(2, device=device, generator=torch.Generator())
-    own = torch.Generator(device).manual_seed(0)
+        torch.rand(2, device=fake_gpu, generator=torch.Generator())
+    own = torch.Generator(fake_gpu).manual_seed(0)
     with fake_device.counted() as after:
-        assert torch.rand(2, device=device, generator=own).device == device
+        assert torch.rand(2, device=fake_gpu, generator=own).device == fake_gpu
     assert after.totals == (1, 0, 0)
     assert counts.operations.total() < 12  # Nothing was added since.
 
 
 @pytest.mark.parametrize("name", SIDES)
-def test_an_lrm_encodes_there(device, tmp_path, name):
+def test_an_lrm_encodes_there(fake_gpu, tmp_path, name):
     frames = frames_of(3)
     crop = square_crop(*frames.shape[1:3])
-    places = torch.device("cpu"), device
+    places = torch.device("cpu"), fake_gpu
     found = [
         encode(model_of(name), "key", frames, crop, StageCache(None), place, batch=2)
         for place in places
@@ -112,7 +105,7 @@ def test_an_lrm_encodes_there(device, tmp_path, name):
 
 
 @pytest.mark.filterwarnings("ignore:robust PCA stopped")
-def test_triplanes_become_planes_there(device):
+def test_triplanes_become_planes_there(fake_gpu):
     def planes(place):
         parts = decompose(moving_sequence(6, 4, 12).to(place), max_iterations=20)
         found = [space_planes(parts.low_rank, static="mean", resolution=16).cpu()]
@@ -124,12 +117,12 @@ def test_triplanes_become_planes_there(device):
             found += [time.cpu(), torch.tensor(left)]
         return found
 
-    for there, here in zip(planes(device), planes("cpu"), strict=True):
+    for there, here in zip(planes(fake_gpu), planes("cpu"), strict=True):
         torch.testing.assert_close(there, here, atol=1e-4, rtol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["six", pytest.param("nine", marks=pytest.mark.slow)])
-def test_training_there_comes_to_the_numbers_of_plain_torch(device, monkeypatch, name):
+def test_training_there_comes_to_the_numbers_of_plain_torch(fake_gpu, monkeypatch, name):
     monkeypatch.setenv("XPLANES_CPU_LOOPS", "0")
     monkeypatch.setattr(DeviceBatches, "can_serve", lambda *_: False)
     # What draws other random numbers is left out.
@@ -148,7 +141,7 @@ def test_training_there_comes_to_the_numbers_of_plain_torch(device, monkeypatch,
         torch.testing.assert_close(ours.cpu(), theirs, atol=1e-4, rtol=1e-4)
 
 
-def test_what_a_step_shows_is_read_now_and_then(device):
+def test_what_a_step_shows_is_read_now_and_then(fake_gpu):
     looked = [batches for batches in range(1, 100) if due(batches)]
     assert looked == [1, 2, 4, 8, 16, 32, 64, 96]
     module, _, steps = trained("six", 33)
@@ -179,7 +172,7 @@ class Broken(LossTerm):
 
 
 @pytest.mark.parametrize("gradient", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_steps_that_are_not_finite_are_left_out(device, monkeypatch, gradient):
+def test_steps_that_are_not_finite_are_left_out(fake_gpu, monkeypatch, gradient):
     monkeypatch.setattr(Broken, "gradient", gradient)
     monkeypatch.setattr(Broken, "steps", range(3, 6))
     seen = {}
@@ -188,7 +181,7 @@ def test_steps_that_are_not_finite_are_left_out(device, monkeypatch, gradient):
         def on_train_batch_end(self, trainer, pl_module, *_):
             seen[trainer.global_step] = pl_module.field.space.detach().cpu().clone()
 
-    made = functools.partial(fake_device.trainer, more=[Watch()])
+    made = functools.partial(on_device.trainer, more=[Watch()])
     module, _, _ = trained("six", 9, trainer=made, losses={"broken": Broken(weight=1.0)})
     assert torch.equal(seen[3], seen[6])
     assert not torch.equal(seen[2], seen[3])
@@ -199,7 +192,7 @@ def test_steps_that_are_not_finite_are_left_out(device, monkeypatch, gradient):
         trained("six", 32, losses={"broken": Broken(weight=1.0)})
 
 
-def test_a_background_is_the_same_without_a_list_of_rays(device):
+def test_a_background_is_the_same_without_a_list_of_rays(fake_gpu):
     generator = torch.Generator().manual_seed(0)
     background = Background(4, 8, width=8, samples=5, precision="32")
     origins, directions = torch.randn(2, 12, 3, generator=generator)
@@ -208,8 +201,8 @@ def test_a_background_is_the_same_without_a_list_of_rays(device):
     opacity[:4] = 1
     field = SimpleNamespace(background=background)
     here = behind(field, origins, directions, opacity, None)
-    field.background = background.to(device)
-    rays = [part.to(device) for part in (origins, directions, opacity)]
+    field.background = background.to(fake_gpu)
+    rays = [part.to(fake_gpu) for part in (origins, directions, opacity)]
     with fake_device.counted() as counts:
         there = behind(field, *rays, None)
     assert counts.totals[1:] == (0, 0)
@@ -217,11 +210,11 @@ def test_a_background_is_the_same_without_a_list_of_rays(device):
     assert (here[:4] == 0).all()
 
 
-def test_warming_up_does_all_of_a_step_and_changes_nothing(device):
+def test_warming_up_does_all_of_a_step_and_changes_nothing(fake_gpu):
     module, data, _ = trained("six", 2)
     before = {name: value.cpu().clone() for name, value in module.state_dict().items()}
     with fake_device.counted() as counts:
-        warm_up(module, data, device)
+        warm_up(module, data, fake_gpu)
     for name in ("_fused_adam_", "scatter_reduce_", "grid_sampler_2d_backward"):
         assert counts.operations[name], name
     assert counts.waits["synchronize"] == 1
@@ -230,15 +223,15 @@ def test_warming_up_does_all_of_a_step_and_changes_nothing(device):
     assert all(p.grad is None for p in module.parameters())
 
 
-def test_the_clock_counts_what_the_device_has_still_to_do(device, monkeypatch):
+def test_the_clock_counts_what_the_device_has_still_to_do(fake_gpu, monkeypatch):
     """Whoever looks at the time waits for the device first; steps do not."""
     clock = TrainingClock()
     with fake_device.counted() as counts:
-        trained("kplanes", 3, trainer=functools.partial(fake_device.trainer, more=[clock]))
+        trained("kplanes", 3, trainer=functools.partial(on_device.trainer, more=[clock]))
     assert clock.seconds > 0
     assert counts.waits["synchronize"] == 1
     lag = 0.3
-    module = SimpleNamespace(device=device)
+    module = SimpleNamespace(device=fake_gpu)
     lagging = SimpleNamespace(should_stop=False, world_size=1)
     clock = TrainingClock()
     monkeypatch.setattr(torch.fake, "synchronize", lambda: time.sleep(lag))
@@ -253,13 +246,13 @@ def test_the_clock_counts_what_the_device_has_still_to_do(device, monkeypatch):
     assert clock.seconds >= 2 * lag
 
 
-def test_an_lrm_whose_frames_are_cached_stays_where_it_is(device, tmp_path):
+def test_an_lrm_whose_frames_are_cached_stays_where_it_is(fake_gpu, tmp_path):
     model, frames, cache = model_of(), frames_of(2), StageCache(tmp_path)
     crop = square_crop(*frames.shape[1:3])
-    first = encode(model, "key", frames, crop, cache, device, batch=2)
+    first = encode(model, "key", frames, crop, cache, fake_gpu, batch=2)
     model = model_of()
     with fake_device.counted() as counts:
-        again = encode(model, "key", frames, crop, cache, device, batch=2)
+        again = encode(model, "key", frames, crop, cache, fake_gpu, batch=2)
     assert counts.totals == (0, 0, 0)
     assert torch.equal(first.triplanes, again.triplanes)
 
@@ -275,14 +268,14 @@ BUDGETS = {
 
 
 @pytest.mark.parametrize("name", BUDGETS)
-def test_steps_keep_to_their_budget_and_views_are_scored(device, name):
+def test_steps_keep_to_their_budget_and_views_are_scored(fake_gpu, name):
     module, data, steps = trained(name, max(BUDGETS[name]) + 1)
     for step, (most, waits, copies) in BUDGETS[name].items():
         counts = steps[step]
         assert counts.operations.total() <= most, counts.operations
         assert (counts.waits.total(), counts.copies.total()) == (waits, copies), counts
     assert all(p.isfinite().all() for p in module.parameters())
-    module.to(device)
+    module.to(fake_gpu)
     views, background = data.scene.splits["test"], data.scene.background
     score, images = score_view(module.field, module.renderer, module.frame, views, 0, background)
     assert 0 < score.psnr < 60

@@ -22,12 +22,6 @@ def splitmix(key, place):
     return bits ^ bits >> 31
 
 
-@pytest.fixture
-def device():
-    fake_device.register()
-    return torch.device(fake_device.NAME, 0)
-
-
 def test_numbers_are_those_of_splitmix():
     for seed, step, stream in itertools.product((0, 3), (0, 10**9), (0, 1_000_003)):
         key = step_generator(seed, step, stream).initial_seed()
@@ -49,14 +43,14 @@ def test_numbers_are_even_and_independent():
 
 
 @pytest.mark.parametrize("background", ["white", "random", "one"])
-def test_batches_have_the_same_bits_on_every_device(device, background):
+def test_batches_have_the_same_bits_on_every_device(fake_gpu, background):
     batches = batches_of(background=background, background_jitter=0.1, seed=2, rank=1)
-    here, there = DeviceBatches(batches, CPU), DeviceBatches(batches, device)
+    here, there = DeviceBatches(batches, CPU), DeviceBatches(batches, fake_gpu)
     for step in (0, 7, 10**9):
         with fake_device.counted() as counts:
             drawn = there.draw(step)
         assert counts.totals[1:] == (0, 0)
-        assert {value.device for value in drawn.values()} == {device}
+        assert {value.device for value in drawn.values()} == {fake_gpu}
         assert same({name: value.cpu() for name, value in drawn.items()}, here.draw(step))
     assert here.draw(3).keys() == batches.draw(3).keys()
     assert not torch.equal(here.draw(3)["jitter"], here.draw(4)["jitter"])
@@ -77,13 +71,13 @@ def test_batches_are_distributed_like_those_of_the_cpu():
     assert not drawn["alpha"][moved].any()
 
 
-def test_who_can_be_served(device, monkeypatch):
+def test_who_can_be_served(fake_gpu, monkeypatch):
     batches = batches_of()
-    assert DeviceBatches.can_serve(batches, device)
+    assert DeviceBatches.can_serve(batches, fake_gpu)
     assert not DeviceBatches.can_serve(batches, CPU)
     monkeypatch.setattr("xplanes.scenes.batches.memory_left", lambda _: 3.9 * batches.views.nbytes)
-    assert not DeviceBatches.can_serve(batches, device)
+    assert not DeviceBatches.can_serve(batches, fake_gpu)
     batches.views = replace(batches.views)
     monkeypatch.setattr(type(batches.views), "is_stored", True)
     monkeypatch.setattr("xplanes.scenes.batches.memory_left", lambda _: float("inf"))
-    assert not DeviceBatches.can_serve(batches, device)
+    assert not DeviceBatches.can_serve(batches, fake_gpu)

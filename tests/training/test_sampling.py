@@ -70,9 +70,13 @@ def test_room_follows_the_samples_of_batches_and_pictures_need_none(tmp_path) ->
         return {renderer.room for renderer in (sampling._training, sampling._coarse)}
 
     assert rooms() == {10240}
-    for samples, room in ((4000, 5120), (1, 1024), (10**6, 10240)):
+    # Steps after the coarse ones have twice the samples.
+    for samples, some in ((3000, {4096, 8192}), (1, {1024}), (10**6, {10240})):
         sampling.expect(samples)
-        assert rooms() == {room}, samples
+        assert rooms() == some, samples
+    sampling.render(fog, along_the_diagonal(), TrainingState(0, 99, 99, 0))
+    sampling.expect(3000)
+    assert rooms() == {4096}
     assert sampling.renderer.room is None
     assert sampling.renderer_at(state.step).room is None
     assert settings.build(fog, Site(frame, **options))._training.room is None

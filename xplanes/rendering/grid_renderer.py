@@ -218,6 +218,7 @@ class OccupancySampler(Sampler):
         self._training = replace(renderer, thinning=settings.thinning, room=room)
         self._coarse = replace(self._training, samples=math.ceil(renderer.samples / 2))
         self._images = replace(renderer, samples=settings.render_samples)
+        self._is_coarse = settings.coarse_steps > 0
         self._coarse_images = replace(self._coarse, room=None)
 
     @property
@@ -240,8 +241,8 @@ class OccupancySampler(Sampler):
         return self._coarse_images if step < self.settings.coarse_steps else self._images
 
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
-        coarse = state.step < self.settings.coarse_steps
-        return (self._coarse if coarse else self._training).render(
+        self._is_coarse = state.step < self.settings.coarse_steps
+        return (self._coarse if self._is_coarse else self._training).render(
             field,
             rays["origins"],
             rays["directions"],
@@ -282,10 +283,13 @@ class OccupancySampler(Sampler):
                 distributed.broadcast(part, src=0)
 
     def expect(self, samples: float) -> None:
-        if self.samples is not None:
-            room = self._room(min(samples, self.samples))
-            self._training = replace(self._training, room=room)
-            self._coarse = replace(self._coarse, room=room)
+        if self.samples is None:
+            return
+        # What coarse steps show comes to twice as much in those after them.
+        finer = self._training.samples / self._coarse.samples if self._is_coarse else 1.0
+        for name, more in (("_coarse", 1.0), ("_training", finer)):
+            room = self._room(min(more * samples, self.samples))
+            setattr(self, name, replace(getattr(self, name), room=room))
 
     def _room(self, samples: float) -> int:
         """Places for batches of so many samples on average: some hold more."""

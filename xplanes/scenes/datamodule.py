@@ -191,10 +191,9 @@ class SceneDataModule(LightningDataModule):
 
     def batches(self, rank: int) -> Batches:
         """The batches of a process, for the module that is being trained, drawn on its device."""
-        if self.trainer is None:
-            return self.batches_for(None, rank)
-        batches = self.batches_for(self.trainer.lightning_module, rank)
-        device = self.trainer.strategy.root_device
+        module = None if self.trainer is None else self.trainer.lightning_module
+        batches = self.batches_for(module, rank)
+        device = getattr(module, "device", torch.device("cpu"))
         if isinstance(batches, RayBatches) and DeviceBatches.can_serve(batches, device):
             return DeviceBatches(batches, device)
         return batches

@@ -27,6 +27,7 @@ def scripts(folder: Path) -> dict[str, list[list[str]]]:
         "skips": [given],
         "rendering": [given],
         "ray_drawing": [[]],
+        "gaussian_rasteriser": [[]],
         "captures": [[]],
         "stages": [[]],
         "pareto": [given],

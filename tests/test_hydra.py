@@ -67,6 +67,7 @@ def test_options_of_hydra_work(arguments, words, tmp_path: Path) -> None:
         ("sampler.samples=3", "model.sampler.samples"),
         ("trainer.plane_lr=3", "model.plane_lr"),
         ("model.sampler.sampels=3", "model.sampler.samples"),
+        ("recpe=paper", "recipe"),
     ],
 )
 def test_unknown_keys_get_hydras_error_and_near_names(override, near, tmp_path: Path) -> None:

@@ -11,11 +11,13 @@ import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.strategies import DDPStrategy
 
 from tests.training.runs import small_config
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError
 from xplanes.scenes.errors import SceneError
+from xplanes.training.fit import Trainer
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -231,3 +233,20 @@ def test_the_script_of_the_docs_runs(tmp_path: Path, monkeypatch: pytest.MonkeyP
     exec(compile(script, "recipes.md", "exec"), {})
     assert (tmp_path / "field.ckpt").is_file()
     assert (tmp_path / "view.png").is_file()
+
+
+def test_what_a_trainer_of_ours_settles_for_gpus(tmp_path: Path) -> None:
+    """TF32 is asked for, and processes do not send each other the grid before each step."""
+    before = torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
+    options = {"accelerator": "cpu", "default_root_dir": tmp_path, "logger": False}
+    try:
+        for tf32, products in ((True, "high"), (False, "highest")):
+            Trainer(**options, tf32=tf32)
+            assert torch.get_float32_matmul_precision() == products
+            assert torch.backends.cudnn.allow_tf32 is tf32
+        shared = Trainer(**options, devices=2, strategy="ddp")
+        assert isinstance(shared.strategy, DDPStrategy)
+        assert shared.strategy._ddp_kwargs["broadcast_buffers"] is False
+    finally:
+        torch.set_float32_matmul_precision(before[0])
+        torch.backends.cudnn.allow_tf32 = before[1]

@@ -4,6 +4,7 @@ import functools
 import importlib
 import importlib.util
 import logging
+import math
 import os
 import sys
 import time
@@ -14,6 +15,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
+
+from xplanes.errors import DeviceError
 
 logger = logging.getLogger(__name__)
 
@@ -117,6 +120,7 @@ _refused: set[str] = set()
 
 def proven(
     what: str,
+    device: torch.device,
     attempt: Callable[[Callable[..., Tensor], torch.dtype], Sequence[Tensor]],
     kernels: Callable[..., Tensor],
     plain: Callable[..., Tensor],
@@ -128,10 +132,14 @@ def proven(
 
     Args:
         what: Name of the work, for the message.
+        device: Where they are tried.
         attempt: Runs one of them on a small input of some precision; returns values and gradients.
         kernels: What is tried.
         plain: Its twin.
         dtype: Type of the planes; the twin computes in float32 at least.
+
+    Raises:
+        DeviceError: If the device answers nothing any more.
     """
     exact = torch.promote_types(dtype, torch.float32)
     tolerance = 1e-4 if dtype == exact else 0.05
@@ -144,16 +152,34 @@ def proven(
                 )
     except Exception as error:
         # Whatever keeps a compiler from working is no reason to fail: there is another way.
+        reason = str(error).strip().split("\n")[0] or "no reason given"
+        _require_alive(device, what, f"{type(error).__name__}: {reason}")
         logger.warning(
             "the Triton kernels for %s are not used: %s: %s. Plain torch does the same, slower; "
             "XPLANES_GPU_KERNELS=0 hides this message.",
             what,
             type(error).__name__,
-            str(error).strip().split("\n")[0] or "no reason given",
+            reason,
         )
         _refused.add(what)
         return False
     return True
+
+
+def _require_alive(device: torch.device, what: str, reason: str) -> None:
+    """Refuse to go on with a GPU whose context a kernel has destroyed: no call works any more."""
+    try:
+        synchronize(device)
+    except Exception as error:
+        raise DeviceError(
+            f"{device}: the GPU stopped answering in a trial of the Triton kernels for {what} "
+            f"({reason}). Start again with XPLANES_GPU_KERNELS=0, which leaves them out"
+        ) from error
+
+
+def memory_left(device: torch.device) -> float:
+    """Bytes that a GPU has left; no limit is known for other devices."""
+    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else math.inf
 
 
 def fast_bf16(device: torch.device) -> bool:
@@ -169,6 +195,17 @@ def compiled(module: str) -> Any:
     """A module of compiled loops; loading the first takes a second, compiling a few more, once."""
     _settle_threads()
     return importlib.import_module(module)
+
+
+def gpu_module(module: str) -> Any:
+    """A module of Triton kernels, which need no numba."""
+    return importlib.import_module(module)
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait until a device has done all that it was asked to do; the CPU always has."""
+    if device.type != "cpu":
+        torch.get_device_module(device).synchronize()
 
 
 @functools.cache

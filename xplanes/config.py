@@ -12,6 +12,9 @@ _PACKAGE = Path(__file__).resolve().parent
 CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
 """The configuration files: inside an installed package, beside it in a checkout."""
 
+CHOICES = ("experiment", "entry", "recipe", "scale")
+"""Groups whose files set keys of other groups."""
+
 
 def compose_plain(name: str | None, overrides: Sequence[str], conf: Path = CONF) -> dict[str, Any]:
     """A configuration with some settings changed, resolved to builtins.
@@ -118,7 +121,8 @@ def _keys(conf: Path) -> dict[str, set[str]]:
 
     for path in conf.rglob("*.yaml"):
         groups = path.relative_to(conf).parts[:-1]
-        if "experiment" in groups:
+        if groups and groups[0] in CHOICES:
+            found.setdefault(groups[0], set())
             continue
         text = path.read_text(encoding="utf-8")
         prefix = "" if "_global_" in text.split("\n", 1)[0] else ".".join(groups)

@@ -3,3 +3,7 @@
 
 class ConfigError(ValueError):
     """A setting that cannot work; the message names the key, the value and the way out."""
+
+
+class DeviceError(RuntimeError):
+    """A device that does not work any more; the message names what it was doing and the way out."""

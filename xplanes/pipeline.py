@@ -15,7 +15,7 @@ from lightning import seed_everything
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from xplanes.backend import warm_up
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, DeviceError
 from xplanes.evaluation.findings import camera_findings
 from xplanes.evaluation.published import check_published
 from xplanes.evaluation.render import orbit_poses, render_path, video_times, write_video
@@ -52,6 +52,7 @@ logger = logging.getLogger(__name__)
 
 KNOWN_ERRORS = (
     ConfigError,
+    DeviceError,
     SceneError,
     LRMError,
     TrainingError,

@@ -1,11 +1,16 @@
 """Random numbers without memory: each use has a stream of its own, numbered here."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum, unique
 
 import torch
+from torch import Tensor
+
+GOLDEN, MIX = 0x9E3779B97F4A7C15, (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
+"""Constants of splitmix64."""
 
 
 @unique
@@ -48,13 +53,50 @@ def step_generator(seed: int, step: int, stream: int = 0) -> torch.Generator:
         step: The training step.
         stream: Tells independent uses apart: a `Stream`, or the rank of a process.
     """
-    # Odd constants spread neighbouring triples over 64 bits (splitmix64).
-    key = (
-        seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9 + stream * 0x94D049BB133111EB
-    ) % 2**64
-    key = ((key ^ (key >> 30)) * 0xBF58476D1CE4E5B9) % 2**64
-    key = ((key ^ (key >> 27)) * 0x94D049BB133111EB) % 2**64
-    return torch.Generator().manual_seed(key ^ (key >> 31))
+    return torch.Generator().manual_seed(_key(seed, step, stream))
+
+
+def _key(seed: int, step: int, stream: int) -> int:
+    """64 bits of a triple; odd constants spread neighbouring ones over them (splitmix64)."""
+    key = (seed * GOLDEN + step * MIX[0] + stream * MIX[1]) % 2**64
+    key = ((key ^ (key >> 30)) * MIX[0]) % 2**64
+    key = ((key ^ (key >> 27)) * MIX[1]) % 2**64
+    return key ^ (key >> 31)
+
+
+def counted_uniform(
+    seed: int, step: int, stream: int, shape: tuple[int, ...], device: torch.device
+) -> Tensor:
+    """Random numbers from 0 to 1, each a function of its place: the same bits on every device.
+
+    Args:
+        seed: The run's seed.
+        step: The training step.
+        stream: Tells independent uses apart: a `Stream`, or the rank of a process.
+        shape: Shape of the result.
+        device: Where they are made, without a word from the host.
+
+    Returns:
+        Multiples of 2^-53 below 1. float64 [...]
+
+    Source: Steele, Lea and Flood, Fast Splittable Pseudorandom Number Generators (splitmix64).
+    """
+    place = torch.arange(math.prod(shape), device=device)
+    bits = place * _signed(GOLDEN) + _signed(_key(seed, step, stream))
+    bits = (bits ^ _shifted(bits, 30)) * _signed(MIX[0])
+    bits = (bits ^ _shifted(bits, 27)) * _signed(MIX[1])
+    bits = bits ^ _shifted(bits, 31)
+    return (_shifted(bits, 11).double() * 2.0**-53).view(shape)
+
+
+def _signed(number: int) -> int:
+    """64 bits as the number that int64 takes them for; its products drop what goes beyond."""
+    return number - 2**64 if number >= 2**63 else number
+
+
+def _shifted(bits: Tensor, by: int) -> Tensor:
+    """Shifted to the right with zeros behind; int64 alone would repeat the sign."""
+    return (bits >> by) & (2 ** (64 - by) - 1)
 
 
 @contextmanager

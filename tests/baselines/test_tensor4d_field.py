@@ -22,8 +22,7 @@ def planes(groups=STATIC, *, fine=True, size=6, filled=True):
     torch.manual_seed(0)
     levels = [Level(size, 5, 2)] + ([Level(2 * size, 5, 3)] if fine else [])
     made = HierarchicalPlanes(groups, levels, blur=4)
-    made.fine.fill_(True)
-    made.blurred.fill_(False)
+    made.show(fine=True, blurred=False)
     if filled:
         with torch.no_grad():
             for plane in made.planes.values():
@@ -87,11 +86,11 @@ def test_planes_are_read_coarsely_at_first():
     made = planes()
     points, times = 2 * torch.rand(20, 3) - 1, torch.zeros(20)
     whole = made(points, times)
-    made.fine.fill_(False)
+    made.show(fine=False, blurred=False)
     coarse = made(points, times)
     assert all((c[:, 2:] == 0).all() for c in coarse)
     assert all(torch.equal(c[:, :2], w[:, :2]) for c, w in zip(coarse, whole, strict=True))
-    made.blurred.fill_(True)
+    made.show(fine=False, blurred=True)
     blurred = made(points, times)
     assert not any(torch.equal(b, c) for b, c in zip(blurred, coarse, strict=True))
     with torch.no_grad():

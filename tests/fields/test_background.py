@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from xplanes.fields.background import FARTHEST, Background, contract, expand
+from xplanes.fields.background import FARTHEST, Background, contract, contract_cube, expand
 from xplanes.rendering.behind import behind, look
 from xplanes.streams import Stream, initial_values
 
 
-def contracted(point):
+def contracted(point, length=lambda point: math.hypot(*point)):
     """Mip-NeRF 360, Eq. 10, in float64."""
     point = np.asarray(point, np.float64)
-    length = math.hypot(*point)
+    length = length(point)
     return point if length <= 1 else (2 - 1 / length) * point / length
 
 
@@ -47,6 +47,19 @@ def test_contraction_is_the_formula_and_keeps_the_unit_ball():
     assert inside.sum() > 50
     assert torch.equal(found[inside], points[inside])
     assert (found.norm(dim=1) < 2 + 1e-6).all()
+
+
+def test_contraction_to_a_cube_is_the_formula_and_keeps_the_unit_cube():
+    generator = torch.Generator().manual_seed(2)
+    points = torch.randn(500, 3, generator=generator) * 10 ** (
+        6 * torch.rand(500, 1, generator=generator) - 3
+    )
+    found = contract_cube(points)
+    expected = [contracted(point, lambda point: np.abs(point).max()) for point in points.tolist()]
+    assert np.abs(found.numpy() - np.stack(expected)).max() < 5e-7
+    inside = points.abs().amax(dim=1) < 0.999
+    assert inside.sum() > 50
+    assert torch.equal(found[inside], points[inside])
 
 
 def test_expansion_undoes_the_contraction():

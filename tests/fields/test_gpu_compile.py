@@ -3,65 +3,40 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 pytest.importorskip("triton", reason="triton is not installed")
 
-PROGRAM = """
-import torch
-import triton
-from triton.backends.compiler import GPUTarget
+SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "compile_kernels.py"
 
-class Driver:
-    # As much of a driver as compiling takes.
-    def get_current_target(self):
-        return GPUTarget("cuda", 90, 32)
 
-    def get_current_device(self):
-        return 0
+def compiled(cache, *options):
+    """Rows of the script's table: case, kernel, architecture, then numbers."""
+    environment = {**os.environ, "OMP_WAIT_POLICY": "PASSIVE", "TRITON_CACHE_DIR": str(cache)}
+    command = [sys.executable, str(SCRIPT), *options]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=580)
+    assert done.returncode == 0, done.stderr
+    lines = [line.strip("| ").split(" | ") for line in done.stdout.splitlines()]
+    return [line for line in lines if len(line) == 8][1:]
 
-    def get_current_stream(self, device=None):
-        return 0
 
-class WithoutLaunch:
-    def __init__(self, kernel):
-        self.kernel = kernel
-
-    def __getitem__(self, grid):
-        def compile(*given, **named):
-            text = self.kernel.warmup(*given, grid=grid, **named).asm["ptx"]
-            print(text.count("ld.global.v4"), text.count("add.v4.f32"))
-        return compile
-
-triton.runtime.driver.set_active(Driver())
-
-from xplanes.fields import gpu, gpu_products
-from xplanes.fields.lookup import plane_features_gpu
-from xplanes.fields.products import STATIC, plane_product_gpu
-from xplanes.fields.xplanes import PLANE_SETS
-
-for module in (gpu, gpu_products):
-    module.forward = WithoutLaunch(module.forward)
-    module.backward = WithoutLaunch(module.backward)
-
-space, time = torch.zeros(3, 9, 9, 40).requires_grad_(), torch.zeros(3, 4, 7, 40).requires_grad_()
-found = plane_features_gpu(space, time, torch.zeros(5, 3), torch.zeros(5), PLANE_SETS["six"])
-found.sum().backward()
-planes = [torch.zeros(1, 8, 5, 5).requires_grad_() for _ in STATIC]
-plane_product_gpu(planes, torch.zeros(5, 4), STATIC).sum().backward()
-"""
+def test_kernels_with_most_numbers_fit_the_registers_of_a_common_gpu(tmp_path):
+    rows = compiled(tmp_path, "--arch", "86", "--only", "nine planes, 40")
+    assert [row[1] for row in rows] == ["gpu.forward", "gpu.backward_by_row"]
+    assert all(int(row[4]) == 0 for row in rows)
 
 
 @pytest.mark.slow
-def test_kernels_compile_for_a_gpu_and_move_four_numbers_at_once(tmp_path):
-    """Down to the GPU's machine code, for one generation of GPUs; only the launch is left out."""
-    environment = {**os.environ, "TRITON_INTERPRET": "0", "TRITON_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-c", PROGRAM]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    reads, product = done.stdout.split("\n")[:2], done.stdout.split("\n")[2:4]
+def test_kernels_compile_for_all_generations_and_move_four_numbers_at_once(tmp_path):
+    """Down to the GPU's machine code; only the launch is left out."""
+    rows = compiled(tmp_path)
+    assert {row[2] for row in rows} == {"80", "86", "90", "120"}
+    moved = {(row[0], row[1]): row[5:7] for row in rows if row[2] == "90"}
     # Four corners of each plane, each read once: three planes of space and three of time; the
     # backward reads the time planes and the three gradients, and adds to all corners.
-    assert reads == ["24 0", "15 24"]
-    assert product == ["12 0", "13 12"]
+    assert moved["six planes, 40 channels", "gpu.forward"] == ["24", "0"]
+    assert moved["six planes, 40 channels", "gpu.backward"] == ["15", "24"]
+    assert moved["nine planes, 40 channels", "gpu.backward_by_row"] == ["27", "36"]
+    assert moved["products, 32 channels", "gpu_products.forward"] == ["24", "0"]

@@ -9,6 +9,7 @@ import torch
 from tests.fields.test_lookup import named, scattered, stacks
 from tests.oracles import plane_features as oracle
 from xplanes import backend
+from xplanes.errors import DeviceError
 from xplanes.fields import lookup
 from xplanes.fields.lookup import plane_features_gpu, plane_features_reference
 from xplanes.fields.xplanes import PLANE_SETS
@@ -250,6 +251,17 @@ def test_kernels_that_fail_their_trial_are_not_used(as_on_a_gpu, monkeypatch, ca
     assert "XPLANES_GPU_KERNELS=0" in message
     assert ("no compiler" in message) == (fault == "raises")
     assert "second line" not in message
+
+
+def test_a_gpu_that_is_lost_in_a_trial_is_not_asked_again(as_on_a_gpu, monkeypatch):
+    def broken(*given):
+        raise RuntimeError("an illegal memory access was encountered")
+
+    monkeypatch.setattr(lookup, "plane_features_gpu", broken)
+    monkeypatch.setattr(backend, "synchronize", broken)
+    words = r"stopped answering.*plane lookup.*illegal memory access.*XPLANES_GPU_KERNELS=0"
+    with pytest.raises(DeviceError, match=words):
+        features()
 
 
 def test_when_kernels_apply(monkeypatch):

@@ -23,6 +23,7 @@ from xplanes.preparation.cache import StageCache
 from xplanes.preparation.fixed_view import canonical_pose, fixed_view, pick_frames, rendering_method
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, scene_frame
+from xplanes.scenes.views import Scene
 
 SMALL_FIELD = (
     "model.resolution=24",
@@ -361,6 +362,24 @@ def test_a_video_of_the_world_around_the_thing_is_not_the_lrms(tmp_path: Path, m
     )
     asked = video_of(given("preparation.fixed_view=video"), surrounded, tmp_path)[0]
     assert bool((asked.views.in_memory()[..., 3] == 255).all())
+
+
+def test_masks_beside_opaque_images_cut_the_thing_out(tmp_path: Path, monkeypatch):
+    bare = ball_scene(size=24)
+    whole = {split: walled(views) for split, views in bare.splits.items()}
+    scene = Scene("ball", whole, cut=bare.splits["train"])
+    assert scene.is_surrounded
+    trained = []
+    fit = module.fit_quietly
+    monkeypatch.setattr(
+        module, "fit_quietly", lambda *given, **how: (trained.append(given), fit(*given, **how))
+    )
+    method = settings(tmp_path, "preparation.fixed_view_steps=3")
+    _, said = video_of(method, scene, tmp_path)
+    ((field, shown, *_),) = trained
+    assert shown.splits["train"] is scene.cut
+    assert field.field.background is None
+    assert not any("no silhouettes" in words for words in said)
 
 
 def test_the_video_of_a_field_in_a_world_shows_the_cube_alone(tmp_path: Path):

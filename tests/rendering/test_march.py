@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from tests.oracles import march as oracle
 from tests.oracles import ray_box
-from xplanes.rendering.marching import march, march_reference
+from xplanes.rendering.marching import march, march_into, march_reference
 from xplanes.rendering.occupancy import OccupancyGrid
 
 STEP = 0.07
@@ -49,6 +49,11 @@ def rays_of(count, dtype=torch.float64, seed=1):
 def twin(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0):
     limit = -math.log(occlusion) if occlusion > 0 else math.inf
     return march_reference(*rays, grid, step=step, skip=skip_empty, limit=limit)
+
+
+def into(rays, grid, room, *, step=STEP, skip_empty=True, occlusion=0.0):
+    limit = -math.log(occlusion) if occlusion > 0 else math.inf
+    return march_into(*rays, grid, step=step, skip=skip_empty, limit=limit, room=room)
 
 
 def by_oracle(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0):
@@ -286,3 +291,51 @@ def test_any_grid_and_step(resolution, bins, step, occlusion, skip, seed):
     ):
         assert found.cells.tolist() == [row[2] for row in kept]
         assert (found.candidates, found.empty, found.occluded) == counts
+
+
+def test_a_fixed_number_of_places_takes_the_same_samples():
+    for (skip, occlusion), dtype in itertools.product(OPTIONS, (torch.float32, torch.float64)):
+        case = f"skip={skip}, occlusion={occlusion}, {dtype}"
+        grid, rays = grid_of(), rays_of(60, dtype)
+        expected = twin(rays, grid, skip_empty=skip, occlusion=occlusion)
+        found = into(rays, grid, len(expected) + 30, skip_empty=skip, occlusion=occlusion)
+        live = found.live
+        assert live.sum() == found.count == len(expected), case
+        assert not live[len(expected) :].any(), case
+        for name in ("ray", "cells", "distances", "points"):
+            assert torch.equal(getattr(found, name)[live], getattr(expected, name)), (case, name)
+        assert torch.equal(found.starts, expected.starts), case
+        assert found.shown.all(), case
+        for name in ("candidates", "empty", "occluded"):
+            assert int(getattr(found, name)) == getattr(expected, name), (case, name)
+        # The others lie where nothing is, behind all samples.
+        assert (found.points[~live] > 1).all(), case
+        assert (found.ray.diff() >= 0).all(), case
+
+
+def test_rays_without_room_are_left_out_whole():
+    grid, rays = grid_of(), rays_of(60)
+    whole = twin(rays, grid)
+    for room in (len(whole), len(whole) - 1, len(whole) // 2):
+        found = into(rays, grid, room)
+        shown = found.shown
+        assert bool(shown.all()) == (room == len(whole)), room
+        kept = shown[whole.ray]
+        assert found.count == kept.sum() <= room, room
+        # Those in front have room; the first without ends it.
+        assert torch.equal(shown, shown.cummin(0).values), room
+        assert kept.sum() + whole.ray.bincount(minlength=60)[shown.sum() :][:1].sum() > room or all(
+            shown
+        ), room
+        assert torch.equal(found.distances[found.live], whole.distances[kept]), room
+        assert torch.equal(found.ray[found.live], whole.ray[kept]), room
+        assert found.occluded == whole.occluded, room
+
+
+def test_no_samples_take_no_place():
+    grid = grid_of(filled=0.0)
+    found = into(rays_of(5), grid, 40)
+    assert found.count == 0
+    assert not found.live.any()
+    assert found.shown.all()
+    assert (found.starts == 0).all()

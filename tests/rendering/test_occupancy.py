@@ -7,6 +7,7 @@ import torch
 
 from xplanes.rendering.marching import march
 from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.streams import counted_uniform
 
 STEP = 0.05
 
@@ -396,3 +397,56 @@ def test_the_state_goes_round():
     other.load_state_dict(grid.state_dict())
     for name in ("density", "occupied", "allowed"):
         assert torch.equal(getattr(grid, name), getattr(other, name))
+
+
+def test_samples_that_do_not_count_change_nothing():
+    drawn = generator()
+    cells = torch.randint(128, (40,), generator=drawn)
+    density, live = 5 * torch.rand(40, generator=drawn), torch.rand(40, generator=drawn) < 0.5
+    ours, theirs, untouched = grid_of(), grid_of(), grid_of()
+    for grid in (ours, theirs, untouched):
+        grid.density.copy_(torch.rand(128, generator=generator(1)))
+        grid.least.copy_(torch.rand(128, generator=generator(2)))
+        grid.occupied.copy_(grid.density > grid.empty_density)
+    before = {name: value.clone() for name, value in untouched.state_dict().items()}
+    ours.observe(cells, density, live)
+    theirs.observe(cells[live], density[live])
+    untouched.observe(cells, density, torch.zeros(40, dtype=torch.bool))
+    for name, value in ours.state_dict().items():
+        assert torch.equal(value, theirs.state_dict()[name]), name
+        assert torch.equal(untouched.state_dict()[name], before[name]), name
+    assert not torch.equal(ours.density, before["density"])
+
+
+def test_looks_by_given_numbers_reach_the_same_cells():
+    """Half of them anywhere, half beside what is occupied; never where nothing may be."""
+    reached = []
+    for by_numbers in (False, True):
+        grid = grid_of(resolution=6, bins=1)
+        corner = torch.zeros(1, 6, 6, 6, dtype=torch.bool)
+        corner[0, :3, :3, :3] = True
+        grid.presume(corner)
+        ruled_out = torch.ones(1, 6, 6, 6, dtype=torch.bool)
+        ruled_out[0, 0] = False
+        grid.allow(ruled_out)
+        seen = torch.zeros(216)
+
+        def field(points, times, grid=grid, seen=seen):
+            seen += cells_of(grid, points, times).bincount(minlength=216)
+            return constant(0.0)(points, times)
+
+        before = grid.occupied.clone()
+        for step in range(200):
+            grid.density.copy_(before * 10.0)
+            grid.occupied.copy_(before)
+            if by_numbers:
+                grid.update_by(field, counted_uniform(0, step, 1, (64, 8), torch.device("cpu")))
+            else:
+                grid.update(field, 64, generator(step))
+        reached.append(seen)
+    plain, counted = reached
+    # The twin leaves out cells that must stay empty before it asks the field, the other after.
+    asked = plain > 0
+    share = counted[asked] / counted[asked].sum()
+    torch.testing.assert_close(share, plain[asked] / plain[asked].sum(), atol=0.004, rtol=0.2)
+    assert (plain > 0).sum() > 20

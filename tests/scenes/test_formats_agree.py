@@ -12,11 +12,13 @@ import torch
 from lightning import Trainer
 
 from tests.captures import save, settings, write_colmap
+from tests.refusals import assert_refused
 from tests.synthetic import ball_views, surrounding, swinging
 from tests.training.runs import SMALL, changed
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.scenes.colmap import ColmapSettings
 from xplanes.scenes.dnerf import BlenderSettings
+from xplanes.scenes.errors import SceneError
 from xplanes.scenes.multicamera import MultiCameraSettings
 from xplanes.scenes.nerfies import NerfiesSettings
 from xplanes.scenes.nerfstudio import NerfstudioSettings
@@ -190,6 +192,31 @@ def test_rays_pixels_masks_and_times_are_those_that_were_written(scenes, name: s
             for mine, theirs in zip(views.image_rays(index), VIEWS.image_rays(place), strict=True):
                 assert (mine - theirs).abs().max() < 1e-5, written
         assert views.times.tolist() == pytest.approx(TIMES[: len(part)], abs=1e-7)
+
+
+@pytest.mark.parametrize("name", ["nerfstudio", "colmap", "nerfies"])
+def test_masks_for_lrms_leave_the_images_whole(name: str, tmp_path: Path) -> None:
+    scene = replace(FORMATS[name](tmp_path), mask_use="lrm").read()
+    train, scored = scene.splits.values()
+    for views, part in ((train, TRAIN), (scored, TEST)):
+        for index, written in enumerate(part):
+            pixels = before_noise(NAMES.index(written))
+            assert np.array_equal(views.image(index)[..., :3].numpy(), pixels), written
+        assert views.is_opaque
+    assert scene.cut is not None
+    assert scene.cut.files == train.files
+    for index, written in enumerate(TRAIN):
+        assert torch.equal(scene.cut.image(index), VIEWS.image(NAMES.index(written))), written
+    static = replace(FORMATS[name](tmp_path), mask_use="lrm", static=True).read().cut
+    assert static is not None
+    assert static.is_static
+
+
+def test_masks_that_are_not_there_are_not_for_lrms(tmp_path: Path) -> None:
+    made = replace(colmap(tmp_path, text=False), mask_use="lrm", masks=None)
+    assert_refused(
+        SceneError, r"data\.mask_use=lrm: no image has a mask file.*alpha", made.read, made
+    )
 
 
 def score(scene: Scene) -> float:

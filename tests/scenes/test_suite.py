@@ -96,7 +96,12 @@ def test_times_and_cameras_of_the_splits(name):
     for split in ("val", "test"):
         held_out = times(name, split)
         assert held_out[0] == 0
-        assert all(a < b < last for a, b in pairwise(held_out))
+        if name in both("rig"):  # A held-out camera takes its pictures with the others.
+            assert set(held_out) <= set(times(name))
+            assert held_out == sorted(held_out)
+            assert len(set(held_out)) == 7
+        else:
+            assert all(a < b < last for a, b in pairwise(held_out))
         distances = torch.cdist(cameras(name, split)[:, :3, 3], cameras(name)[:, :3, 3])
         assert distances.min() > 1e-3 * SUITE_SCENES[name].rig.distance
 
@@ -305,9 +310,11 @@ def test_captures_have_a_world_behind_and_masks_of_the_thing(name, tmp_path):
             *(f"data.{key}={value}" for key, value in counts.items()))  # fmt: skip
     scene = build(compose_plain("train", data)["data"], SceneSettings, "data").read()
     assert scene.splits["train"].is_opaque
+    assert set(scene.splits) == {"train", "val", "test"}
     shots = SUITE_SCENES[name].rig.capture({"train": 3}, f"{name} 0").shots["train"]
     for number, (time, camera) in enumerate(shots):
         mask = np.asarray(Image.open(folder / MASKS / "train" / f"r_{number:03d}.png"))
+        assert np.array_equal(scene.splits["train"].thing_in(number), mask)
         alone = render_image(assembly_of(name).pose(time), camera, SIDE)
         # The world hides nothing of the thing, but for what a pixel's rays share with it.
         assert np.abs(mask.astype(int) - alone[..., 3]).max() <= 64
@@ -315,6 +322,29 @@ def test_captures_have_a_world_behind_and_masks_of_the_thing(name, tmp_path):
         border = np.concatenate([colours[0], colours[-1], colours[:, 0], colours[:, -1]])
         assert len(np.unique(border // 16, axis=0)) > 8
         assert 0.03 < (mask > 127).mean() < 0.5
+
+
+def test_masks_of_a_thing_cut_it_out_where_that_is_asked_for(tmp_path):
+    folder = ("data=suite", f"data.root={tmp_path}", f"data.resolution={SIDE}",
+              "data.train_views=2", "data.val_views=1", "data.test_views=1")  # fmt: skip
+
+    def scene(name, use):
+        given = compose_plain("train", [*folder, f"data.scene={name}", f"data.mask_use={use}"])
+        return build(given["data"], SceneSettings, "data").read()
+
+    whole, alpha, lrm = (scene("phone", use) for use in ("score", "alpha", "lrm"))
+    masks = whole.splits["train"].thing
+    assert whole.cut is None
+    assert alpha.cut is None
+    assert torch.equal(alpha.splits["train"].images[..., 3], masks)
+    assert alpha.splits["test"].is_opaque
+    assert torch.equal(lrm.cut.images, alpha.splits["train"].images)
+    assert torch.equal(lrm.splits["train"].images, whole.splits["train"].images)
+    shown = masks == 255
+    assert torch.equal(lrm.cut.images[shown], whole.splits["train"].images[shown])
+    assert not lrm.cut.images[masks == 0].any()
+    words = "data.mask_use=alpha: dark stands in no world.*score"
+    assert_refused(SceneError, words, lambda: scene("dark", "alpha"), "dark")
 
 
 def test_layers_are_composited_from_front_to_back():

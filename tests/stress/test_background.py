@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.stress.references import worst
-from xplanes.fields.background import RADIUS, Background, contract, expand
+from xplanes.fields.background import RADIUS, Background, contract, contract_cube, expand
 from xplanes.rendering.behind import behind
 from xplanes.streams import Stream, initial_values
 
@@ -21,6 +21,19 @@ def towards():
     near = axes + 1e-8 * generator.standard_normal(axes.shape)
     found = np.concatenate([axes, near, np.ones((1, 3)), generator.standard_normal((40, 3))])
     return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+def test_contraction_to_a_cube(tally, kind) -> None:
+    """Contraction to a cube: points 0 to 1e30 away, on and near the axes, against float64"""
+    for length in LENGTHS:
+        points = torch.from_numpy(length * towards()).to(kind)
+        exact = points.double().numpy()
+        far = np.abs(exact).max(axis=1, keepdims=True).clip(1)
+        found = contract_cube(points)
+        tally.finite(found)
+        tally.error(worst(found, (2 - 1 / far) * exact / far), 1e-6)
+        assert (found.double().abs() <= RADIUS * (1 + 1e-6)).all()
 
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
@@ -51,7 +64,7 @@ def test_expansion(tally) -> None:
 def test_a_nan_stays_where_it_is(tally) -> None:
     """Contraction: a point that is NaN stays so, and spoils no other"""
     points = torch.tensor([[1.0, 2.0, 3.0], [float("nan"), 0.0, 1.0], [0.1, 0.0, 0.0]])
-    for function in (contract, expand):
+    for function in (contract, contract_cube, expand):
         found = function(points)
         assert found[1].isnan().any()
         tally.finite(found[[0, 2]])

@@ -17,7 +17,7 @@ from xplanes.rendering.base import Rendering
 from xplanes.training import collapse
 from xplanes.training.checkpoints import Checkpoints
 from xplanes.training.collapse import CollapseWatch, verdict
-from xplanes.training.evaluation import blank_psnr, floaters
+from xplanes.training.evaluation import blank_psnr, floaters, psnr_thing
 from xplanes.training.module import RadianceModule, mean_opacities
 
 QUICK = ("trainer.max_steps=24", "callbacks.evaluation.at=[]", "callbacks.checkpoints.every=14")
@@ -149,6 +149,15 @@ def test_floaters_are_background_pixels_that_show_something() -> None:
     opacity = torch.tensor([[0.0, 0.06, 0.04, 1], [1, 0, 1, 1]])
     assert floaters(opacity, alpha) == pytest.approx(2 / 5)
     assert math.isnan(floaters(opacity, torch.full_like(alpha, 255)))
+
+
+def test_the_thing_is_scored_where_most_of_a_pixel_shows_it() -> None:
+    truth, colour = torch.zeros(2, 2, 3), torch.zeros(2, 2, 3)
+    colour[0], colour[1] = 0.1, 1.0
+    mask = torch.tensor([[255, 128], [127, 0]], dtype=torch.uint8)
+    assert psnr_thing(colour, truth, mask) == pytest.approx(20.0)
+    assert math.isnan(psnr_thing(colour, truth, None))
+    assert math.isnan(psnr_thing(colour, truth, torch.zeros_like(mask)))
 
 
 def test_a_run_that_shows_nothing_says_so(

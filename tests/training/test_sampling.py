@@ -59,6 +59,25 @@ def test_images_of_the_trained_field_have_samples_of_their_own(sampling) -> None
     assert sampling.renderer.grid is sampling.grid
 
 
+def test_room_follows_the_samples_of_batches_and_pictures_need_none(tmp_path) -> None:
+    frame = cube_frame(1.0, torch.zeros(3))
+    options = {"times": torch.zeros(1), "seed": 0, "precision": "32"}
+    settings = Method.read(small_config(tmp_path)).model.sampler
+    sampling = settings.build(fog, Site(frame, **options, samples_per_batch=8192))
+    state = TrainingState(0, 0, 0, 0)
+
+    def rooms() -> set[int | None]:
+        return {renderer.room for renderer in (sampling._training, sampling._coarse)}
+
+    assert rooms() == {10240}
+    for samples, room in ((4000, 5120), (1, 1024), (10**6, 10240)):
+        sampling.expect(samples)
+        assert rooms() == {room}, samples
+    assert sampling.renderer.room is None
+    assert sampling.renderer_at(state.step).room is None
+    assert settings.build(fog, Site(frame, **options))._training.room is None
+
+
 def test_no_samples_for_images_are_refused(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"model\.sampler\.render_samples=0: must be above 0"):
         Method.read(small_config(tmp_path, "model.sampler.render_samples=0"))

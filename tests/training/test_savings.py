@@ -33,9 +33,9 @@ def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Watched:
     steps: list[tuple[int, int]] = []
     count = RadianceModule._count
 
-    def note(self, samples, rays) -> None:
-        steps.append((rays, len(samples)))
-        count(self, samples, rays)
+    def note(self, shown, rays) -> None:
+        steps.append((rays, shown["samples"]))
+        count(self, shown, rays)
 
     # Outside the silhouettes the field keeps its initial values.
     config = small_config(

@@ -9,10 +9,12 @@ import lightning
 import pytest
 import torch
 
+from tests.baselines.runs import KPLANES, PROPOSAL, TINEUVOX
 from tests.synthetic import ball_views, swinging
 from tests.training.runs import small_config
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.rendering.behind import look
+from xplanes.rendering.proposal import spaced, unspaced
 from xplanes.scenes.views import Scene
 from xplanes.training.collapse import CollapseWatch
 from xplanes.training.evaluation import render_view
@@ -180,6 +182,66 @@ def test_a_resumed_training_ends_with_the_same_numbers(trained, tmp_path):
     fitted(resumed, "world", tmp_path, STEPS, checkpoint=tmp_path / "half.ckpt")
     for name, value in straight.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
+
+
+BASELINES = {
+    "kplanes": (*KPLANES, *PROPOSAL),
+    "kplanes_explicit": (*KPLANES, *PROPOSAL),
+    "tineuvox_s": (*TINEUVOX, "model.background.samples=4"),
+}
+
+
+def baseline(model, kind):
+    module = RadianceModule.compose(f"model={model}", *BASELINES[model])
+    module.build(scene(kind))
+    return module
+
+
+@pytest.mark.parametrize("model", BASELINES)
+def test_baselines_see_the_world_in_their_own_way(model):
+    module = baseline(model, "world")
+    batch = SceneDataModule.of(scene("world")).batches_for(module, 0).draw(0)
+    rendering = module.sampler.render(module.field, batch, module.state)
+    sum(module._terms(rendering, batch, module.state).values()).backward()
+    module.model.regularise(module.state)
+    if model == "tineuvox_s":
+        assert "a background" in module.field.outline
+        assert module.field.background.planes.grad.abs().sum() > 0
+    else:
+        assert "contracted space" in module.field.outline
+        assert rendering.samples.distances.max() > 10  # The cube ends at 6.
+    groups = [id(p) for group in module.model.groups() for p in group["params"]]
+    assert sorted(groups) == sorted(id(p) for p in module.field.parameters())
+    assert baseline(model, "alpha").field.outline in module.field.outline.replace(
+        " over contracted space", ""
+    )
+
+
+def test_what_is_behind_a_box_begins_where_rays_leave_it():
+    module = baseline("tineuvox_s", "world")
+    field, renderer = module.field, module.renderer
+    rays = module.frame.rays(*scene("world").splits["train"].image_rays(0))
+    with torch.no_grad():
+        field.density.bias.fill_(-60.0)  # Empty: all light passes.
+        found = renderer.image(field, *rays, 0.0, torch.ones(3))
+        leave = renderer.ends(*rays, field.bounds())[1]
+        expected = look(field.background, *rays, ends=lambda *_: (None, leave))
+    assert found["opacity"].max() < 1e-6
+    torch.testing.assert_close(found["colour"], expected)
+    low, high = field.bounds()
+    ends = rays[0] + leave[:, None] * rays[1]
+    assert (ends > low - 1e-4).all()
+    assert (ends < high + 1e-4).all()
+
+
+def test_samples_of_contracted_space_are_even_in_distance_then_in_its_inverse():
+    places = torch.linspace(0, 0.999, 200, dtype=torch.float64)
+    distances = unspaced(places)
+    torch.testing.assert_close(spaced(distances), places)
+    near, far = places < 0.5, places > 0.5
+    torch.testing.assert_close(distances[near], 2 * places[near])
+    step = (1 / distances[far]).diff()
+    torch.testing.assert_close(step, step[:1].expand_as(step))
 
 
 def test_samplers_of_proposals_see_the_background_too():

@@ -95,6 +95,6 @@ def score_table(scores: dict[str, Any]) -> str:
 
 def _numbers(row: dict[str, Any], names: list[str]) -> str:
     return "".join(
-        f"{row[name]:>12.{2 if name == 'psnr' else 4}f}" if name in row else " " * 12
+        f"{row[name]:>12.{2 if name.startswith('psnr') else 4}f}" if name in row else " " * 12
         for name in names
     )

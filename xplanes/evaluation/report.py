@@ -133,6 +133,7 @@ def summary(
         "skipped": {
             "empty": counts["empty"] / candidates,
             "occluded": counts["occluded"] / candidates,
+            "no_room": counts["no_room"] / max(1, counts["rays"] + counts["no_room"]),
             "gradients": 1 - counts["passed"] / max(1, counts["samples"]),
             "background": background_skipped,
             "static": float(not module.field.moves),
@@ -208,9 +209,11 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             f"{metrics['converged']}"
         )
     prepare = sum(seconds["prepare"].values())
-    floaters = ""
+    more_scores = ""
+    if "psnr_thing" in metrics["test"]:
+        more_scores += f"  of the thing {metrics['test']['psnr_thing']:.2f}"
     if "floaters" in metrics["test"]:
-        floaters = f"  floaters {100 * metrics['test']['floaters']:.2f}%"
+        more_scores += f"  floaters {100 * metrics['test']['floaters']:.2f}%"
     blank = []
     if metrics["test"]["psnr"] < metrics["blank_psnr"] + LITTLE:
         blank.append(
@@ -223,7 +226,7 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
         [
             "",
             f"{metrics['split']:<9}psnr {metrics['test']['psnr']:.2f}  ssim "
-            f"{metrics['test']['ssim']:.4f}{floaters}  over {len(metrics['views'])} views, step "
+            f"{metrics['test']['ssim']:.4f}{more_scores}  over {len(metrics['views'])} views, step "
             f"{metrics['step']}",
             *blank,
             f"time     prepare {prepare:.1f} s + train {seconds['train']:.1f} s · {warm_up}scoring "

@@ -19,6 +19,7 @@ from xplanes.files import read_rows as read_csv
 SCORES = {
     "psnr": ("test", "psnr"),
     "ssim": ("test", "ssim"),
+    "psnr_thing": ("test", "psnr_thing"),
     "floaters": ("test", "floaters"),
     "steps": ("step",),
     "prepare_seconds": ("seconds", "prepare"),
@@ -31,6 +32,7 @@ SCORES = {
 MEASURES = (
     "psnr",
     "ssim",
+    "psnr_thing",
     "floaters",
     "start_psnr",
     "seconds_to_20",

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +20,11 @@ UNLISTED = (
 )
 """Settings that say nothing about a result."""
 
+SPREAD = ("psnr", "ssim", "psnr_thing")
+"""Scores whose standard deviation over seeds is shown."""
+
 LABELS = {
+    "psnr_thing": "psnr thing",
     "start_psnr": "step 0",
     "seconds_to_20": "s to 20 dB",
     "prepare_seconds": "prepare s",
@@ -30,6 +34,7 @@ LABELS = {
 }
 FORMATS = {
     "psnr": ".2f",
+    "psnr_thing": ".2f",
     "start_psnr": ".2f",
     "ssim": ".4f",
     "floaters": ".4f",
@@ -90,17 +95,24 @@ def run_table(
     rows: Sequence[RunRow], names: Sequence[str], *, exact: bool = False
 ) -> tuple[list[str], list[list[str]]]:
     """Header and one line per run; ``exact`` keeps all digits, for CSV."""
-    header = ["run", *(_label(n, exact) for n in names), *(_label(n, exact) for n in MEASURES)]
+    measures = _measures(rows)
+    header = ["run", *(_label(n, exact) for n in names), *(_label(n, exact) for n in measures)]
     lines = [
         [
             row.name,
             *(_text(row.settings[n]) if n in row.settings else "" for n in names),
-            *(_number(row.scores.get(n), n, exact) for n in MEASURES),
+            *(_number(row.scores.get(n), n, exact) for n in measures),
             row.status,
         ]
         for row in rows
     ]
     return [*header, "status"], lines
+
+
+def _measures(rows: Iterable[RunRow]) -> list[str]:
+    """Columns of a table: that of the thing is there if any run scores it alone."""
+    known = any("psnr_thing" in row.scores for row in rows)
+    return [name for name in MEASURES if known or name != "psnr_thing"]
 
 
 def seed_groups(rows: Sequence[RunRow]) -> list[list[RunRow]]:
@@ -118,20 +130,21 @@ def seed_table(
     groups: Sequence[Sequence[RunRow]], names: Sequence[str], *, exact: bool = False
 ) -> tuple[list[str], list[list[str]]]:
     """Header and one line per setting; quality with its standard deviation, the rest as means."""
+    measures = _measures(row for group in groups for row in group)
     header = [*(_label(n, exact) for n in names), "seeds"]
-    for name in MEASURES:
+    for name in measures:
         label = _label(name, exact)
-        spread = name in ("psnr", "ssim")
+        spread = name in SPREAD
         header += [label, f"{name}_std"] if spread and exact else [label]
     lines = []
     for group in groups:
         settings = group[0].settings
         line = [_text(settings[n]) if n in settings else "" for n in names] + [str(len(group))]
-        for name in MEASURES:
+        for name in measures:
             values = [row.scores[name] for row in group if name in row.scores]
             mean = math.fsum(values) / len(values) if values else None
             shown = _number(mean, name, exact)
-            if name not in ("psnr", "ssim"):
+            if name not in SPREAD:
                 line.append(shown)
                 continue
             std = _number(_deviation(values), name, exact)

@@ -152,6 +152,86 @@ def forward(
     tl.store(features + offset + 2 * CHANNELS, yz, mask=mask)
 
 
+@triton.jit
+def upstream_of(gradient, n, count, channel, ROW: tl.constexpr, CHANNELS: tl.constexpr):
+    """Gradient of one of the three features. [points, channels]"""
+    offset = n[:, None] * (3 * CHANNELS) + (ROW * CHANNELS + channel[None, :])
+    mask = (n < count)[:, None] & (channel < CHANNELS)[None, :]
+    return tl.load(gradient + offset, mask=mask, other=0.0)
+
+
+@triton.jit
+def row_backward(
+    time,
+    source,
+    line,
+    across,
+    down,
+    time_gradient,
+    timesteps,
+    width,
+    channel,
+    FIRST: tl.constexpr,
+    SECOND: tl.constexpr,
+    CHANNELS: tl.constexpr,
+):
+    """Gradients of the two time planes of one row."""
+    first = read(time, FIRST * timesteps, width, line, across, channel, CHANNELS)
+    second = read(time, SECOND * timesteps, width, line, down, channel, CHANNELS)
+    step = FIRST * timesteps
+    spread(time_gradient, step, width, line, across, source * second, channel, CHANNELS)
+    step = SECOND * timesteps
+    spread(time_gradient, step, width, line, down, source * first, channel, CHANNELS)
+
+
+@triton.jit(do_not_specialize=SIZES)
+def backward_by_row(
+    time,
+    points,
+    times,
+    gradient,
+    space_gradient,
+    time_gradient,
+    count,
+    size,
+    timesteps,
+    width,
+    ROWS: tl.constexpr,
+    AXES: tl.constexpr,
+    SPACE: tl.constexpr,
+    CHANNELS: tl.constexpr,
+    POINTS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    # Six time planes in one program are more than the registers hold. No two rows share one, so
+    # that each program takes a row: the third axis of the grid.
+    n = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
+    channel = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
+    x, y, z = coordinates(points, n, count)
+    line = time_taps(tl.load(times + n, mask=n < count, other=0.0), timesteps)
+    for r in tl.static_range(3):
+        if tl.program_id(2) == r:
+            a, b = (x, y, z)[AXES[ROWS[r][0]]], (x, y, z)[AXES[ROWS[r][1]]]
+            source = upstream_of(gradient, n, count, channel, r, CHANNELS)
+            if SPACE:
+                column, row = space_taps(a, size), space_taps(b, size)
+                spread(space_gradient, r * size, size, row, column, source, channel, CHANNELS)
+            row_backward(
+                time,
+                source,
+                line,
+                space_taps(a, width),
+                space_taps(b, width),
+                time_gradient,
+                timesteps,
+                width,
+                channel,
+                ROWS[r][0],
+                ROWS[r][1],
+                CHANNELS,
+            )
+
+
 @triton.jit(do_not_specialize=SIZES)
 def backward(
     time,
@@ -174,11 +254,9 @@ def backward(
     n = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
     channel = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     x, y, z = coordinates(points, n, count)
-    offset = n[:, None] * (3 * CHANNELS) + channel[None, :]
-    mask = (n < count)[:, None] & (channel < CHANNELS)[None, :]
-    xy = tl.load(gradient + offset, mask=mask, other=0.0)
-    xz = tl.load(gradient + offset + CHANNELS, mask=mask, other=0.0)
-    yz = tl.load(gradient + offset + 2 * CHANNELS, mask=mask, other=0.0)
+    xy = upstream_of(gradient, n, count, channel, 0, CHANNELS)
+    xz = upstream_of(gradient, n, count, channel, 1, CHANNELS)
+    yz = upstream_of(gradient, n, count, channel, 2, CHANNELS)
     upstream = xy, xz, yz
     if SPACE:
         column, row, depth = space_taps(x, size), space_taps(y, size), space_taps(z, size)
@@ -222,9 +300,10 @@ def gather(space, time, points, times, rows, axes, features):
 
 
 def scatter(size, time, points, times, rows, axes, gradient, space_gradient, time_gradient):
-    """Launches `backward`; gradients that are not None are added to."""
+    """Launches `backward`, or `backward_by_row`; gradients that are not None are added to."""
     grid, blocks = tiles(len(points), gradient.shape[2])
     moving = axes if time_gradient is not None else ()
+    by_row = len(moving) == 2 * len(rows)
     sizes = (len(points), size, *(time.shape[1:3] if moving else (1, 1)))
     unused = gradient
     tensors = (
@@ -237,4 +316,7 @@ def scatter(size, time, points, times, rows, axes, gradient, space_gradient, tim
     )
     flags = {"ROWS": rows, "AXES": moving, "SPACE": space_gradient is not None}
     with torch.cuda.device_of(gradient):
-        backward[grid](*tensors, *sizes, **flags, **blocks)
+        if by_row and moving:
+            backward_by_row[*grid, len(rows)](*tensors, *sizes, **flags, **blocks)
+        else:
+            backward[grid](*tensors, *sizes, **flags, **blocks)

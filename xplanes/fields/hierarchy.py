@@ -72,9 +72,7 @@ class HierarchicalPlanes(nn.Module):
         levels: From coarse to fine.
         blur: Texels to which planes are averaged down while ``blurred``.
 
-    Attributes:
-        fine: Whether levels beyond the first are read; zeros stand in for them otherwise.
-        blurred: Whether planes are averaged down.
+    `show` says which levels are read, and whether blurred; both belong to the state.
 
     Source: Tensor4D, released code.
     """
@@ -87,6 +85,8 @@ class HierarchicalPlanes(nn.Module):
         self.groups, self.levels, self.blur = groups, tuple(levels), blur
         self.register_buffer("fine", torch.tensor(False))
         self.register_buffer("blurred", torch.tensor(True))
+        self._fine, self._blurred = False, True
+        self.register_load_state_dict_post_hook(lambda planes, _: planes._read_buffers())
         self.planes = nn.ParameterDict()
         for number, level in enumerate(levels):
             for group in groups:
@@ -94,6 +94,22 @@ class HierarchicalPlanes(nn.Module):
                     rows = level.rows if "t" in name else level.resolution
                     plane = torch.zeros(rows, level.resolution, level.channels)
                     self.planes[self._key(number, group, name)] = nn.Parameter(plane)
+
+    def _read_buffers(self) -> None:
+        """Keep Python's values of the buffers, for which a GPU need not be waited for."""
+        self._fine, self._blurred = bool(self.fine), bool(self.blurred)
+
+    def show(self, *, fine: bool, blurred: bool) -> None:
+        """Choose what is read.
+
+        Args:
+            fine: Whether levels beyond the first are read; zeros stand in for them otherwise.
+            blurred: Whether planes are averaged down.
+        """
+        if (fine, blurred) != (self._fine, self._blurred):
+            self._fine, self._blurred = fine, blurred
+            self.fine.fill_(fine)
+            self.blurred.fill_(blurred)
 
     @staticmethod
     def _key(level: int, group: tuple[str, ...], name: str) -> str:
@@ -108,7 +124,7 @@ class HierarchicalPlanes(nn.Module):
         """Features of each group, for points in [-1, 1]^3. [N, 3], [N] -> [N, width] each"""
         scaled = EARLIEST + (LATEST - EARLIEST) * times
         place = dict(zip(AXES, [*points.unbind(dim=1), scaled], strict=True))
-        blurred, fine = bool(self.blurred), bool(self.fine)
+        blurred, fine = self._blurred, self._fine
         found = []
         for group in self.groups:
             parts = []

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from xplanes.fields.background import RADIUS, contract_cube
 from xplanes.fields.base import ViewDependentField
 from xplanes.fields.networks import PaddedMLP, spherical_harmonics, truncated_exponential
 from xplanes.fields.products import PlaneProducts
@@ -76,15 +77,22 @@ class KPlanes(ViewDependentField):
         products: Planes.
         decoder: From their features to density and colour.
         unit: World units per unit of the field's frame; the decoder's density is per world unit.
+        contracted: Whether the planes cover all of space, contracted, instead of the cube.
 
     Source: K-Planes, Section 3.
     """
 
     def __init__(
-        self, products: PlaneProducts, decoder: HybridDecoder | ExplicitDecoder, unit: float = 1.0
+        self,
+        products: PlaneProducts,
+        decoder: HybridDecoder | ExplicitDecoder,
+        unit: float = 1.0,
+        *,
+        contracted: bool = False,
     ) -> None:
         super().__init__()
         self.products, self.decoder, self.unit = products, decoder, unit
+        self.contracted = contracted
 
     @property
     def planes(self) -> Mapping[str, Tensor]:
@@ -105,9 +113,13 @@ class KPlanes(ViewDependentField):
         sizes = "/".join(
             str(plane.shape[3]) for name, plane in self.products.planes() if name == "xy"
         )
-        return f"({' '.join(self.products.names)}, {sizes}) · {self.products.channels} channels"
+        space = " over contracted space" if self.contracted else ""
+        names = " ".join(self.products.names)
+        return f"({names}, {sizes}{space}) · {self.products.channels} channels"
 
     def geometry(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+        if self.contracted:
+            points = contract_cube(points) / RADIUS
         logit, features = self.decoder.geometry(self.products(points, times))
         return truncated_exponential(logit - 1) * self.unit, features
 
@@ -124,6 +136,7 @@ class DensityField(nn.Module):
         linear: Whether the layers have no activation between them.
         unit: World units per unit of the field's frame.
         precision: Of the matrix products.
+        contracted: As for `KPlanes`.
 
     Source: K-Planes, released code; Mip-NeRF 360, Section 3.
     """
@@ -136,14 +149,17 @@ class DensityField(nn.Module):
         linear: bool = False,
         unit: float = 1.0,
         precision: str = "32",
+        contracted: bool = False,
     ) -> None:
         super().__init__()
-        self.products, self.unit = products, unit
+        self.products, self.unit, self.contracted = products, unit, contracted
         self.network = PaddedMLP(
             [products.features, width, 1], activation=not linear, precision=precision
         )
 
     def forward(self, points: Tensor, times: Tensor) -> Tensor:
         """Density per unit length of the field's frame. [N, 3], [N] -> [N]"""
+        if self.contracted:
+            points = contract_cube(points) / RADIUS
         logit = self.network(self.products(points, times))[:, 0]
         return truncated_exponential(logit - 1) * self.unit

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from xplanes.backend import compiled, cpu_loops, gpu_kernels, proven, waves
+from xplanes.backend import compiled, cpu_loops, gpu_kernels, gpu_module, proven, waves
 
 Rows = tuple[tuple[int, int], ...]
 """For each space plane, the two time planes whose product is added to it."""
@@ -147,7 +147,7 @@ class _Kernels(torch.autograd.Function):
         axes = () if time is None else tuple(time_plane_axes(rows))
         features = space.new_empty(len(points), 3, space.shape[3])
         if len(points):
-            gpu = compiled("xplanes.fields.gpu")
+            gpu = gpu_module("xplanes.fields.gpu")
             gpu.gather(space, time, points, times, rows, axes, features)
         ctx.save_for_backward(time, points, times)
         ctx.space, ctx.rows, ctx.axes = (space.shape, space.dtype), rows, axes
@@ -164,7 +164,7 @@ class _Kernels(torch.autograd.Function):
         of_space = gradient.new_zeros(shape) if ctx.needs_input_grad[0] else None
         of_time = gradient.new_zeros(time.shape) if ctx.needs_input_grad[1] else None
         if len(points):
-            gpu = compiled("xplanes.fields.gpu")
+            gpu = gpu_module("xplanes.fields.gpu")
             gpu.scatter(shape[1], time, points, times, rows, axes, gradient, of_space, of_time)
         of_space = None if of_space is None else of_space.to(dtype)
         of_time = None if of_time is None else of_time.to(time.dtype)
@@ -186,7 +186,7 @@ def _kernels_hold(device: torch.device, dtype: torch.dtype, channels: int, rows:
         return [value, *torch.autograd.grad((value * upstream).sum(), leaves)]
 
     what = f"plane lookup ({channels} channels, {dtype})"
-    return proven(what, attempt, plane_features_gpu, plane_features_reference, dtype)
+    return proven(what, device, attempt, plane_features_gpu, plane_features_reference, dtype)
 
 
 def _arrays(*tensors: Tensor) -> tuple[Any, ...]:

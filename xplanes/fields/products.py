@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from xplanes.backend import compiled, cpu_loops, gpu_kernels, proven, waves
+from xplanes.backend import compiled, cpu_loops, gpu_kernels, gpu_module, proven, waves
 
 AXES = "xyzt"
 
@@ -177,7 +177,7 @@ class _Kernels(torch.autograd.Function):
         places = places.to(torch.promote_types(first.dtype, torch.float32)).contiguous()
         product = first.new_empty(len(places), first.shape[1])
         if len(places):
-            gpu = compiled("xplanes.fields.gpu_products")
+            gpu = gpu_module("xplanes.fields.gpu_products")
             gpu.multiply(tuple(_rows(plane) for plane in planes), places, axes, product)
         ctx.save_for_backward(places, *planes)
         ctx.axes = axes
@@ -195,7 +195,7 @@ class _Kernels(torch.autograd.Function):
             for plane in planes
         ]
         if len(places):
-            compiled("xplanes.fields.gpu_products").multiply_backward(
+            gpu_module("xplanes.fields.gpu_products").multiply_backward(
                 tuple(_rows(plane) for plane in planes),
                 places,
                 ctx.axes,
@@ -223,7 +223,7 @@ def _kernels_hold(
         return [value, *torch.autograd.grad((value * upstream).sum(), planes)]
 
     what = f"products of planes ({channels} channels, {dtype})"
-    return proven(what, attempt, plane_product_gpu, plane_product_reference, dtype)
+    return proven(what, device, attempt, plane_product_gpu, plane_product_reference, dtype)
 
 
 def _rows(plane: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from xplanes.fields.background import Background
 from xplanes.fields.base import ViewDependentField
 from xplanes.fields.networks import layers, octaves
 
@@ -32,6 +33,10 @@ class TiNeuVox(ViewDependentField):
         moves: Whether points are moved to canonical space; False for a static scene.
         unit: World units per unit of the field's frame.
         precision: Of the matrix products.
+        background: What lies behind the grid's box; None for a plain colour.
+
+    Attributes:
+        count: Number of cells of the grid as it is now.
 
     Source: TiNeuVox, released code.
     """
@@ -52,6 +57,7 @@ class TiNeuVox(ViewDependentField):
         moves: bool = True,
         unit: float = 1.0,
         precision: str = "32",
+        background: Background | None = None,
     ) -> None:
         super().__init__()
         self.resolution, self.channels, self.octaves, self.unit = (
@@ -64,7 +70,8 @@ class TiNeuVox(ViewDependentField):
         self.shift = math.log(1 / (1 - alpha) - 1)
         self.register_buffer("box", box)
         self.register_buffer("voxels", torch.tensor(resolution**3 // 2**halvings))
-        self.grid = nn.Parameter(torch.zeros(1, channels, *self._size(int(self.voxels))))
+        self._read_buffers()
+        self.grid = nn.Parameter(torch.zeros(1, channels, *self._size(self.count)))
         points, times, directions, features = (1 + 2 * count for count in octaves)
         time_features = PER_CHANNEL * channels
         self.time = layers([times, width, time_features])
@@ -74,7 +81,14 @@ class TiNeuVox(ViewDependentField):
         self.density = nn.Linear(width, 1)
         self.tint = nn.Linear(width, width)
         self.colours = layers([width + 3 * directions, width // 2, 3])
+        self.background = background
         self.register_load_state_dict_pre_hook(_fit_grid)
+        self.register_load_state_dict_post_hook(lambda field, _: field._read_buffers())
+
+    def _read_buffers(self) -> None:
+        """Keep on the host what each step asks for: a GPU would be waited for."""
+        self.count = int(self.voxels)
+        self._corners = self.box.double().cpu()
 
     @property
     def planes(self) -> Mapping[str, Tensor]:
@@ -98,12 +112,13 @@ class TiNeuVox(ViewDependentField):
     @property
     def outline(self) -> str:
         cells = " x ".join(str(size) for size in self._size(self.resolution**3))
-        return f"(grid of {cells} cells) · {self.channels} channels"
+        behind = "" if self.background is None else " · a background"
+        return f"(grid of {cells} cells) · {self.channels} channels{behind}"
 
     @property
     def cell(self) -> float:
         """Side of a cell in units of the frame."""
-        return self._cell(int(self.voxels)) / self.unit
+        return self._cell(self.count) / self.unit
 
     def bounds(self) -> Tensor:
         """Least and largest corner of the grid in the field's frame. [2, 3]"""
@@ -117,6 +132,7 @@ class TiNeuVox(ViewDependentField):
             self.grid.data, size=size, mode="trilinear", align_corners=True
         )
         self.voxels.fill_(voxels)
+        self.count = voxels
 
     def read(self, places: Tensor) -> Tensor:
         """The grid at three spacings, zero outside. World positions [N, 3] -> [N, 3 C]"""
@@ -157,11 +173,11 @@ class TiNeuVox(ViewDependentField):
         return torch.autocast(values.device.type, torch.bfloat16, enabled=self._precision == "bf16")
 
     def _cell(self, voxels: int) -> float:
-        low, high = self.box.double()
+        low, high = self._corners
         return float(((high - low).prod() / voxels) ** (1 / 3))
 
     def _size(self, voxels: int) -> list[int]:
-        low, high = self.box.double()
+        low, high = self._corners
         # Whole cells, but a rounding error must not cost one.
         sides = (high - low) / self._cell(voxels) + 1e-4
         return [max(2, int(side)) for side in sides.tolist()]

@@ -35,10 +35,12 @@ class KPlanesSettings(ModelSettings):
     field_class: ClassVar = KPlanes
 
     variant: Literal["hybrid", "explicit"]  # MLP decoder, or linear decoder with learned bases.
+    # Contract space around the cube where images show a world: planes then cover all of space.
+    contract: bool
     half_side: Positive | None  # Half the side of a cube at the origin; null: the scene's cube.
     resolution: Count  # Texels along each space axis at the first scale.
     scales: list[Count]  # Factors on the space resolution.
-    time_resolution: Count | None  # Rows of time; null: half the training views.
+    time_resolution: Count | None  # Rows of time; null: half the distinct times, all if seen often.
     channels: Count  # Channels of each plane and scale.
     space_low: float  # Lower bound of the uniform initialisation of space planes.
     space_high: float  # Upper bound. Time planes are initialised to 1.
@@ -72,7 +74,8 @@ class KPlanesSettings(ModelSettings):
                 high=self.space_high,
             )
             decode = decoder(products.features, self.width, precision=site.precision)
-        return KPlanesModel(self, KPlanes(products, decode, site.unit))
+        contracted = self.contract and site.surrounded
+        return KPlanesModel(self, KPlanes(products, decode, site.unit, contracted=contracted))
 
 
 class KPlanesModel(Model):

@@ -154,8 +154,10 @@ class Tensor4DDensityModel(Model):
     def before_step(self, state: TrainingState, optimizer: torch.optim.Optimizer) -> None:
         for part in self._field.children():
             if isinstance(part, HierarchicalPlanes):
-                part.fine.fill_(state.step >= self.settings.fine_from)
-                part.blurred.fill_(state.step < self.settings.blur_until)
+                part.show(
+                    fine=state.step >= self.settings.fine_from,
+                    blurred=state.step < self.settings.blur_until,
+                )
 
 
 class Tensor4DModel(Tensor4DDensityModel):

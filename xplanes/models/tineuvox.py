@@ -9,6 +9,7 @@ from torch import Tensor
 
 from xplanes.errors import ConfigError
 from xplanes.fields.tineuvox import TiNeuVox
+from xplanes.models.background import BackgroundSettings
 from xplanes.models.base import InitialValues, Model, ModelSettings, colour_error
 from xplanes.rendering.base import Rendering
 from xplanes.rendering.fixed_step import FixedStepRendering
@@ -54,6 +55,8 @@ class TiNeuVoxSettings(ModelSettings):
     deformation_learning_rate: Positive  # Learning rate of the deformation network.
     network_learning_rate: Positive  # Learning rate of the other networks.
     decay_steps: Count  # Steps over which learning rates decay to a tenth.
+    # What lies behind the box, for opaque images of a scene in a world; null: a plain colour.
+    background: BackgroundSettings | None = None
     loss: TiNeuVoxLoss
 
     def check(self) -> None:
@@ -90,6 +93,7 @@ class TiNeuVoxSettings(ModelSettings):
                 moves=site.moves,
                 unit=site.unit,
                 precision=site.precision,
+                background=None if self.background is None else self.background.build(site),
             )
         return TiNeuVoxModel(self, field)
 
@@ -126,9 +130,13 @@ class TiNeuVoxModel(Model):
             }
         ]
         for name, part in field.named_children():
+            if part is field.background:
+                continue
             deforms = name == "deformation"
             rate = settings.deformation_learning_rate if deforms else settings.network_learning_rate
             groups.append({"params": list(part.parameters()), "lr": rate, "name": name})
+        if field.background is not None and settings.background is not None:
+            groups += settings.background.groups(field.background)
         return groups
 
     def optimizer(self, groups: list[Group]) -> torch.optim.Optimizer:
@@ -145,9 +153,13 @@ class TiNeuVoxModel(Model):
 
     def before_step(self, state: TrainingState, optimizer: torch.optim.Optimizer) -> None:
         voxels = self.voxels(state.step)
-        if int(self._field.voxels) != voxels:
+        if self._field.count != voxels:
             self._field.resize(voxels)
             optimizer.state.clear()
+
+    def regularise(self, state: TrainingState) -> None:
+        if self._field.background is not None and self.settings.background is not None:
+            self.settings.background.regularise(self._field.background)
 
     def losses(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
         terms = {
@@ -162,7 +174,7 @@ class TiNeuVoxModel(Model):
         return terms
 
     def scalars(self) -> dict[str, float]:
-        return {"grid/cells": float(self._field.voxels)}
+        return {"grid/cells": float(self._field.count)}
 
 
 def frusta_box(views: Views, near: float, far: float, margin: float) -> Tensor:
@@ -250,6 +262,16 @@ class MaskedAdam(torch.optim.Optimizer):
             mean.lerp_(gradient, 1 - first)
             square.mul_(second).addcmul_(gradient, gradient, value=1 - second)
             parameter.addcdiv_(mean, square.sqrt().add_(group["eps"]), value=-size * group["lr"])
+            return
+        if parameter.device.type != "cpu":
+            # A list of what is reached would be waited for.
+            still = gradient == 0
+            new_mean = torch.where(still, mean, mean.lerp(gradient, 1 - first))
+            new_square = (square * second).addcmul_(gradient, gradient, value=1 - second)
+            mean.copy_(new_mean)
+            square.copy_(torch.where(still, square, new_square))
+            change = mean / square.sqrt().add_(group["eps"])
+            parameter.sub_(change.masked_fill_(still, 0), alpha=size * group["lr"])
             return
         reached = gradient.flatten().nonzero()[:, 0]
         flat = gradient.flatten()[reached]

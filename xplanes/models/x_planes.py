@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from xplanes.decomposition.sparse_loss import SparseProduct
-from xplanes.fields.background import Background
 from xplanes.fields.decoder import Decoder
 from xplanes.fields.regularisers import (
     add_distance_gradient,
@@ -24,6 +23,7 @@ from xplanes.fields.regularisers import (
     total_variation,
 )
 from xplanes.fields.xplanes import XPlanes, random_planes
+from xplanes.models.background import BackgroundSettings
 from xplanes.models.base import (
     InitialValues,
     Model,
@@ -37,7 +37,7 @@ from xplanes.rendering.base import Rendering
 from xplanes.rendering.sampler import Group, Site, time_rows
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
-from xplanes.streams import Stream, TrainingState, initial_values, step_generator
+from xplanes.streams import Stream, TrainingState, step_generator
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,16 +57,6 @@ class DecoderSettings(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BackgroundSettings(Settings):
-    """A static world behind the field's cube, for opaque images of a scene in a world."""
-
-    resolution: Count  # Texels along each side of its planes, over contracted space.
-    channels: Count  # Channels of each plane.
-    samples: Steps  # Samples of a ray behind the cube; 0: its colour depends on direction alone.
-    width: Count  # Neurons of the decoder's hidden layer.
-
-
-@dataclass(frozen=True, kw_only=True)
 class XPlanesLoss(Settings):
     """Weights of the terms of the loss beyond the colour's mean squared error."""
 
@@ -76,6 +66,7 @@ class XPlanesLoss(Settings):
     # over planes, along time too.
     variation: Literal["mean", "coded"]
     total_variation: Weight  # Weight of total variation.
+    world_variation: Weight  # The same in front of a background, in place of it.
     time_smoothness: Weight  # Weight of time smoothness (squared second differences).
     time_magnitude: Weight  # Weight of the squared values of time planes.
     time_identity: Weight  # Weight of the time planes' mean distance from 1, as in K-Planes.
@@ -97,8 +88,8 @@ class XPlanesSettings(ModelSettings):
 
     plane_set: Literal["six", "nine", "three"]
     resolution: Count  # Texels along each space axis.
-    # Rows of time. half: half the number of distinct times, as in K-Planes; null: the same, but as
-    # many as the LRM has timesteps if these are more.
+    # Rows of time. half: half the number of distinct times, as in K-Planes; null: the same, or all
+    # of them where each is seen often, and as many as the LRM has timesteps if these are more.
     time_resolution: Count | Literal["half"] | None
     channels: Count  # Channels of each plane.
     space_scale: Weight  # Standard deviation of randomly initialised space planes.
@@ -139,7 +130,7 @@ class XPlanesSettings(ModelSettings):
     def build_field(self, site: Site, initial: InitialValues | None = None) -> XPlanes:
         """The field: planes and decoder from what is given, the rest of it random."""
         plane_set = self.plane_set if site.moves else "three"
-        background = self._background(site)
+        background = None if self.background is None else self.background.build(site)
         generator = step_generator(site.seed, 0, Stream.INITIAL_FIELD)
         planes: Mapping[str, Tensor]
         if initial is not None:
@@ -177,20 +168,6 @@ class XPlanesSettings(ModelSettings):
         decoder.requires_grad_(not options.freeze)
         return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set, background=background)
 
-    def _background(self, site: Site) -> Background | None:
-        """What lies behind the cube; None for a plain colour."""
-        if self.background is None or not site.surrounded:
-            return None
-        options = self.background
-        with initial_values(site.seed, Stream.BACKGROUND):
-            return Background(
-                options.channels,
-                options.resolution,
-                width=options.width,
-                samples=options.samples,
-                precision="bf16" if site.precision == "bf16" else "32",
-            )
-
 
 class XPlanesModel(Model):
     """The colour's error, smooth planes, and products of time planes near what moves.
@@ -214,6 +191,9 @@ class XPlanesModel(Model):
         steps = self.weights.initial_steps
         self.fade = None if steps is None else steps / views
         self.opacity = self.weights.opacity
+        self.total_variation = self.weights.total_variation
+        if field.background is not None:
+            self.total_variation = self.weights.world_variation
         self._opaque = site.views is not None and site.views.is_opaque
         self.product: SparseProduct | None = None
         self.initial_weight, self._initial = 0.0, []
@@ -248,12 +228,8 @@ class XPlanesModel(Model):
         decoder = [p for p in field.decoder.parameters() if p.requires_grad]
         if decoder:
             groups.append({"params": decoder, "lr": settings.decoder_lr, "name": "decoder"})
-        if (world := field.background) is not None:
-            decoder = list(world.decoder.parameters())
-            groups += [
-                {"params": [world.planes], "lr": settings.plane_lr, "name": "background"},
-                {"params": decoder, "lr": settings.decoder_lr, "name": "background_decoder"},
-            ]
+        if field.background is not None and settings.background is not None:
+            groups += settings.background.groups(field.background)
         return groups
 
     def losses(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
@@ -275,6 +251,8 @@ class XPlanesModel(Model):
         every, field, weights = self.weights.every, self._field, self.weights
         if state.step % every or field.space.grad is None:
             return
+        if field.background is not None and self.settings.background is not None:
+            self.settings.background.regularise(field.background, every)
         fading = self._fading(state.step)
         if not fading:
             self._initial, self.product = [], None  # Large, and of no more use.
@@ -286,7 +264,7 @@ class XPlanesModel(Model):
                 if plane.grad is not None:
                     add_distance_gradient(plane.grad, plane, initial, weight)
         for plane, dims, factor in self._variation():
-            if (weight := factor * weights.total_variation * every) and plane.grad is not None:
+            if (weight := factor * self.total_variation * every) and plane.grad is not None:
                 add_total_variation_gradient(plane.grad, plane, dims, weight)
         if field.time is None or field.time.grad is None:
             return
@@ -309,13 +287,16 @@ class XPlanesModel(Model):
         weights, field, fading = self.weights, self._field, self._fading(state.step)
         terms: dict[str, tuple[float, Callable[[], Any]]] = {
             "total_variation": (
-                weights.total_variation,
+                self.total_variation,
                 lambda: sum(
                     factor * total_variation(plane, dims)
                     for plane, dims, factor in self._variation()
                 ),
             )
         }
+        if (world := field.background) is not None and (options := self.settings.background):
+            variation = options.total_variation
+            terms["background"] = (variation, lambda: total_variation(world.planes, (1, 2)))
         if self._initial:
             terms["initialisation"] = (fading * self.initial_weight, self._distance)
         if (time := field.time) is not None:

@@ -70,7 +70,8 @@ def encode(
             found[frame_key] = stage.content["triplane"]
             seconds += stage.seconds
     cached = len(found)
-    model = model.to(device)
+    if missing:
+        model = model.to(device)
     for chunk in _progress(missing, batch):
         began = time.perf_counter()
         first = torch.tensor([places[frame_key][0] for frame_key in chunk])

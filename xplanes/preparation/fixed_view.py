@@ -97,10 +97,13 @@ def fixed_view(
         check_camera(scene.video)
         views = pick_frames(scene.video, torch.linspace(0, 1, count) if count > 1 else times[:1])
         return FixedView(views, frame.centre, 0.0, f"{len(views)} frames of the scene's video")
-    if scene.is_surrounded:
+    if scene.cut is not None:
+        place = replace(place, scene=replace(scene, splits=scene.splits | {"train": scene.cut}))
+    elif scene.is_surrounded:
         place.say(
             f"fixed view: the images of {scene.name} have no silhouettes, so the LRM is shown all "
-            "that is found in the cube, the ground included; masks would show it the thing alone"
+            "that is found in the cube, the ground included; masks would show it the thing alone "
+            "(data.mask_use=lrm)"
         )
     return _rendered(method, place, view, size, count, cache)
 

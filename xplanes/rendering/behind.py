@@ -1,5 +1,6 @@
-"""What rays see behind the field's cube."""
+"""What rays see behind the box in which a field lives."""
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -10,7 +11,13 @@ from xplanes.rendering.box import ray_box
 from xplanes.rendering.compositing import OPAQUE, composite
 
 DARK = 1e-3
-"""Share of the light that must pass the cube for a ray to look behind it."""
+"""Share of the light that must pass the field for a ray to look behind it."""
+
+Ends = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""From origins and directions to the distances at which rays enter and leave a box, see `ray_box`.
+
+[R, 3], [R, 3] -> [R], [R]
+"""
 
 
 def behind(
@@ -20,17 +27,19 @@ def behind(
     opacity: Tensor,
     plain: Tensor,
     jitter: Tensor | None = None,
+    ends: Ends = ray_box,
 ) -> Tensor:
-    """Colours behind the cube: of the field's background where it has one, else a plain one.
+    """Colours behind a field: of its background where it has one, else a plain one.
 
     Args:
         field: Its ``background`` is a `Background`, None, or not there.
         origins: Ray origins in the field's frame. [R, 3]
         directions: Unit directions. [R, 3]
-        opacity: Share of each ray's light that the cube stops; the background of rays that it
+        opacity: Share of each ray's light that the field stops; the background of rays that it
             stops whole is not computed, and black. [R]
         plain: Colour behind a field without a background. [3] or [R, 3]
         jitter: Place of each ray's samples within their steps; the middle when None. [R]
+        ends: Where rays meet the field's box.
 
     Returns:
         Gradients reach the background. [3] or [R, 3]
@@ -38,38 +47,47 @@ def behind(
     background: Background | None = getattr(field, "background", None)
     if background is None:
         return plain
-    seen = (opacity.detach() < 1 - DARK).nonzero()[:, 0]
+    clear = opacity.detach() < 1 - DARK
+    if clear.device.type != "cpu":
+        # Looking for those few would be waited for.
+        return torch.where(clear[:, None], look(background, origins, directions, jitter), 0)
+    seen = clear.nonzero()[:, 0]
     place = None if jitter is None else jitter[seen]
-    colour = look(background, origins[seen], directions[seen], place)
+    colour = look(background, origins[seen], directions[seen], place, ends)
     black = torch.zeros_like(directions, dtype=colour.dtype)
     return black.index_put((seen,), colour)
 
 
 def look(
-    background: Background, origins: Tensor, directions: Tensor, jitter: Tensor | None = None
+    background: Background,
+    origins: Tensor,
+    directions: Tensor,
+    jitter: Tensor | None = None,
+    ends: Ends = ray_box,
 ) -> Tensor:
-    """Colours that rays see in a background, from where they leave the cube to infinity.
+    """Colours that rays see in a background, from where they leave a field's box to infinity.
 
     Samples are even in inverse distance, and the last one, at infinity, is opaque. A ray that
-    misses the cube looks from half its origin's distance from the cube's centre on.
+    misses the box looks from half its origin's distance from the frame's centre on.
 
     Args:
         background: The background.
         origins: Ray origins in the field's frame. [R, 3]
         directions: Unit directions. [R, 3]
         jitter: Place of each ray's samples within their steps; the middle when None. [R]
+        ends: Where rays meet the box.
 
     Returns:
         [R, 3]
     """
     rays, count = len(origins), background.samples
-    far = ray_box(origins, directions)[1]
+    far = ends(origins, directions)[1]
     first = torch.where(far > 0, far, 0.5 * origins.norm(dim=-1))[:, None]
     steps = torch.arange(count, device=origins.device)
     within = 0.5 if jitter is None else jitter[:, None]
     horizon = RADIUS * directions[:, None]
-    ends = _at(origins, directions, first / (1 - steps / count))
-    lengths = torch.cat([ends, horizon], dim=1).diff(dim=1).norm(dim=-1)
+    edges = _at(origins, directions, first / (1 - steps / count))
+    lengths = torch.cat([edges, horizon], dim=1).diff(dim=1).norm(dim=-1)
     points = _at(origins, directions, first / (1 - (steps + within) / count))
     points = torch.cat([points, horizon], dim=1)
     colour, density = background(points.flatten(0, 1))

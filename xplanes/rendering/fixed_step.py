@@ -1,6 +1,7 @@
 """Rays through a field's box at equal steps; colour only where it counts."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 from xplanes.errors import ConfigError
 from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
+from xplanes.rendering.behind import behind
 from xplanes.rendering.compositing import composite
 from xplanes.rendering.marching import Samples
 from xplanes.rendering.sampler import Sampler, SamplerSettings, Site, check_range
@@ -69,7 +71,8 @@ class FixedStepRenderer(RayRenderer):
         jitter: None = None,
     ) -> FixedStepRendering:
         step = self.step * field.cell
-        samples = self.place(origins, directions, field.bounds(), step)
+        box = field.bounds()
+        samples = self.place(origins, directions, box, step)
         density, features = field.geometry(samples.points, times[samples.ray])
         depth = density * step
         with torch.no_grad():
@@ -84,6 +87,8 @@ class FixedStepRenderer(RayRenderer):
         colour = nothing.to(colours.dtype).index_put((seen,), colours)
         total, weights = composite(torch.where(clear, 0, depth), colour, *rays)
         opacity = total[:, 3]
+        ends = partial(self.ends, box=box)
+        background = behind(field, origins, directions, opacity, background, ends=ends)
         return FixedStepRendering(
             colour=total[:, :3] + (1 - opacity)[:, None] * background,
             opacity=opacity,
@@ -95,6 +100,14 @@ class FixedStepRenderer(RayRenderer):
             ray=ray,
         )
 
+    def ends(self, origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
+        """Distances, from near to far, between which rays are in a box. [R, 3] -> [R], [R]"""
+        slopes = torch.where(directions == 0, 1e-6, directions)
+        first, second = (box[0] - origins) / slopes, (box[1] - origins) / slopes
+        enter = torch.minimum(first, second).amax(dim=1).clamp(self.near, self.far)
+        leave = torch.maximum(first, second).amin(dim=1).clamp(self.near, self.far)
+        return enter, leave
+
     @torch.no_grad()
     def place(self, origins: Tensor, directions: Tensor, box: Tensor, step: float) -> Samples:
         """All samples of rays in the box and between near and far.
@@ -105,10 +118,7 @@ class FixedStepRenderer(RayRenderer):
             box: Least and largest corner. [2, 3]
             step: Distance between samples.
         """
-        slopes = torch.where(directions == 0, 1e-6, directions)
-        first, second = (box[0] - origins) / slopes, (box[1] - origins) / slopes
-        enter = torch.minimum(first, second).amax(dim=1).clamp(self.near, self.far)
-        leave = torch.maximum(first, second).amin(dim=1).clamp(self.near, self.far)
+        enter, leave = self.ends(origins, directions, box)
         count = ((leave - enter) / step).ceil().long().clamp_min(1)
         number = torch.arange(int(count.max()) if len(count) else 0, device=count.device)
         distances = enter[:, None] + number * step

@@ -22,7 +22,13 @@ from xplanes.rendering.thinning import Cut
 from xplanes.rendering.warming import render_one_ray
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Range, Share, Steps, Weight
-from xplanes.streams import Stream, TrainingState, step_generator
+from xplanes.streams import Stream, TrainingState, counted_uniform, step_generator
+
+SPARE = 1.25
+"""Places for the samples of a batch, over their average."""
+
+STEP_OF_ROOM = 1024
+"""Their number is a multiple of this."""
 
 DIAGONAL = 2 * math.sqrt(3)
 """Longest way through the field's cube."""
@@ -38,7 +44,9 @@ class GridRenderer(RayRenderer):
         skip_empty: Skip samples in empty cells.
         occlusion: Skip samples behind surfaces that leave less light than this; 0 skips none.
         thinning: Where gradients are wanted, samples whose own is below this times the mean may be
-            left out, see `Cut.pass_on`; 0 leaves none out.
+            left out, see `Cut.pass_on`; 0 leaves none out. On the CPU alone: elsewhere choosing
+            costs more than what it saves.
+        room: Places for samples where nothing may wait for their number, see `march`.
     """
 
     grid: OccupancyGrid
@@ -46,6 +54,7 @@ class GridRenderer(RayRenderer):
     skip_empty: bool = True
     occlusion: float = 0.001
     thinning: float = 0.0
+    room: int | None = None
 
     @property
     def device(self) -> torch.device:
@@ -88,15 +97,18 @@ class GridRenderer(RayRenderer):
             step=self.step,
             skip_empty=self.skip_empty,
             occlusion=self.occlusion,
+            room=self.room,
         )
 
         def ask(chosen: Tensor | slice) -> tuple[Tensor, Tensor]:
             points, ray = samples.points[chosen], samples.ray[chosen]
             return shade(field, points, times, directions, ray)
 
-        thin = self.thinning > 0 and torch.is_grad_enabled()
+        thin = self.thinning > 0 and torch.is_grad_enabled() and origins.device.type == "cpu"
         cut = Cut.of(ask, self.thinning) if thin else None
         colour, density = (cut.colour, cut.density) if cut else ask(slice(None))
+        if samples.live is not None:
+            density = torch.where(samples.live, density, 0)
         total, _ = composite(
             density * self.step, colour, samples.distances, samples.ray, samples.starts
         )
@@ -124,6 +136,7 @@ class OccupancySettings(SamplerSettings):
     grid_resolution: Count  # Cells of the occupancy grid along each side.
     time_bins: Count  # Bins of the occupancy grid along time.
     threshold: Fraction  # Opacity of one step below which a cell is empty.
+    world_threshold: Fraction  # The same in front of a background, in place of it.
     decay: Share  # Decay of the density of a cell at each update.
     skip_empty: bool  # Skip samples in empty cells.
     skip_occluded: bool  # Skip samples behind opaque surfaces.
@@ -150,11 +163,12 @@ class OccupancySettings(SamplerSettings):
             )
 
     def build(self, field: RadianceField, site: Site) -> "OccupancySampler":
+        plain = getattr(field, "background", None) is None
         grid = OccupancyGrid(
             self.grid_resolution,
             self.time_bins if site.moves else 1,
             step=DIAGONAL / self.samples,
-            threshold=self.threshold,
+            threshold=self.threshold if plain else self.world_threshold,
             decay=self.decay,
         )
         renderer = GridRenderer(
@@ -168,7 +182,7 @@ class OccupancySettings(SamplerSettings):
                 carve(grid, site.views, site.frame)
             if site.initialised and self.fill:
                 _fill(renderer, field, site)
-        return OccupancySampler(renderer, self)
+        return OccupancySampler(renderer, self, site.samples_per_batch)
 
     def for_video(self) -> "OccupancySettings":
         return replace(self, render_samples=self.samples)
@@ -193,13 +207,18 @@ class OccupancySampler(Sampler):
     Args:
         renderer: Its grid is changed in place.
         settings: Upkeep of the grid.
+        samples: Samples of a batch on average at most; None if not known.
     """
 
-    def __init__(self, renderer: GridRenderer, settings: OccupancySettings) -> None:
-        self.settings, self.grid = settings, renderer.grid
-        self._training = replace(renderer, thinning=settings.thinning)
+    def __init__(
+        self, renderer: GridRenderer, settings: OccupancySettings, samples: int | None = None
+    ) -> None:
+        self.settings, self.grid, self.samples = settings, renderer.grid, samples
+        room = None if samples is None else self._room(samples)
+        self._training = replace(renderer, thinning=settings.thinning, room=room)
         self._coarse = replace(self._training, samples=math.ceil(renderer.samples / 2))
         self._images = replace(renderer, samples=settings.render_samples)
+        self._coarse_images = replace(self._coarse, room=None)
 
     @property
     def renderer(self) -> GridRenderer:
@@ -218,7 +237,7 @@ class OccupancySampler(Sampler):
 
     def renderer_at(self, step: int) -> GridRenderer:
         # At first the grid hides little, and images of all samples would take longer than steps.
-        return self._coarse if step < self.settings.coarse_steps else self._images
+        return self._coarse_images if step < self.settings.coarse_steps else self._images
 
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
         coarse = state.step < self.settings.coarse_steps
@@ -231,13 +250,14 @@ class OccupancySampler(Sampler):
             rays["jitter"],
         )
 
-    def pass_on(self, rendering: Rendering, state: TrainingState) -> int:
+    def pass_on(self, rendering: Rendering, state: TrainingState) -> int | Tensor:
         if rendering.cut is None:
-            return len(rendering.samples)
+            return rendering.samples.count
         return rendering.cut.pass_on(state.generator(rendering.density.device, Stream.THINNING))
 
     def observe(self, rendering: Rendering) -> None:
-        self.grid.observe(rendering.samples.cells, rendering.density)
+        samples = rendering.samples
+        self.grid.observe(samples.cells, rendering.density, samples.live)
 
     def update(self, field: Any, state: TrainingState) -> None:
         step, settings = state.step, self.settings
@@ -248,6 +268,10 @@ class OccupancySampler(Sampler):
         generator = step_generator(state.seed, step, Stream.GRID)
         if sweeping:
             self.grid.sweep(field, generator)
+        elif (device := self.grid.density.device).type != "cpu":
+            shape = (settings.update_cells, 8)
+            uniform = counted_uniform(state.seed, step, Stream.GRID, shape, device)
+            self.grid.update_by(field, uniform)
         else:
             self.grid.update(field, settings.update_cells, generator)
 
@@ -256,6 +280,19 @@ class OccupancySampler(Sampler):
         if distributed.is_available() and distributed.is_initialized():
             for part in (self.grid.density, self.grid.least, self.grid.occupied):
                 distributed.broadcast(part, src=0)
+
+    def expect(self, samples: float) -> None:
+        if self.samples is not None:
+            room = self._room(min(samples, self.samples))
+            self._training = replace(self._training, room=room)
+            self._coarse = replace(self._coarse, room=room)
+
+    def _room(self, samples: float) -> int:
+        """Places for batches of so many samples on average: some hold more."""
+        # A ray must find room, and few sizes let memory be used again.
+        return STEP_OF_ROOM * math.ceil(
+            max(SPARE * samples, 2 * self.settings.samples) / STEP_OF_ROOM
+        )
 
     def scalars(self) -> dict[str, float]:
         return {"sampler/occupied": self.grid.occupied_fraction}

@@ -11,6 +11,9 @@ from xplanes.rendering.box import ray_box
 from xplanes.rendering.compositing import OPAQUE, depth_before
 from xplanes.rendering.occupancy import OccupancyGrid
 
+OUTSIDE = 3.0
+"""Coordinate of places without a sample, beyond the planes: nothing is read or added there."""
+
 
 @dataclass(frozen=True)
 class Samples:
@@ -25,6 +28,12 @@ class Samples:
         candidates: Samples in the box before any was dropped.
         empty: Samples dropped because their cell is empty.
         occluded: Samples dropped because an opaque surface lies in front.
+        live: Where room was set apart for samples: which places hold one; None if all do. [N]
+        number: How many do. []
+        shown: Which rays found room; None if all did. [R]
+
+    With ``live`` the other numbers of samples are tensors too, and the places without a sample lie
+    outside the cube, behind all others.
     """
 
     ray: Tensor
@@ -32,12 +41,20 @@ class Samples:
     points: Tensor
     distances: Tensor
     cells: Tensor
-    candidates: int
-    empty: int
-    occluded: int
+    candidates: int | Tensor
+    empty: int | Tensor
+    occluded: int | Tensor
+    live: Tensor | None = None
+    number: Tensor | None = None
+    shown: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.ray)
+
+    @property
+    def count(self) -> int | Tensor:
+        """Samples that there are; a tensor where only the device knows."""
+        return len(self.ray) if self.number is None else self.number
 
 
 def march(
@@ -50,6 +67,7 @@ def march(
     step: float,
     skip_empty: bool = True,
     occlusion: float = 0.0,
+    room: int | None = None,
 ) -> Samples:
     """Place samples at equal steps through the cube [-1, 1]^3 and keep the useful ones.
 
@@ -63,6 +81,9 @@ def march(
         skip_empty: Whether samples in empty cells are dropped.
         occlusion: Samples that the grid's least densities leave less light than this are dropped;
             0 keeps all.
+        room: Places set apart for samples on a device other than the CPU, so that nothing waits for
+            their number. Rays without room are left out whole, and those behind them. None takes as
+            many as there are.
 
     Returns:
         The samples that remain.
@@ -72,6 +93,11 @@ def march(
         return _march_cpu(
             origins, directions, times, jitter, grid, step=step, skip=skip_empty, limit=limit
         )
+    if room is not None and origins.device.type != "cpu":
+        return march_into(
+            origins, directions, times, jitter, grid, step=step, skip=skip_empty, limit=limit,
+            room=room,
+        )  # fmt: skip
     return march_reference(
         origins, directions, times, jitter, grid, step=step, skip=skip_empty, limit=limit
     )
@@ -91,14 +117,9 @@ def march_reference(
     """The same as `march`, in whole-tensor operations."""
     near, far = ray_box(origins, directions)
     steps = int(((far - near).max() / step).ceil()) + 1 if len(near) else 0
-    offset = torch.arange(steps, device=near.device, dtype=near.dtype) + jitter[:, None]
-    distances = near[:, None] + offset * step
-    inside = distances < far[:, None]
-    half = 0.5 * grid.resolution
-    cells = grid.bins(times)[:, None]
-    for axis in (2, 1, 0):
-        place = (origins[:, axis, None] + distances * directions[:, axis, None] + 1) * half
-        cells = cells * grid.resolution + place.long().clamp_(0, grid.resolution - 1)
+    distances, cells, inside = _all_samples(
+        origins, directions, times, jitter, near, far, grid, step, steps
+    )
     live = inside & grid.occupied[cells] if skip else inside
     ray, place = live.nonzero(as_tuple=True)
     distances, cells = distances[ray, place], cells[ray, place]
@@ -117,6 +138,80 @@ def march_reference(
         candidates=candidates,
         empty=candidates - found,
         occluded=found - len(ray),
+    )
+
+
+def _all_samples(
+    origins: Tensor,
+    directions: Tensor,
+    times: Tensor,
+    jitter: Tensor,
+    near: Tensor,
+    far: Tensor,
+    grid: OccupancyGrid,
+    step: float,
+    steps: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Distance and cell of so many samples of each ray, and whether they lie in the cube. [R, S]"""
+    offset = torch.arange(steps, device=near.device, dtype=near.dtype) + jitter[:, None]
+    distances = near[:, None] + offset * step
+    half = 0.5 * grid.resolution
+    cells = grid.bins(times)[:, None]
+    for axis in (2, 1, 0):
+        place = (origins[:, axis, None] + distances * directions[:, axis, None] + 1) * half
+        cells = cells * grid.resolution + place.long().clamp_(0, grid.resolution - 1)
+    return distances, cells, distances < far[:, None]
+
+
+def march_into(
+    origins: Tensor,
+    directions: Tensor,
+    times: Tensor,
+    jitter: Tensor,
+    grid: OccupancyGrid,
+    *,
+    step: float,
+    skip: bool,
+    limit: float,
+    room: int,
+) -> Samples:
+    """The same as `march_reference` into a fixed number of places, without waiting for the device.
+
+    Samples are counted, the counts summed up, and each place finds its sample by the sum.
+    """
+    near, far = ray_box(origins, directions)
+    rays, steps = len(near), math.ceil(2 * math.sqrt(3) / step) + 1
+    distances, cells, inside = _all_samples(
+        origins, directions, times, jitter, near, far, grid, step, steps
+    )
+    met = inside & grid.occupied[cells] if skip else inside
+    kept = met
+    if math.isfinite(limit):
+        depth = (grid.least[cells].double() * step).clamp_max(OPAQUE) * met
+        kept = met & (depth.cumsum(1) - depth < limit)
+    running = kept.flatten().cumsum(0)
+    ends = running.view(rays, steps)[:, -1]
+    shown = ends <= room
+    total = (ends * shown).amax()
+    slot = torch.arange(room, device=near.device)
+    live = slot < total
+    place = torch.searchsorted(running, slot + 1).clamp_max_(rays * steps - 1)
+    ray = torch.where(live, torch.div(place, steps, rounding_mode="floor"), rays - 1)
+    distances = distances.flatten()[place]
+    points = torch.addcmul(origins[ray], directions[ray], distances[:, None])
+    candidates, found = inside.sum(), met.sum()
+    return Samples(
+        ray=ray,
+        starts=torch.minimum(ends - kept.sum(dim=1), total),
+        points=torch.where(live[:, None], points, OUTSIDE),
+        distances=torch.where(live, distances, 0),
+        cells=cells.flatten()[place],
+        candidates=candidates,
+        empty=candidates - found,
+        occluded=found - running[-1],
+        live=live,
+        number=total,
+        shown=shown,
     )
 
 

@@ -95,14 +95,28 @@ class OccupancyGrid(nn.Module):
         return float(self.occupied.float().mean())
 
     @torch.no_grad()
-    def observe(self, cells: Tensor, density: Tensor) -> None:
-        """Take in the field's density at samples; cells ruled out stay empty. [N], [N]"""
+    def observe(self, cells: Tensor, density: Tensor, live: Tensor | None = None) -> None:
+        """Take in the field's density at samples; cells ruled out stay empty.
+
+        Args:
+            cells: Cell of each sample. [N]
+            density: Density there. [N]
+            live: Which of them count; all when None. [N]
+        """
         density = self._usable(density)
-        seen = torch.maximum(self.density[cells] * self.decay, density) * self.allowed[cells]
+        if live is not None:
+            # All others repeat one that counts, which changes nothing.
+            one = live.long().argmax(dim=0, keepdim=True)
+            cells = torch.where(live, cells, cells[one])
+            density = torch.where(live, density, density[one])
+        before, least = self.density[cells], self.least[cells]
+        seen = torch.maximum(before * self.decay, density) * self.allowed[cells]
+        looked = torch.minimum(density, torch.lerp(least, density, TRUST))
+        if live is not None:
+            none = ~live.any()
+            seen, looked = torch.where(none, before, seen), torch.where(none, least, looked)
         self.density.scatter_reduce_(0, cells, seen, "amax", include_self=False)
-        least = self.least[cells]
-        least = torch.minimum(density, torch.lerp(least, density, TRUST))
-        self.least.scatter_reduce_(0, cells, least, "amin", include_self=False)
+        self.least.scatter_reduce_(0, cells, looked, "amin", include_self=False)
         self.occupied[cells] = self.density[cells] > self.empty_density
 
     @torch.no_grad()
@@ -162,14 +176,38 @@ class OccupancyGrid(nn.Module):
         points, times = self.draw(cells, uniform)
         self.observe(cells, field(points, times)[1])
 
+    @torch.no_grad()
+    def update_by(self, field: Field, uniform: Tensor) -> None:
+        """The same as `update` by given random numbers, without waiting for the device.
+
+        Args:
+            field: From points [N, 3] and times [N] to colour [N, 3] and density [N].
+            uniform: Numbers from 0 to 1, eight for each cell at most. [N, 8]
+        """
+        count, total = len(uniform), self.density.numel()
+        chosen = uniform[:, 0]
+        running = self.occupied.cumsum(0)
+        number = (chosen[: count // 2] * running[-1]).long() + 1
+        beside = torch.searchsorted(running, number).clamp_max_(total - 1)
+        beside = self._moved(beside, (3 * uniform[: count // 2, 1:4].T).long() - 1)
+        anywhere = (chosen[count // 2 :] * total).long()
+        cells = torch.cat([anywhere, beside])
+        looked_at = self.allowed[cells] & (self.likely[cells] | self._beside_occupied(cells))
+        points, times = self.draw(cells, uniform[:, 4:].float())
+        self.observe(cells, field(points, times)[1], looked_at)
+
     def _near_occupied(self, count: int, generator: torch.Generator) -> Tensor:
         """Random cells of the same time within one step of an occupied one, along each axis."""
-        device, size = self.density.device, self.resolution
+        device = self.density.device
         cells = self.occupied.nonzero()[:, 0]
         if not len(cells):
             return cells
         cells = cells[torch.randint(len(cells), (count,), generator=generator).to(device)]
-        moves = torch.randint(-1, 2, (3, count), generator=generator).to(device)
+        return self._moved(cells, torch.randint(-1, 2, (3, count), generator=generator).to(device))
+
+    def _moved(self, cells: Tensor, moves: Tensor) -> Tensor:
+        """Cells some steps away on each axis, within the grid. [N], [3, N] -> [N]"""
+        size = self.resolution
         for stride, move in zip((1, size, size**2), moves, strict=True):
             place = torch.div(cells, stride, rounding_mode="floor") % size
             cells = cells + ((place + move).clamp(0, size - 1) - place) * stride

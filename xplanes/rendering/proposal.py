@@ -26,6 +26,9 @@ from xplanes.streams import Stream, TrainingState, initial_values
 ALWAYS = 10
 """First steps, in each of which the density fields learn."""
 
+NEAREST, FARTHEST = 0.05, 1000.0
+"""Where samples of contracted space begin and end, in units of the field's frame."""
+
 SMALLEST = 1e-7
 """Keeps the histogram term finite where the field sees nothing."""
 
@@ -35,7 +38,7 @@ class Level:
     """Samples of one round.
 
     Attributes:
-        edges: Ends of the samples, from 0 at near to 1 at far. [R, S + 1]
+        edges: Ends of the samples, from 0 at near to 1 at far, as they are spaced. [R, S + 1]
         weights: Share of the light that each sample sends. [R, S]
     """
 
@@ -64,6 +67,8 @@ class ProposalRenderer(RayRenderer):
         near: Distance at which samples begin, in the field's frame; None where rays enter the cube.
         far: Distance at which they end; None where rays leave the cube.
         padding: As for `resample`.
+        contracted: Sample all of space: evenly up to a distance of 1, evenly in inverse distance
+            beyond.
 
     Source: K-Planes, released code; Mip-NeRF 360, Section 3.
     """
@@ -79,8 +84,10 @@ class ProposalRenderer(RayRenderer):
         near: float | None = None,
         far: float | None = None,
         padding: float = 0.01,
+        contracted: bool = False,
     ) -> None:
         self.proposals, self.counts, self.samples = proposals, tuple(counts), samples
+        self.contracted = contracted
         self.near, self.far, self.padding = near, far, padding
         # With the density fields it goes into checkpoints, and to their device.
         proposals.register_buffer("exponent", torch.ones(()))
@@ -121,7 +128,7 @@ class ProposalRenderer(RayRenderer):
             One value per ray; gradients reach the field.
         """
         near, far = self._range(origins, directions)
-        place = _Rays(origins, directions, near, far)
+        place = _Rays(origins, directions, near, far, self.contracted)
         levels = []
         with torch.set_grad_enabled(learn and torch.is_grad_enabled()):
             for proposal, count in zip(self.proposals, self.counts, strict=True):
@@ -178,13 +185,31 @@ class _Rays:
     directions: Tensor
     near: Tensor
     far: Tensor
+    contracted: bool = False
 
     def samples(self, edges: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Distances and lengths [R, S] and points [R S, 3] of the bins between ``edges``."""
-        ends = self.near[:, None] + edges * (self.far - self.near)[:, None]
+        near, far = self.near[:, None], self.far[:, None]
+        if self.contracted:
+            ends = unspaced(torch.lerp(spaced(near), spaced(far), edges))
+        else:
+            ends = near + edges * (far - near)
         distances = (ends[:, 1:] + ends[:, :-1]) / 2
         points = self.origins[:, None] + distances[..., None] * self.directions[:, None]
         return distances, ends[:, 1:] - ends[:, :-1], points.flatten(0, 1)
+
+
+def spaced(distances: Tensor) -> Tensor:
+    """Distances as numbers from 0 to 1 that are even in distance, then in its inverse. [...]
+
+    Source: K-Planes, released code.
+    """
+    return torch.where(distances < 1, distances / 2, 1 - 1 / (2 * distances.clamp_min(1)))
+
+
+def unspaced(places: Tensor) -> Tensor:
+    """The inverse of `spaced`, for numbers below 1. [...]"""
+    return torch.where(places < 0.5, 2 * places, 1 / (2 - 2 * places.clamp_min(0.5)))
 
 
 def dense_samples(points: Tensor, distances: Tensor) -> Samples:
@@ -209,8 +234,8 @@ class ProposalSettings(SamplerSettings):
 
     devices: ClassVar[int | None] = 1
 
-    near: Weight | None  # Near bound in world units; null: the cube.
-    far: Positive | None  # Far bound in world units; null: the cube.
+    near: Weight | None  # Near bound in world units; null: the cube. Not of contracted space.
+    far: Positive | None  # Far bound in world units; null: the cube. Not of contracted space.
     samples: Count  # Samples per ray in the field.
     proposal_samples: list[Count]  # Samples per ray in each density field.
     resolutions: list[Count]  # Texels along each space axis of each density field.
@@ -254,8 +279,11 @@ class ProposalSettings(SamplerSettings):
             )
 
     def build(self, field: RadianceField, site: Site) -> "ProposalSampler":
-        bounds = {}
-        if self.near is not None and self.far is not None:
+        bounds: dict[str, float] = {}
+        contracted = getattr(field, "contracted", False)
+        if contracted:
+            bounds = {"near": NEAREST, "far": FARTHEST}
+        elif self.near is not None and self.far is not None:
             check_range(site, self.near, self.far)
             scale = site.frame.scale
             bounds = {"near": self.near * scale, "far": self.far * scale}
@@ -277,10 +305,16 @@ class ProposalSettings(SamplerSettings):
                         linear=self.linear,
                         unit=site.unit,
                         precision=site.precision,
+                        contracted=contracted,
                     )
                 )
         renderer = ProposalRenderer(
-            proposals, self.proposal_samples, self.samples, padding=self.padding, **bounds
+            proposals,
+            self.proposal_samples,
+            self.samples,
+            padding=self.padding,
+            contracted=contracted,
+            **bounds,
         )
         return ProposalSampler(renderer, self)
 

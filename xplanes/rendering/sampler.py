@@ -21,6 +21,9 @@ from xplanes.streams import TrainingState
 
 logger = logging.getLogger(__name__)
 
+VIEWS_PER_ROW = 4
+"""Views of one timestep that a row of time for it alone needs."""
+
 Group = dict[str, Any]
 """Parameters of one learning rate: ``params``, ``lr`` and ``name``."""
 
@@ -40,6 +43,7 @@ class Site:
         surrounded: Whether the training images show a world around the scene, so that there is
             something to see behind the field's cube.
         device: Where it is going to be trained; the CPU when None.
+        samples_per_batch: Samples of a training batch on average; None if not known.
     """
 
     frame: Frame
@@ -51,6 +55,7 @@ class Site:
     initialised: bool = False
     surrounded: bool = False
     device: torch.device | None = None
+    samples_per_batch: int | None = None
 
     @property
     def unit(self) -> float:
@@ -69,8 +74,16 @@ class Site:
 
 
 def time_rows(times: Tensor) -> int:
-    """Rows of time where the settings leave them open: one for two distinct times. [V]"""
-    return max(2, math.ceil(len(times.unique()) / 2))
+    """Rows of time where the settings leave them open.
+
+    One for two distinct times; one for each where there are enough views of it to tell what it
+    shows without its neighbours.
+
+    Args:
+        times: Time of each training view. [V]
+    """
+    distinct = len(times.unique())
+    return max(2, math.ceil(distinct / 2), min(distinct, len(times) // VIEWS_PER_ROW))
 
 
 class Sampler(ABC):
@@ -107,13 +120,13 @@ class Sampler(ABC):
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
         """Render the rays of a batch, with jitter."""
 
-    def pass_on(self, rendering: Any, state: TrainingState) -> int:
+    def pass_on(self, rendering: Any, state: TrainingState) -> int | Tensor:
         """Take gradients to the field where rendering cut them off.
 
         Returns:
             Number of samples that the field got gradients of.
         """
-        return len(rendering.samples)
+        return rendering.samples.count
 
     def losses(self, rendering: Any) -> dict[str, Tensor]:
         """The sampler's own terms of the loss, weighted, by name. [] each"""
@@ -129,6 +142,10 @@ class Sampler(ABC):
 
     def update(self, field: Any, state: TrainingState) -> None:
         """Do what is due after an optimiser step."""
+        return
+
+    def expect(self, samples: float) -> None:
+        """Make ready for batches of so many samples on average."""
         return
 
     def scalars(self) -> dict[str, float]:

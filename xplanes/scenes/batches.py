@@ -1,5 +1,6 @@
 """Ray batches drawn without memory: the step alone decides what is in them."""
 
+import copy
 from dataclasses import dataclass
 from typing import Literal
 
@@ -7,6 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from xplanes.backend import memory_left
+from xplanes.scenes.changes import changing
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.silhouettes import foreground
 from xplanes.scenes.store import (
@@ -20,18 +23,24 @@ from xplanes.scenes.store import (
 )
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Settings, Share
-from xplanes.streams import step_generator
+from xplanes.streams import counted_uniform, step_generator
 
 Batch = dict[str, Tensor]
 
 NEAR_SILHOUETTE = 0.02
 """Share of the image's side around silhouettes that counts as near."""
 
+STILL_SHARE = 0.5
+"""Share of rays at pixels of fixed cameras where nothing changes."""
+
 PER_TILE = 32
 """Rays from one tile, of images in a file of tiles."""
 
 LEAST_TILES = 32
 """Tiles of a batch at least, if it has as many rays."""
+
+LARGEST_SHARE = 0.25
+"""Share of a GPU's free memory that images may take."""
 
 AHEAD = 8
 """Batches whose tiles the system is told to read in advance."""
@@ -45,7 +54,7 @@ class RaySettings(Settings):
     samples_per_batch: Count  # Maximum number of samples per batch, on average.
     accumulate: Count  # Batches per optimiser step.
     background: Literal["white", "random", "one"]  # random: per ray; one: random per batch.
-    skip_background: bool  # Sample rays near the silhouettes more often.
+    skip_background: bool  # Sample rays near silhouettes, and where something changes, more often.
     background_share: Share  # Share of rays far from the silhouettes.
     background_jitter: Share  # Maximum random offset of the times of these rays.
 
@@ -55,7 +64,9 @@ class RayBatches:
 
     With ``skip_background`` rays far from the silhouettes are drawn at ``background_share`` instead
     of at their share of the pixels. They show nothing but background; a few keep the air clear of
-    floaters. Space far from a silhouette counts as empty shortly before and after, too.
+    floaters. Space far from a silhouette counts as empty shortly before and after, too. Opaque
+    images of fixed cameras have no silhouettes, but pixels that change: the others are drawn at
+    `STILL_SHARE`, at their own times.
 
     Of images in a file of tiles each batch takes `PER_TILE` pixels of each of some tiles, so that
     it reads few places of the disk; every pixel is still as likely as any other. Near and far are
@@ -77,10 +88,13 @@ class RayBatches:
         self.background = settings.background
         widths = views.intrinsics.size[:, 1].tolist()
         margins = [max(1, round(NEAR_SILHOUETTE * width)) for width in widths]
+        changes = None
         if isinstance(views.images, StoredImages):
             self.near, self.far = _tile_pools(views, views.images, margins)
         else:
-            near = foreground(views, margins)
+            if settings.skip_background and views.is_opaque:
+                changes = changing(views, margins)  # Large captures are drawn from evenly.
+            near = foreground(views, margins) if changes is None else changes
             far = ~near
             if views.is_cut:
                 valid = views.valid()
@@ -89,8 +103,9 @@ class RayBatches:
         self._prefetched = -1
         natural = len(self.far) / (len(self.near) + len(self.far))
         skip = settings.skip_background and 0 < natural < 1
-        self.far_share = min(settings.background_share, natural) if skip else natural
-        jitter = skip and not views.is_static
+        share = settings.background_share if changes is None else STILL_SHARE
+        self.far_share = min(share, natural) if skip else natural
+        jitter = skip and not views.is_static and changes is None
         self.background_jitter = settings.background_jitter if jitter else 0.0
         self.skipped = max(0.0, 1 - self.far_share / natural) * natural if skip else 0.0
         """Share of all pixels that uniform drawing would have shown and this one leaves out."""
@@ -110,10 +125,6 @@ class RayBatches:
             drawn = self._from_tiles(self.views.images, uniform, generator)
         else:
             drawn = self._from_memory(self.views.images, uniform)
-        far, view, row, column, colour = drawn
-        origins, directions = self.views.pixel_rays(view, row.float(), column.float())
-        origins, directions = self.frame.rays(origins, directions)
-        colour = colour.float() / 255
         shape = (self.rays, 3)
         if self.background == "random":
             background = torch.rand(shape, generator=generator)
@@ -121,14 +132,27 @@ class RayBatches:
             background = torch.rand(3, generator=generator).expand(shape)
         else:
             background = torch.ones(shape)
+        move = None
+        if self.background_jitter:
+            move = torch.rand(self.rays, generator=generator)
+        return self._served(drawn, background, move, uniform[:, 2].float())
+
+    def _served(
+        self, drawn: tuple[Tensor, ...], background: Tensor, move: Tensor | None, jitter: Tensor
+    ) -> Batch:
+        """A batch of pixels, what lies behind them, and random numbers from 0 to 1."""
+        far, view, row, column, colour = drawn
+        origins, directions = self.views.pixel_rays(view, row.float(), column.float())
+        origins, directions = self.frame.rays(origins, directions)
+        colour = colour.float() / 255
         return {
             "origins": origins,
             "directions": directions,
-            "times": self._times(view, far, generator),
+            "times": self._times(view, far, move),
             "target": colour[:, :3] + (1 - colour[:, 3:]) * background,
             "background": background,
             "alpha": colour[:, 3],
-            "jitter": uniform[:, 2].float(),
+            "jitter": jitter,
         }
 
     def _choose(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
@@ -206,13 +230,57 @@ class RayBatches:
             self.views.images.prefetch(*place[:, :2].unbind(dim=1))
         self._prefetched = step + AHEAD
 
-    def _times(self, view: Tensor, far: Tensor, generator: torch.Generator) -> Tensor:
-        """Times of rays, those far from silhouettes moved. int64 [R], bool [R] -> [R]"""
+    def _times(self, view: Tensor, far: Tensor, move: Tensor | None) -> Tensor:
+        """Times of rays, those far from silhouettes moved. int64 [R], bool [R], [R] -> [R]"""
         times = self.views.times[view]
-        if not self.background_jitter:
+        if move is None:
             return times
-        move = self.background_jitter * (2 * torch.rand(self.rays, generator=generator) - 1)
+        move = self.background_jitter * (2 * move - 1)
         return torch.where(far, (times + move).clamp(0, 1), times)
+
+
+class DeviceBatches(RayBatches):
+    """Batches drawn where the images lie, on a GPU: nothing is copied there, and nothing waits.
+
+    Like those of `RayBatches` they are a function of (seed, step, rank), of the same distribution;
+    the random numbers are others, each made from its own place (`counted_uniform`), so that they
+    are the same on every device.
+
+    Args:
+        batches: What to draw, from pinhole images in memory.
+        device: Where.
+    """
+
+    def __init__(self, batches: RayBatches, device: torch.device) -> None:
+        self.__dict__.update(batches.__dict__)
+        self.device = device
+        self.views = batches.views.to(device)
+        self.frame = batches.frame.to(device)
+        self.near, self.far = (
+            pool.to(device) if isinstance(pool, _PixelPool) else pool
+            for pool in (batches.near, batches.far)
+        )
+
+    @staticmethod
+    def can_serve(batches: RayBatches, device: torch.device) -> bool:
+        """Whether these rays can be drawn on a device, and their images have room there."""
+        views = batches.views
+        if device.type == "cpu" or views.is_stored or views.intrinsics.lenses is not None:
+            return False
+        return views.nbytes < LARGEST_SHARE * memory_left(device)
+
+    def draw(self, step: int) -> Batch:
+        shape = (self.rays, 7)
+        uniform = counted_uniform(self.seed, step, self.rank, shape, self.device)
+        assert isinstance(self.views.images, Tensor)
+        drawn = self._from_memory(self.views.images, uniform)
+        background = uniform[:, 3:6].float()
+        if self.background == "one":
+            background = background[:1].expand(self.rays, 3)
+        elif self.background == "white":
+            background = torch.ones_like(background)
+        move = uniform[:, 6].float() if self.background_jitter else None
+        return self._served(drawn, background, move, uniform[:, 2].float())
 
 
 class _PixelPool:
@@ -232,6 +300,12 @@ class _PixelPool:
 
     def __len__(self) -> int:
         return self.count
+
+    def to(self, device: torch.device) -> "_PixelPool":
+        """The same on another device."""
+        moved = copy.copy(self)
+        moved.pixels = None if self.pixels is None else self.pixels.to(device)
+        return moved
 
     def pick(self, uniform: Tensor) -> Tensor:
         """Pixels at places given by numbers from 0 to 1. [K] -> [K, 1]"""

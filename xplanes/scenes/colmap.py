@@ -15,13 +15,14 @@ from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, read_mo
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.listing import (
     Listing,
+    MaskUse,
     held_out,
     image_path,
     is_number,
     mask_files,
     oriented,
     picked,
-    read_views,
+    read_splits,
     refuse_repeats,
     require_precision,
     require_shapes,
@@ -49,6 +50,7 @@ class ColmapSettings(SceneSettings):
     # Folder of masks: NAME.png for each image NAME, black where nothing is to be shown. Null for
     # none: masks that hid moving things from COLMAP would hide them here, too.
     masks: str | None
+    mask_use: MaskUse  # Masks become alpha, or cut the thing out for LRMs alone.
     # Times of the images: a CSV file with the columns file and time, or rank, for the order in each
     # camera's folder. Null for the numbers in the file names.
     times: str | None
@@ -98,14 +100,8 @@ class ColmapSettings(SceneSettings):
             f"{self.eval_every}, or choose another data.eval_split.",
         )
         chosen = thinned(chosen, self.views, self.eval_views, self.folder)
-        return Scene(
-            self.folder.resolve().name,
-            {
-                split: read_views(part, self.resolution, self.image_cache)
-                for split, part in chosen.items()
-            },
-            points=points,
-        )
+        splits_read, cut = read_splits(chosen, self.resolution, self.image_cache, self.mask_use)
+        return Scene(self.folder.resolve().name, splits_read, points=points, cut=cut)
 
     def _listing(self, model: SparseModel) -> tuple[Listing, torch.Tensor | None]:
         """All images of the capture, and the model's points."""

@@ -16,7 +16,7 @@ from xplanes.components import build, plugins
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.files import read_json
-from xplanes.scenes.batches import Batch, RayBatches, RaySettings
+from xplanes.scenes.batches import Batch, DeviceBatches, RayBatches, RaySettings
 from xplanes.scenes.errors import MissingSplitError
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.source import SceneSettings
@@ -188,10 +188,14 @@ class SceneDataModule(LightningDataModule):
         self.held_out = len(parts["val"])
 
     def batches(self, rank: int) -> RayBatches:
-        """The batches of a process, for the module that is being trained."""
-        return self.batches_for(
-            None if self.trainer is None else self.trainer.lightning_module, rank
-        )
+        """The batches of a process, for the module that is being trained, drawn on its device."""
+        if self.trainer is None:
+            return self.batches_for(None, rank)
+        batches = self.batches_for(self.trainer.lightning_module, rank)
+        device = self.trainer.strategy.root_device
+        if not DeviceBatches.can_serve(batches, device):
+            return batches
+        return DeviceBatches(batches, device)
 
     def batches_for(self, module: Any, rank: int) -> RayBatches:
         """The batches of a process for a LightningModule, or for none that says anything."""

@@ -1,7 +1,7 @@
 """The field's frame: the cube [-1, 1]^3 and how the world maps into it."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -45,6 +45,10 @@ class Frame:
     rotation: Tensor
     centre: Tensor
     source: str = ""
+
+    def to(self, device: torch.device) -> "Frame":
+        """The same on another device."""
+        return replace(self, rotation=self.rotation.to(device), centre=self.centre.to(device))
 
     def points(self, world: Tensor) -> Tensor:
         """World points in the field's frame. [..., 3]"""

@@ -4,9 +4,9 @@ import json
 import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PureWindowsPath
-from typing import Any, TypeGuard
+from typing import Any, Literal, TypeGuard
 
 import numpy as np
 import torch
@@ -35,6 +35,9 @@ FARTHEST_ASIDE, STRONGEST = 1e3, 1e6
 
 SHAPE_TOLERANCE = 0.02
 """By how much the aspect ratio of an image may differ from that of its camera."""
+
+MaskUse = Literal["alpha", "lrm"]
+"""What mask files are for: alpha of the images, or `Scene.cut` alone."""
 
 
 @dataclass(frozen=True)
@@ -257,6 +260,38 @@ def read_views(listing: Listing, resolution: int | None, cache: Path | None = No
     views = Views(images, listing.camera_to_world, listing.times, intrinsics, listing.files)
     _warn_of_empty(views, listing)
     return views
+
+
+def read_splits(
+    parts: Mapping[str, Listing],
+    resolution: int | None,
+    cache: Path | None,
+    mask_use: MaskUse,
+) -> tuple[dict[str, Views], Views | None]:
+    """Read the images of all splits.
+
+    Args:
+        parts: The images of each split.
+        resolution: As for `read_views`.
+        cache: As for `read_views`.
+        mask_use: Whether masks become alpha, or are for LRMs alone.
+
+    Returns:
+        The views of each split, and `Scene.cut`.
+
+    Raises:
+        SceneError: As `read_views`; or if LRMs alone are to have masks and there are none.
+    """
+    cut = None
+    if mask_use == "lrm":
+        if not any(part.masks for part in parts.values()):
+            raise SceneError(
+                "data.mask_use=lrm: no image has a mask file. Add masks, or set it to alpha."
+            )
+        if "train" in parts:
+            cut = read_views(parts["train"], resolution, cache)
+        parts = {split: replace(part, masks=()) for split, part in parts.items()}
+    return {split: read_views(part, resolution, cache) for split, part in parts.items()}, cut
 
 
 def require_shapes(listing: Listing) -> None:

@@ -15,6 +15,7 @@ from xplanes.scenes.images import native_sizes
 from xplanes.scenes.listing import (
     Calibration,
     Listing,
+    MaskUse,
     checked_pose,
     held_out,
     image_path,
@@ -24,7 +25,7 @@ from xplanes.scenes.listing import (
     oriented,
     picked,
     read_object,
-    read_views,
+    read_splits,
     refuse_repeats,
     require_precision,
     require_shapes,
@@ -57,6 +58,7 @@ class NerfiesSettings(SceneSettings):
     # Folder of masks, with the folders and names of rgb, black where nothing is to be shown; null
     # for none. DyCheck's co-visibility masks say what views share, not what is there.
     masks: str | None
+    mask_use: MaskUse  # Masks become alpha, or cut the thing out for LRMs alone.
     # One image in so many is held out as val, by time, then name, where the capture lists none.
     eval_every: Count
     orient: bool  # Turn the world so that the cameras' mean up vector becomes its z axis.
@@ -84,14 +86,8 @@ class NerfiesSettings(SceneSettings):
             "Leave data.eval_split out, or set it to val.",
         )
         parts = thinned(parts, self.views, self.eval_views, folder)
-        return Scene(
-            folder.resolve().name,
-            {
-                split: read_views(part, self.resolution, self.image_cache)
-                for split, part in parts.items()
-            },
-            points=points,
-        )
+        splits_read, cut = read_splits(parts, self.resolution, self.image_cache, self.mask_use)
+        return Scene(folder.resolve().name, splits_read, points=points, cut=cut)
 
     def _listing(self, names: Sequence[str]) -> tuple[Listing, torch.Tensor | None]:
         """The images of these names, and the points of the capture."""

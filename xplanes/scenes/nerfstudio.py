@@ -6,7 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from xplanes.scenes.errors import MissingSplitError, SceneError
-from xplanes.scenes.listing import Listing, held_out, image_path, read_views, short, thinned
+from xplanes.scenes.listing import (
+    Listing,
+    MaskUse,
+    held_out,
+    image_path,
+    read_splits,
+    short,
+    thinned,
+)
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.transforms import listing_of, read_frames
 from xplanes.scenes.views import Scene
@@ -25,6 +33,7 @@ class NerfstudioSettings(SceneSettings):
     # One frame in so many is held out as val, by time, then file name; not the first and the last.
     # Captures that list their splits (train_filenames, ...) keep them.
     eval_every: Count
+    mask_use: MaskUse  # Masks of mask_path become alpha, or cut the thing out for LRMs alone.
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:
@@ -36,6 +45,7 @@ class NerfstudioSettings(SceneSettings):
             resolution=self.resolution,
             splits=splits,
             eval_every=self.eval_every,
+            mask_use=self.mask_use,
             views=self.views,
             eval_views=self.eval_views,
             cache=self.image_cache,
@@ -48,6 +58,7 @@ def read_capture(
     resolution: int | None,
     splits: Sequence[str],
     eval_every: int = 8,
+    mask_use: MaskUse = "alpha",
     views: int | None = None,
     eval_views: int | None = None,
     cache: Path | None = None,
@@ -63,6 +74,7 @@ def read_capture(
         resolution: Width of the images in pixels; None keeps the native sizes.
         splits: Names of the splits to read: train, val, test.
         eval_every: Where the file lists no splits, one frame in so many goes to val.
+        mask_use: Whether the masks of ``mask_path`` become alpha, or are for LRMs alone.
         views: Number of views to keep of the train split, spread evenly over time;
             None keeps all.
         eval_views: The same for every other split, at most.
@@ -92,10 +104,8 @@ def read_capture(
             raise _no_split(path, split, parts, eval_every)
         chosen[split] = listing.subset(parts[split])
     chosen = thinned(chosen, views, eval_views, folder)
-    return Scene(
-        folder.resolve().name,
-        {split: read_views(part, resolution, cache) for split, part in chosen.items()},
-    )
+    read, cut = read_splits(chosen, resolution, cache, mask_use)
+    return Scene(folder.resolve().name, read, cut=cut)
 
 
 def _listed_splits(

@@ -28,11 +28,16 @@ def foreground(views: Views, margin: int | Sequence[int]) -> Tensor:
     margins = [margin] * len(views) if isinstance(margin, int) else margin
     for index, reach in enumerate(margins):
         alpha = views.image(index)[..., 3]
-        mask, side = near[index, : alpha.shape[0], : alpha.shape[1]], 2 * reach + 1
-        # Rows, then columns: the square's pixels number many more.
-        rows = F.max_pool2d((alpha > 0).float()[None], (side, 1), stride=1, padding=(reach, 0))
-        mask[:] = F.max_pool2d(rows, (1, side), stride=1, padding=(0, reach))[0] > 0
+        near[index, : alpha.shape[0], : alpha.shape[1]] = widened(alpha > 0, reach)
     return near
+
+
+def widened(mask: Tensor, reach: int) -> Tensor:
+    """Pixels within a square of ``reach`` pixels around those of a mask. bool [H, W]"""
+    side = 2 * reach + 1
+    # Rows, then columns: the square's pixels number many more.
+    rows = F.max_pool2d(mask.float()[None], (side, 1), stride=1, padding=(reach, 0))
+    return F.max_pool2d(rows, (1, side), stride=1, padding=(0, reach))[0] > 0
 
 
 def may_hold(views: Views, points: Tensor, *, radius: float) -> Tensor:

@@ -42,7 +42,10 @@ def as_static(scene: Scene, reason: str) -> Scene:
     if video is not None:
         video = video.subset(torch.zeros(1, dtype=torch.long))
         video = replace(video, times=torch.zeros(1))
-    return replace(scene, splits=splits, video=video, static_reason=reason)
+    cut = scene.cut
+    if cut is not None:
+        cut = replace(cut, times=torch.zeros_like(cut.times))
+    return replace(scene, splits=splits, video=video, cut=cut, static_reason=reason)
 
 
 @dataclass(frozen=True, kw_only=True)

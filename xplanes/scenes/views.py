@@ -177,6 +177,8 @@ class Views:
         intrinsics: Focal lengths, principal points and sizes. A number stands for centred images
             of size H x W that share this focal length in pixels.
         files: Name of each image, relative to the scene's folder.
+        thing: Share of each pixel that shows the thing, where that is known of images that show
+            more; for scores alone. None where it is not. uint8 [V, H, W]
     """
 
     images: Tensor | StoredImages
@@ -184,6 +186,7 @@ class Views:
     times: Tensor
     intrinsics: Intrinsics
     files: tuple[str, ...]
+    thing: Tensor | None = None
 
     def __post_init__(self) -> None:
         count, height, width = self.images.shape[:3]
@@ -196,6 +199,11 @@ class Views:
                 f"views.images is {list(self.images.shape)}, which does not fit "
                 f"{len(size)} images of at most {size.amax(dim=0).tolist() if len(size) else 0} "
                 "pixels, as views.intrinsics says"
+            )
+        if self.thing is not None and self.thing.shape != (count, height, width):
+            raise ValueError(
+                f"views.thing is {list(self.thing.shape)}, but views.images are "
+                f"{[count, height, width]}"
             )
 
     def __len__(self) -> int:
@@ -279,6 +287,13 @@ class Views:
         height, width = self.size(index)
         return self.images[index, :height, :width]
 
+    def thing_in(self, index: int) -> Tensor | None:
+        """Share of each pixel of image ``index`` that shows the thing, if known. uint8 [h, w]"""
+        if self.thing is None:
+            return None
+        height, width = self.size(index)
+        return self.thing[index, :height, :width]
+
     def in_memory(self) -> Tensor:
         """All images, with padding. uint8 [V, H, W, 4]"""
         if isinstance(self.images, Tensor):
@@ -311,6 +326,22 @@ class Views:
                 found[index, : has_ray.shape[0], : has_ray.shape[1]] &= has_ray
         return found
 
+    def to(self, device: torch.device) -> "Views":
+        """Views in memory, without lenses, on another device."""
+        intrinsics = self.intrinsics
+        assert isinstance(self.images, Tensor)
+        assert intrinsics.lenses is None
+        focal, centre, size = (
+            number.to(device) for number in (intrinsics.focal, intrinsics.centre, intrinsics.size)
+        )
+        return Views(
+            self.images.to(device),
+            self.camera_to_world.to(device),
+            self.times.to(device),
+            Intrinsics(focal, centre, size),
+            self.files,
+        )
+
     def subset(self, indices: Tensor) -> "Views":
         """The views at ``indices``, in that order. [K]"""
         intrinsics = self.intrinsics.subset(indices)
@@ -321,12 +352,14 @@ class Views:
         if isinstance(images, Tensor) and len(intrinsics) and self.is_padded:
             height, width = intrinsics.size.amax(dim=0).tolist()
             images = images[:, :height, :width].contiguous()
+        height, width = images.shape[1:3]
         return Views(
             images,
             self.camera_to_world[indices],
             self.times[indices],
             intrinsics,
             tuple(self.files[i] for i in indices.tolist()),
+            None if self.thing is None else self.thing[indices, :height, :width],
         )
 
     def composite(self, index: int, background: Tensor) -> Tensor:
@@ -437,6 +470,8 @@ class Scene:
         static_reason: Why the scene is known to be static; empty if it may move.
         points: Points on surfaces, as structure from motion finds them, in the world; None where
             there are none. float32 [N, 3]
+        cut: The training views with all but the thing cut out, for LRMs, where those of ``splits``
+            are whole; None where masks are in the alpha of ``splits``, or there are none.
     """
 
     name: str
@@ -445,6 +480,7 @@ class Scene:
     background: Tensor = field(default_factory=lambda: torch.ones(3))
     static_reason: str = ""
     points: Tensor | None = None
+    cut: Views | None = None
 
     @cached_property
     def is_surrounded(self) -> bool:

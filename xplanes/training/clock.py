@@ -9,14 +9,21 @@ import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
+from xplanes.backend import synchronize
+
 C = TypeVar("C", bound=Callback)
+
+
+SHARED = 8
+"""Batches from one agreement of processes that train together to the next: on the time, and on
+whether to stop."""
 
 
 class TrainingClock(Callback):
     """Counts the seconds spent on training, and ends training when they are used up.
 
     Drawing rays counts; validation, scores, images and checkpoints do not: whoever does such work
-    does it inside `off_clock`. Works in any Trainer.
+    does it inside `off_clock`. Work that a GPU still has to do counts, too. Works in any Trainer.
 
     Args:
         max_seconds: Seconds after which training ends; None for no limit.
@@ -29,6 +36,7 @@ class TrainingClock(Callback):
         self.max_seconds = max_seconds
         self.seconds = 0.0
         self._mark = 0.0
+        self._device = torch.device("cpu")
 
     @property
     def progress(self) -> float:
@@ -38,11 +46,14 @@ class TrainingClock(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self.max_seconds is not None and self.seconds >= self.max_seconds:
             trainer.should_stop = True
+        self._device = pl_module.device
         self._mark = time.perf_counter()
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
+        if trainer.world_size > 1 and (batch_idx + 1) % SHARED:
+            return
         now = time.perf_counter()
         spent = now - self._mark
         if trainer.world_size > 1:
@@ -59,17 +70,27 @@ class TrainingClock(Callback):
     @contextmanager
     def off(self) -> Iterator[None]:
         """Leave out what happens inside."""
+        synchronize(self._device)
         began = time.perf_counter()
         try:
             yield
         finally:
+            synchronize(self._device)
             self._mark += time.perf_counter() - began
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        synchronize(self._device)
         self._left = time.perf_counter()
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        synchronize(self._device)
         self._mark += time.perf_counter() - self._left
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self._device.type != "cpu" or trainer.world_size > 1:
+            synchronize(self._device)
+            self.seconds += time.perf_counter() - self._mark
+            self._mark = time.perf_counter()
 
     def state_dict(self) -> dict[str, Any]:
         return {"seconds": self.seconds}

@@ -31,6 +31,9 @@ logger = logging.getLogger(__name__)
 VISIBLE = 0.05
 """Opacity above which a background pixel shows a floater."""
 
+SOLID = 128
+"""Share of a pixel, of 255, from which it shows the thing."""
+
 SHOWN = 4
 """Views whose images go to the logger at each evaluation."""
 
@@ -44,6 +47,7 @@ class ViewScore:
         time: Its time, from 0 to 1.
         psnr: In dB.
         ssim: Structural similarity.
+        psnr_thing: In dB, over the pixels that show the thing; NaN where they are not known.
         floaters: Share of background pixels (alpha 0 in the true image) that are not transparent;
             NaN where the image has none.
     """
@@ -53,16 +57,14 @@ class ViewScore:
     psnr: float
     ssim: float
     floaters: float
+    psnr_thing: float = math.nan
 
     @property
     def scores(self) -> dict[str, float]:
         """The numbers by name, those that are known."""
-        found = {"psnr": self.psnr, "ssim": self.ssim, "floaters": self.floaters}
-        return {
-            name: value
-            for name, value in found.items()
-            if name != "floaters" or not math.isnan(value)
-        }
+        found = {"psnr": self.psnr, "ssim": self.ssim}
+        maybe = {"psnr_thing": self.psnr_thing, "floaters": self.floaters}
+        return found | {name: value for name, value in maybe.items() if not math.isnan(value)}
 
 
 @dataclass(frozen=True)
@@ -121,8 +123,22 @@ def score_view(
         psnr=psnr(colour, truth),
         ssim=ssim(colour, truth),
         floaters=floaters(image["opacity"].float(), views.image(index)[..., 3]),
+        psnr_thing=psnr_thing(colour, truth, views.thing_in(index)),
     )
     return score, ViewImages(truth, colour, image["depth"].float(), image["opacity"].float())
+
+
+def psnr_thing(colour: Tensor, truth: Tensor, thing: Tensor | None) -> float:
+    """PSNR in dB of the pixels most of which show the thing; NaN where there are none.
+
+    Args:
+        colour: Rendered colours. [H, W, 3]
+        truth: True colours. [H, W, 3]
+        thing: Share of each pixel that shows the thing; None where it is not known. uint8 [H, W]
+    """
+    if thing is None or not (shown := thing >= SOLID).any():
+        return math.nan
+    return psnr(colour[shown], truth[shown])
 
 
 def floaters(opacity: Tensor, alpha: Tensor) -> float:
@@ -135,7 +151,7 @@ def floaters(opacity: Tensor, alpha: Tensor) -> float:
 
 def mean_scores(scores: Sequence[ViewScore]) -> dict[str, float]:
     """Means over views of each score that any of them has."""
-    names = ("psnr", "ssim", "floaters")
+    names = ("psnr", "ssim", "psnr_thing", "floaters")
     found = {name: [s.scores[name] for s in scores if name in s.scores] for name in names}
     return {name: mean(values) for name, values in found.items() if values}
 

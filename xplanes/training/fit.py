@@ -12,8 +12,9 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, ProgressBar
 from lightning.pytorch.plugins.io import CheckpointIO
+from lightning.pytorch.strategies import DDPStrategy
 
-from xplanes.backend import cpu_loops
+from xplanes.backend import cpu_loops, synchronize
 from xplanes.errors import ConfigError
 from xplanes.rendering.warming import warming_up
 from xplanes.scenes.datamodule import SceneDataModule
@@ -36,6 +37,7 @@ class Trainer(lightning.Trainer):
         accelerator: auto (CUDA where there is a GPU, else the CPU), cpu, or gpu.
         devices: Processes; rays are split between them.
         deterministic: The same digits each time; CPU only, with a budget in steps.
+        tf32: Let GPUs round the factors of float32 products to 10 bits (TF32), which is faster.
         log_every_n_steps: Steps from one log to the next; 0 for none.
         callbacks: Callbacks; a `TrainingClock` and an `Interrupt` are added.
         plugins: Lightning's; checkpoints are written atomically unless one of them writes them.
@@ -53,6 +55,7 @@ class Trainer(lightning.Trainer):
         accelerator: str = "auto",
         devices: Count = 1,
         deterministic: bool | Literal["warn"] = False,
+        tf32: bool = False,
         log_every_n_steps: Steps | None = None,
         callbacks: Sequence[Callback] = (),
         plugins: Any = None,
@@ -85,6 +88,12 @@ class Trainer(lightning.Trainer):
         used = list(callbacks)
         if not others.get("enable_progress_bar", True):
             used = [callback for callback in used if not isinstance(callback, ProgressBar)]
+        # Of the whole process: the LRM, too, computes in what precision=32 says.
+        torch.set_float32_matmul_precision("high" if tf32 else "highest")
+        torch.backends.cudnn.allow_tf32 = tf32
+        if others.get("strategy") == "ddp":
+            # The processes agree on the occupancy grid themselves, before it is maintained.
+            others["strategy"] = DDPStrategy(broadcast_buffers=False)
         self.interrupt = Interrupt()
         quiet_lightning()
         super().__init__(
@@ -163,8 +172,9 @@ def fit_quietly(
         accelerator="gpu" if device.type == "cuda" else "cpu",
         max_steps=max_steps,
         max_seconds=max_seconds,
-        # A Trainer sets this for the whole process, and the run's own was there first.
+        # A Trainer sets these for the whole process, and the run's own was there first.
         deterministic=device.type == "cpu" and torch.are_deterministic_algorithms_enabled(),
+        tf32=torch.backends.cudnn.allow_tf32,
         callbacks=[CollapseWatch(), Checkpoints(checkpoint_every)],
         default_root_dir=folder,
         logger=False,
@@ -178,7 +188,7 @@ def fit_quietly(
 
 def warm_up(module: RadianceModule, data: SceneDataModule, device: torch.device) -> None:
     """Run all loops once on a few rays, so that compiling them is not on the training clock."""
-    if device.type == "cuda":
+    if device.type != "cpu":
         # The kernels are tried where they will run; Lightning would move the module a little later.
         module.to(device)
     elif not cpu_loops(next(module.field.parameters())):
@@ -187,6 +197,10 @@ def warm_up(module: RadianceModule, data: SceneDataModule, device: torch.device)
     batches = data.batches_for(module, 0)
     rays = {name: value[:8].to(device) for name, value in batches.draw(0).items()}
     with warming_up():
+        if device.type != "cpu":
+            module.rehearse(rays)
+            synchronize(device)
+            return
         rendering = module.sampler.render(module.field, rays, module.state)
         rendering.colour.sum().backward()
         module.sampler.pass_on(rendering, module.state)
@@ -225,8 +239,7 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
         rendering.colour.sum().backward()
         module.sampler.pass_on(rendering, module.state)
         module.zero_grad(set_to_none=True)
-        if device.type == "cuda":
-            torch.cuda.synchronize()
+        synchronize(device)
         seconds.append(time.perf_counter() - began)
     views = data.scene.splits[data.test_split]
     ends = module.frame.rays(*views.image_rays(0))
@@ -240,6 +253,7 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
         float(views.times[0]),
         data.scene.background.to(device),
     )
+    synchronize(device)
     return Estimate(min(seconds), len(chosen) / (time.perf_counter() - began))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
-from xplanes.training.clock import find_callback
+from xplanes.training.clock import SHARED, find_callback
 
 
 class Stopped(KeyboardInterrupt):
@@ -37,6 +37,8 @@ class Interrupt(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         if trainer.world_size > 1:
+            if (batch_idx + 1) % SHARED:
+                return
             # Saving takes all processes: they must stop after the same step.
             self.asked = trainer.strategy.reduce_boolean_decision(self.asked, all=False)
         # Modules that gather batches for an update say where one is whole.

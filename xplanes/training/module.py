@@ -1,5 +1,6 @@
 """The LightningModule: one field, trained on rays."""
 
+import copy
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -25,6 +26,7 @@ from xplanes.scenes.frame import Frame, frame_content, read_frame
 from xplanes.scenes.views import Scene
 from xplanes.streams import TrainingState
 from xplanes.training.clock import training_seconds
+from xplanes.training.meters import Meters, due
 
 ANOTHER_SEED = 1_000_003
 """Added to the seed of a field that begins anew."""
@@ -32,9 +34,12 @@ ANOTHER_SEED = 1_000_003
 PATIENCE = 20
 """Steps in a row with a loss or gradient that is not finite after which training gives up."""
 
-COUNTS = ("rays", "candidates", "empty", "occluded", "samples", "passed")
+COUNTS = ("rays", "candidates", "empty", "occluded", "samples", "passed", "no_room")
 """What a run counts: rays, samples in their box, those dropped as empty or occluded, those left,
-and those whose gradients reached the field."""
+those whose gradients reached the field, and rays left out for want of room on a GPU."""
+
+DROPPED = ("candidates", "empty", "occluded")
+"""Numbers of samples before some are dropped."""
 
 
 OPACITIES = 5
@@ -79,13 +84,16 @@ class RadianceModule(LightningModule):
         self.initialisation: Initialisation | None = None
         self.batches = 0
         self.rays = 0
-        self.counts = dict.fromkeys(COUNTS, 0)
+        self.counts: dict[str, int] = dict.fromkeys(COUNTS, 0)
         self.unusable = 0
         self.unusable_in_a_row = 0
         self.restarts = 0
         """How often the field has begun anew, see `restart`."""
         self.last: dict[str, float] = {}
         """Loss and PSNR of the last batch, mean opacities, and the last scores of views."""
+        self._meters = Meters()
+        self._broken: Tensor | None = None
+        self._opacities: dict[str, Tensor] = {}
         self._steps = math.inf
         self._loaded_step = 0
         self._schedules: list[Any] = []
@@ -172,6 +180,7 @@ class RadianceModule(LightningModule):
             initialised=found.values is not None,
             surrounded=scene.is_surrounded,
             device=device,
+            samples_per_batch=found.model.rays.samples_per_batch,
         )
         self.initialisation = found
         self._assemble(found.model, site)
@@ -264,6 +273,9 @@ class RadianceModule(LightningModule):
         terms = self._terms(rendering, rays, state)
         loss = sum(terms.values())
         assert isinstance(loss, Tensor)
+        if loss.device.type != "cpu" and _takes_flags(optimizer.optimizer):
+            self._go_on_without_waiting(optimizer, state, rendering, rays, terms, loss)
+            return
         value = float(loss.detach())
         self.batches += 1
         # All ranks must skip a step together: one that waits for the others' gradients would hang.
@@ -273,18 +285,117 @@ class RadianceModule(LightningModule):
             self._refuse(f"the loss was {value}", not_finite(self.named_parameters()), rendering)
             return
         self.manual_backward(loss / self.ray_settings.accumulate)
-        self.counts["passed"] += sampler.pass_on(rendering, state)
+        self.counts["passed"] += int(sampler.pass_on(rendering, state))
         sampler.observe(rendering)
-        self._count(rendering.samples, len(rays["times"]))
+        samples = rendering.samples
+        shown = {name: int(getattr(samples, name)) for name in DROPPED}
+        self._count(shown | {"samples": int(samples.count)}, len(rays["times"]))
         error = float(colour_error(rendering, rays).detach())
         self.last |= {"loss": value, "psnr": -10 * math.log10(max(error, 1e-10))}
         # Before a background that is learnt, no pixel is known to need opacity or to lack it.
         plain = getattr(self.field, "background", None) is None
         if plain and self.batches % OPACITIES == 0:
-            self.last |= mean_opacities(rendering, rays)
+            self.last |= {n: float(value) for n, value in mean_opacities(rendering, rays).items()}
         self._log_terms(terms, state)
         if self.between_updates:
             self._update(optimizer, state, rendering)
+
+    def _go_on_without_waiting(
+        self,
+        optimizer: LightningOptimizer,
+        state: TrainingState,
+        rendering: Rendering,
+        rays: Batch,
+        terms: dict[str, Tensor],
+        loss: Tensor,
+    ) -> None:
+        """The rest of a step on a GPU: the host runs ahead, and looks at what came out later.
+
+        Whether loss and gradients are finite stays on the GPU, where the optimiser leaves the step
+        out if they are not; such a step counts as one.
+        """
+        sampler = self._parts[1]
+        self.batches += 1
+        broken = (~loss.detach().isfinite()).float()
+        self._broken = broken if self._broken is None else torch.maximum(self._broken, broken)
+        self.manual_backward(loss / self.ray_settings.accumulate)
+        passed = sampler.pass_on(rendering, state)
+        sampler.observe(rendering)
+        count, samples = len(rays["times"]), rendering.samples
+        shown: Tensor | None = getattr(samples, "shown", None)
+        values = {name: getattr(samples, name) for name in DROPPED}
+        values |= {"samples": samples.count, "passed": passed, "batches": 1, "all rays": count}
+        values |= {"rays": count if shown is None else shown.sum()}
+        error = (rendering.colour.detach() - rays["target"]).square().mean(dim=1)
+        values |= {"loss": loss, "error": masked_mean(error, shown)}
+        plain = getattr(self.field, "background", None) is None
+        if plain and self.batches % OPACITIES == 0:
+            self._opacities = mean_opacities(rendering, rays)
+        if self.between_updates:
+            values["skipped"] = self._update_by_flag(optimizer, state)
+        else:
+            values["skipped"] = 0
+        self._meters.add(values)
+        if due(self.batches) or self._logs_now:
+            self._read_meters(rendering)
+        self._log_terms(terms, state)
+
+    def _update_by_flag(self, optimizer: LightningOptimizer, state: TrainingState) -> Tensor:
+        """Step unless loss or gradients are not finite; 1 if they were not, on the device. []"""
+        model, sampler = self._parts
+        model.regularise(state)
+        sampler.regularise()
+        gradients = [p.grad for p in self.parameters() if p.grad is not None]
+        broken = (~nn.utils.get_total_norm(gradients).float().square().isfinite()).float()
+        if self._broken is not None:
+            broken = torch.maximum(broken, self._broken)
+        self._broken = None
+        if self.trainer.world_size > 1:
+            # All ranks must skip a step together, for their planes must stay equal.
+            torch.distributed.all_reduce(broken, op=torch.distributed.ReduceOp.MAX)
+        # As a gradient scaler tells it.
+        optimizer.optimizer.found_inf = broken  # type: ignore[attr-defined]
+        optimizer.step()
+        optimizer.zero_grad()
+        sampler.update(self.field, state)
+        return broken
+
+    def _read_meters(self, rendering: Rendering) -> None:
+        """Take in what the batches since the last look showed."""
+        found = self._meters.read()
+        batches, skipped = int(found.pop("batches")), int(found.pop("skipped"))
+        self.last |= {
+            "loss": found.pop("loss") / batches,
+            "psnr": -10 * math.log10(max(found.pop("error") / batches, 1e-10)),
+        }
+        self.last |= {name: float(value) for name, value in self._opacities.items()}
+        self.counts["passed"] += int(found.pop("passed"))
+        rays = int(found.pop("rays"))
+        self.counts["no_room"] += int(found.pop("all rays")) - rays
+        self._count({name: int(value) for name, value in found.items()}, rays)
+        # Of batches of as many rays as the next one has.
+        self._parts[1].expect(found["samples"] * self.rays / max(1, rays))
+        self.unusable += skipped
+        whole = skipped and skipped >= batches // self.ray_settings.accumulate
+        self.unusable_in_a_row = self.unusable_in_a_row + skipped if whole else 0
+        if self.unusable_in_a_row >= PATIENCE:
+            broken = not_finite(self.named_parameters())
+            self._give_up("the loss or a gradient was not finite", broken, rendering)
+
+    def rehearse(self, rays: Batch) -> None:
+        """Do all that a step does on a copy of the field, so that its kernels are compiled."""
+        model, sampler = copy.deepcopy(self._parts)
+        state = self.state
+        optimizer = model.optimizer([*model.groups(), *sampler.groups()])
+        rendering = sampler.render(model.field, rays, state)
+        terms = model.losses(rendering, rays, state) | sampler.losses(rendering)
+        torch.stack(list(terms.values())).sum().backward()
+        sampler.pass_on(rendering, state)
+        sampler.observe(rendering)
+        model.regularise(state)
+        sampler.regularise()
+        optimizer.step()
+        sampler.update(model.field, state)
 
     def _terms(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
         """All terms of the loss that need the rays, weighted, by name."""
@@ -311,10 +422,15 @@ class RadianceModule(LightningModule):
         optimizer.zero_grad()
         sampler.update(self.field, state)
 
+    @property
+    def _logs_now(self) -> bool:
+        """Whether the Trainer wants logs of the last batch."""
+        every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
+        return bool(every and not self.batches % every and self.trainer.loggers)
+
     def _log_terms(self, terms: Mapping[str, Tensor], state: TrainingState) -> None:
         """Log every term of the loss, weighted, where the Trainer wants logs of this step."""
-        every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
-        if not every or self.batches % every or not self.trainer.loggers:
+        if not self._logs_now:
             return
         model, sampler = self._parts
         values = {name: float(term.detach()) for name, term in terms.items()}
@@ -331,22 +447,24 @@ class RadianceModule(LightningModule):
             entries["time/train_s"] = seconds
         self.log_dict(entries | sampler.scalars() | model.scalars(), batch_size=1)
 
-    def _count(self, samples: Any, rays: int) -> None:
-        for name in ("candidates", "empty", "occluded"):
-            self.counts[name] += getattr(samples, name)
+    def _count(self, shown: Mapping[str, int], rays: int) -> None:
+        """Take in numbers of samples, by name, and of rays, of some batches."""
+        for name, value in shown.items():
+            self.counts[name] += value
         self.counts["rays"] += rays
-        self.counts["samples"] += len(samples)
         # Rays of the next batch: as many as keep its samples near the target.
         settings = self.ray_settings
-        room = settings.samples_per_batch * rays / max(1, len(samples))
+        room = settings.samples_per_batch * rays / max(1, shown["samples"])
         self.rays = max(64, min(settings.per_batch, int(room)))
 
     def _refuse(self, what: str, broken: list[str], rendering: Rendering) -> None:
         """Leave a step out, and give up after `PATIENCE` of them in a row."""
         self.unusable += 1
         self.unusable_in_a_row += 1
-        if self.unusable_in_a_row < PATIENCE:
-            return
+        if self.unusable_in_a_row >= PATIENCE:
+            self._give_up(what, broken, rendering)
+
+    def _give_up(self, what: str, broken: list[str], rendering: Rendering) -> None:
         density = rendering.density
         raise TrainingError(
             f"{what} for {PATIENCE} steps in a row, at step {self.global_step}; not finite: "
@@ -478,7 +596,8 @@ class RadianceModule(LightningModule):
             self.restarts = progress["restarts"]
             self._loaded_step = checkpoint["global_step"]
             self.batches, self.unusable = progress["batches"], progress["unusable"]
-            self.rays, self.counts = progress["rays"], dict(progress["counts"])
+            self.rays = progress["rays"]
+            self.counts = dict.fromkeys(COUNTS, 0) | progress["counts"]
         except (KeyError, TypeError, AttributeError) as error:
             raise ConfigError(
                 f"the checkpoint cannot be used ({type(error).__name__}: {error}): it is damaged, "
@@ -498,6 +617,7 @@ class RadianceModule(LightningModule):
             precision=_precision(settings, torch.device("cpu")),
             bounds=content["bounds"],
             surrounded=content.get("surrounded", False),  # Not in older checkpoints.
+            samples_per_batch=settings.rays.samples_per_batch,
         )
         self._assemble(settings, site)
 
@@ -548,17 +668,30 @@ def _precision(settings: ModelSettings, device: torch.device) -> str:
     return settings.precision
 
 
-def mean_opacities(rendering: Rendering, rays: Batch) -> dict[str, float]:
+def mean_opacities(rendering: Rendering, rays: Batch) -> dict[str, Tensor]:
     """Mean opacity of rays that must show something, and of those that must not; NaN for none.
 
     The former are opaque and of another colour than the background; the latter are transparent.
+    Rays that were left out do not count.
     """
     opacity = rendering.opacity.detach()
     far = (rays["target"] - rays["background"]).abs().amax(dim=-1) > 0.2
-    return {
-        "foreground": float(opacity[far & (rays["alpha"] > 0.5)].mean()),
-        "background": float(opacity[rays["alpha"] == 0].mean()),
-    }
+    which = {"foreground": far & (rays["alpha"] > 0.5), "background": rays["alpha"] == 0}
+    if opacity.device.type == "cpu":
+        return {name: opacity[chosen].mean() for name, chosen in which.items()}
+    shown: Tensor | None = getattr(rendering.samples, "shown", None)
+    both = which if shown is None else {name: some & shown for name, some in which.items()}
+    return {name: masked_mean(opacity, some) for name, some in both.items()}
+
+
+def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Mean of some values, without a list of which; NaN for none. [N], bool [N] -> []"""
+    return values.mean() if mask is None else (values * mask).sum() / mask.sum()
+
+
+def _takes_flags(optimizer: torch.optim.Optimizer) -> bool:
+    """Whether an optimiser leaves a step out where a tensor says so, as fused Adam does."""
+    return bool(getattr(optimizer, "_step_supports_amp_scaling", False))
 
 
 NamedTensors = Iterable[tuple[str, Tensor]]

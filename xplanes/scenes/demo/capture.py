@@ -3,7 +3,7 @@
 import math
 import random
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -170,18 +170,20 @@ class Phone(Rig):
 
 @dataclass(frozen=True)
 class Array(Rig):
-    """Fixed cameras that all take a picture at each timestep; the last one may lack some."""
+    """Fixed cameras that all take a picture at each timestep; the last one may lack some.
+
+    Validation and test views are of the same timesteps, as those of a held-out camera.
+    """
 
     fixed: int = 8  # type: ignore[assignment]
 
-    def _stations(
-        self, count: int, draw: random.Random, seed: str, *, training: bool
-    ) -> list[Station]:
-        stations = super()._stations(count, draw, seed, training=training)
-        if not training:
-            return stations
-        times = even_times(math.ceil(count / self.fixed))
-        return [
-            (times[i // self.fixed], azimuth, elevation)
-            for i, (_, azimuth, elevation) in enumerate(stations)
-        ]
+    def capture(self, counts: Mapping[str, int], seed: str) -> Capture:
+        whole = super().capture(counts, seed)
+        times = even_times(math.ceil(counts["train"] / self.fixed))
+        shots = {}
+        for split, taken in whole.shots.items():
+            cameras = self.fixed if split == "train" else len(taken) / len(times)
+            shots[split] = [
+                (self.end * times[int(i / cameras)], camera) for i, (_, camera) in enumerate(taken)
+            ]
+        return replace(whole, shots=shots)

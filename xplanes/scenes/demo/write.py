@@ -10,12 +10,14 @@ import threading
 from abc import ABC
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import time as now
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
+import torch
 from PIL import Image
+from torch import Tensor
 
 from xplanes.backend import threads
 from xplanes.scenes.demo.assembly import Assembly
@@ -27,14 +29,15 @@ from xplanes.scenes.demo.suite import suite_scene
 from xplanes.scenes.demo.world import World
 from xplanes.scenes.dnerf import read_scene
 from xplanes.scenes.errors import SceneError
+from xplanes.scenes.images import load_images
 from xplanes.scenes.source import SceneSettings
-from xplanes.scenes.views import Scene
+from xplanes.scenes.views import Scene, Views
 from xplanes.settings import Count, Steps
 
 VERSION = 2
 """Version of the renderer; increase it whenever the images of a scene change."""
 
-SUITE_VERSION = 1
+SUITE_VERSION = 2
 """The same for the scenes of the suite."""
 
 RECORD = "demo.json"
@@ -314,7 +317,7 @@ class ProceduralSettings(SceneSettings, ABC):
     def load(self, splits: Sequence[str]) -> Scene:
         folder = self.folder
         try:
-            return read_scene(
+            scene = read_scene(
                 folder,
                 resolution=self.resolution,
                 splits=splits,
@@ -322,10 +325,22 @@ class ProceduralSettings(SceneSettings, ABC):
                 eval_views=self.eval_views,
                 cache=self.image_cache,
             )
+            return _with_masks(scene, folder / MASKS)
         except SceneError as problem:
             raise SceneError(
                 f"{problem} This is a demo scene: delete {folder} to render it again"
             ) from problem
+
+
+def _with_masks(scene: Scene, folder: Path) -> Scene:
+    """The scene with the masks of its thing, if it stands in a world."""
+    if not folder.is_dir():
+        return scene
+    splits = {}
+    for split, views in scene.splits.items():
+        masks = load_images([folder / file for file in views.files], None)
+        splits[split] = replace(views, thing=masks[..., 0])
+    return replace(scene, splits=splits)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -340,3 +355,29 @@ class SuiteSettings(ProceduralSettings):
     """A scene of the suite, rendered on first use."""
 
     ensure = staticmethod(ensure_suite_scene)
+
+    # Masks of a thing in a world: for scores alone, alpha of the training images, or for LRMs, too.
+    mask_use: Literal["score", "alpha", "lrm"]
+
+    def load(self, splits: Sequence[str]) -> Scene:
+        scene = super().load(splits)
+        train = scene.splits.get("train")
+        if self.mask_use == "score" or train is None:
+            return scene
+        if train.thing is None:
+            raise SceneError(
+                f"data.mask_use={self.mask_use}: {self.scene} stands in no world, so it has no "
+                "masks. Set it to score."
+            )
+        cut = cut_out(train, train.thing)
+        if self.mask_use == "lrm":
+            return replace(scene, cut=cut)
+        return replace(scene, splits=scene.splits | {"train": cut})
+
+
+def cut_out(views: Views, thing: Tensor) -> Views:
+    """Opaque views with the share of each pixel that shows the thing as alpha. uint8 [V, H, W]"""
+    images = views.in_memory().clone()
+    images[..., :3] = (images[..., :3].float() * thing[..., None] / 255).round().to(torch.uint8)
+    images[..., 3] = thing
+    return replace(views, images=images)

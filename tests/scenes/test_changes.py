@@ -1,0 +1,85 @@
+"""What changes before fixed cameras, and the rays that see it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.synthetic import ball_views, surrounding, swinging
+from xplanes.components import build
+from xplanes.config import compose_plain
+from xplanes.models.base import ModelSettings
+from xplanes.rendering.sampler import time_rows
+from xplanes.scenes.batches import STILL_SHARE, RayBatches
+from xplanes.scenes.changes import CHANGE, changing
+from xplanes.scenes.frame import scene_frame
+
+FRAMES, CAMERAS, SIZE = 7, 3, 30
+
+
+def rig(**how):
+    """A ball that swings before grey walls, seen by fixed cameras that take pictures together."""
+    poses = surrounding(CAMERAS, 4.0).repeat(FRAMES, 1, 1)
+    times = torch.linspace(0, 1, FRAMES).repeat_interleave(CAMERAS)
+    views = ball_views(
+        CAMERAS * FRAMES, 0.3, centre=swinging(0.8, 0.8), times=times, poses=poses, size=SIZE, **how
+    )
+    images = views.images.clone()
+    images[images[..., 3] == 0] = torch.tensor([90, 140, 60, 255], dtype=torch.uint8)
+    return replace(views, images=images), views.images[..., 3] > 0
+
+
+def test_what_differs_from_the_cameras_median_changes():
+    views, ball = rig()
+    found = changing(views, [0] * len(views))
+    assert found is not None
+    images = views.images.view(FRAMES, CAMERAS, SIZE, SIZE, 4).numpy().astype(int)
+    for camera in range(CAMERAS):
+        taken = images[:, camera, ..., :3]
+        expected = abs(taken - np.median(taken, axis=0)).max(axis=-1) >= CHANGE
+        assert torch.equal(found.view(FRAMES, CAMERAS, SIZE, SIZE)[:, camera],
+                           torch.from_numpy(expected))  # fmt: skip
+    assert (found & ball).sum() > 0.8 * ball.sum()
+    wide = changing(views, [2] * len(views))
+    assert wide is not None
+    assert (wide | found).equal(wide)
+    assert wide.sum() > found.sum()
+
+
+def test_cameras_that_move_or_show_nothing_that_changes_are_left_alone():
+    views, _ = rig()
+    moved = views.camera_to_world + 1e-3 * torch.rand(len(views), 1, 1)
+    assert changing(replace(views, camera_to_world=moved), [0] * len(views)) is None
+    still = replace(views, images=views.images[:1].expand_as(views.images).contiguous())
+    assert changing(still, [0] * len(views)) is None
+    assert changing(views.subset(torch.arange(2 * CAMERAS)), [0] * 2 * CAMERAS) is None
+
+
+def test_rays_see_more_of_what_changes_and_all_of_the_rest():
+    views, _ = rig()
+    settings = build(compose_plain("train", [])["model"], ModelSettings, "model").rays
+    frame = scene_frame(views)
+    drawn = RayBatches(views, frame, settings, seed=0)
+    share = float(changing(views, [1] * len(views)).float().mean())
+    assert 0.02 < share < 0.5
+    assert drawn.far_share == STILL_SHARE
+    assert drawn.background_jitter == 0
+    batch = drawn.draw(0)
+    assert set(batch["times"].tolist()) <= set(views.times.tolist())
+    uniform = RayBatches(views, frame, replace(settings, skip_background=False), seed=0)
+    assert uniform.far_share == 0
+    green = torch.tensor([90, 140, 60]) / 255
+    ball = [float((b["target"] - green).abs().sum(dim=1).gt(0.1).float().mean())
+            for b in (batch, uniform.draw(0))]  # fmt: skip
+    assert ball[0] > 1.5 * ball[1]
+    transparent = ball_views(6, 0.5, poses=views.camera_to_world[:1].expand(6, 4, 4), size=SIZE)
+    assert RayBatches(transparent, frame, settings, seed=0).background_jitter > 0
+
+
+@pytest.mark.parametrize(
+    ("times", "views_each", "rows"),
+    [(1, 5, 2), (2, 1, 2), (50, 1, 25), (50, 2, 25), (51, 2, 26), (12, 4, 12), (12, 8, 12)],
+)
+def test_rows_of_time_where_they_are_left_open(times, views_each, rows):
+    assert time_rows(torch.linspace(0, 1, times).repeat(views_each)) == rows

@@ -1,0 +1,289 @@
+"""Off the CPU: training, images, scores and preparation on a device that refuses what a GPU would.
+
+The budgets are what is reached today. A change that lowers a number lowers it here, too.
+"""
+
+import functools
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import ClassVar
+
+import lightning
+import pytest
+import torch
+from lightning.pytorch.callbacks import Callback
+
+from tests import fake_device
+from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX, baseline_config
+from tests.lrm.reduced import SIDES
+from tests.preparation.sequences import moving_sequence
+from tests.preparation.test_encode import frames_of, model_of
+from tests.synthetic import ball_scene
+from tests.training.runs import small_config
+from xplanes import RadianceModule, SceneDataModule
+from xplanes.decomposition import decompose, space_planes, time_planes, unexplained_energy
+from xplanes.fields.background import Background
+from xplanes.fields.xplanes import PLANE_SETS
+from xplanes.lrm.images import square_crop
+from xplanes.models.base import LossTerm
+from xplanes.preparation.cache import StageCache
+from xplanes.preparation.encode import encode
+from xplanes.rendering.behind import behind
+from xplanes.scenes.batches import DeviceBatches
+from xplanes.training.clock import TrainingClock
+from xplanes.training.evaluation import score_view
+from xplanes.training.fit import warm_up
+from xplanes.training.meters import due
+from xplanes.training.module import TrainingError
+
+NOWHERE = Path("nowhere")
+"""Folder of a scene that is handed over instead."""
+
+CONFIGS = {
+    "six": lambda *more: small_config(NOWHERE, *more),
+    "nine": lambda *more: small_config(NOWHERE, "model=nine_planes", *more),
+    "kplanes": lambda *more: baseline_config(NOWHERE, "model=kplanes", *KPLANES, *PROPOSAL, *more),
+    "tineuvox": lambda *more: baseline_config(NOWHERE, "model=tineuvox_s", *TINEUVOX, *more),
+    "tensor4d": lambda *more: baseline_config(NOWHERE, "model=tensor4d", *TENSOR4D, *NEUS, *more),
+}
+
+
+@pytest.fixture
+def device(monkeypatch):
+    fake_device.register()
+    monkeypatch.setattr(torch, "Generator", fake_device.FakeGenerator)
+    return torch.device(fake_device.NAME, 0)
+
+
+def trained(name, steps, *more, trainer=fake_device.trainer, losses=None):
+    """A module after some steps, its data, and the counts of each step."""
+    module = RadianceModule(CONFIGS[name](*more))
+    module.method = replace(module.method, losses=losses or {})
+    data = SceneDataModule.of(ball_scene(6, 16))
+    counts = fake_device.StepCounts()
+    trainer(max_steps=steps, callbacks=[counts], limit_val_batches=0).fit(module, data)
+    return module, data, counts.steps
+
+
+on_the_cpu = functools.partial(
+    lightning.Trainer,
+    accelerator="cpu",
+    logger=False,
+    enable_checkpointing=False,
+    enable_progress_bar=False,
+    enable_model_summary=False,
+)
+
+
+def test_the_device_refuses_what_a_gpu_refuses_and_counts_what_it_is_asked(device):
+    with fake_device.counted() as counts:
+        there = torch.arange(6, device=device).float()
+        assert counts.totals == (2, 0, 0)
+        assert (there + torch.tensor(1.0)).device == device  # A single number is passed along.
+        moved = torch.ones(2).to(device)
+        assert counts.totals == (3, 0, 1)
+        assert (there[there > 2] + 1).tolist() == [4.0, 5.0, 6.0]
+        assert counts.waits == {"index": 1, "to the CPU": 1}
+        assert float(there.sum()) == 15
+        assert counts.waits.total() == 3
+    with pytest.raises(RuntimeError, match="two devices, fake and cpu"):
+        moved + torch.ones(2)
+    with pytest.raises(RuntimeError, match="generator of the CPU"):
+        torch.rand(2, device=device, generator=torch.Generator())
+    own = torch.Generator(device).manual_seed(0)
+    with fake_device.counted() as after:
+        assert torch.rand(2, device=device, generator=own).device == device
+    assert after.totals == (1, 0, 0)
+    assert counts.operations.total() < 12  # Nothing was added since.
+
+
+@pytest.mark.parametrize("name", SIDES)
+def test_an_lrm_encodes_there(device, tmp_path, name):
+    frames = frames_of(3)
+    crop = square_crop(*frames.shape[1:3])
+    places = torch.device("cpu"), device
+    found = [
+        encode(model_of(name), "key", frames, crop, StageCache(None), place, batch=2)
+        for place in places
+    ]
+    torch.testing.assert_close(found[1].triplanes, found[0].triplanes)
+
+
+@pytest.mark.filterwarnings("ignore:robust PCA stopped")
+def test_triplanes_become_planes_there(device):
+    def planes(place):
+        parts = decompose(moving_sequence(6, 4, 12).to(place), max_iterations=20)
+        found = [space_planes(parts.low_rank, static="mean", resolution=16).cpu()]
+        for plane_set in ("six", "nine"):
+            generator = torch.Generator().manual_seed(0)
+            sizes = {"resolution": 16, "time_resolution": 4, "noise": 0.01}
+            time = time_planes(parts.sparse, plane_set=plane_set, generator=generator, **sizes)
+            left = unexplained_energy(time, parts.sparse, rows=PLANE_SETS[plane_set])
+            found += [time.cpu(), torch.tensor(left)]
+        return found
+
+    for there, here in zip(planes(device), planes("cpu"), strict=True):
+        torch.testing.assert_close(there, here, atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["six", pytest.param("nine", marks=pytest.mark.slow)])
+def test_training_there_comes_to_the_numbers_of_plain_torch(device, monkeypatch, name):
+    monkeypatch.setenv("XPLANES_CPU_LOOPS", "0")
+    monkeypatch.setattr(DeviceBatches, "can_serve", lambda *_: False)
+    # What draws other random numbers is left out.
+    options = (
+        "model.sampler.thinning=0",
+        "model.sampler.update_every=1000",
+        "model.sampler.sweep_at=[8]",
+        "model.rays.samples_per_batch=16384",
+        "model.precision=32",
+    )
+    there, _, _ = trained(name, 16, *options)
+    here, _, _ = trained(name, 16, *options, trainer=on_the_cpu)
+    assert there.counts == here.counts
+    assert there.counts["no_room"] == 0
+    for ours, theirs in zip(there.parameters(), here.parameters(), strict=True):
+        torch.testing.assert_close(ours.cpu(), theirs, atol=1e-4, rtol=1e-4)
+
+
+def test_what_a_step_shows_is_read_now_and_then(device):
+    looked = [batches for batches in range(1, 100) if due(batches)]
+    assert looked == [1, 2, 4, 8, 16, 32, 64, 96]
+    module, _, steps = trained("six", 33)
+    # The sweep of step 15 lists the occupied cells, and an epoch of Lightning's ends now and then.
+    waiting = {n + 1 for n, counts in enumerate(steps) if counts.waits["to the CPU"]}
+    assert waiting == {1, 2, 4, 8, 16, 32}
+    seen = module.counts
+    left = seen["candidates"] - seen["empty"] - seen["occluded"]
+    assert 0 < seen["samples"] == seen["passed"] < left  # The others were of rays without room.
+    assert seen["no_room"] > 0
+    assert 32 * 128 < seen["rays"] + seen["no_room"] <= 32 * 256
+    assert 0 < module.last["psnr"] < 40
+    assert 0 < module.last["foreground"] < 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Broken(LossTerm):
+    """Not finite at some steps, in value or gradient."""
+
+    steps: ClassVar = range(0)
+    gradient: ClassVar = False
+
+    def value(self, field, rendering, rays, state):
+        first = next(field.parameters())
+        if state.step not in self.steps:
+            return 0 * first.sum()
+        return (first * 0 + 1e-30).log().sum() * 1e30 * 1e30 if self.gradient else first.sum() / 0
+
+
+@pytest.mark.parametrize("gradient", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_steps_that_are_not_finite_are_left_out(device, monkeypatch, gradient):
+    monkeypatch.setattr(Broken, "gradient", gradient)
+    monkeypatch.setattr(Broken, "steps", range(3, 6))
+    seen = {}
+
+    class Watch(Callback):
+        def on_train_batch_end(self, trainer, pl_module, *_):
+            seen[trainer.global_step] = pl_module.field.space.detach().cpu().clone()
+
+    made = functools.partial(fake_device.trainer, more=[Watch()])
+    module, _, _ = trained("six", 9, trainer=made, losses={"broken": Broken(weight=1.0)})
+    assert torch.equal(seen[3], seen[6])
+    assert not torch.equal(seen[2], seen[3])
+    assert not torch.equal(seen[6], seen[7])
+    assert module.unusable == 3
+    monkeypatch.setattr(Broken, "steps", range(100))
+    with pytest.raises(TrainingError, match=r"not finite for 20 steps in a row.*plane_lr"):
+        trained("six", 32, losses={"broken": Broken(weight=1.0)})
+
+
+def test_a_background_is_the_same_without_a_list_of_rays(device):
+    generator = torch.Generator().manual_seed(0)
+    background = Background(4, 8, width=8, samples=5, precision="32")
+    origins, directions = torch.randn(2, 12, 3, generator=generator)
+    directions = torch.nn.functional.normalize(directions, dim=1)
+    opacity = torch.rand(12, generator=generator)
+    opacity[:4] = 1
+    field = SimpleNamespace(background=background)
+    here = behind(field, origins, directions, opacity, None)
+    field.background = background.to(device)
+    rays = [part.to(device) for part in (origins, directions, opacity)]
+    with fake_device.counted() as counts:
+        there = behind(field, *rays, None)
+    assert counts.totals[1:] == (0, 0)
+    torch.testing.assert_close(there.cpu(), here)
+    assert (here[:4] == 0).all()
+
+
+def test_warming_up_does_all_of_a_step_and_changes_nothing(device):
+    module, data, _ = trained("six", 2)
+    before = {name: value.cpu().clone() for name, value in module.state_dict().items()}
+    with fake_device.counted() as counts:
+        warm_up(module, data, device)
+    for name in ("_fused_adam_", "scatter_reduce_", "grid_sampler_2d_backward"):
+        assert counts.operations[name], name
+    assert counts.waits["synchronize"] == 1
+    for name, value in module.state_dict().items():
+        assert torch.equal(value.cpu(), before[name]), name
+    assert all(p.grad is None for p in module.parameters())
+
+
+def test_the_clock_counts_what_the_device_has_still_to_do(device, monkeypatch):
+    """Whoever looks at the time waits for the device first; steps do not."""
+    clock = TrainingClock()
+    with fake_device.counted() as counts:
+        trained("kplanes", 3, trainer=functools.partial(fake_device.trainer, more=[clock]))
+    assert clock.seconds > 0
+    assert counts.waits["synchronize"] == 1
+    lag = 0.3
+    module = SimpleNamespace(device=device)
+    lagging = SimpleNamespace(should_stop=False, world_size=1)
+    clock = TrainingClock()
+    monkeypatch.setattr(torch.fake, "synchronize", lambda: time.sleep(lag))
+    clock.on_train_start(lagging, module)
+    clock.on_train_batch_end(lagging, module, None, None, 0)
+    assert clock.seconds < lag / 2
+    with clock.off():
+        pass
+    clock.on_train_batch_end(lagging, module, None, None, 1)
+    assert lag <= clock.seconds < 1.5 * lag  # What was asked before the block, not what it asked.
+    clock.on_train_end(lagging, module)
+    assert clock.seconds >= 2 * lag
+
+
+def test_an_lrm_whose_frames_are_cached_stays_where_it_is(device, tmp_path):
+    model, frames, cache = model_of(), frames_of(2), StageCache(tmp_path)
+    crop = square_crop(*frames.shape[1:3])
+    first = encode(model, "key", frames, crop, cache, device, batch=2)
+    model = model_of()
+    with fake_device.counted() as counts:
+        again = encode(model, "key", frames, crop, cache, device, batch=2)
+    assert counts.totals == (0, 0, 0)
+    assert torch.equal(first.triplanes, again.triplanes)
+
+
+BUDGETS = {
+    "six": {2: (449, 0, 0), 8: (621, 0, 0)},
+    "nine": {2: (461, 0, 0), 8: (639, 0, 0)},
+    "kplanes": {2: (1049, 0, 0)},
+    "tineuvox": {2: (675, 6, 0)},
+    "tensor4d": {2: (3532, 1, 0)},
+}
+"""Operations at most, waits and copies of a normal step, and of one that maintains the grid."""
+
+
+@pytest.mark.parametrize("name", BUDGETS)
+def test_steps_keep_to_their_budget_and_views_are_scored(device, name):
+    module, data, steps = trained(name, max(BUDGETS[name]) + 1)
+    for step, (most, waits, copies) in BUDGETS[name].items():
+        counts = steps[step]
+        assert counts.operations.total() <= most, counts.operations
+        assert (counts.waits.total(), counts.copies.total()) == (waits, copies), counts
+    assert all(p.isfinite().all() for p in module.parameters())
+    module.to(device)
+    views, background = data.scene.splits["test"], data.scene.background
+    score, images = score_view(module.field, module.renderer, module.frame, views, 0, background)
+    assert 0 < score.psnr < 60
+    assert images.colour.device.type == "cpu"

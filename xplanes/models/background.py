@@ -1,0 +1,50 @@
+"""The world behind a field: its settings, learning rates and smoothness, for any model."""
+
+from dataclasses import dataclass
+
+from xplanes.fields.background import Background
+from xplanes.fields.regularisers import add_total_variation_gradient
+from xplanes.rendering.sampler import Group, Site
+from xplanes.settings import Count, Positive, Settings, Steps, Weight
+from xplanes.streams import Stream, initial_values
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackgroundSettings(Settings):
+    """A static world behind the field, for opaque images of a scene in a world."""
+
+    resolution: Count  # Texels along each side of its planes, over contracted space.
+    channels: Count  # Channels of each plane.
+    samples: Steps  # Samples of a ray behind the field; 0: its colour depends on direction alone.
+    width: Count  # Neurons of the decoder's hidden layer.
+    total_variation: Weight  # Weight of total variation of its planes.
+    plane_lr: Positive  # Learning rate of its planes.
+    decoder_lr: Positive  # Learning rate of its decoder.
+
+    def build(self, site: Site) -> Background | None:
+        """What lies behind the field; None where images show no world."""
+        if not site.surrounded:
+            return None
+        with initial_values(site.seed, Stream.BACKGROUND):
+            return Background(
+                self.channels,
+                self.resolution,
+                width=self.width,
+                samples=self.samples,
+                precision="bf16" if site.precision == "bf16" else "32",
+            )
+
+    def groups(self, background: Background) -> list[Group]:
+        """Its trainable parameters."""
+        decoder = list(background.decoder.parameters())
+        return [
+            {"params": [background.planes], "lr": self.plane_lr, "name": "background"},
+            {"params": decoder, "lr": self.decoder_lr, "name": "background_decoder"},
+        ]
+
+    def regularise(self, background: Background, every: int = 1) -> None:
+        """Add the gradient of its total variation, as much as for ``every`` steps."""
+        planes = background.planes
+        if planes.grad is not None and self.total_variation:
+            weight = self.total_variation * every
+            add_total_variation_gradient(planes.grad, planes, (1, 2), weight)

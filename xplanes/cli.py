@@ -293,7 +293,10 @@ def _add_view(commands: "argparse._SubParsersAction") -> None:
     parser = commands.add_parser("view", help="interactive viewer in the browser (extra: viewer)")
     _add_run(parser)
     parser.add_argument(
-        "--port", type=int, default=8080, help="port; 0: any free one; default: %(default)s"
+        "--port",
+        type=int,
+        default=8080,
+        help="port that is served; 0: any free one; default: %(default)s",
     )
     parser.add_argument(
         "--host", default="127.0.0.1", help="address that is served; default: %(default)s"

@@ -280,7 +280,17 @@ def test_the_papers_choices_run(tmp_path: Path):
     found, _ = initialised(
         tmp_path, SEQUENCE, "decomposition=paper", "decomposition.max_iterations=50"
     )
-    assert found.report["unexplained"]["before"] == found.report["unexplained"]["after"]
+    assert found.values is not None
+    time = {name: plane for name, plane in found.values.planes.items() if "t" in name}
+    assert len(time) == 3
+    assert all((plane == 1).all() for plane in time.values())
+    near, _ = initialised(
+        tmp_path,
+        SEQUENCE,
+        *("decomposition=paper", "decomposition.max_iterations=50"),
+        "decomposition.dynamic=random",
+    )
+    assert near.report["unexplained"]["before"] == near.report["unexplained"]["after"]
 
 
 def test_a_source_that_is_not_there_is_refused_first(tmp_path: Path):

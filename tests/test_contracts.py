@@ -37,7 +37,6 @@ from xplanes.models.initialisation import (
     PreparationSettings,
 )
 from xplanes.rendering.sampler import SamplerSettings
-from xplanes.scenes.batches import RayBatches
 from xplanes.scenes.source import SceneSettings
 from xplanes.settings import Range, Settings
 from xplanes.settings import leaves as values_of
@@ -70,7 +69,7 @@ MODELS = [name for group, name in OPTIONS if group == "model"]
 def names(group, *, paper):
     """Options of a group, of those that are for X-Planes alone or of the others."""
     for option, name in OPTIONS:
-        if option == group:
+        if option == group and not name.startswith("gaussians"):  # They have no rays to set.
             text = (CONF / group / f"{name}.yaml").read_text()
             own = "recipe: paper" in text or "_planes" in name or name.startswith("ablation")
             if own == paper:
@@ -96,6 +95,9 @@ COMPOSITIONS = [
     ["recipe=paper", "preparation=paper"],
     ["recipe=fair", "scale=demo"],
     ["model=tineuvox_b"],
+    ["model=gaussians_hexplane", "model/sampler=rasteriser"],
+    ["model=gaussians_hexplane_published", "entry=gaussians_hexplane_published"],
+    ["entry=gaussians_hexplane"],
     *(
         [choice for choice in both if choice is not None]
         for paper in (True, False)
@@ -116,6 +118,9 @@ TINY_MODELS = {
         ("Tensor4DSettings", "Tensor4DDensitySettings"),
         ("model.resolution=6", "model.fine_resolution=8", "model.channels=2", "model.width=8"),
     ),
+    "HexPlaneGaussiansSettings": (
+        *("model.count=40", "model.resolution=4", "model.channels=2", "model.width=8"),
+    ),
 }
 TINY_SAMPLERS = {
     "OccupancySettings": ("model.sampler.grid_resolution=6", "model.sampler.samples=16"),
@@ -127,6 +132,7 @@ TINY_SAMPLERS = {
     ),
     "FixedStepSettings": (),
     "NeusSettings": ("model.sampler.samples=8", "model.sampler.more_samples=5"),
+    "RasteriserSettings": (),
 }
 
 
@@ -139,6 +145,7 @@ def small(*overrides, **changes):
     plain = to_plain(composed(*overrides))
     model, sampler = class_name(plain["model"]), class_name(plain["model"]["sampler"])
     tiny = ("model.rays.per_batch=32", "model.rays.samples_per_batch=4096")
+    tiny = tiny if "per_batch" in plain["model"]["rays"] else ()
     values = [f"{key}={value}" for key, value in changes.items()]
     return changed(overrides, *TINY_MODELS[model], *TINY_SAMPLERS[sampler], *tiny, *values)
 
@@ -151,7 +158,8 @@ def built(plain, scene):
     module = RadianceModule(plain)
     module.build(scene, initialise=lambda method, place: Initialisation(method.model, place.frame))
     views = scene.splits["train"]
-    return module, RayBatches(views, module.frame, module.ray_settings, seed=module.method.seed)
+    settings, seed = module.ray_settings, module.method.seed
+    return module, settings.batches(views, module.frame, seed=seed, rank=0)
 
 
 # conf/ and settings
@@ -195,7 +203,8 @@ def test_every_option_composes_reads_and_builds(overrides, tmp_path):
     module = module.to(experiment.device)
     rays = {name: value.to(experiment.device) for name, value in batches.draw(0).items()}
     colour = module.sampler.render(module.field, rays, module.state).colour
-    assert colour.shape == (32, 3)
+    assert colour.shape == rays["target"].shape
+    assert len(colour) == (module.ray_settings.most or 16 * 16)
     assert colour.isfinite().all()
     if "logger=wandb" in overrides and importlib.util.find_spec("wandb") is None:
         with pytest.raises(ConfigError, match=r"logger\.wandb.*wandb"):
@@ -313,6 +322,12 @@ def test_other_yaml_files_set_what_their_classes_take():
                 assert set(node) - {"_target_"} <= taken, told
 
 
+MODELS_OF_A_KIND = (
+    *("kplanes", "tineuvox_s", "tensor4d", "tensor4d_density", "gaussians_hexplane"),
+)
+"""One of each class of settings but X-Planes'."""
+
+
 @functools.cache
 def plains():
     """Configurations that hold all keys between them."""
@@ -320,7 +335,7 @@ def plains():
         ["lrm=small", "data=demo"],
         ["lrm=tiny", "data=dnerf"],
         ["lrm=file"],
-        *(["model=" + name] for name in ("kplanes", "tineuvox_s", "tensor4d", "tensor4d_density")),
+        *(["model=" + name] for name in MODELS_OF_A_KIND),
     ]
     return [to_plain(composed(*chosen)) for chosen in choices]
 

@@ -169,7 +169,7 @@ def check_name(entry, config):
 
 def test_comparisons_give_all_models_the_same_and_name_them_right():
     left = set(ENTRIES)
-    for name in ("table1", "lego_models"):
+    for name in ("fair", "lego_models"):
         text = yaml.safe_load((CONF / "experiment" / f"{name}.yaml").read_text())
         entries = text["hydra"]["sweeper"]["params"]["entry"].split(",")
         assert set(entries) <= set(ENTRIES), name

@@ -21,6 +21,7 @@ from xplanes.models.initialisation import Method, Place, RandomSettings
 from xplanes.preparation import fixed_view as module
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.fixed_view import canonical_pose, fixed_view, pick_frames, rendering_method
+from xplanes.rendering.base import RayRenderer
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, scene_frame
 from xplanes.scenes.views import Scene
@@ -118,7 +119,7 @@ def test_kplanes_render_as_published(tmp_path: Path):
 
 
 def test_a_model_that_is_not_there_cannot_render(tmp_path: Path):
-    with pytest.raises(ConfigError, match=r"^preparation\.fixed_view_model=nerf: .* of kplanes, "):
+    with pytest.raises(ConfigError, match=r"^preparation\.fixed_view_model=nerf: .* kplanes, "):
         settings(tmp_path, "preparation.fixed_view_model=nerf")
 
 
@@ -133,10 +134,15 @@ def small_fields(monkeypatch):
     monkeypatch.setattr(module, "compose_plain", composed)
 
 
-class KnownField:
+class KnownField(RayRenderer):
     """Stands for a trained field: shows a moving ball, and keeps where rays began."""
 
-    device = torch.device("cpu")
+    @property
+    def device(self):
+        return torch.device("cpu")
+
+    def render(self, *_arguments, **_options):
+        raise NotImplementedError
 
     def __init__(self, frame: Frame, radius: float, centre):
         self.frame, self.radius, self.centre = frame, radius, centre

@@ -16,6 +16,7 @@ from xplanes.evaluation.render import lens
 from xplanes.metrics import psnr
 from xplanes.models.tineuvox import frusta_box
 from xplanes.preparation.fixed_view import check_camera
+from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.carving import carve
 from xplanes.rendering.filling import fill
 from xplanes.rendering.occupancy import OccupancyGrid
@@ -430,10 +431,15 @@ def test_the_box_of_the_frusta_is_that_of_all_cameras():
     assert np.abs(frusta_box(views, 2.0, 6.0, 1.1).numpy() - expected).max() < 1e-5
 
 
-class Ball:
+class Ball(RayRenderer):
     """Stands for a renderer of a field that shows the ball."""
 
-    device = torch.device("cpu")
+    @property
+    def device(self):
+        return torch.device("cpu")
+
+    def render(self, *_arguments, **_options):
+        raise NotImplementedError
 
     def image(self, field, origins, directions, time, background):
         along = -(origins * directions).sum(dim=1, keepdim=True)

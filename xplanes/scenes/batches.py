@@ -477,28 +477,43 @@ def _tile_pools(
     views: Views, images: StoredImages, margins: list[int]
 ) -> tuple[_TilePool, _TilePool]:
     """The cells of tiles within some pixels of the silhouettes, and all others."""
-    places, cells, pixels = [], ([], []), ([], [])
-    for index, margin in enumerate(margins):
-        reach = -(-margin // CELL)
-        lit = images.lit(index).float()[None]
-        near = F.max_pool2d(lit, 2 * reach + 1, stride=1, padding=reach)[0] > 0
+    numbers = torch.tensor(
+        [-(-height // TILE) * -(-width // TILE) for height, width in _sizes(images)]
+    )
+    ends = numbers.cumsum(dim=0)
+    total = int(numbers.sum())
+    # Filled image by image: small tensors that stay, among large ones that go, would scatter both.
+    places = torch.empty(total, 2, dtype=torch.int32)
+    bits = torch.empty(2, total, (TILE // CELL) ** 2 // 8, dtype=torch.uint8)
+    counts = torch.empty(2, total, dtype=torch.int64)
+    for index, (size, margin) in enumerate(zip(_sizes(images), margins, strict=True)):
+        part = slice(int(ends[index] - numbers[index]), int(ends[index]))
+        places[part, 0] = index
+        places[part, 1] = torch.arange(int(numbers[index]), dtype=torch.int32)
+        lit = near = images.lit(index)
+        if not lit.all():
+            reach = -(-margin // CELL)
+            around = F.max_pool2d(lit.float()[None], 2 * reach + 1, stride=1, padding=reach)
+            near = around[0] > 0
         shown = views.intrinsics.has_ray(index)
         if shown is None:
-            height, width = (_lengths(side) for side in images.sizes[index].tolist())
+            height, width = (_lengths(side) for side in size)
             count = height[:, None] * width
         else:
             count = count_in_squares(shown, CELL)
-        for chosen, bits, counts in zip((near, ~near), cells, pixels, strict=True):
-            bits.append(torch.from_numpy(packed(by_tile(chosen))))
-            counts.append(by_tile(count * chosen).sum(dim=1))
-        number = torch.arange(len(pixels[0][-1]), dtype=torch.int32)
-        places.append(torch.stack([torch.full_like(number, index), number], dim=1))
-    place, pools = torch.cat(places), []
-    for bits, counts in zip(cells, pixels, strict=True):
-        count = torch.cat(counts)
-        pools.append(_TilePool(place[count > 0], torch.cat(bits)[count > 0], count[count > 0]))
-    near_pool, far_pool = pools
+        for pool, chosen in enumerate((near, ~near)):
+            bits[pool, part] = torch.from_numpy(packed(by_tile(chosen)))
+            counts[pool, part] = by_tile(count * chosen).sum(dim=1)
+    near_pool, far_pool = (
+        _TilePool(places[count > 0], bit[count > 0], count[count > 0])
+        for bit, count in zip(bits, counts, strict=True)
+    )
     return near_pool, far_pool
+
+
+def _sizes(images: StoredImages) -> list[tuple[int, int]]:
+    """Height and width of each image."""
+    return [(height, width) for height, width in images.sizes.tolist()]
 
 
 def _in_cells(

@@ -2,7 +2,7 @@
 
     python benchmarks/gaussians.py [--lego FOLDER] [--seconds 30] [--work FOLDER] [--only CASE]
 
-Writes results/gaussians.md and gaussians.csv beside this file. Seconds are those that the process
+Writes docs/results/gaussians.md and gaussians.csv. Seconds are those that the process
 has computed in training, on one thread, so that other programs on the machine do not count. Runs
 kept in the work folder are not repeated; ``--only`` makes the runs of one case and no tables.
 """

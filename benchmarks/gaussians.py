@@ -1,10 +1,11 @@
-"""Gaussians against six planes after equal seconds of one core.
+"""Gaussians and their initialisations against six planes, after equal seconds of one core.
 
     python benchmarks/gaussians.py [--lego FOLDER] [--seconds 30] [--work FOLDER] [--only CASE]
 
 Writes docs/results/gaussians.md and gaussians.csv. Seconds are those that the process
-has computed in training, on one thread, so that other programs on the machine do not count. Runs
-kept in the work folder are not repeated; ``--only`` makes the runs of one case and no tables.
+has computed on one thread, so that other programs on the machine do not count; the initialisation's
+are among them. Runs kept in the work folder are not repeated; ``--only`` makes the runs of one case
+and no tables.
 """
 
 import os
@@ -19,23 +20,33 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning import LightningModule
 from lightning.pytorch.callbacks import Callback
 from runner import RESULTS, command, lego, machine, markdown
 
 from xplanes.config import compose_plain
+from xplanes.fields.gaussians import Gaussians
 from xplanes.files import write_json, write_rows, write_text
 from xplanes.scenes.datamodule import SceneDataModule
-from xplanes.training.evaluation import mean_scores, render_view, score_view
+from xplanes.scenes.views import Views
+from xplanes.training.evaluation import ViewScore, mean_scores, render_view, score_view
 from xplanes.training.fit import Trainer
 from xplanes.training.module import RadianceModule
 
-MODELS = {
-    "six_planes, random": ("model=six_planes", "lrm=none"),
-    "gaussians_hexplane": ("model=gaussians_hexplane",),
-    "gaussians_hexplane, random points": ("model=gaussians_hexplane", "model.points=random"),
+INITIALISATIONS = {
+    "hull": ("model.points=silhouettes",),
+    "random points": ("model.points=random",),
+    "field": ("lrm=field",),
 }
-COLUMNS = ("scene", "model", "psnr", "ssim", "steps", "seconds", "ms per view", "parameters")
+MODELS = {
+    "six_planes, random planes": ("model=six_planes", "lrm=none"),
+    **{
+        f"{model}, {name}": (f"model={model}", *how)
+        for model in ("gaussians_hexplane", "gaussians_deform", "gaussians_spacetime")
+        for name, how in INITIALISATIONS.items()
+    },
+}
+COLUMNS = ("scene", "model", "psnr", "ssim", "first psnr", "initialisation s", "seconds", "steps")
+COLUMNS += ("gaussians", "ms per view")
 
 
 class Computed(Callback):
@@ -52,7 +63,8 @@ class Computed(Callback):
     def progress(self) -> float:
         return min(1.0, self.spent / self.budget) if self.begun else 0.0
 
-    def on_train_start(self, trainer: Any, pl_module: LightningModule) -> None:
+    def begin(self) -> None:
+        """Count from now on."""
         self.begun = time.process_time()
 
     def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
@@ -76,22 +88,34 @@ def measure(overrides: list[str], seconds: float) -> dict[str, Any]:
             limit_val_batches=0,
         )
         data.setup("fit")
+        views = data.read_split(data.test_split)
+        clock.begin()
         module.build(data.scene)
+        prepared = clock.spent
+        first = mean_scores(_scores(module, data, views))
+        clock.begun = time.process_time() - prepared
         trainer.train(module, data)
         spent = clock.spent
-    views = data.read_split(data.test_split)
+    scores = _scores(module, data, views)
     seen = (module.field, module.renderer, module.frame, views)
-    scores = [score_view(*seen, index, data.scene.background)[0] for index in range(len(views))]
     began = time.process_time()
     for index in range(len(views)):
         render_view(*seen, index, data.scene.background)
     return {
         **mean_scores(scores),
+        "first psnr": first["psnr"],
+        "initialisation s": prepared,
         "steps": trainer.global_step,
         "seconds": spent,
         "ms per view": 1000 * (time.process_time() - began) / len(views),
-        "parameters": sum(p.numel() for p in module.parameters()),
+        "gaussians": len(module.field) if isinstance(module.field, Gaussians) else None,
     }
+
+
+def _scores(module: RadianceModule, data: SceneDataModule, views: Views) -> list[ViewScore]:
+    """Scores of all views of the split."""
+    seen = (module.field, module.renderer, module.frame, views)
+    return [score_view(*seen, index, data.scene.background)[0] for index in range(len(views))]
 
 
 def cases(folder: Path | None) -> dict[str, list[str]]:
@@ -112,6 +136,8 @@ def main() -> None:
     parser.add_argument("--only")
     options = parser.parse_args()
     torch.set_num_threads(1)
+    # Loops are compiled on first use.
+    measure(["model=six_planes", "lrm=none", "data.resolution=16"], 0.2)
     rows = []
     for scene, where in cases(options.lego).items():
         for model, how in MODELS.items():
@@ -120,11 +146,13 @@ def main() -> None:
                 continue
             path = options.work / f"{case}, {options.seconds:g} s.json"
             if not path.is_file():
-                write_json(path, measure([*where, *how], options.seconds))
+                made = [*where, *how, "preparation.cache=null"]
+                write_json(path, measure(made, options.seconds))
             rows.append({"scene": scene, "model": model, **json.loads(path.read_text())})
     if options.only is not None:
         return
-    digits = {"psnr": 2, "ssim": 4, "seconds": 1, "ms per view": 0}
+    digits = {"psnr": 2, "ssim": 4, "first psnr": 2, "initialisation s": 1, "seconds": 1}
+    digits["ms per view"] = 0
     table = [
         tuple(f"{row[c]:.{digits[c]}f}" if c in digits else f"{row[c]}" for c in COLUMNS)
         for row in rows

@@ -22,7 +22,7 @@ NEIGHBOURS = 3
 """Whose mean squared distance is the first variance of a Gaussian (Kerbl et al. 2023)."""
 
 FIRST_OPACITY = 0.1
-"""Of every Gaussian (Kerbl et al. 2023)."""
+"""Of every Gaussian, where nothing is known of surfaces (Kerbl et al. 2023)."""
 
 ROWS = 1024
 """Points whose distances to all others are in memory at once."""
@@ -45,11 +45,15 @@ class PointCloud:
         points: Places in the field's frame. [N, 3]
         colours: From 0 to 1. [N, 3]
         times: When each was seen there, from 0 to 1; None where that is not known. [N]
+        scales: Standard deviations; None for the distances to neighbours. [N]
+        opacity: Of all of them, from 0 to 1.
     """
 
     points: Tensor
     colours: Tensor
     times: Tensor | None = None
+    scales: Tensor | None = None
+    opacity: float = FIRST_OPACITY
 
 
 @dataclass(frozen=True)
@@ -97,11 +101,11 @@ class Gaussians(Representation):
     def __init__(self, cloud: PointCloud, *, degree: int, extent: float, moves: bool) -> None:
         super().__init__()
         points, count = cloud.points, len(cloud.points)
-        spacing = neighbour_distance(points)
+        scales = neighbour_distance(points) if cloud.scales is None else cloud.scales
         self.means = nn.Parameter(points.clone())
         self.quaternions = nn.Parameter(points.new_tensor([1.0, 0, 0, 0]).repeat(count, 1))
-        self.log_scales = nn.Parameter(spacing.log()[:, None].repeat(1, 3))
-        self.logits = nn.Parameter(torch.full((count,), FIRST_OPACITY).logit())
+        self.log_scales = nn.Parameter(scales.log()[:, None].repeat(1, 3))
+        self.logits = nn.Parameter(torch.full((count,), cloud.opacity).logit())
         self.base = nn.Parameter((cloud.colours - 0.5)[:, None] / BASE)  # [N, 1, 3]
         self.detail = nn.Parameter(torch.zeros(count, (degree + 1) ** 2 - 1, 3))
         self._moves = moves

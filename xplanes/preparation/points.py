@@ -9,7 +9,7 @@ from torch import Tensor
 
 from xplanes.config import CONF, compose_plain
 from xplanes.errors import ConfigError
-from xplanes.fields.gaussians import PointCloud
+from xplanes.fields.gaussians import PointCloud, neighbour_distance
 from xplanes.fields.xplanes import XPlanes
 from xplanes.models.base import InitialValues
 from xplanes.models.gaussians import GaussiansSettings
@@ -24,7 +24,7 @@ from xplanes.models.initialisation import (
 from xplanes.preparation.fixed_view import intrinsics_key, trained_field
 from xplanes.preparation.sources import cache_of
 from xplanes.rendering.base import RayRenderer
-from xplanes.scenes.frame import Frame, frame_content
+from xplanes.scenes.frame import frame_content
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Positive
 from xplanes.streams import Stream, step_generator
@@ -37,7 +37,13 @@ ROUNDS = 200
 """Times that rays are drawn, at most."""
 
 OPAQUE = 0.5
-"""Opacity of a ray from which on there is a surface."""
+"""Opacity of a ray from which on there is a surface, and first opacity of the Gaussians on it."""
+
+CANDIDATES = 2
+"""Points that are looked for, of which one is kept: the denser half."""
+
+WIDEST = 1.5
+"""Scale of a Gaussian at most, in medians of all: single points far away would be large."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +56,6 @@ class FieldSettings(InitialiserSettings):
     source: str  # What the field is initialised from: a file of conf/lrm; none: random.
     steps: Count  # Maximum number of its training steps.
     seconds: Positive | None  # Maximum time of its training; null: no limit.
-    times: Count  # Timesteps at which points are taken, evenly spread; 1: the middle.
 
     def check(self) -> None:
         sources = sorted(path.stem for path in (CONF / "lrm").glob("*.yaml"))
@@ -90,7 +95,7 @@ class FieldInitialiser(Initialiser):
             intrinsics_key(views.intrinsics),
             frame_content(place.frame),
             field.plain(),
-            [settings.steps, settings.seconds, settings.times, count],
+            [settings.steps, settings.seconds, count],
         ]
 
         def make() -> dict[str, Any]:
@@ -98,16 +103,29 @@ class FieldInitialiser(Initialiser):
             with cache.workshop("points", inputs) as folder:
                 budget = {"steps": settings.steps, "seconds": settings.seconds}
                 module = trained_field(field, place, folder, **budget)
-                cloud = self._look(module, views, place.frame, count, method.seed)
-                return {"points": cloud.points, "colours": cloud.colours, "times": cloud.times}
+                found = surface_points(module, views, count, seed=method.seed)
+            if not len(found.points):
+                raise ConfigError(
+                    f"lrm.steps={settings.steps}: {settings.model} shows nothing yet that points "
+                    "could lie on; raise lrm.steps, or set lrm=none"
+                )
+            assert module.frame is not None
+            points = place.frame.points(module.frame.to_world(found.points))
+            return {"points": points, "colours": found.colours, "times": found.times}
 
         stage = cache.stage("points", inputs, make, alone=True)
+        scales = neighbour_distance(stage.content["points"])
+        cloud = PointCloud(
+            **stage.content,
+            scales=scales.clamp(max=WIDEST * float(scales.median())),
+            opacity=OPAQUE,
+        )
         return Initialisation(
             model=method.model,
             frame=place.frame,
-            values=InitialValues({}, points=PointCloud(**stage.content)),
+            values=InitialValues({}, points=cloud),
             seconds=no_time() | {"field": stage.seconds},
-            words=f"{len(stage.content['points']):,} points on the surfaces of {settings.model}, "
+            words=f"{len(cloud.points):,} points on the surfaces of {settings.model}, "
             f"trained for {self._budget}",
         )
 
@@ -116,69 +134,46 @@ class FieldInitialiser(Initialiser):
         steps, seconds = self.settings.steps, self.settings.seconds
         return f"{steps} steps" if seconds is None else f"up to {steps} steps or {seconds:g} s"
 
-    def _look(
-        self, module: RadianceModule, views: Views, frame: Frame, count: int, seed: int
-    ) -> PointCloud:
-        times = torch.linspace(0, 1, self.settings.times)
-        if views.is_static or len(times) == 1:
-            times = views.times[:1] if views.is_static else torch.tensor([0.5])
-        cloud = surface_points(module, views, times, count, seed=seed)
-        if not len(cloud.points):
-            raise ConfigError(
-                f"lrm.steps={self.settings.steps}: {self.settings.model} shows nothing yet that "
-                "points could lie on; raise lrm.steps, or set lrm=none"
-            )
-        assert module.frame is not None
-        return replace(cloud, points=frame.points(module.frame.to_world(cloud.points)))
-
 
 @torch.no_grad()
-def surface_points(
-    module: RadianceModule, views: Views, times: Tensor, count: int, *, seed: int
-) -> PointCloud:
+def surface_points(module: RadianceModule, views: Views, count: int, *, seed: int) -> PointCloud:
     """Points where rays through random pixels of the views meet what a field shows.
 
-    A point lies at the mean distance of what its ray sees, if that stops half of the light, and has
-    the colour that is seen. What lies behind the field's cube is left out.
+    A point lies at the mean distance of what its ray sees at its view's time, if that stops half of
+    the light, and has the colour that is seen. Of twice as many the denser half is kept: between
+    two surfaces there is nothing. What lies behind the field's cube is left out.
 
     Args:
-        module: A trained radiance field.
-        views: Whose cameras are looked through, each at all times.
-        times: When, in turn. [T]
+        module: A trained radiance field, whose background is taken away.
+        views: Whose cameras are looked through.
         count: Number of points; there are fewer if the field is hardly seen.
         seed: Source of the pixels.
 
     Returns:
-        The points, in the field's frame.
+        The points, in the field's frame, with their times.
     """
     renderer, frame, field = module.renderer, module.frame, module.field
     assert isinstance(renderer, RayRenderer)
+    assert isinstance(field, XPlanes)
     assert frame is not None
-    if isinstance(field, XPlanes):
-        field.background = None
+    field.background = None
     device, black = renderer.device, torch.zeros(3, device=renderer.device)
-    # As many of each time, and the last rounds for times at which little is seen.
-    wanted = torch.full((len(times),), count // len(times))
-    wanted[: count % len(times)] += 1
-    parts: list[tuple[Tensor, Tensor, Tensor]] = []
+    parts: list[tuple[Tensor, ...]] = []
     for step in range(ROUNDS):
-        if not bool((wanted > 0).any()):
+        if sum(len(part[0]) for part in parts) >= CANDIDATES * count:
             break
-        number = int(wanted.argmax())
         generator = step_generator(seed, step, Stream.SIGHT)
         chosen = torch.randint(len(views), (RAYS,), generator=generator)
-        place = torch.rand(RAYS, 2, generator=generator) * views.intrinsics.size[chosen]
-        rows, columns = place.floor().unbind(dim=1)
-        rays = frame.rays(*views.pixel_rays(chosen, rows, columns))
+        pixels = torch.rand(RAYS, 2, generator=generator) * views.intrinsics.size[chosen]
+        rays = frame.rays(*views.pixel_rays(chosen, *pixels.floor().unbind(dim=1)))
         origins, directions = (ray.to(device) for ray in rays)
-        seen = renderer.image(field, origins, directions, float(times[number]), black)
-        points = origins + seen["depth"][:, None] * directions
-        colours = seen["colour"] / seen["opacity"].clamp(min=1e-6)[:, None]
-        inside = (seen["opacity"] >= OPAQUE) & (points.abs() <= 1).all(dim=1)
-        found = inside.nonzero()[: int(wanted[number]), 0]
-        wanted[number] -= len(found)
-        part = points[found].cpu(), colours[found].clamp(0, 1).cpu()
-        parts.append((*part, times[number].expand(len(found))))
-    if not parts:
-        return PointCloud(torch.empty(0, 3), torch.empty(0, 3), torch.empty(0))
-    return PointCloud(*(torch.cat(part) for part in zip(*parts, strict=True)))
+        times = views.times[chosen].to(device)
+        seen = renderer.render(field, origins, directions, times, black)
+        points = origins + seen.depth[:, None] * directions
+        found = ((seen.opacity >= OPAQUE) & (points.abs() <= 1).all(dim=1)).nonzero()[:, 0]
+        colours = seen.colour[found] / seen.opacity[found, None]
+        parts.append((points[found], colours.clamp(0, 1), times[found]))
+    points, colours, times = (torch.cat(part).float() for part in zip(*parts, strict=True))
+    density = field(points, times)[1]
+    dense = density.topk(min(count, len(points) // CANDIDATES)).indices
+    return PointCloud(*(values[dense].cpu() for values in (points, colours, times)))

@@ -68,7 +68,9 @@ class GaussiansSettings(ModelSettings):
         """What the Gaussians are made from; places are drawn with torch's generator."""
         if initial is not None and initial.points is not None:
             return initial.points
-        if self.points == "silhouettes" and site.views is not None:
+        if site.views is None:
+            return random_points(1)  # A checkpoint brings its own.
+        if self.points == "silhouettes":
             return hull_points(site.views, site.frame, self.count)
         return random_points(self.count)
 

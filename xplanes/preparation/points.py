@@ -64,25 +64,28 @@ class FieldSettings(InitialiserSettings):
             raise ConfigError(f"source={self.source}: must be one of {', '.join(sources)}")
 
     def load(self, say: Callable[[str], None] = print) -> "FieldInitialiser":
-        return FieldInitialiser(self)
+        overrides = [f"model={self.model}", f"lrm={self.source}"]
+        method = Method.read(compose_plain("train", overrides))
+        method.lrm.load(say)  # Weights that are not there are told of now.
+        return FieldInitialiser(self, method)
 
 
 class FieldInitialiser(Initialiser):
     """Trains a field, and takes points from where the training cameras see its surfaces.
 
     Args:
-        settings: Which field, and for how long.
+        settings: For how long.
+        field: How the field is made.
     """
 
-    def __init__(self, settings: FieldSettings) -> None:
-        self.settings = settings
+    def __init__(self, settings: FieldSettings, field: Method) -> None:
+        self.settings, self.field = settings, field
 
     def initialise(self, method: Method, place: Place) -> Initialisation:
         settings, views = self.settings, place.scene.splits["train"]
         count = cast(GaussiansSettings, method.model).count
-        overrides = [f"model={settings.model}", f"lrm={settings.source}"]
         field = replace(
-            Method.read(compose_plain("train", overrides)),
+            self.field,
             seed=method.seed,
             preparation=method.preparation,
             decomposition=method.decomposition,
@@ -137,7 +140,7 @@ class FieldInitialiser(Initialiser):
 
 @torch.no_grad()
 def surface_points(module: RadianceModule, views: Views, count: int, *, seed: int) -> PointCloud:
-    """Points where rays through random pixels of the views meet what a field shows.
+    """Points where rays through random places of the views meet what a field shows.
 
     A point lies at the mean distance of what its ray sees at its view's time, if that stops half of
     the light, and has the colour that is seen. Of twice as many the denser half is kept: between
@@ -147,7 +150,7 @@ def surface_points(module: RadianceModule, views: Views, count: int, *, seed: in
         module: A trained radiance field, whose background is taken away.
         views: Whose cameras are looked through.
         count: Number of points; there are fewer if the field is hardly seen.
-        seed: Source of the pixels.
+        seed: Source of the places.
 
     Returns:
         The points, in the field's frame, with their times.
@@ -164,8 +167,8 @@ def surface_points(module: RadianceModule, views: Views, count: int, *, seed: in
             break
         generator = step_generator(seed, step, Stream.SIGHT)
         chosen = torch.randint(len(views), (RAYS,), generator=generator)
-        pixels = torch.rand(RAYS, 2, generator=generator) * views.intrinsics.size[chosen]
-        rays = frame.rays(*views.pixel_rays(chosen, *pixels.floor().unbind(dim=1)))
+        place = torch.rand(RAYS, 2, generator=generator) * views.intrinsics.size[chosen] - 0.5
+        rays = frame.rays(*views.pixel_rays(chosen, *place.unbind(dim=1)))
         origins, directions = (ray.to(device) for ray in rays)
         times = views.times[chosen].to(device)
         seen = renderer.render(field, origins, directions, times, black)
@@ -176,4 +179,4 @@ def surface_points(module: RadianceModule, views: Views, count: int, *, seed: in
     points, colours, times = (torch.cat(part).float() for part in zip(*parts, strict=True))
     density = field(points, times)[1]
     dense = density.topk(min(count, len(points) // CANDIDATES)).indices
-    return PointCloud(*(values[dense].cpu() for values in (points, colours, times)))
+    return PointCloud(points[dense].cpu(), colours[dense].cpu(), times[dense].cpu())

@@ -48,12 +48,14 @@ def rays_of(count, dtype=torch.float64, seed=1):
 
 def twin(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0):
     limit = -math.log(occlusion) if occlusion > 0 else math.inf
-    return march_reference(*rays, grid, step=step, skip=skip_empty, limit=limit)
+    occupied = grid.occupied if skip_empty else None
+    return march_reference(*rays, grid, step=step, occupied=occupied, limit=limit)
 
 
 def into(rays, grid, room, *, step=STEP, skip_empty=True, occlusion=0.0):
     limit = -math.log(occlusion) if occlusion > 0 else math.inf
-    return march_into(*rays, grid, step=step, skip=skip_empty, limit=limit, room=room)
+    occupied = grid.occupied if skip_empty else None
+    return march_into(*rays, grid, step=step, occupied=occupied, limit=limit, room=room)
 
 
 def by_oracle(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0):
@@ -111,6 +113,18 @@ def test_loops_and_twin_agree_on_many_rays():
             )
         for name in ("candidates", "empty", "occluded"):
             assert getattr(ours, name) == getattr(theirs, name), (case, name)
+
+
+def test_samples_in_unseen_cells_are_dropped_where_asked():
+    grid, rays = grid_of(), rays_of(60)
+    grid.lit_before.copy_(torch.rand(216, generator=torch.Generator().manual_seed(2)) < 0.5)
+    dark = (grid.lit_before == 0).repeat(3)
+    every = march(*rays, grid, step=STEP)
+    seen = march(*rays, grid, step=STEP, skip_unseen=True)
+    assert seen.cells.tolist() == [cell for cell in every.cells.tolist() if not dark[cell]]
+    assert 0 < len(seen) < len(every)
+    whole = march(*rays, grid, step=STEP, skip_empty=False, skip_unseen=True)
+    assert whole.empty == 0
 
 
 def test_in_float32_only_samples_on_borders_differ():

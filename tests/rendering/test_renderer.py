@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -215,3 +216,31 @@ def test_jitter_moves_samples_within_their_steps():
     first = samples.distances[samples.starts]
     expected = 2 * math.sqrt(3) + jitter * renderer.step
     torch.testing.assert_close(first, expected)
+
+
+@pytest.mark.parametrize("skip_unseen", [True, False])
+def test_images_show_nothing_that_no_training_ray_has_seen(skip_unseen):
+    """A slab seen from above alone, with untrained matter below it, which another view looks at."""
+    renderer = renderer_of()
+
+    def slab(points, times):
+        density = torch.where(points[:, 2] < 0, 200.0, 0.0).to(points)
+        return COLOUR.expand(len(points), 3), density
+
+    count = 4000
+    generator = torch.Generator().manual_seed(0)
+    origins = 1.8 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.9
+    origins[:, 2] = 2
+    down = torch.tensor([0, 0, -1.0]).double().expand(count, 3)
+    times = torch.zeros(count, dtype=torch.float64)
+    renderer.grid.forget_light()
+    seen = renderer.render(slab, origins, down, times, WHITE)
+    renderer.grid.light(seen.samples.cells, seen.weights)
+    images = replace(renderer, skip_unseen=skip_unseen)
+    above = images.render(slab, origins, down, times, WHITE)
+    torch.testing.assert_close(above.opacity, torch.ones_like(times), atol=1e-6, rtol=0)
+    heights = torch.linspace(-0.95, -0.55, 13, dtype=torch.float64)
+    origins = torch.stack([torch.full_like(heights, 2), torch.zeros_like(heights), heights], dim=1)
+    sideways = torch.tensor([-1.0, 0, 0]).double().expand(13, 3)
+    below = images.render(slab, origins, sideways, times[:13], WHITE)
+    assert (below.opacity == (0 if skip_unseen else 1)).all()

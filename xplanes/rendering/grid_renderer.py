@@ -30,8 +30,22 @@ SPARE = 1.25
 STEP_OF_ROOM = 1024
 """Their number is a multiple of this."""
 
+UNSEEN_FROM = 400
+"""Step of the first sweep after which a cell may count as unseen: before, few have met a ray."""
+
 DIAGONAL = 2 * math.sqrt(3)
 """Longest way through the field's cube."""
+
+
+@dataclass(frozen=True)
+class GridRendering(Rendering):
+    """What rays see, and which samples they see it by.
+
+    Attributes:
+        weights: Share of its ray's light that each sample stops, without gradient. [N]
+    """
+
+    weights: Tensor
 
 
 @dataclass(frozen=True)
@@ -42,6 +56,7 @@ class GridRenderer(RayRenderer):
         grid: Which cells hold something, and when.
         samples: Steps along the diagonal of the field's cube.
         skip_empty: Skip samples in empty cells.
+        skip_unseen: Skip samples in cells of which training rays have seen nothing.
         occlusion: Skip samples behind surfaces that leave less light than this; 0 skips none.
         thinning: Where gradients are wanted, samples whose own is below this times the mean may be
             left out, see `Cut.pass_on`; 0 leaves none out. On the CPU alone: elsewhere choosing
@@ -52,6 +67,7 @@ class GridRenderer(RayRenderer):
     grid: OccupancyGrid
     samples: int
     skip_empty: bool = True
+    skip_unseen: bool = False
     occlusion: float = 0.001
     thinning: float = 0.0
     room: int | None = None
@@ -73,7 +89,7 @@ class GridRenderer(RayRenderer):
         times: Tensor,
         background: Tensor,
         jitter: Tensor | None = None,
-    ) -> Rendering:
+    ) -> GridRendering:
         """Render rays.
 
         Args:
@@ -96,6 +112,7 @@ class GridRenderer(RayRenderer):
             self.grid,
             step=self.step,
             skip_empty=self.skip_empty,
+            skip_unseen=self.skip_unseen,
             occlusion=self.occlusion,
             room=self.room,
         )
@@ -109,17 +126,18 @@ class GridRenderer(RayRenderer):
         colour, density = (cut.colour, cut.density) if cut else ask(slice(None))
         if samples.live is not None:
             density = torch.where(samples.live, density, 0)
-        total, _ = composite(
+        total, weights = composite(
             density * self.step, colour, samples.distances, samples.ray, samples.starts
         )
         opacity = total[:, 3]
         background = behind(field, origins, directions, opacity, background, jitter)
-        return Rendering(
+        return GridRendering(
             colour=total[:, :3] + (1 - opacity)[:, None] * background,
             opacity=opacity,
             depth=(total[:, 4] / opacity.clamp_min(1e-6)).detach(),
             density=density.detach(),
             samples=samples,
+            weights=weights,
             cut=cut,
         )
 
@@ -139,6 +157,7 @@ class OccupancySettings(SamplerSettings):
     world_threshold: Fraction  # The same in front of a background, in place of it.
     decay: Share  # Decay of the density of a cell at each update.
     skip_empty: bool  # Skip samples in empty cells.
+    skip_unseen: bool  # Images show no cell that no training ray has seen.
     skip_occluded: bool  # Skip samples behind opaque surfaces.
     occlusion: Annotated[float, Range(0, 1)]  # Transmittance below which a surface is opaque.
     thinning: Weight  # Gradients below this times the mean are subsampled; 0: none.
@@ -217,9 +236,10 @@ class OccupancySampler(Sampler):
         room = None if samples is None else self._room(samples)
         self._training = replace(renderer, thinning=settings.thinning, room=room)
         self._coarse = replace(self._training, samples=math.ceil(renderer.samples / 2))
-        self._images = replace(renderer, samples=settings.render_samples)
+        images = replace(renderer, skip_unseen=settings.skip_unseen)
+        self._images = replace(images, samples=settings.render_samples)
         self._is_coarse = settings.coarse_steps > 0
-        self._coarse_images = replace(self._coarse, room=None)
+        self._coarse_images = replace(images, samples=self._coarse.samples)
 
     @property
     def renderer(self) -> GridRenderer:
@@ -240,7 +260,7 @@ class OccupancySampler(Sampler):
         # At first the grid hides little, and images of all samples would take longer than steps.
         return self._coarse_images if step < self.settings.coarse_steps else self._images
 
-    def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
+    def render(self, field: Any, rays: Batch, state: TrainingState) -> GridRendering:
         self._is_coarse = state.step < self.settings.coarse_steps
         return (self._coarse if self._is_coarse else self._training).render(
             field,
@@ -256,9 +276,10 @@ class OccupancySampler(Sampler):
             return rendering.samples.count
         return rendering.cut.pass_on(state.generator(rendering.density.device, Stream.THINNING))
 
-    def observe(self, rendering: Rendering) -> None:
+    def observe(self, rendering: GridRendering) -> None:
         samples = rendering.samples
         self.grid.observe(samples.cells, rendering.density, samples.live)
+        self.grid.light(samples.cells, rendering.weights)
 
     def update(self, field: Any, state: TrainingState) -> None:
         step, settings = state.step, self.settings
@@ -268,6 +289,8 @@ class OccupancySampler(Sampler):
         self._agree()
         generator = step_generator(state.seed, step, Stream.GRID)
         if sweeping:
+            if step >= UNSEEN_FROM:
+                self.grid.forget_light()
             self.grid.sweep(field, generator)
         elif (device := self.grid.density.device).type != "cpu":
             shape = (settings.update_cells, 8)
@@ -281,6 +304,7 @@ class OccupancySampler(Sampler):
         if distributed.is_available() and distributed.is_initialized():
             for part in (self.grid.density, self.grid.least, self.grid.occupied):
                 distributed.broadcast(part, src=0)
+            distributed.all_reduce(self.grid.lit, distributed.ReduceOp.MAX)
 
     def expect(self, samples: float) -> None:
         if self.samples is None:

@@ -66,6 +66,7 @@ def march(
     *,
     step: float,
     skip_empty: bool = True,
+    skip_unseen: bool = False,
     occlusion: float = 0.0,
     room: int | None = None,
 ) -> Samples:
@@ -79,6 +80,7 @@ def march(
         grid: Tells which cells are empty.
         step: Distance between samples.
         skip_empty: Whether samples in empty cells are dropped.
+        skip_unseen: Whether samples in cells that no training ray has seen are dropped as well.
         occlusion: Samples that the grid's least densities leave less light than this are dropped;
             0 keeps all.
         room: Places set apart for samples on a device other than the CPU, so that nothing waits for
@@ -89,17 +91,18 @@ def march(
         The samples that remain.
     """
     limit = -math.log(occlusion) if occlusion > 0 else math.inf
+    occupied = (grid.seen if skip_unseen else grid.occupied) if skip_empty else None
     if cpu_loops(origins):
         return _march_cpu(
-            origins, directions, times, jitter, grid, step=step, skip=skip_empty, limit=limit
+            origins, directions, times, jitter, grid, step=step, occupied=occupied, limit=limit
         )
     if room is not None and origins.device.type != "cpu":
         return march_into(
-            origins, directions, times, jitter, grid, step=step, skip=skip_empty, limit=limit,
+            origins, directions, times, jitter, grid, step=step, occupied=occupied, limit=limit,
             room=room,
         )  # fmt: skip
     return march_reference(
-        origins, directions, times, jitter, grid, step=step, skip=skip_empty, limit=limit
+        origins, directions, times, jitter, grid, step=step, occupied=occupied, limit=limit
     )
 
 
@@ -111,7 +114,7 @@ def march_reference(
     grid: OccupancyGrid,
     *,
     step: float,
-    skip: bool,
+    occupied: Tensor | None,
     limit: float,
 ) -> Samples:
     """The same as `march`, in whole-tensor operations."""
@@ -120,7 +123,7 @@ def march_reference(
     distances, cells, inside = _all_samples(
         origins, directions, times, jitter, near, far, grid, step, steps
     )
-    live = inside & grid.occupied[cells] if skip else inside
+    live = inside if occupied is None else inside & occupied[cells]
     ray, place = live.nonzero(as_tuple=True)
     distances, cells = distances[ray, place], cells[ray, place]
     candidates, found = int(inside.sum()), len(ray)
@@ -171,7 +174,7 @@ def march_into(
     grid: OccupancyGrid,
     *,
     step: float,
-    skip: bool,
+    occupied: Tensor | None,
     limit: float,
     room: int,
 ) -> Samples:
@@ -184,7 +187,7 @@ def march_into(
     distances, cells, inside = _all_samples(
         origins, directions, times, jitter, near, far, grid, step, steps
     )
-    met = inside & grid.occupied[cells] if skip else inside
+    met = inside if occupied is None else inside & occupied[cells]
     kept = met
     if math.isfinite(limit):
         depth = (grid.least[cells].double() * step).clamp_max(OPAQUE) * met
@@ -229,7 +232,7 @@ def _march_cpu(
     grid: OccupancyGrid,
     *,
     step: float,
-    skip: bool,
+    occupied: Tensor | None,
     limit: float,
 ) -> Samples:
     cpu = compiled("xplanes.rendering.cpu")
@@ -239,11 +242,12 @@ def _march_cpu(
     rays = [
         t.numpy() for t in ((origins + 1) * half, directions * half, near, far, jitter.contiguous())
     ]
-    bins, occupied = grid.bins(times).numpy(), grid.occupied.numpy()
+    bins, skip = grid.bins(times).numpy(), occupied is not None
+    wanted = (grid.occupied if occupied is None else occupied).numpy()
     counts = torch.empty(3, len(near), dtype=torch.int64)
     size = grid.resolution
     cpu.count_samples(
-        *rays, bins, occupied, grid.least.numpy(), size, step, limit, skip, counts.numpy()
+        *rays, bins, wanted, grid.least.numpy(), size, step, limit, skip, counts.numpy()
     )
     candidates, found, kept = counts.sum(dim=1).tolist()
     starts = counts[2].cumsum(0) - counts[2]
@@ -258,7 +262,7 @@ def _march_cpu(
         near,
         jitter_array,
         bins,
-        occupied,
+        wanted,
         size,
         step,
         skip,

@@ -136,7 +136,7 @@ class Sampler(ABC):
         """Add gradients of the sampler's own parameters."""
         return
 
-    def observe(self, rendering: Rendering) -> None:
+    def observe(self, rendering: Any) -> None:
         """Learn from what a batch showed."""
         return
 

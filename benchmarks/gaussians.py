@@ -128,6 +128,19 @@ def cases(folder: Path | None) -> dict[str, list[str]]:
     return found
 
 
+def _begins(rows: list[dict[str, Any]]) -> str:
+    """A table of what the hull's alternatives give, scene by scene and model by model."""
+    found = {(row["scene"], row["model"]): row["psnr"] for row in rows}
+    lines = []
+    for scene, name in found:
+        model, _, begin = name.rpartition(", ")
+        if begin == "hull":
+            hull = found[scene, name]
+            others = (found[scene, f"{model}, {other}"] for other in ("random points", "field"))
+            lines.append((scene, model, f"{hull:.2f}", *(f"{psnr - hull:+.2f}" for psnr in others)))
+    return markdown(("scene", "model", "hull", "random points", "field"), lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--lego", type=Path)
@@ -157,11 +170,16 @@ def main() -> None:
         tuple(f"{row[c]:.{digits[c]}f}" if c in digits else f"{row[c]}" for c in COLUMNS)
         for row in rows
     ]
+    begins = _begins(rows)
     write_rows(RESULTS / "gaussians.csv", COLUMNS, table)
     text = (
-        f"# Gaussians against six planes\n\n{options.seconds:g} s of one core for each training, "
-        "random initialisation, seed 0; scored on the test split of demo scenes and the val split "
-        f"of lego.\n\n{markdown(COLUMNS, table)}\n\n{machine()}\n\n    {command()}\n"
+        f"# Gaussians against six planes\n\n{options.seconds:g} s of one core for each run, its "
+        "initialisation included, seed 0; scored on the test split of demo scenes and the val "
+        "split of lego. Gaussians begin on the silhouettes' hull (`model.points=silhouettes`, the "
+        "default), anywhere (`model.points=random`), or on the surfaces of a six-plane field that "
+        "is trained first (`lrm=field`). `first psnr` is that of the initial model.\n\n"
+        f"{markdown(COLUMNS, table)}\n\n## PSNR of each initialisation\n\n"
+        f"Differences in dB from the hull.\n\n{begins}\n\n{machine()}\n\n    {command()}\n"
     )
     write_text(RESULTS / "gaussians.md", text)
 

@@ -248,6 +248,7 @@ def test_first_points_lie_on_what_a_field_shows(tmp_path, monkeypatch):
     again.build(scene, frame, say=said.append)
     assert len(said) == 1
     assert torch.equal(again.field.means, field.means)
+    monkeypatch.setattr(points, "ROUNDS", 1)
     monkeypatch.setattr(points, "OPAQUE", 2.0)
     early = RadianceModule(config | {"lrm": config["lrm"] | {"steps": 1}})
     with pytest.raises(ConfigError, match=r"lrm\.steps=1: six_planes shows nothing yet"):

@@ -33,7 +33,7 @@ from xplanes.training.module import RadianceModule
 RAYS = 8192
 """Rays that are drawn together."""
 
-ROUNDS = 200
+ROUNDS = 40
 """Times that rays are drawn, at most."""
 
 OPAQUE = 0.5

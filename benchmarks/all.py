@@ -28,6 +28,7 @@ def scripts(folder: Path) -> dict[str, list[list[str]]]:
         "rendering": [given],
         "ray_drawing": [[]],
         "gaussian_rasteriser": [[]],
+        "gaussians": [given],
         "captures": [[]],
         "stages": [[]],
         "pareto": [given],

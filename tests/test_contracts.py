@@ -97,7 +97,11 @@ COMPOSITIONS = [
     ["model=tineuvox_b"],
     ["model=gaussians_hexplane", "model/sampler=rasteriser"],
     ["model=gaussians_hexplane_published", "entry=gaussians_hexplane_published"],
-    ["entry=gaussians_hexplane"],
+    ["model=gaussians_deform", "entry=gaussians_hexplane"],
+    ["model=gaussians_deform_published", "entry=gaussians_deform"],
+    ["model=gaussians_spacetime", "lrm=field", "entry=gaussians_deform_published"],
+    ["model=gaussians_spacetime_published", "entry=gaussians_spacetime"],
+    ["entry=gaussians_spacetime_published"],
     *(
         [choice for choice in both if choice is not None]
         for paper in (True, False)
@@ -121,6 +125,8 @@ TINY_MODELS = {
     "HexPlaneGaussiansSettings": (
         *("model.count=40", "model.resolution=4", "model.channels=2", "model.width=8"),
     ),
+    "DeformedGaussiansSettings": ("model.count=40", "model.depth=2", "model.width=8"),
+    "SpacetimeGaussiansSettings": ("model.count=40",),
 }
 TINY_SAMPLERS = {
     "OccupancySettings": ("model.sampler.grid_resolution=6", "model.sampler.samples=16"),
@@ -324,6 +330,7 @@ def test_other_yaml_files_set_what_their_classes_take():
 
 MODELS_OF_A_KIND = (
     *("kplanes", "tineuvox_s", "tensor4d", "tensor4d_density", "gaussians_hexplane"),
+    *("gaussians_deform", "gaussians_spacetime"),
 )
 """One of each class of settings but X-Planes'."""
 
@@ -335,6 +342,7 @@ def plains():
         ["lrm=small", "data=demo"],
         ["lrm=tiny", "data=dnerf"],
         ["lrm=file"],
+        ["model=gaussians_spacetime", "lrm=field"],
         *(["model=" + name] for name in MODELS_OF_A_KIND),
     ]
     return [to_plain(composed(*chosen)) for chosen in choices]

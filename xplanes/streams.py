@@ -47,6 +47,10 @@ class Stream(IntEnum):
     """Order of the training views, where a batch is a whole view."""
     SPLITTING = 1_000_333
     """Where the halves of split Gaussians go."""
+    TIME_NOISE = 1_000_357
+    """Noise on the times at which Gaussians are deformed."""
+    SIGHT = 1_000_381
+    """Rays along which points of a field are looked for."""
 
 
 def step_generator(seed: int, step: int, stream: int = 0) -> torch.Generator:

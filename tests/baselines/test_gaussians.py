@@ -14,10 +14,10 @@ from tests.synthetic import ball_scene, ball_views
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.evaluation.export import ExportOptions, export, write_gaussians
-from xplanes.fields.gaussians import Gaussians, HexPlaneGaussians, neighbour_distance
+from xplanes.fields.gaussians import Gaussians, HexPlaneGaussians, PointCloud, neighbour_distance
 from xplanes.fields.products import PlaneProducts
 from xplanes.models.densification import densify, reset_opacity, select_rows
-from xplanes.models.gaussians_hexplane import camera_extent
+from xplanes.models.gaussians import camera_extent
 from xplanes.models.hull import hull_points
 from xplanes.models.initialisation import Method
 from xplanes.preparation.fixed_view import rendering_method
@@ -43,8 +43,7 @@ def gaussians(count: int, *, degree: int = 1, moves: bool = True) -> HexPlaneGau
     torch.manual_seed(0)
     planes = PlaneProducts(4, 6, [1, 2], 5, low=0.1, high=0.5) if moves else None
     field = HexPlaneGaussians(
-        torch.rand(count, 3) - 0.5,
-        torch.rand(count, 3),
+        PointCloud(torch.rand(count, 3) - 0.5, torch.rand(count, 3)),
         degree=degree,
         extent=2.0,
         planes=planes,
@@ -246,7 +245,7 @@ def test_a_gaussian_is_seen_where_its_point_is(frame):
     views = ball_views(3, 0.6, size=48)
     point = torch.tensor([[0.35, -0.25, 0.4]])
     field = HexPlaneGaussians(
-        *(frame.points(point), torch.tensor([[0.2, 0.4, 0.9]])),
+        PointCloud(frame.points(point), torch.tensor([[0.2, 0.4, 0.9]])),
         degree=0, extent=1.0, planes=None, width=8,
     )  # fmt: skip
     with torch.no_grad():
@@ -275,7 +274,8 @@ def test_a_gaussian_is_seen_where_its_point_is(frame):
 def test_points_on_the_hull_of_a_ball():
     views = ball_views(40, 0.6, size=64)
     torch.manual_seed(0)
-    points, colours = hull_points(views, FRAME, 500)
+    cloud = hull_points(views, FRAME, 500)
+    points, colours = cloud.points, cloud.colours
     away = FRAME.to_world(points).norm(dim=1)
     cell = 2 / 48 / FRAME.scale
     assert away.max() < 0.6 + 3 * cell
@@ -284,9 +284,9 @@ def test_points_on_the_hull_of_a_ball():
     assert (colours - expected).abs().max() < 0.02
     assert away.std() > 0
     opaque = replace(views, images=views.in_memory().index_fill(3, torch.tensor(3), 255))
-    anywhere, grey = hull_points(opaque, FRAME, 500)
-    assert float(anywhere.abs().max()) > 0.9
-    assert (grey == 0.5).all()
+    anywhere = hull_points(opaque, FRAME, 500)
+    assert float(anywhere.points.abs().max()) > 0.9
+    assert (anywhere.colours == 0.5).all()
 
 
 def test_first_scales_are_the_distances_to_neighbours():
@@ -311,7 +311,8 @@ def test_learning_rates_decay_in_each_stage():
     views = ball_views(9, 0.6, distance=4.0)
     places = views.camera_to_world[:, :3, 3].numpy()
     farthest = max(np.linalg.norm(place - places.mean(axis=0)) for place in places)
-    assert camera_extent(views) == pytest.approx(1.1 * farthest, rel=1e-5)
+    site = Site(FRAME, views.times, 0, "32", views=views)
+    assert camera_extent(site) == pytest.approx(1.1 * farthest * FRAME.scale, rel=1e-5)
 
 
 def test_gradients_of_the_planes_terms_are_those_of_their_values():

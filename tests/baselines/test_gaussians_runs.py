@@ -1,5 +1,6 @@
 """What runs of Gaussians promise."""
 
+import pytest
 import torch
 
 from tests.baselines.checks import check_reload, check_resume, metrics, scores
@@ -7,12 +8,9 @@ from tests.baselines.runs import baseline_config
 from xplanes.pipeline import run
 
 SMALL = (
+    "data.resolution=24",
+    "data.train_views=10",
     "model.count=200",
-    "model.resolution=8",
-    "model.channels=4",
-    "model.width=16",
-    "model.time_resolution=4",
-    "model.network_lr=0.005",
     "model.degree_every=10",
     "model.densify.every=6",
     "model.densify.first=4",
@@ -20,12 +18,19 @@ SMALL = (
     "model.densify.until=0.7",
     "trainer.max_steps=60",
 )
+MODELS = {
+    "gaussians_hexplane": (
+        *("model.resolution=8", "model.channels=4", "model.width=16", "model.time_resolution=4"),
+    ),
+    "gaussians_deform": ("model.depth=2", "model.width=16", "model.time_noise=0.1"),
+    "gaussians_spacetime": ("lrm=field", "lrm.steps=60"),
+}
 
 
-def test_run_learns_grows_resumes_and_is_loaded(scenes, tmp_path, monkeypatch):
-    config = baseline_config(
-        scenes, "model=gaussians_hexplane", *SMALL, "data.resolution=24", "data.train_views=10"
-    )
+@pytest.mark.parametrize("name", MODELS)
+def test_run_learns_grows_resumes_and_is_loaded(scenes, tmp_path, monkeypatch, name):
+    cache = f"preparation.cache={tmp_path}/cache"
+    config = baseline_config(scenes, f"model={name}", *SMALL, *MODELS[name], cache)
     folder = tmp_path / "whole"
     run(config, folder, [], resume=False)
     found = scores(folder)

@@ -166,11 +166,11 @@ def test_the_video_shows_what_the_field_holds_from_the_models_camera(tmp_path: P
     """In K-Planes' own cube, with rays that begin as far away as in training."""
     scene, centre, fields = ball_scene(count=12, size=24), swinging(0.3, 0.5), []
 
-    def known(_rendering, _method, _place, frame, _folder):
-        fields.append(KnownField(frame, 0.5, centre))
+    def known(_method, place, _folder, **_budget):
+        fields.append(KnownField(place.frame, 0.5, centre))
         return fields[0]
 
-    monkeypatch.setattr(module, "_train", known)
+    monkeypatch.setattr(module, "trained_field", known)
     method = settings(tmp_path, "preparation.fixed_view_model=kplanes")
     made, _ = video_of(method, scene, tmp_path / "cache")
     assert fields[0].frame.scale == pytest.approx(1 / 1.3)
@@ -307,7 +307,7 @@ def test_a_field_renders_the_scene_and_the_video_is_cached(
     assert alpha[:, :3, :3].mean() < 0.2
     assert (made.views.images[..., :3] <= made.views.images[..., 3:]).all()
     assert [p.suffix for p in sorted(cache.iterdir())] == [".lock", ".pt"]
-    monkeypatch.setattr(module, "_train", None)
+    monkeypatch.setattr(module, "trained_field", None)
     again, said = video_of(settings(tmp_path), scene, cache)
     assert said == []
     assert again.seconds == made.seconds

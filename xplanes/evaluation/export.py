@@ -466,7 +466,8 @@ def write_gaussians(path: Path, trained: TrainedRun, time: float) -> None:
         " ".join(f"f_rest_{n}" for n in range(3 * (harmonics.shape[1] - 1))): harmonics[:, 1:]
         .transpose(1, 2)
         .flatten(1),
-        "opacity": posed.opacities.logit()[:, None],
+        # Of opacities of 0 and 1 it would be infinite.
+        "opacity": posed.opacities.logit(eps=1e-6)[:, None],
         "scale_0 scale_1 scale_2": posed.scales.log() - math.log(frame.scale),
         "rot_0 rot_1 rot_2 rot_3": F.normalize(posed.quaternions, dim=1),
     }

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from xplanes.fields.base import Representation
+from xplanes.fields.gaussians import PointCloud
 from xplanes.rendering.base import Rendering
 from xplanes.rendering.sampler import Group, SamplerSettings, Site, scene_cube
 from xplanes.scenes.batches import Batch, RaySettings
@@ -24,15 +25,17 @@ class InitialValues:
     """Initial values of a field that is not initialised randomly.
 
     Attributes:
-        planes: Planes by name. [C, rows, columns] each
+        planes: Planes by name; none for Gaussians. [C, rows, columns] each
         decoder: Weights of the decoder; None for a fresh one.
         sparse: Target of the regulariser L_r for the time planes; None disables L_r.
             [T, 3, C, H, H]
+        points: What Gaussians are made from; None for planes.
     """
 
     planes: Mapping[str, Tensor]
     decoder: Mapping[str, Tensor] | None = None
     sparse: Tensor | None = None
+    points: PointCloud | None = None
 
 
 class Model(ABC):
@@ -100,8 +103,8 @@ class Model(ABC):
 class ModelSettings(Settings, ABC):
     """Base of the settings of models."""
 
-    takes_initialisation: ClassVar[bool] = False
-    """Whether an LRM can initialise the field."""
+    takes: ClassVar[Literal["planes", "points"] | None] = None
+    """What of an initialisation the field can begin with; None for nothing."""
     devices: ClassVar[int | None] = 1
     """Devices that it can be trained on at most; None for any number."""
     field_class: ClassVar[type[Representation] | None] = None

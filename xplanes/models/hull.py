@@ -4,6 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from xplanes.fields.gaussians import PointCloud
 from xplanes.scenes.cameras import project
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.silhouettes import may_hold
@@ -22,12 +23,12 @@ CHUNK = 2**15
 """Cells that are looked at together."""
 
 
-def random_points(count: int) -> tuple[Tensor, Tensor]:
-    """Grey points anywhere in the cube [-1, 1]^3, with torch's generator. [N, 3], [N, 3]"""
-    return 2 * torch.rand(count, 3) - 1, torch.full((count, 3), 0.5)
+def random_points(count: int) -> PointCloud:
+    """Grey points anywhere in the cube [-1, 1]^3, with torch's generator."""
+    return PointCloud(2 * torch.rand(count, 3) - 1, torch.full((count, 3), 0.5))
 
 
-def hull_points(views: Views, frame: Frame, count: int) -> tuple[Tensor, Tensor]:
+def hull_points(views: Views, frame: Frame, count: int) -> PointCloud:
     """Points on the surface of what the silhouettes of all times have in common.
 
     Args:
@@ -37,8 +38,7 @@ def hull_points(views: Views, frame: Frame, count: int) -> tuple[Tensor, Tensor]
             views look at least.
 
     Returns:
-        Places in the field's frame and colours from 0 to 1: the mean over views of the pixels that
-        show a point, hidden or not. [N, 3], [N, 3]
+        The points; colours are the mean over views of the pixels that show them, hidden or not.
     """
     if views.is_opaque:
         return random_points(count)
@@ -54,7 +54,7 @@ def hull_points(views: Views, frame: Frame, count: int) -> tuple[Tensor, Tensor]
     surface = (solid & around).flatten().nonzero()[:, 0]
     cells = surface[torch.randint(len(surface), (count,))]
     points = centres[cells] + (2 * torch.rand(count, 3) - 1) / CELLS
-    return points, _mean_colours(views, frame.to_world(points))
+    return PointCloud(points, _mean_colours(views, frame.to_world(points)))
 
 
 def _agreement(views: Views, points: Tensor, radius: float) -> Tensor:

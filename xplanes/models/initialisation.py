@@ -97,6 +97,9 @@ class Initialiser(ABC):
 class InitialiserSettings(Settings, ABC):
     """Base of the settings in the group ``lrm``."""
 
+    gives: ClassVar[Literal["planes", "points"]] = "planes"
+    """What a field is initialised with."""
+
     name: str  # Name in run directories and tables.
 
     @abstractmethod
@@ -207,10 +210,17 @@ class Method:
                 "LRM that it takes unless told otherwise, into the defaults of the model's file"
             )
         lrm = build(config["lrm"], InitialiserSettings, "lrm")
-        if not (isinstance(lrm, RandomSettings) or model.takes_initialisation):
+        if not isinstance(lrm, RandomSettings) and lrm.gives != model.takes:
+            where = f"lrm={lrm.name} with model={model.name}: "
+            if lrm.gives == "points":
+                raise ConfigError(
+                    f"{where}points initialise Gaussians alone; set lrm=none, or "
+                    "model=gaussians_hexplane or another model of Gaussians"
+                )
+            points = " or lrm=field (points)" if model.takes == "points" else ""
             raise ConfigError(
-                f"lrm={lrm.name} with model={model.name}: triplanes initialise X-Planes alone; set "
-                "lrm=none, or model=six_planes or model=nine_planes"
+                f"{where}triplanes initialise X-Planes alone; set lrm=none{points}, or "
+                "model=six_planes or model=nine_planes"
             )
         if model.field_class is not None:
             model.sampler.require_kind(model.field_class)

@@ -90,7 +90,7 @@ class XPlanesLoss(Settings):
 class XPlanesSettings(ModelSettings):
     """X-Planes with six or nine planes (three without time)."""
 
-    takes_initialisation: ClassVar[bool] = True
+    takes: ClassVar = "planes"
     devices: ClassVar[int | None] = None
     field_class: ClassVar = XPlanes
 

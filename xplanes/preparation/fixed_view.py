@@ -230,7 +230,7 @@ def _rendered(
         train.identity,
         train.camera_to_world,
         train.times,
-        _intrinsics_key(train.intrinsics),
+        intrinsics_key(train.intrinsics),
         frame_content(own_frame),
         rendering.model.plain(),
         [method.seed, options.fixed_view_seconds, options.fixed_view_steps],
@@ -243,7 +243,13 @@ def _rendered(
             f"{count} frames from where the LRM's camera stands"
         )
         with cache.workshop("fixed_view", inputs) as folder:
-            module = _train(rendering, method, place, own_frame, folder)
+            module = trained_field(
+                rendering,
+                replace(place, frame=own_frame),
+                folder,
+                steps=options.fixed_view_steps,
+                seconds=options.fixed_view_seconds,
+            )
             return {"images": _render(module, own_frame, pose, focal, side, count, back)}
 
     stage = cache.stage("fixed_view", inputs, make, alone=True)
@@ -264,27 +270,35 @@ def _budget(options: PreparationSettings) -> str:
     return f"{steps} steps" if seconds is None else f"up to {steps} steps or {seconds:g} s"
 
 
-def _intrinsics_key(intrinsics: Intrinsics) -> list[Tensor]:
+def intrinsics_key(intrinsics: Intrinsics) -> list[Tensor]:
+    """What cameras' intrinsics consist of, for keys of cached stages."""
     key = [intrinsics.focal, intrinsics.centre, intrinsics.size]
     if (lenses := intrinsics.lenses) is not None:
         key += [lenses.model, lenses.coefficients, lenses.skew]
     return key
 
 
-def _train(
-    rendering: Method, method: Method, place: Place, frame: Frame, folder: Path
+def trained_field(
+    method: Method, place: Place, folder: Path, *, steps: int, seconds: float | None
 ) -> RadianceModule:
-    """Train the field; an interrupted training is resumed."""
-    module = RadianceModule.of(rendering)
-    module.build(place.scene, frame, device=place.device)
-    options = method.preparation
+    """Train a field for a short time; an interrupted training is resumed.
+
+    Args:
+        method: Settings of the field.
+        place: The scene and the field's frame.
+        folder: Where its checkpoints lie.
+        steps: Training steps at most.
+        seconds: Seconds of training at most; None for no limit.
+    """
+    module = RadianceModule.of(method)
+    module.build(place.scene, place.frame, device=place.device, say=place.say)
     fit_quietly(
         module,
         place.scene,
         folder,
         device=place.device,
-        max_steps=options.fixed_view_steps,
-        max_seconds=options.fixed_view_seconds,
+        max_steps=steps,
+        max_seconds=seconds,
         checkpoint_every=CHECKPOINT_EVERY,
     )
     return module.eval()

@@ -96,7 +96,7 @@ class LRMInitialiser(Initialiser):
         self.settings, self.lrm = settings, lrm
 
     def initialise(self, method: Method, place: Place) -> Initialisation:
-        cache = _cache(method, place)
+        cache = cache_of(method, place)
         made = reconstruct(method, self.settings, place, self.lrm, cache)
         found = from_sequence(
             made.sequence, method, place, cache, source=made.words, seconds=made.seconds
@@ -139,11 +139,16 @@ class FileInitialiser(Initialiser):
         began = time.perf_counter()
         sequence = load_triplanes(self.path)
         seconds = {"lrm": time.perf_counter() - began}
-        cache = _cache(method, place)
+        cache = cache_of(method, place)
         return from_sequence(sequence, method, place, cache, source=str(self.path), seconds=seconds)
 
 
-def _cache(method: Method, place: Place) -> StageCache:
+def cache_of(method: Method, place: Place) -> StageCache:
+    """The cache of a run's stages.
+
+    Raises:
+        ConfigError: If processes share the run and there is no cache for them to share.
+    """
     folder = method.preparation.cache
     if place.devices > 1 and folder is None:
         raise ConfigError(

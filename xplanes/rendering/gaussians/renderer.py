@@ -148,7 +148,8 @@ class Rasteriser(Sampler):
     def render(self, field: Any, rays: Batch, state: TrainingState) -> RasterisedRendering:
         camera = camera_in(self.frame, rays["camera"])
         background = rays["background"][0]
-        image = self._renderer.draw(field, camera, float(rays["times"][0]), background)
+        time = field.training_time(float(rays["times"][0]), state)
+        image = self._renderer.draw(field, camera, time, background)
         if image.means2d.requires_grad:
             image.means2d.retain_grad()
         empty = image.opacity.new_empty(0)

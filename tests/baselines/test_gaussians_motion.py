@@ -1,0 +1,279 @@
+"""Models of Gaussians beside 4D-GS: how theirs move, and where all of them may begin."""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.baselines.runs import baseline_config
+from tests.baselines.test_gaussians import FRAME, control, stepped, trained
+from tests.synthetic import ball_scene, ball_views, swinging
+from xplanes.config import compose_plain
+from xplanes.errors import ConfigError
+from xplanes.evaluation.export import write_gaussians
+from xplanes.fields.gaussians import DeformedGaussians, PointCloud, SpacetimeGaussians
+from xplanes.metrics import ssim
+from xplanes.models.densification import densify
+from xplanes.models.initialisation import Method
+from xplanes.preparation import points
+from xplanes.rendering.sampler import Site
+from xplanes.scenes.frame import cube_frame
+from xplanes.scenes.views import Scene
+from xplanes.streams import TrainingState
+from xplanes.training.module import RadianceModule
+
+
+def cloud(count, seed=0):
+    torch.manual_seed(seed)
+    return PointCloud(torch.rand(count, 3) - 0.5, torch.rand(count, 3), torch.rand(count))
+
+
+def shaken(field):
+    """The field with numbers of its own everywhere."""
+    with torch.no_grad():
+        for name in field.PARAMETERS[1:]:
+            getattr(field, name).add_(0.3 * torch.randn_like(getattr(field, name)))
+        for parameter in getattr(field, "network", torch.nn.Module()).parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    field.deforms.fill_(True)
+    return field
+
+
+def spacetime(count, *, moves=True):
+    field = SpacetimeGaussians(cloud(count), degree=1, extent=2.0, moves=moves, width=0.5)
+    return shaken(field) if moves else field
+
+
+def deformed(count, *, depth=3, moves=True, **noise):
+    field = DeformedGaussians(
+        cloud(count), degree=1, extent=2.0, moves=moves,
+        depth=depth, width=8, octaves=(2, 3), **noise,
+    )  # fmt: skip
+    return shaken(field) if moves else field
+
+
+def doubles(field):
+    return {name: value.detach().double().numpy() for name, value in field.state_dict().items()}
+
+
+def settings(model, *overrides):
+    names = [f"model={model}", *(f"model.{text}" for text in overrides)]
+    return Method.read(compose_plain("train", names)).model
+
+
+@pytest.mark.parametrize("time", [0.0, 0.35, 1.0])
+def test_spacetime_gaussians_follow_their_polynomials(time):
+    """One after the other in float64, as the paper's Eq. 7 to 9 have them."""
+    field = spacetime(20)
+    posed, values = field.at(time), doubles(field)
+    for row in range(20):
+        since = time - values["centres"][row]
+        mean = values["means"][row] + sum(
+            values["motion"][row, power - 1] * since**power for power in (1, 2, 3)
+        )
+        unit = values["quaternions"][row] / np.linalg.norm(values["quaternions"][row])
+        width = math.exp(values["log_widths"][row])
+        opacity = math.exp(-((since / width) ** 2)) / (1 + math.exp(-values["logits"][row]))
+        found = (posed.means[row], posed.quaternions[row], posed.opacities[row], posed.scales[row])
+        turned = unit + since * values["spin"][row]
+        for mine, theirs in zip(
+            found, (mean, turned, opacity, np.exp(values["log_scales"][row])), strict=True
+        ):
+            np.testing.assert_allclose(mine.detach().numpy(), theirs, rtol=2e-5, atol=1e-6)
+    posed.means.sum().backward()
+    # Where a Gaussian moves says nothing about when it is there.
+    assert field.centres.grad is None
+    field.at(time).opacities.sum().backward()
+    assert field.centres.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("depth", [1, 3, 8])
+def test_a_network_deforms_gaussians(depth):
+    """The network layer by layer in float64; the input enters again after the middle layer."""
+    field, time = deformed(10, depth=depth), 0.3
+    values = doubles(field)
+
+    def encoded(number, octaves):
+        waves = [f(2**n * number) for n in range(octaves) for f in (np.sin, np.cos)]
+        return np.concatenate([number, *waves])
+
+    def layer(name, column):
+        return values[f"network.{name}.weight"] @ column + values[f"network.{name}.bias"]
+
+    posed = field.at(time)
+    times = layer("time.2", np.maximum(layer("time.0", encoded(np.array([time]), 3)), 0))
+    for row in range(10):
+        given = np.concatenate([encoded(values["means"][row], 2), times])
+        hidden = given
+        for number in range(depth):
+            entry = np.concatenate([given, hidden]) if number == depth // 2 + 1 else hidden
+            hidden = np.maximum(layer(f"hidden.{number}", entry), 0)
+        unit = values["quaternions"][row] / np.linalg.norm(values["quaternions"][row])
+        scale = np.abs(np.exp(values["log_scales"][row]) + layer("growth", hidden))
+        found = (posed.means[row], posed.quaternions[row], posed.scales[row])
+        expected = (values["means"][row] + layer("shift", hidden), unit + layer("turn", hidden))
+        for mine, theirs in zip(found, (*expected, scale), strict=True):
+            np.testing.assert_allclose(mine.detach().numpy(), theirs, rtol=2e-5, atol=2e-6)
+    posed.means.sum().backward()
+    assert torch.equal(field.means.grad, torch.ones_like(field.means))
+    assert field.network["time"][0].weight.grad.abs().max() > 0
+
+
+def test_nothing_has_moved_when_the_deformation_begins():
+    torch.manual_seed(0)
+    field = settings("gaussians_deform").build(Site(FRAME, torch.tensor([0.0, 1.0]), 0, "32")).field
+    still = field.at(0.2)
+    field.deforms.fill_(True)
+    moved = field.at(0.2)
+    assert torch.equal(still.means, moved.means)
+    torch.testing.assert_close(still.scales, moved.scales)
+
+
+@pytest.mark.parametrize("make", [spacetime, deformed])
+def test_static_gaussians_stay_as_they_are(make):
+    field = make(5, moves=False)
+    first, later = field.at(0.0), field.at(0.9)
+    assert torch.equal(first.means, later.means)
+    assert torch.equal(first.opacities, later.opacities)
+
+
+def test_noise_on_time_fades_and_repeats_itself():
+    field = deformed(3, noise=0.02, noise_until=0.5)
+    times = [field.training_time(0.4, TrainingState(7, n, n, 0)) for n in range(400)]
+    assert np.mean(times) == pytest.approx(0.4, abs=0.004)
+    assert np.std(times) == pytest.approx(0.02, rel=0.1)
+    half = [field.training_time(0.4, TrainingState(7, n, n, 0, 0.25)) for n in range(400)]
+    np.testing.assert_allclose(np.array(half) - 0.4, (np.array(times) - 0.4) / 2, atol=1e-12)
+    assert field.training_time(0.4, TrainingState(7, 3, 3, 0)) == times[3]
+    assert field.training_time(0.4, TrainingState(7, 3, 3, 0, 0.5)) == 0.4
+    field.deforms.fill_(False)
+    assert field.training_time(0.4, TrainingState(7, 3, 3, 0)) == 0.4
+    assert deformed(3).training_time(0.4, TrainingState(7, 3, 3, 0)) == 0.4
+
+
+def test_published_learning_rates():
+    site = Site(FRAME, torch.tensor([0.0, 1.0]), 0, "32")
+    model = settings("gaussians_deform_published", "count=10").build(site)
+    peaks = {group["name"]: group["lr"] for group in model.groups()}
+    # 5 times 0.00016 in D-NeRF's world, whose cameras' extent is 4.4.
+    assert 4.4 * peaks["means"] == pytest.approx(0.0008, rel=0.02)
+    assert peaks["network"] == pytest.approx(0.0008)
+    steps = 40_000
+    assert peaks["network"] * model.rate_of("network", steps, 1.0) == pytest.approx(1.6e-6)
+    assert model.rate_of("means", 30_000, 30_000 / steps) == pytest.approx(0.01)
+    assert model.rate_of("means", steps, 1.0) == pytest.approx(0.01)
+    assert model.rate_of("logits", steps, 1.0) == 1
+    assert model.static_share * steps == 3000
+    assert model.settings.densify.until * steps == 15_000
+    model = settings("gaussians_spacetime_published", "count=10").build(site)
+    peaks = {group["name"]: group["lr"] for group in model.groups()}
+    assert peaks["motion"] == pytest.approx(1.75 * peaks["means"])
+    assert set(peaks) == set(SpacetimeGaussians.PARAMETERS)
+    assert model.settings.densify.until * 30_000 == 9000
+
+
+def test_loss_is_a_mixture_of_absolute_and_structural_errors():
+    model = settings("gaussians_spacetime").build(Site(FRAME, torch.tensor([0.0, 1.0]), 0, "32"))
+    image, truth = torch.rand(2, 20, 24, 3, generator=torch.Generator().manual_seed(0))
+    rendering = SimpleNamespace(colour=image.view(-1, 3), image=SimpleNamespace(colour=image))
+    terms = model.losses(rendering, {"target": truth.view(-1, 3)}, TrainingState(0, 0, 0, 0))
+    assert float(terms["colour"]) == pytest.approx(0.8 * float((image - truth).abs().mean()))
+    expected = 0.2 * (1 - ssim(image, truth))
+    assert float(terms["dissimilarity"]) == pytest.approx(expected, rel=1e-4)
+
+
+def test_halves_keep_their_time_and_their_path():
+    field = spacetime(20)
+    field.seen.fill_(1)
+    field.slopes.fill_(1)
+    optimizer = stepped(field)
+    before = {name: getattr(field, name).detach().clone() for name in field.PARAMETERS}
+    densify(field, optimizer, control(), torch.Generator().manual_seed(1), remove_large=False)
+    assert len(field) == 40
+    for name in ("centres", "log_widths", "motion", "spin"):
+        assert torch.equal(getattr(field, name)[20:], before[name]), name
+        assert not optimizer.state[getattr(field, name)]["exp_avg"][20:].any(), name
+
+
+def test_a_ply_has_finite_numbers_for_what_is_not_there(tmp_path):
+    field = spacetime(12)
+    with torch.no_grad():
+        field.log_widths.fill_(math.log(0.01))
+        field.centres.fill_(0.0)
+    assert float(field.at(1.0).opacities.detach().max()) == 0
+    write_gaussians(tmp_path / "a.ply", trained(field), 1.0)
+    head, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    names = [line.split()[-1] for line in head.decode().splitlines() if "property" in line]
+    table = np.frombuffer(body, "<f4").reshape(12, -1)
+    assert np.isfinite(table).all()
+    opacities = 1 / (1 + np.exp(-table[:, names.index("opacity")].astype(float)))
+    assert (opacities < 1 / 255).all()
+
+
+def test_first_points_lie_on_what_a_field_shows(tmp_path, monkeypatch):
+    """A ball that swings: points on its surface, where it is at their times."""
+    path, radius = swinging(0.4, 1), 0.35
+    views = ball_views(40, radius, size=24, centre=path)
+    scene = Scene("ball", {"train": views, "test": views})
+    config = baseline_config(
+        tmp_path, "model=gaussians_spacetime", "lrm=field", "lrm.steps=80", "model.count=300",
+        f"preparation.cache={tmp_path}/cache",
+    )  # fmt: skip
+    frame, said = cube_frame(1.3, torch.tensor([0.1, 0.0, 0.0])), []
+    module = RadianceModule(config)
+    module.build(scene, frame, say=said.append)
+    found, field = module.initialisation, module.field
+    assert said == ["points: training six_planes for 80 steps"]
+    assert len(field) == 300
+    assert found.seconds["field"] > 0
+    assert found.words == "300 points on the surfaces of six_planes, trained for 80 steps"
+    assert torch.equal(field.centres, found.values.points.times)
+    assert set(field.centres.tolist()) <= set(views.times.tolist())
+    places = frame.to_world(field.means.detach())
+    centres = torch.stack([path(time) for time in field.centres.tolist()])
+    error = ((places - centres).norm(dim=1) - radius).abs()
+    assert error.median() < 0.1
+    assert torch.corrcoef(torch.stack([places[:, 0], centres[:, 0]]))[0, 1] > 0.5
+    assert len(places.unique(dim=0)) == 300
+    colours = field.base.detach()[:, 0] * 0.28209479177387814 + 0.5
+    expected = torch.tensor([200.0, 100.0, 50.0]) / 255
+    # So early nearer than grey, which is 0.3 away.
+    assert (colours.median(dim=0).values - expected).abs().max() < 0.25
+    widest = field.scales.detach().amax(dim=1)
+    assert widest.max() <= 1.5001 * widest.median()
+    again = RadianceModule(config)
+    again.build(scene, frame, say=said.append)
+    assert len(said) == 1
+    assert torch.equal(again.field.means, field.means)
+    monkeypatch.setattr(points, "ROUNDS", 1)
+    monkeypatch.setattr(points, "OPAQUE", 2.0)
+    early = RadianceModule(config | {"lrm": config["lrm"] | {"steps": 1}})
+    with pytest.raises(ConfigError, match=r"lrm\.steps=1: six_planes shows nothing yet"):
+        early.build(scene, frame, say=said.append)
+
+
+def test_what_cannot_begin_with_points_or_planes_is_refused(scenes):
+    for overrides, words in (
+        (("model=six_planes", "lrm=field"), r"lrm=field with model=six_planes: points .* lrm=none"),
+        (("model=kplanes", "lrm=field"), r"points initialise Gaussians alone"),
+        (("model=gaussians_deform", "lrm=tiny"), r"triplanes .* lrm=none or lrm=field \(points\)"),
+        (("model=gaussians_deform", "lrm=field", "lrm.source=field"), r"source=field: must be one"),
+        (
+            ("model=gaussians_deform", "model.final_network_lr=0"),
+            r"final_network_lr=0\.0:",
+        ),
+        (("model=gaussians_spacetime", "model.precision=bf16"), r"precision=bf16: Gaussians"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            Method.read(compose_plain("train", list(overrides)))
+
+
+def test_checkpoints_of_gaussians_are_built_without_points():
+    views = ball_scene().splits["train"]
+    model = settings("gaussians_spacetime")
+    site = Site(FRAME, views.times, 0, "32", views=views)
+    assert len(model.build(site).field) == 4000
+    assert len(model.build(replace(site, views=None)).field) == 1

@@ -1,64 +1,146 @@
-"""All benchmarks, one after the other: some hours on two cores.
+"""The results below docs/results, made again where they are stale: some hours on two cores.
 
-    python benchmarks/all.py [--lego FOLDER] [--only NAME ...]
+    python benchmarks/all.py [--lego FOLDER] [--list] [--only NAME ...]
 
-Needs the extra `dev` and D-NeRF's lego (`xplanes download dnerf`). Each script writes
-its own page below docs/results anew; one that fails does not stop the others.
-Nothing else should run.
+A result is stale if it was made with another version, on another kind of machine, or before the
+code or the settings that it measures changed; comments and docstrings do not count. --list says
+which are and why; --only makes those named, stale or not. Needs the extra `dev` and D-NeRF's lego
+(`xplanes download dnerf`). One script that fails does not stop the others. Nothing else should run.
 """
 
 import argparse
+import ast
+import hashlib
+import json
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
-from runner import lego
+from runner import RESULTS, lego, machine
+
+from xplanes import __version__
+from xplanes.files import write_text
 
 HERE = Path(__file__).resolve().parent
+MADE = RESULTS / "made.json"
+
+TRAINING = ("conf", *(f"xplanes/{part}" for part in ("fields", "models", "rendering", "training")))
+START = ("conf", *(f"xplanes/{part}" for part in ("decomposition", "lrm", "preparation")))
+
+PARTS: dict[str, tuple[str, ...]] = {
+    "where_time_goes": TRAINING,
+    "lego_curves": (*TRAINING, "xplanes/scenes"),
+    "skips": (*TRAINING, "xplanes/scenes"),
+    "rendering": ("xplanes/fields", "xplanes/rendering"),
+    "ray_drawing": ("xplanes/scenes",),
+    "gaussian_rasteriser": ("xplanes/rendering/gaussians",),
+    "gaussians": (*TRAINING, "xplanes/preparation"),
+    "captures": (*TRAINING, "xplanes/scenes"),
+    "stages": START,
+    "pareto": (*TRAINING, *START[1:]),
+    "lrm_sizes": ("xplanes/lrm",),
+    "decomposition_speed": ("xplanes/decomposition",),
+    "decomposition_stress": ("xplanes/decomposition",),
+    "conversion_options": (*TRAINING, *START[1:]),
+    "rank_curve": START,
+    "stability": (*TRAINING, "xplanes/decomposition", "tests/stress"),
+    "faults": ("xplanes", "tests/faults"),
+}
+"""What each script measures."""
 
 
 def scripts(folder: Path) -> dict[str, list[list[str]]]:
     """The arguments of each script's runs, by its name; ``folder`` is that of lego."""
-    given = ["--lego", str(folder)]
-    return {
-        "where_time_goes": [[], ["--name", "lego", *lego(folder.resolve())]],
-        "lego_curves": [given],
-        "skips": [given],
-        "rendering": [given],
-        "ray_drawing": [[]],
-        "gaussian_rasteriser": [[]],
-        "gaussians": [given],
-        "captures": [[]],
-        "stages": [[]],
-        "pareto": [given],
-        "lrm_sizes": [[]],
-        "decomposition_speed": [[]],
-        "decomposition_stress": [[]],
-        "conversion_options": [[]],
-        "rank_curve": [[]],
-        "stability": [[]],
-        "faults": [[]],
-    }
+    scene = ["--lego", str(folder)]
+    given = {name: [scene] for name in ("lego_curves", "skips", "rendering", "gaussians", "pareto")}
+    given["where_time_goes"] = [[], ["--name", "lego", *lego(folder.resolve())]]
+    return {name: given.get(name, [[]]) for name in PARTS}
+
+
+def digest(files: Iterable[Path]) -> str:
+    """A number that changes with code and settings, but not with comments and docstrings."""
+    found = hashlib.sha256()
+    for file in files:
+        text = file.read_text(encoding="utf-8")
+        if file.suffix == ".py":
+            text = ast.dump(_without_docstrings(ast.parse(text)))
+        else:
+            lines = (line.split("  #")[0].rstrip() for line in text.splitlines())
+            text = "\n".join(line for line in lines if line and not line.startswith("#"))
+        found.update(f"{file.name}\0{text}\0".encode())
+    return found.hexdigest()[:16]
+
+
+def _without_docstrings(tree: ast.AST) -> ast.AST:
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            kept = [line for line in body if not _is_text(line)]
+            node.body = kept  # type: ignore[attr-defined]
+    return tree
+
+
+def _is_text(line: ast.stmt) -> bool:
+    return (
+        isinstance(line, ast.Expr)
+        and isinstance(line.value, ast.Constant)
+        and isinstance(line.value.value, str)
+    )
+
+
+def state_of(name: str, root: Path = HERE.parent) -> dict[str, Any]:
+    """Version, machine and measured code as they are now."""
+    parts = {}
+    for part in (*PARTS[name], f"benchmarks/{name}.py"):
+        path = root / part
+        files = (
+            [path] if path.is_file() else sorted(path.rglob("*.py")) + sorted(path.rglob("*.yaml"))
+        )
+        parts[part] = digest(files)
+    return {"version": __version__, "machine": machine(), "parts": parts}
+
+
+def why_stale(now: dict[str, Any], then: dict[str, Any] | None) -> str:
+    """What has changed since a result was made, in words; empty if nothing has."""
+    if then is None:
+        return "not recorded"
+    changes = [f"made with {then['version']}"] * (then["version"] != now["version"])
+    changes += [f"made on {then['machine']}"] * (then["machine"] != now["machine"])
+    parts = [name for name, code in now["parts"].items() if then["parts"].get(name) != code]
+    changes += [f"changed since: {', '.join(parts)}"] * bool(parts)
+    return "; ".join(changes)
 
 
 def main() -> int:
-    names = list(scripts(Path()))
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--lego", type=Path, default=Path("data/dnerf/lego"))
-    parser.add_argument("--only", nargs="+", choices=names, default=names)
+    parser.add_argument("--list", action="store_true", help="say what is stale, and make nothing")
+    parser.add_argument("--only", nargs="+", choices=list(PARTS))
     args = parser.parse_args()
-    chosen = {name: runs for name, runs in scripts(args.lego).items() if name in args.only}
+    made = json.loads(MADE.read_text(encoding="utf-8")) if MADE.is_file() else {}
+    stale = {name: why_stale(state_of(name), made.get(name)) for name in PARTS}
+    for name, reason in stale.items():
+        print(f"{name:<22}{reason or 'up to date'}")
+    if args.list:
+        return 0
+    wanted = args.only or [name for name, reason in stale.items() if reason]
+    chosen = {name: runs for name, runs in scripts(args.lego).items() if name in wanted}
     if any(any(runs) for runs in chosen.values()) and not args.lego.is_dir():
         parser.error(f"--lego {args.lego}: there is no such folder; xplanes download dnerf")
     failed = []
     for name, runs in chosen.items():
-        began = time.perf_counter()
+        state, began = state_of(name), time.perf_counter()
         script = [sys.executable, str(HERE / f"{name}.py")]
         codes = [subprocess.run([*script, *line], check=False).returncode for line in runs]
         print(f"{name}: {time.perf_counter() - began:.0f} s, exit codes {codes}", flush=True)
         if any(codes):
             failed.append(name)
+            continue
+        made[name] = state
+        write_text(MADE, json.dumps(dict(sorted(made.items())), indent=1) + "\n")
     if failed:
         print(f"failed: {', '.join(failed)}")
     return bool(failed)

@@ -1,4 +1,4 @@
-"""What captures without silhouettes reach: with and without a background, and in other models.
+"""What captures and other scenes of the suite reach, in variants and in other models.
 
     python benchmarks/captures.py [--scenes phone,rig,phone_test,rig_test] [--resolution 100]
         [--steps 1000 | --seconds 120] [--variants NAMES] [--seeds 1] [--together 1]
@@ -6,7 +6,8 @@
 
 Writes docs/results/NAME.md and NAME.csv. The scenes are procedural captures of the
 suite, whose masks of the thing are known: scores are those of whole pictures, and of the pixels
-that show the thing. Variants of X-Planes with six planes:
+that show the thing. Of scenes with silhouettes there is the former alone. Variants of X-Planes
+with six planes:
 
 * `plain`: without a background;
 * `sky`: a background whose colour depends on direction alone;
@@ -67,7 +68,10 @@ def overrides(scene: str, variant: str, seed: int, args: argparse.Namespace) -> 
     steps, seconds = (args.steps, None) if args.seconds is None else (None, args.seconds)
     return [
         *("data=suite", f"data.scene={scene}", f"data.resolution={args.resolution}"),
-        *(f"data.root={args.root}", f"data.train_views={VIEWS[scene.removesuffix('_test')]}"),
+        *(
+            f"data.root={args.root}",
+            f"data.train_views={VIEWS.get(scene.removesuffix('_test'), 50)}",
+        ),
         *VARIANTS[variant],
         *(f"trainer.max_steps={steps or -1}", f"trainer.max_seconds={seconds or 'null'}"),
         *("callbacks.evaluation.at=[]", "callbacks.evaluation.views=1", "logger=none"),
@@ -76,20 +80,28 @@ def overrides(scene: str, variant: str, seed: int, args: argparse.Namespace) -> 
 
 
 def row(scene: str, variant: str, runs: list[Measured]) -> list[str]:
-    """Means over the seeds."""
+    """Means over the seeds, with the standard deviation of scores."""
 
-    def mean(*path: str) -> float:
-        values = []
+    def values(*path: str) -> list[float]:
+        found = []
         for run in runs:
             value = run.metrics
             for key in path:
                 value = value[key]
-            values.append(float(value))
-        return statistics.mean(values)
+            found.append(float(value))
+        return found
+
+    def mean(*path: str) -> float:
+        return statistics.mean(values(*path))
+
+    def score(name: str) -> str:
+        if name not in runs[0].metrics["test"]:
+            return ""
+        spread = f" ± {statistics.stdev(values('test', name)):.2f}" if len(runs) > 1 else ""
+        return f"{mean('test', name):.2f}{spread}"
 
     steps, seconds = mean("step"), mean("seconds", "train")
-    whole = "" if variant.startswith("masks") else f"{mean('test', 'psnr'):.2f}"
-    scores = [whole, f"{mean('test', 'psnr_thing'):.2f}"]
+    scores = ["" if variant.startswith("masks") else score("psnr"), score("psnr_thing")]
     times = [f"{steps:.0f}", f"{seconds:.0f}", f"{1000 * seconds / steps:.0f}"]
     return [scene, variant, *scores, *times, f"{mean('peak_memory_bytes') / 2**30:.1f}"]
 
@@ -129,10 +141,13 @@ def main() -> None:
             if len(runs) == args.seeds:
                 print("  ".join(row(scene, variant, runs)), flush=True)
     rows = [row(*key, runs) for key, runs in found.items()]
+    title = "Captures without silhouettes"
+    if not set(args.scenes.split(",")) <= set(captures):
+        title = "Scenes of the suite"
     budget = f"{args.steps} steps" if args.seconds is None else f"{args.seconds:g} s"
     write_rows(RESULTS / f"{args.name}.csv", COLUMNS, rows)
     text = [
-        "# Captures without silhouettes",
+        f"# {title}",
         "",
         f"After {budget} at {args.resolution} pixels, mean over {args.seeds} "
         f"seed{'s' if args.seeds > 1 else ''}. {machine()}.",

@@ -65,6 +65,7 @@ def test_what_is_made_is_recorded_and_what_fails_is_not(
         return subprocess.CompletedProcess(line, int(ran[-1] == "stages"))
 
     monkeypatch.setattr(every, "MADE", tmp_path / "made.json")
+    monkeypatch.setattr(every, "machine", lambda: "this one")
     monkeypatch.setattr(every.subprocess, "run", execute)
     monkeypatch.setattr(sys, "argv", ["all.py", "--only", "stages", "ray_drawing"])
     assert every.main() == 1

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from xplanes.rendering.box import Field
 from xplanes.rendering.compositing import OPAQUE
 
-LIT = 0.03
+LIT = 0.1
 """Share of a ray's light from which a cell that stops it counts as seen."""
 
 TRUST = 0.1

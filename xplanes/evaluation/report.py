@@ -59,8 +59,7 @@ def header(
     trainable = sum(p.numel() for p in module.parameters() if p.requires_grad)
     frozen = sum(p.numel() for p in module.parameters()) - trainable
     cube = f"cube {2 / frame.scale:.2f} wide" + (f", from {frame.source}" if frame.source else "")
-    moving, model = "", module.model
-    assert model is not None
+    moving = ""
     if not module.field.moves:
         reason = scene.static_reason or "one timestep only"
         moving = f" · trains as a static one, without time planes: {reason}"
@@ -74,7 +73,7 @@ def header(
         "run": str(run),
         "data": f"{experiment.data.name} {scene.name} · {counts} views · "
         f"{train.outline} · {size:.1f} MB{where} · {cube}",
-        "model": f"{experiment.method.model.name} {model.outline} · "
+        "model": f"{experiment.method.model.name} {module.field.outline} · "
         f"{trainable:,} parameters, {frozen:,} frozen{moving}",
         "from": module.initialisation.words,
         "samples": module.sampler.outline,

@@ -1,10 +1,8 @@
 """The X-Planes field: three space planes, six or nine space-time factors, one decoder."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from xplanes.fields.background import Background
@@ -107,14 +105,6 @@ class XPlanes(RadianceField):
         behind = "" if self.background is None else " · a background"
         return f"({' '.join(self.planes)}) · {self.space.shape[3]} channels{behind}"
 
-    def _load_from_state_dict(
-        self, state_dict: Any, prefix: str, *arguments: Any, **options: Any
-    ) -> None:
-        stored = state_dict.get(f"{prefix}space", self.space)
-        if stored.shape != self.space.shape and stored.shape[3:] == self.space.shape[3:]:
-            self.space.data = self.space.new_zeros(stored.shape)  # It has been refined.
-        super()._load_from_state_dict(state_dict, prefix, *arguments, **options)
-
     def features(self, points: Tensor, times: Tensor) -> Tensor:
         """Features that the decoder sees. [N, 3], [N] -> [N, 3 C]"""
         return plane_features(self.space, self.time, points, times, self.rows).flatten(1)
@@ -131,13 +121,6 @@ class XPlanes(RadianceField):
             frame. [N, 3], [N]
         """
         return self.decoder(self.features(points, times))
-
-
-def refined(planes: Tensor, resolution: int) -> Tensor:
-    """Planes with more texels, which show the same. [P, H, H, C] -> [P, R, R, C]"""
-    channels_first = planes.permute(0, 3, 1, 2)
-    fine = F.interpolate(channels_first, (resolution, resolution), mode="bilinear")
-    return fine.permute(0, 2, 3, 1).contiguous()
 
 
 def _stack(planes: Mapping[str, Tensor], names: Sequence[str]) -> Tensor:

@@ -56,11 +56,6 @@ class Model(ABC):
     def groups(self) -> list[Group]:
         """The field's trainable parameters."""
 
-    @property
-    def outline(self) -> str:
-        """What is trained, in a few words."""
-        return self.field.outline
-
     def optimizer(self, groups: list[Group]) -> torch.optim.Optimizer:
         """The optimiser of the field's and the sampler's parameters."""
         return torch.optim.Adam(groups, eps=1e-15, fused=True)

@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import torch
-from torch import Tensor, distributed
+from torch import Tensor
 
 from xplanes.decomposition.sparse_loss import SparseProduct
-from xplanes.errors import ConfigError
 from xplanes.fields.decoder import Decoder
 from xplanes.fields.regularisers import (
     add_distance_gradient,
@@ -23,7 +22,7 @@ from xplanes.fields.regularisers import (
     time_smoothness,
     total_variation,
 )
-from xplanes.fields.xplanes import XPlanes, random_planes, refined
+from xplanes.fields.xplanes import XPlanes, random_planes
 from xplanes.models.background import BackgroundSettings
 from xplanes.models.base import (
     InitialValues,
@@ -37,15 +36,8 @@ from xplanes.models.base import (
 from xplanes.rendering.base import Rendering
 from xplanes.rendering.sampler import Group, Site, time_rows
 from xplanes.scenes.batches import Batch
-from xplanes.scenes.frame import pixel_footprint
 from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
 from xplanes.streams import Stream, TrainingState, step_generator
-
-TEXEL = 4
-"""Pixels of a training image, where it looks at the middle of the cube, in a texel at most."""
-
-REFINE_FROM, REFINE_UNTIL = 1000, 0.5
-"""First step, and last share of the budget, at which planes are refined."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,9 +88,6 @@ class XPlanesSettings(ModelSettings):
 
     plane_set: Literal["six", "nine", "three"]
     resolution: Count  # Texels along each space axis.
-    # Texels of the space planes once details are left to learn. auto: twice as many where one would
-    # be wider than 4 pixels of the training images; null: as many as before. One process only.
-    final_resolution: Count | Literal["auto"] | None
     # Rows of time. half: half the number of distinct times, as in K-Planes; null: the same, or all
     # of them where each is seen often, and as many as the LRM has timesteps if these are more.
     time_resolution: Count | Literal["half"] | None
@@ -118,23 +107,6 @@ class XPlanesSettings(ModelSettings):
     @property
     def is_static(self) -> bool:
         return self.plane_set == "three"
-
-    def check(self) -> None:
-        if isinstance(self.final_resolution, int) and self.final_resolution < self.resolution:
-            raise ConfigError(
-                f"final_resolution={self.final_resolution}: must be at least the initial "
-                f"resolution={self.resolution}, or null for no other"
-            )
-
-    def fine_texels(self, site: Site) -> int:
-        """Texels along each axis of the space planes in the end."""
-        if self.final_resolution != "auto":
-            return self.final_resolution or self.resolution
-        if site.views is None:
-            return self.resolution
-        texel = 2 / self.resolution
-        wide = texel > TEXEL * pixel_footprint(site.views, site.frame)
-        return 2 * self.resolution if wide else self.resolution
 
     def stronger(self) -> "XPlanesSettings":
         loss = replace(self.loss, opacity=10 * max(self.loss.opacity, 0.1))
@@ -236,7 +208,6 @@ class XPlanesModel(Model):
                 )
         if self.initial_weight:
             self._initial = [plane.detach().clone() for plane in self._planes]
-        self.texels = settings.fine_texels(site)
         self.advice = (
             f"Lower model.plane_lr={settings.plane_lr} or model.decoder_lr={settings.decoder_lr}"
         )
@@ -244,13 +215,6 @@ class XPlanesModel(Model):
     @property
     def field(self) -> XPlanes:
         return self._field
-
-    @property
-    def outline(self) -> str:
-        texels = f"{self._field.space.shape[1]} texels"
-        if self._field.space.shape[1] < self.texels:
-            texels += f", {self.texels} from step {REFINE_FROM} on"
-        return f"{self._field.outline} · {texels}"
 
     @property
     def _planes(self) -> list[Tensor]:
@@ -283,23 +247,6 @@ class XPlanesModel(Model):
         settings = self.settings
         return warm_cosine(step, progress, warmup=settings.warmup_steps, final=settings.final_lr)
 
-    def before_step(self, state: TrainingState, optimizer: torch.optim.Optimizer) -> None:
-        old, size = self._field.space, self._field.space.shape[1]
-        if size >= self.texels or state.step < REFINE_FROM or state.progress > REFINE_UNTIL:
-            return
-        if state.batch % self.settings.rays.accumulate:
-            return  # Gradients wait, texel by texel.
-        if distributed.is_available() and distributed.is_initialized():
-            return  # The processes have agreed on the shapes of gradients.
-        # Each texel is met by fewer samples, which make its gradients smaller.
-        share = (size / self.texels) ** 2
-        for name, moments in optimizer.state.get(old, {}).items():
-            if name != "step":
-                power = 2 if name.endswith("sq") else 1
-                optimizer.state[old][name] = refined(moments, self.texels) * share**power
-        old.grad = None
-        old.data = refined(old.data, self.texels)
-
     def regularise(self, state: TrainingState) -> None:
         every, field, weights = self.weights.every, self._field, self.weights
         if state.step % every or field.space.grad is None:
@@ -310,11 +257,8 @@ class XPlanesModel(Model):
         if not fading:
             self._initial, self.product = [], None  # Large, and of no more use.
         elif self.initial_weight:
-            # The field may have moved to another device since, or been refined.
-            self._initial = [
-                _like(initial, plane)
-                for initial, plane in zip(self._initial, self._planes, strict=True)
-            ]
+            # The field may have moved to another device since.
+            self._initial = [plane.to(field.space.device) for plane in self._initial]
             weight = fading * self.initial_weight * every
             for plane, initial in zip(self._planes, self._initial, strict=True):
                 if plane.grad is not None:
@@ -379,15 +323,9 @@ class XPlanesModel(Model):
         """Sum over the planes' stacks of the mean squared distance from their initial values."""
         pairs = zip(self._planes, self._initial, strict=True)
         return sum(
-            float((plane - _like(initial, plane)).square().mean()) for plane, initial in pairs
+            float((plane - initial.to(plane.device)).square().mean()) for plane, initial in pairs
         )
 
     def _fading(self, step: int) -> float:
         """Factor on the regularisers that keep the field near its initialisation."""
         return 1.0 if self.fade is None else max(0.0, 1 - step / self.fade)
-
-
-def _like(initial: Tensor, plane: Tensor) -> Tensor:
-    """Initial planes on the device and with the texels of what they have become."""
-    initial = initial.to(plane.device)
-    return initial if initial.shape == plane.shape else refined(initial, plane.shape[1])

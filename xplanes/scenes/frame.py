@@ -63,14 +63,6 @@ class Frame:
         return points @ self.rotation / self.scale + self.centre
 
 
-def pixel_footprint(views: Views, frame: Frame) -> float:
-    """Width of a pixel of the median view in the middle of the cube, in the field's frame."""
-    cameras = views.camera_to_world[:, :3, 3].double()
-    away = (cameras - frame.centre.to(cameras)).norm(dim=1)
-    focal = views.intrinsics.pinhole.mean(dim=1).to(away)
-    return frame.scale * float((away / focal).median())
-
-
 def frame_content(frame: Frame) -> dict[str, Any]:
     """A frame as tensors and builtins, for files."""
     return {"scale": frame.scale, "rotation": frame.rotation, "centre": frame.centre}

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -91,15 +92,17 @@ def _is_text(line: ast.stmt) -> bool:
     )
 
 
-def state_of(name: str, root: Path = HERE.parent) -> dict[str, Any]:
+@cache
+def digest_of(part: str) -> str:
+    """The `digest` of a file, or of the code and settings in a folder of the repository."""
+    path = HERE.parent / part
+    found = [file for ending in ("*.py", "*.yaml") for file in sorted(path.rglob(ending))]
+    return digest([path] if path.is_file() else found)
+
+
+def state_of(name: str) -> dict[str, Any]:
     """Version, machine and measured code as they are now."""
-    parts = {}
-    for part in (*PARTS[name], f"benchmarks/{name}.py"):
-        path = root / part
-        files = (
-            [path] if path.is_file() else sorted(path.rglob("*.py")) + sorted(path.rglob("*.yaml"))
-        )
-        parts[part] = digest(files)
+    parts = {part: digest_of(part) for part in (*PARTS[name], f"benchmarks/{name}.py")}
     return {"version": __version__, "machine": machine(), "parts": parts}
 
 

@@ -72,14 +72,11 @@ def test_settings_are_checked_before_the_run_directory_is_made(tmp_path: Path, m
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("override", ["model.rays.per_batch=0", "+trainer.foo=1"])
-def test_setting_out_of_range_stops_before_anything_is_written(
-    override: str, tmp_path: Path
-) -> None:
-    result = train(override, f"hydra.run.dir={tmp_path / 'run'}")
+def test_setting_out_of_range_stops_before_anything_is_written(tmp_path: Path) -> None:
+    result = train("model.rays.per_batch=0", f"hydra.run.dir={tmp_path / 'run'}")
     assert result.returncode == 1
     assert result.stderr.count("\n") == 1, result.stderr
-    assert override.removeprefix("+").split("=")[0] in result.stderr
+    assert "model.rays.per_batch" in result.stderr
     assert not list(tmp_path.iterdir())
 
 
@@ -105,6 +102,7 @@ def test_an_experiment_says_itself_that_it_is_a_multirun() -> None:
     assert prepare(["seed=1"]) == ["seed=1"]
 
 
+@pytest.mark.slow
 def test_an_experiment_needs_no_flag(scenes: str, tmp_path: Path) -> None:
     place = f"hydra.sweep.dir={tmp_path}"
     result = train(
@@ -232,6 +230,7 @@ def test_killed_and_resumed_run_ends_with_the_same_numbers(scenes: str, tmp_path
     assert exact(killed) == exact(whole)
 
 
+@pytest.mark.slow
 def test_a_resumed_run_finds_groups_of_the_users_own_again(scenes: str, tmp_path: Path) -> None:
     conf, run = tmp_path / "conf", tmp_path / "run"
     (conf / "model").mkdir(parents=True)
@@ -249,6 +248,7 @@ def test_a_resumed_run_finds_groups_of_the_users_own_again(scenes: str, tmp_path
     assert path in (run / "overrides.txt").read_text().splitlines()
 
 
+@pytest.mark.slow
 def test_a_field_renders_the_scene_inside_a_job(scenes: str, tmp_path: Path) -> None:
     # That field's own settings are composed while Hydra's job is under way.
     folder = tmp_path / "run"

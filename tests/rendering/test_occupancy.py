@@ -457,7 +457,7 @@ def test_a_cell_is_seen_once_a_ray_of_any_time_gave_it_light():
     assert torch.equal(grid.seen, grid.occupied)  # Before the first rays nothing counts as unseen.
     grid.forget_light()
     assert not grid.seen.any()
-    # Cell 5 at both times, cell 9 by many faint rays, cell 70 = 6 + 64 by one of several.
+    # Cell 5 at both times, cell 9 by faint light alone, cell 70 = 6 + 64 by one of several.
     grid.light(
         torch.tensor([5, 69, 9, 9, 9, 70, 70]), torch.tensor([0.5, 0.1] + [0.02] * 4 + [0.4])
     )

@@ -7,7 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from xplanes.rendering.grid_renderer import DIAGONAL, GridRenderer
+from xplanes.config import compose_plain
+from xplanes.rendering.grid_renderer import (
+    DIAGONAL,
+    GridRenderer,
+    OccupancySampler,
+    OccupancySettings,
+)
 from xplanes.rendering.occupancy import OccupancyGrid
 
 COLOUR = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
@@ -218,6 +224,24 @@ def test_jitter_moves_samples_within_their_steps():
     torch.testing.assert_close(first, expected)
 
 
+def sampler_of(renderer):
+    options = compose_plain("train", [])["model"]["sampler"]
+    known = {key: value for key, value in options.items() if key not in ("_target_", "name")}
+    return OccupancySampler(renderer, OccupancySettings(name="occupancy", **known))
+
+
+def test_what_lets_light_through_is_seen_to_its_end():
+    """Fog of which no cell stops much, and each its share."""
+    renderer, rays = renderer_of(), rays_of(400)
+    renderer.grid.forget_light()
+    seen = renderer.render(fog(0.3), *rays, WHITE)
+    assert seen.weights.max() < 0.02
+    sampler_of(renderer).observe(seen)
+    assert renderer.grid.seen[seen.samples.cells].all()
+    again = replace(renderer, skip_unseen=True).render(fog(0.3), *rays, WHITE)
+    assert torch.equal(again.opacity, seen.opacity)
+
+
 @pytest.mark.parametrize("skip_unseen", [True, False])
 def test_images_show_nothing_that_no_training_ray_has_seen(skip_unseen):
     """A slab seen from above alone, with untrained matter below it, which another view looks at."""
@@ -235,7 +259,7 @@ def test_images_show_nothing_that_no_training_ray_has_seen(skip_unseen):
     times = torch.zeros(count, dtype=torch.float64)
     renderer.grid.forget_light()
     seen = renderer.render(slab, origins, down, times, WHITE)
-    renderer.grid.light(seen.samples.cells, seen.weights)
+    sampler_of(renderer).observe(seen)
     images = replace(renderer, skip_unseen=skip_unseen)
     above = images.render(slab, origins, down, times, WHITE)
     torch.testing.assert_close(above.opacity, torch.ones_like(times), atol=1e-6, rtol=0)

@@ -64,7 +64,7 @@ def stopped(optical_depth: Tensor) -> Tensor:
 
 
 def depth_before(optical_depth: Tensor, ray: Tensor, starts: Tensor) -> Tensor:
-    """Optical depth in front of each sample on its own ray. float64 [N]
+    """Optical depth, or what else adds up, in front of each sample on its own ray. float64 [N]
 
     One running sum over all rays, less the sum at the ray's first sample. In float64, with depths
     limited to `OPAQUE`, a million samples keep seven digits behind the point.

@@ -13,7 +13,7 @@ from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.rendering.behind import behind
 from xplanes.rendering.box import Field, shade
 from xplanes.rendering.carving import carve
-from xplanes.rendering.compositing import composite
+from xplanes.rendering.compositing import composite, depth_before
 from xplanes.rendering.filling import fill
 from xplanes.rendering.marching import march
 from xplanes.rendering.occupancy import OccupancyGrid
@@ -279,7 +279,9 @@ class OccupancySampler(Sampler):
     def observe(self, rendering: GridRendering) -> None:
         samples = rendering.samples
         self.grid.observe(samples.cells, rendering.density, samples.live)
-        self.grid.light(samples.cells, rendering.weights)
+        # What has not been stopped before a sample reaches it.
+        light = 1 - depth_before(rendering.weights, samples.ray, samples.starts)
+        self.grid.light(samples.cells, light if samples.live is None else light * samples.live)
 
     def update(self, field: Any, state: TrainingState) -> None:
         step, settings = state.step, self.settings

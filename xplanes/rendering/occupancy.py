@@ -8,7 +8,7 @@ from xplanes.rendering.box import Field
 from xplanes.rendering.compositing import OPAQUE
 
 LIT = 0.1
-"""Share of a ray's light from which a cell that stops it counts as seen."""
+"""Share of the light from which a cell that it reaches counts as seen."""
 
 TRUST = 0.1
 """Share by which the least density of a cell rises towards what a look shows."""
@@ -27,9 +27,10 @@ class OccupancyGrid(nn.Module):
     has a high density but lets light through; only by ``least`` can it be told to hide what lies
     behind it.
 
-    ``lit`` is the largest share of a training ray's light that each cell of space has stopped at
-    any time. What lies behind surfaces or below the ground in all training images is never lit:
-    nothing tells the field what is there, and images of other views shall not show it.
+    ``lit`` is the largest share of the light that has reached each cell of space on a training ray,
+    past all that lay in front, at any time. What lies behind surfaces or below the ground in all
+    training images is never lit: nothing tells the field what is there, and images of other views
+    shall not show it.
 
     Args:
         resolution: Cells along each side.
@@ -131,15 +132,15 @@ class OccupancyGrid(nn.Module):
         self.occupied[cells] = self.density[cells] > self.empty_density
 
     @torch.no_grad()
-    def light(self, cells: Tensor, weights: Tensor) -> None:
-        """Take in how much light samples of training rays have stopped.
+    def light(self, cells: Tensor, light: Tensor) -> None:
+        """Take in how much light reaches samples of training rays.
 
         Args:
             cells: Cell of each sample. [N]
-            weights: Share of its ray's light. [N]
+            light: Share of the light that nothing in front stops. [N]
         """
-        weights = weights.float().nan_to_num(0.0)
-        self.lit.scatter_reduce_(0, cells % len(self.lit), weights, "amax")
+        light = light.float().nan_to_num(0.0)
+        self.lit.scatter_reduce_(0, cells % len(self.lit), light, "amax")
 
     @torch.no_grad()
     def forget_light(self) -> None:

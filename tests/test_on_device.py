@@ -17,6 +17,7 @@ from lightning.pytorch.callbacks import Callback
 
 from tests import fake_device, on_device
 from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX, baseline_config
+from tests.baselines.test_gaussians_runs import SMALL as GAUSSIANS
 from tests.lrm.reduced import SIDES
 from tests.preparation.sequences import moving_sequence
 from tests.preparation.test_encode import frames_of, model_of
@@ -46,6 +47,9 @@ CONFIGS = {
     "nine": lambda *more: small_config(NOWHERE, "model=nine_planes", *more),
     "kplanes": lambda *more: baseline_config(NOWHERE, "model=kplanes", *KPLANES, *PROPOSAL, *more),
     "tineuvox": lambda *more: baseline_config(NOWHERE, "model=tineuvox_s", *TINEUVOX, *more),
+    "gaussians": lambda *more: baseline_config(
+        NOWHERE, "model=gaussians_hexplane", *GAUSSIANS, *more
+    ),
     "tensor4d": lambda *more: baseline_config(NOWHERE, "model=tensor4d", *TENSOR4D, *NEUS, *more),
 }
 
@@ -264,6 +268,7 @@ BUDGETS = {
     "nine": {2: (461, 0, 0), 8: (639, 0, 0)},
     "kplanes": {2: (1049, 0, 0)},
     "tineuvox": {2: (675, 6, 0)},
+    "gaussians": {2: (1020, 14, 14)},
     "tensor4d": {2: (3532, 1, 0)},
 }
 """Operations at most, waits and copies of a normal step, and of one that maintains the grid."""

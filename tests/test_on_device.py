@@ -17,6 +17,7 @@ from lightning.pytorch.callbacks import Callback
 
 from tests import fake_device, on_device
 from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX, baseline_config
+from tests.baselines.test_gaussians_runs import SMALL as GAUSSIANS
 from tests.lrm.reduced import SIDES
 from tests.preparation.sequences import moving_sequence
 from tests.preparation.test_encode import frames_of, model_of
@@ -46,6 +47,9 @@ CONFIGS = {
     "nine": lambda *more: small_config(NOWHERE, "model=nine_planes", *more),
     "kplanes": lambda *more: baseline_config(NOWHERE, "model=kplanes", *KPLANES, *PROPOSAL, *more),
     "tineuvox": lambda *more: baseline_config(NOWHERE, "model=tineuvox_s", *TINEUVOX, *more),
+    "gaussians": lambda *more: baseline_config(
+        NOWHERE, "model=gaussians_hexplane", *GAUSSIANS, *more
+    ),
     "tensor4d": lambda *more: baseline_config(NOWHERE, "model=tensor4d", *TENSOR4D, *NEUS, *more),
 }
 
@@ -148,11 +152,13 @@ def test_what_a_step_shows_is_read_now_and_then(fake_gpu):
     # The sweep of step 15 lists the occupied cells, and an epoch of Lightning's ends now and then.
     waiting = {n + 1 for n, counts in enumerate(steps) if counts.waits["to the CPU"]}
     assert waiting == {1, 2, 4, 8, 16, 32}
+    assert module.batches == 33
     seen = module.counts
     left = seen["candidates"] - seen["empty"] - seen["occluded"]
     assert 0 < seen["samples"] == seen["passed"] < left  # The others were of rays without room.
     assert seen["no_room"] > 0
-    assert 32 * 128 < seen["rays"] + seen["no_room"] <= 32 * 256
+    # The last batch is read at the end.
+    assert 33 * 128 < seen["rays"] + seen["no_room"] <= 33 * 256
     assert 0 < module.last["psnr"] < 40
     assert 0 < module.last["foreground"] < 1
 
@@ -262,6 +268,7 @@ BUDGETS = {
     "nine": {2: (473, 0, 0), 8: (651, 0, 0)},
     "kplanes": {2: (1049, 0, 0)},
     "tineuvox": {2: (675, 6, 0)},
+    "gaussians": {2: (1020, 14, 14)},
     "tensor4d": {2: (3532, 1, 0)},
 }
 """Operations at most, waits and copies of a normal step, and of one that maintains the grid."""

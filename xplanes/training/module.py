@@ -318,8 +318,8 @@ class RadianceModule(LightningModule):
         """
         sampler = self._parts[1]
         self.batches += 1
-        broken = (~loss.detach().isfinite()).float()
-        self._broken = broken if self._broken is None else torch.maximum(self._broken, broken)
+        bad = (~loss.detach().isfinite()).float()
+        self._broken = bad if self._broken is None else torch.maximum(self._broken, bad)
         self.manual_backward(loss / self.ray_settings.accumulate)
         passed = sampler.pass_on(rendering, state)
         sampler.observe(rendering)
@@ -339,7 +339,10 @@ class RadianceModule(LightningModule):
             values["skipped"] = 0
         self._meters.add(values)
         if due(self.batches) or self._logs_now:
-            self._read_meters(rendering)
+            self._read_meters()
+            if self.unusable_in_a_row >= PATIENCE:
+                broken = not_finite(self.named_parameters())
+                self._give_up("the loss or a gradient was not finite", broken, rendering)
         self._log_terms(terms, state)
 
     def _update_by_flag(self, optimizer: LightningOptimizer, state: TrainingState) -> Tensor:
@@ -362,9 +365,13 @@ class RadianceModule(LightningModule):
         sampler.update(self.field, state)
         return broken
 
-    def _read_meters(self, rendering: Rendering) -> None:
-        """Take in what the batches since the last look showed."""
-        found = self._meters.read()
+    def on_train_end(self) -> None:
+        self._read_meters()
+
+    def _read_meters(self) -> None:
+        """Take in what the batches since the last look showed, if there were any."""
+        if not (found := self._meters.read()):
+            return
         batches, skipped = int(found.pop("batches")), int(found.pop("skipped"))
         self.last |= {
             "loss": found.pop("loss") / batches,
@@ -380,9 +387,6 @@ class RadianceModule(LightningModule):
         self.unusable += skipped
         whole = skipped and skipped >= batches // self.ray_settings.accumulate
         self.unusable_in_a_row = self.unusable_in_a_row + skipped if whole else 0
-        if self.unusable_in_a_row >= PATIENCE:
-            broken = not_finite(self.named_parameters())
-            self._give_up("the loss or a gradient was not finite", broken, rendering)
 
     def rehearse(self, rays: Batch) -> None:
         """Do all that a step does on a copy of the field, so that its kernels are compiled."""
@@ -555,6 +559,7 @@ class RadianceModule(LightningModule):
     # Checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self._read_meters()
         checkpoint["progress"] = {
             "batches": self.batches,
             "rays": self.rays,

@@ -177,7 +177,7 @@ def test_errors_of_kernels_are_seen(gpu, tmp_path):
 
     def broken(sizes):
         case = gpu.product_case(sizes)
-        return gpu.Case(case.planes, lambda planes: 1.01 * case.twin(planes), case.twin, case.least)
+        return gpu.Case(case.leaves, lambda leaves: 1.01 * case.twin(leaves), case.twin, case.least)
 
     gpu.compare(record, "products", broken, sizes)
     assert "products, 2 channels, 8 texels" in record.error

@@ -320,7 +320,7 @@ class Upkeep(Callback):
 @pytest.mark.parametrize(
     ("trainer", "size", "sweeps", "looks", "coarse", "warm", "rays"),
     [
-        (on_device.trainer, "auto", [2, 5, 10], [0, 3, 6, 9], 3, 4, 512),
+        (on_device.trainer, "auto", [2, 5, 10], [0, 6], 3, 4, 512),
         pytest.param(
             *(on_device.trainer, "256", [4, 10], [0, 6], 5, 7, 256), marks=pytest.mark.slow
         ),

@@ -127,7 +127,12 @@ class GridRenderer(RayRenderer):
         if samples.live is not None:
             density = torch.where(samples.live, density, 0)
         total, weights = composite(
-            density * self.step, colour, samples.distances, samples.ray, samples.starts
+            density * self.step,
+            colour,
+            samples.distances,
+            samples.ray,
+            samples.starts,
+            samples.number,
         )
         opacity = total[:, 3]
         background = behind(field, origins, directions, opacity, background, jitter)
@@ -209,13 +214,15 @@ class OccupancySettings(SamplerSettings):
         )
 
     def scaled(self, site: Site) -> "OccupancySettings":
-        """The same schedule in steps of the batches of a site."""
+        """The same schedule in steps of the batches of a site.
+
+        Random cells are looked at as often as before, for rays of large batches meet more cells.
+        """
         return replace(
             self,
             coarse_steps=site.steps(self.coarse_steps),
             sweep_at=[site.steps(step) for step in self.sweep_at],
             sweep_every=site.steps(self.sweep_every),
-            update_every=site.steps(self.update_every),
         )
 
     def for_video(self) -> "OccupancySettings":

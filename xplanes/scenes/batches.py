@@ -116,7 +116,7 @@ class BatchSettings(Settings, ABC):
 class RaySettings(BatchSettings):
     """Which rays a training step gets."""
 
-    # Maximum number of rays per batch. auto: 1024 on the CPU, 32768 on a GPU, where the schedules of
+    # Maximum number of rays per batch. auto: 1024 on the CPU, 32768 on a GPU, where schedules of
     # X-Planes and of the occupancy grid take 1/32 of their steps.
     per_batch: Count | Literal["auto"]
     # Maximum number of samples per batch, on average. auto: 8192 on the CPU, 524288 on a GPU.

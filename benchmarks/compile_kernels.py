@@ -127,11 +127,11 @@ def products(channels: int) -> None:
     plane_product_gpu(planes, torch.zeros(5, 4), DYNAMIC).sum().backward()
 
 
-def compositing(*, room: bool) -> None:
-    """Samples along rays, with places left or without."""
-    starts, number = torch.zeros(3, dtype=torch.int64), torch.tensor(5) if room else None
+def compositing() -> None:
+    """Samples along rays."""
+    starts = torch.zeros(3, dtype=torch.int64)
     depth, colour = torch.zeros(5).requires_grad_(), torch.zeros(5, 3).requires_grad_()
-    composite_gpu(depth, colour, torch.zeros(5), starts, number)[0].sum().backward()
+    composite_gpu(depth, colour, torch.zeros(5), starts)[0].sum().backward()
 
 
 CASES: dict[str, Callable[[], None]] = {
@@ -140,8 +140,7 @@ CASES: dict[str, Callable[[], None]] = {
     "nine planes, 16 channels": lambda: lookup("nine", 16),
     "nine planes, 40 channels": lambda: lookup("nine", 40),
     "products, 32 channels": lambda: products(32),
-    "compositing": lambda: compositing(room=False),
-    "compositing with room": lambda: compositing(room=True),
+    "compositing": compositing,
 }
 
 

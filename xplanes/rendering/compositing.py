@@ -143,12 +143,14 @@ class _Kernels(torch.autograd.Function):
         number: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         gpu = gpu_module("xplanes.rendering.gpu")
-        inputs = [t.contiguous() for t in (optical_depth, colour, distances, starts)]
+        if number is None:
+            number = starts.new_full((), len(optical_depth))
+        inputs = [t.contiguous() for t in (optical_depth, colour, distances, starts, number)]
         # Places behind the last sample are not written to.
         weights, light = torch.zeros_like(inputs[0]), torch.empty_like(inputs[0])
         total = optical_depth.new_empty(len(starts), 5)
-        gpu.launch(gpu.forward, inputs, number, (weights, light, total), OPAQUE)
-        ctx.save_for_backward(*inputs, number, weights, light)
+        gpu.launch(gpu.forward, len(starts), inputs, (weights, light, total), OPAQUE)
+        ctx.save_for_backward(*inputs, weights, light)
         ctx.mark_non_differentiable(weights)
         return total, weights
 
@@ -158,11 +160,11 @@ class _Kernels(torch.autograd.Function):
         ctx: Any, *gradients: Tensor
     ) -> tuple[Tensor | None, ...]:
         gpu = gpu_module("xplanes.rendering.gpu")
-        *inputs, number, weights, light = ctx.saved_tensors
+        *inputs, weights, light = ctx.saved_tensors
         d_depth, d_colour = torch.zeros_like(inputs[0]), torch.zeros_like(inputs[1])
         gradient = gradients[0].to(weights.dtype).contiguous()
         results = weights, light, gradient, d_depth, d_colour
-        gpu.launch(gpu.backward, inputs, number, results, OPAQUE)
+        gpu.launch(gpu.backward, len(gradient), inputs, results, OPAQUE)
         return d_depth, d_colour, None, None, None
 
 
@@ -172,18 +174,20 @@ def _kernels_hold(device: torch.device, dtype: torch.dtype) -> bool:
 
     def attempt(function: Callable[..., Any], precision: torch.dtype) -> list[Tensor]:
         # A ray of many samples, one of none, and one of a single sample.
-        ray = torch.full((50,), 0, device=device)
+        ray = torch.zeros(50, dtype=torch.int64, device=device)
         ray[-1] = 2
         starts = torch.searchsorted(ray, torch.arange(4, device=device))
-        leaves = [(0.2 + waves(device, 50).abs()), waves(device, 50, 3)]
+        leaves = [0.2 + waves(device, 50).abs(), waves(device, 50, 3)]
         leaves = [leaf.to(precision).requires_grad_() for leaf in leaves]
         distances = waves(device, 50).to(precision)
         total, weights = function(*leaves, distances, ray, starts)
         upstream = waves(device, 4, 5).to(precision)
         return [total, weights, *torch.autograd.grad((total * upstream).sum(), leaves)]
 
-    def kernels(*given: Tensor) -> Any:
-        return composite_gpu(*given[:3], given[4])
+    def kernels(
+        optical_depth: Tensor, colour: Tensor, distances: Tensor, ray: Tensor, starts: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        return composite_gpu(optical_depth, colour, distances, starts)
 
     what = f"compositing ({dtype})"
     return proven(what, device, attempt, kernels, composite_reference, dtype)

@@ -19,13 +19,10 @@ TERMS = tl.constexpr(12)
 
 
 @triton.jit
-def ends_of(starts, number, count, rays, COUNTED: tl.constexpr):
+def ends_of(starts, number, rays):
     """A ray, its first sample, and the place behind its last one."""
     ray = tl.program_id(0)
-    last = count.to(tl.int64)
-    if COUNTED:
-        last = tl.load(number)
-    end = tl.load(starts + ray + 1, mask=ray + 1 < rays, other=last)
+    end = tl.load(starts + ray + 1, mask=ray + 1 < rays, other=tl.load(number))
     return ray, tl.load(starts + ray), end
 
 
@@ -47,7 +44,7 @@ def stopped(depth):
     return tl.where(depth < 0.5, thin * series, 1 - tl.exp(-depth))
 
 
-@triton.jit(do_not_specialize=["count", "rays"])
+@triton.jit(do_not_specialize=["rays"])
 def forward(
     optical_depth,
     colour,
@@ -57,13 +54,11 @@ def forward(
     weights,
     light,
     total,
-    count,
     rays,
     opaque,
-    COUNTED: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    ray, start, end = ends_of(starts, number, count, rays, COUNTED)
+    ray, start, end = ends_of(starts, number, rays)
     zero = tl.zeros([BLOCK], optical_depth.dtype.element_ty)
     red, green, blue, opacity, far, before = zero, zero, zero, zero, zero, zero
     for first in range(start, end, BLOCK):
@@ -99,7 +94,7 @@ def value_of(colour, distances, n, live, red, green, blue, opacity, far):
     return value + far * tl.load(distances + n, mask=live, other=0.0) + opacity
 
 
-@triton.jit(do_not_specialize=["count", "rays"])
+@triton.jit(do_not_specialize=["rays"])
 def backward(
     optical_depth,
     colour,
@@ -111,13 +106,11 @@ def backward(
     gradient,
     d_depth,
     d_colour,
-    count,
     rays,
     opaque,
-    COUNTED: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    ray, start, end = ends_of(starts, number, count, rays, COUNTED)
+    ray, start, end = ends_of(starts, number, rays)
     red, green = tl.load(gradient + 5 * ray), tl.load(gradient + 5 * ray + 1)
     blue, opacity = tl.load(gradient + 5 * ray + 2), tl.load(gradient + 5 * ray + 3)
     far = tl.load(gradient + 5 * ray + 4)
@@ -145,12 +138,8 @@ def backward(
         tl.store(d_colour + 3 * n + 2, weight * blue, mask=live)
 
 
-def launch(kernel, inputs, number, results, opaque):
-    """Launches `forward` or `backward` for the rays of ``inputs``, the last of which are starts."""
-    optical_depth, starts = inputs[0], inputs[-1]
-    counted = number is not None
-    given = *inputs, number if counted else starts, *results
-    sizes = len(optical_depth), len(starts), opaque
-    if len(starts):
-        with torch.cuda.device_of(optical_depth):
-            kernel[(len(starts),)](*given, *sizes, COUNTED=counted, BLOCK=BLOCK, num_warps=1)
+def launch(kernel, rays, inputs, results, opaque):
+    """Launches `forward` or `backward` for so many rays."""
+    if rays:
+        with torch.cuda.device_of(inputs[0]):
+            kernel[(rays,)](*inputs, *results, rays, opaque, BLOCK=BLOCK, num_warps=1)

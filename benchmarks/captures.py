@@ -58,8 +58,8 @@ VARIANTS = {
 }
 VIEWS = {"phone": 60, "rig": 96}
 COLUMNS = (
-    *("scene", "variant", "PSNR, dB", "PSNR of the thing, dB", "steps", "seconds"),
-    *("ms a step", "memory, GB"),
+    *("scene", "variant", "PSNR, dB", "PSNR of the thing, dB", "SSIM", "floaters, %"),
+    *("steps", "seconds", "ms a step", "memory, GB"),
 )
 
 
@@ -94,14 +94,18 @@ def row(scene: str, variant: str, runs: list[Measured]) -> list[str]:
     def mean(*path: str) -> float:
         return statistics.mean(values(*path))
 
-    def score(name: str) -> str:
+    def score(name: str, scale: int = 1, digits: int = 2) -> str:
         if name not in runs[0].metrics["test"]:
             return ""
-        spread = f" ± {statistics.stdev(values('test', name)):.2f}" if len(runs) > 1 else ""
-        return f"{mean('test', name):.2f}{spread}"
+        found = [scale * value for value in values("test", name)]
+        spread = f" ± {statistics.stdev(found):.{digits}f}" if len(runs) > 1 else ""
+        return f"{statistics.mean(found):.{digits}f}{spread}"
 
     steps, seconds = mean("step"), mean("seconds", "train")
-    scores = ["" if variant.startswith("masks") else score("psnr"), score("psnr_thing")]
+    whole = [score("psnr"), score("psnr_thing"), score("ssim", digits=3)]
+    if variant.startswith("masks"):
+        whole = ["", whole[1], ""]
+    scores = [*whole, score("floaters", 100)]
     times = [f"{steps:.0f}", f"{seconds:.0f}", f"{1000 * seconds / steps:.0f}"]
     return [scene, variant, *scores, *times, f"{mean('peak_memory_bytes') / 2**30:.1f}"]
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import warm
 from xplanes.cli import main
 
 
@@ -29,7 +30,9 @@ def test_help_loads_nothing_heavy(tmp_path):
 
 
 def test_evaluate_as_a_program(trained_run: Path, tmp_path: Path):
-    done = python("-m", "xplanes", "evaluate", str(trained_run), "--lpips", "none", cwd=tmp_path)
+    done = warm.run(
+        *("-m", "xplanes", "evaluate", str(trained_run), "--lpips", "none"), cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert lines[0] == f"run         {trained_run}"

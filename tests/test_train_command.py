@@ -12,22 +12,13 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
+from tests import warm
 from tests.training.runs import SMALL
+from tests.warm import train
 from xplanes.config import CONF
 from xplanes.launch import SettingsCheck, prepare
 
 ROOT = Path(__file__).resolve().parent.parent
-
-
-def train(*arguments: str, timeout: float = 240) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, str(ROOT / "train.py"), *arguments],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        check=False,
-    )
 
 
 def exact(folder: Path) -> tuple:
@@ -170,9 +161,19 @@ def test_two_processes_share_the_rays_and_end_with_one_model(scenes: str, tmp_pa
 def test_two_processes_stop_together_and_resume(scenes: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     checkpoint = run / "checkpoints" / "last.ckpt"
-    process = start(run, scenes, "trainer=ddp", "trainer.max_steps=100000")
+    process = subprocess.Popen(
+        [
+            *(sys.executable, str(ROOT / "train.py"), scenes, *SMALL, "trainer=ddp"),
+            *("trainer.max_steps=100000", "callbacks.checkpoints.every=20"),
+            f"hydra.run.dir={run}",
+        ],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "OMP_WAIT_POLICY": "PASSIVE"},
+    )
     try:
-        wait_for(checkpoint, process)
+        warm.wait_for(checkpoint, process)
         before = checkpoint.stat().st_mtime_ns
         process.send_signal(signal.SIGINT)  # to the first alone
         process.wait(60)
@@ -186,30 +187,17 @@ def test_two_processes_stop_together_and_resume(scenes: str, tmp_path: Path) -> 
     assert torch.load(checkpoint, weights_only=True)["global_step"] == step + 5
 
 
-def start(run: Path, scenes: str, *overrides: str) -> subprocess.Popen[bytes]:
-    arguments = [scenes, *SMALL, "trainer.max_steps=400", "callbacks.checkpoints.every=20"]
-    arguments += overrides
-    return subprocess.Popen(
-        [sys.executable, str(ROOT / "train.py"), *arguments, f"hydra.run.dir={run}"],
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, "OMP_WAIT_POLICY": "PASSIVE"},
+def start(run: Path, scenes: str) -> warm.Running:
+    return warm.start(
+        *(str(ROOT / "train.py"), scenes, *SMALL, "trainer.max_steps=400"),
+        *("callbacks.checkpoints.every=20", f"hydra.run.dir={run}"),
     )
-
-
-def wait_for(path: Path, process: subprocess.Popen[bytes]) -> None:
-    deadline = time.monotonic() + 120
-    while not path.is_file():
-        assert process.poll() is None, "ended before its first checkpoint"
-        assert time.monotonic() < deadline, f"no {path}"
-        time.sleep(0.05)
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(scenes: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     process = start(run, scenes)
-    wait_for(run / "checkpoints" / "last.ckpt", process)
+    warm.wait_for(run / "checkpoints" / "last.ckpt", process)
     process.send_signal(signal.SIGINT)
     assert process.wait(60) == 130
     assert '"status": "interrupted"' in (run / "run.json").read_text()
@@ -220,10 +208,9 @@ def test_killed_and_resumed_run_ends_with_the_same_numbers(scenes: str, tmp_path
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert start(whole, scenes).wait(240) == 0
     process = start(killed, scenes)
-    wait_for(killed / "checkpoints" / "last.ckpt", process)
+    warm.wait_for(killed / "checkpoints" / "last.ckpt", process)
     time.sleep(0.3)
     process.kill()
-    process.wait()
     assert not (killed / "metrics.json").exists()
     result = train(f"resume={killed}")
     assert result.returncode == 0, result.stderr

@@ -2,32 +2,25 @@
 
 import csv
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 from hydra.types import RunMode
 
 from tests.training.runs import SMALL
+from tests.warm import train
 from xplanes.evaluation.table import SweepTable, choose_gpu
-
-ROOT = Path(__file__).resolve().parents[2]
 
 CHANGED = ("model.channels", "trainer.max_steps", "callbacks.evaluation.at")
 
 
 def test_a_failed_job_is_a_row_and_the_others_go_on(trained_run: Path, tmp_path: Path):
-    command = [
-        *(sys.executable, str(ROOT / "train.py"), "-m", "model.channels=0,4"),
+    done = train(
+        *("-m", "model.channels=0,4"),
         *(option for option in SMALL if not option.startswith(CHANGED)),
         *("trainer.max_steps=2", "callbacks.evaluation.at=[]"),
         *(f"data.root={trained_run.parents[1] / 'scenes'}", f"hydra.sweep.dir={tmp_path}"),
-    ]
-    environment = os.environ | {"OMP_WAIT_POLICY": "PASSIVE"}
-    done = subprocess.run(
-        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120
+        cwd=tmp_path,
     )
     assert done.returncode == 1, done.stderr
     with (tmp_path / "table.csv").open() as file:

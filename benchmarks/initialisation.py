@@ -1,0 +1,170 @@
+"""What the LRM's initialisation gives: PSNR at equal total time, preparation included.
+
+    python benchmarks/initialisation.py [--lego FOLDER] [--seconds 20] [--few-seconds 15]
+        [--seeds 3] [--resolution 100] [--together 1] [--work FOLDER]
+
+Writes docs/results/initialisation.md, .csv and .png. Each scene is trained from random
+initialisation and from the bundled `tiny`: with all views for --seconds, and with five of them for
+--few-seconds. The preparation of `tiny` is part of its time: it is measured first, and training
+gets what is left. Demo scenes bring a video of a fixed camera, whose frames the LRM sees and random
+initialisation does not; lego and the suite's scenes have none, so a field is trained to film them,
+and both see the same images. Each run is a process of its own with one thread, and seconds are
+those of its CPU time (cpu_clock.py); ``--together`` so many run side by side.
+"""
+
+import argparse
+import os
+import statistics
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+from runner import CPU_CLOCK, RESULTS, Measured, command, lego, machine, markdown, run_apart
+
+from xplanes.files import replacing, write_rows, write_text
+
+DEMOS = ("excavator", "walker", "balls", "windmill")
+SUITE = ("half_circle_test", "topology_test")
+STARTS = ("none", "tiny")
+FEW = 5
+COLUMNS = (
+    *("scene", "views", "initialisation", "preparation, s", "before the first step, dB"),
+    *("PSNR, dB", "SSIM", "steps"),
+)
+
+
+class Case(NamedTuple):
+    """A scene with its views."""
+
+    scene: str
+    overrides: tuple[str, ...]
+    views: int | None
+    seconds: float
+
+
+def cases(args: argparse.Namespace) -> list[Case]:
+    scenes = {name: (f"data.scene={name}",) for name in DEMOS}
+    if args.lego.is_dir():
+        scenes["lego (val)"] = tuple(lego(args.lego.resolve()))
+    found = {name: ("data=suite", f"data.scene={name}") for name in SUITE}
+    every = [Case(name, given, None, args.seconds) for name, given in (scenes | found).items()]
+    few = [Case(name, given, FEW, args.few_seconds) for name, given in scenes.items()]
+    return every + few
+
+
+def train(case: Case, start: str, seed: int, seconds: float, args: argparse.Namespace) -> Measured:
+    """One run; without seconds, what comes before its first step alone."""
+    # A stage taken from the cache would cost its run nothing.
+    given = [*case.overrides, f"data.resolution={args.resolution}", "preparation.cache=null"]
+    given += [f"lrm={start}", f"data.views={case.views or 'null'}", f"seed={seed}"]
+    given += [f"trainer.max_seconds={seconds:.2f}" if seconds else "trainer.max_seconds=null"]
+    given += [f"trainer.max_steps={1000000 if seconds else 1}"]
+    given += ["callbacks.evaluation.at=[0.0]" if seconds else "callbacks.evaluation.at=[]"]
+    given += ["media=false", "logger=none", "trainer.accelerator=cpu"]
+    name = f"{case.scene.split()[0]}_{case.views or 'all'}_{start}_{seed}_{seconds:.2f}"
+    return run_apart(given, args.work.absolute() / name, CPU_CLOCK)
+
+
+def preparation(run: Measured) -> float:
+    """Seconds before training that random initialisation does not take."""
+    return sum(run.metrics["seconds"]["prepare"].values())
+
+
+def measure(case: Case, start: str, seed: int, args: argparse.Namespace) -> Measured:
+    if start == "none":
+        return train(case, start, seed, case.seconds, args)
+    before = preparation(train(case, start, seed, 0, args))
+    return train(case, start, seed, case.seconds - before, args)
+
+
+def row(case: Case, start: str, runs: list[Measured]) -> tuple:
+    """Means over the seeds, with the standard deviation of PSNR."""
+    psnr = [run.metrics["test"]["psnr"] for run in runs]
+    spread = f" ± {statistics.stdev(psnr):.2f}" if len(psnr) > 1 else ""
+    first = statistics.mean(float(run.curve[0]["psnr"]) for run in runs)
+    return (
+        *(case.scene, case.views or "all", start),
+        f"{statistics.mean(map(preparation, runs)) if start != 'none' else 0:.1f}",
+        f"{first:.2f}",
+        f"{statistics.mean(psnr):.2f}{spread}",
+        f"{statistics.mean(run.metrics['test']['ssim'] for run in runs):.3f}",
+        f"{statistics.mean(run.metrics['step'] for run in runs):.0f}",
+    )
+
+
+def plot(found: dict[tuple[Case, str], list[Measured]]) -> None:
+    """Lead of `tiny` in each scene, with all views and with few of them."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(7, 3.6))
+    scenes = list(dict.fromkeys(case.scene for case, _ in found))
+    for offset, few in ((-0.2, False), (0.2, True)):
+        rows = [case for case, start in found if start == "none" and (case.views == FEW) == few]
+        for case in rows:
+            pairs = zip(found[case, "tiny"], found[case, "none"], strict=True)
+            lead = [a.metrics["test"]["psnr"] - b.metrics["test"]["psnr"] for a, b in pairs]
+            axes.bar(
+                scenes.index(case.scene) + offset,
+                statistics.mean(lead),
+                0.38,
+                yerr=statistics.stdev(lead) if len(lead) > 1 else None,
+                color="C1" if few else "C0",
+                label=None if case is not rows[0] else f"{FEW} views" if few else "all views",
+            )
+    axes.axhline(0, color="0.3", linewidth=0.8)
+    axes.set_xticks(range(len(scenes)), scenes, rotation=20, ha="right")
+    axes.set(ylabel="lead of tiny, dB")
+    axes.legend()
+    axes.grid(axis="y", alpha=0.3)
+    figure.tight_layout()
+    with replacing(RESULTS / "initialisation.png") as temporary:
+        figure.savefig(temporary, dpi=120, format="png")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--lego", type=Path, default=Path("data/dnerf/lego"))
+    parser.add_argument("--seconds", type=float, default=20)
+    parser.add_argument("--few-seconds", type=float, default=15)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--resolution", type=int, default=100)
+    parser.add_argument("--together", type=int, default=1, help="runs side by side")
+    parser.add_argument("--work", type=Path, default=Path("outputs/benchmarks/initialisation"))
+    args = parser.parse_args()
+    os.environ["OMP_NUM_THREADS"] = "1"
+    pairs = [(case, start) for case in cases(args) for start in STARTS]
+    jobs = [(case, start, seed) for case, start in pairs for seed in range(args.seeds)]
+    found: dict[tuple[Case, str], list[Measured]] = {}
+    with ThreadPoolExecutor(args.together) as pool:
+        measured = pool.map(lambda job: measure(*job, args), jobs)
+        for (case, start, _), run in zip(jobs, measured, strict=True):
+            runs = found.setdefault((case, start), [])
+            runs.append(run)
+            if len(runs) == args.seeds:
+                print("  ".join(map(str, row(case, start, runs))), flush=True)
+    rows = [row(*key, runs) for key, runs in found.items()]
+    write_rows(RESULTS / "initialisation.csv", COLUMNS, rows)
+    plot(found)
+    seeds = f"means of {args.seeds} seeds" if args.seeds > 1 else "one seed"
+    text = f"""# What the initialisation gives
+
+    {command()}
+
+Six planes at {args.resolution} pixels; {seeds}; {machine()}. The budget is {args.seconds:g} s of
+one core's CPU time with all views and {args.few_seconds:g} s with {FEW}; **it includes the
+preparation**, which is what `tiny` takes before its first step. Demo scenes (the first four) have a
+video of a fixed camera, which the LRM sees and random initialisation does not. The others have
+none: the preparation trains a field that films them, and both starts see the same images.
+
+![Lead of tiny over random initialisation](initialisation.png)
+
+{markdown(COLUMNS, rows)}
+"""
+    write_text(RESULTS / "initialisation.md", text)
+
+
+if __name__ == "__main__":
+    main()

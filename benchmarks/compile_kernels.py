@@ -33,6 +33,7 @@ from triton.runtime.jit import JITFunction
 from xplanes.fields.lookup import plane_features_gpu
 from xplanes.fields.products import DYNAMIC, plane_product_gpu
 from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
+from xplanes.rendering.compositing import composite_gpu
 
 ARCHITECTURES = (80, 86, 90, 120)
 """Compute capabilities: A100, RTX 3090, H100, RTX 5090."""
@@ -126,12 +127,20 @@ def products(channels: int) -> None:
     plane_product_gpu(planes, torch.zeros(5, 4), DYNAMIC).sum().backward()
 
 
+def compositing() -> None:
+    """Samples along rays."""
+    starts = torch.zeros(3, dtype=torch.int64)
+    depth, colour = torch.zeros(5).requires_grad_(), torch.zeros(5, 3).requires_grad_()
+    composite_gpu(depth, colour, torch.zeros(5), starts)[0].sum().backward()
+
+
 CASES: dict[str, Callable[[], None]] = {
     "six planes, 16 channels": lambda: lookup("six", 16),
     "six planes, 40 channels": lambda: lookup("six", 40),
     "nine planes, 16 channels": lambda: lookup("nine", 16),
     "nine planes, 40 channels": lambda: lookup("nine", 40),
     "products, 32 channels": lambda: products(32),
+    "compositing": compositing,
 }
 
 

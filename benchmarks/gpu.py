@@ -46,6 +46,7 @@ from xplanes.fields.products import DYNAMIC, plane_product_gpu, plane_product_re
 from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 from xplanes.files import read_json, require_writable, write_json, write_rows, write_text
 from xplanes.lrm.bundled import load_bundled
+from xplanes.rendering.compositing import composite_gpu, composite_reference
 from xplanes.scenes.batches import DeviceBatches
 
 BEGAN = time.monotonic()
@@ -127,16 +128,16 @@ class Record:
 
 @dataclass(frozen=True)
 class Case:
-    """Planes and points, and the two ways to read them.
+    """What gets gradients, and the two ways to values.
 
     Attributes:
-        planes: What gets gradients.
-        kernels: From planes to values, by Triton.
+        leaves: What gets gradients: planes, or optical depths and colours.
+        kernels: From these to values, by Triton.
         twin: The same by torch, in any precision.
         least: Bytes that the forward and the backward must move.
     """
 
-    planes: list[Tensor]
+    leaves: list[Tensor]
     kernels: Callable[[list[Tensor]], Tensor]
     twin: Callable[[list[Tensor]], Tensor]
     least: tuple[int, int]
@@ -155,7 +156,7 @@ class Sizes:
 
     @property
     def words(self) -> str:
-        return f"{self.channels} channels, {self.texels} texels"
+        return f", {self.channels} channels, {self.texels} texels" if self.channels else ""
 
 
 def along_rays(sizes: Sizes) -> tuple[Tensor, Tensor]:
@@ -207,11 +208,31 @@ def product_case(sizes: Sizes) -> Case:
     )
 
 
+def compositing_case(sizes: Sizes, samples: int) -> Case:
+    """Rays of so many samples on average, some of none."""
+    device = sizes.device
+    starts = torch.randint(sizes.points, (sizes.points // samples,), device=device).sort()[0]
+    starts[0] = 0
+    ray = torch.searchsorted(starts, torch.arange(sizes.points, device=device), right=True) - 1
+    depth = (3 / samples) * torch.rand(sizes.points, device=device)
+    leaves = [depth, torch.rand(sizes.points, 3, device=device)]
+    distances = torch.rand(sizes.points, device=device)
+
+    def twin(leaves: list[Tensor]) -> Tensor:
+        return composite_reference(*leaves, distances.to(leaves[0].dtype), ray, starts)[0]
+
+    # A sample's depth, colour and distance are read, its weight and the light before it written;
+    # the backward reads all of these.
+    rays = starts.nbytes + 20 * len(starts)
+    least = rays + 7 * depth.nbytes, rays + 11 * depth.nbytes
+    return Case(leaves, lambda leaves: composite_gpu(*leaves, distances, starts)[0], twin, least)
+
+
 def errors(case: Case) -> dict[str, tuple[float, str]]:
     """Largest differences from the twin in float64, over its largest value."""
 
     def values(function: Callable[[list[Tensor]], Tensor], precision: torch.dtype) -> list[Tensor]:
-        leaves = [plane.to(precision, copy=True).requires_grad_() for plane in case.planes]
+        leaves = [plane.to(precision, copy=True).requires_grad_() for plane in case.leaves]
         value = function(leaves)
         weights = torch.linspace(-1, 1, value.numel(), device=value.device, dtype=torch.float64)
         upstream = (1000 * weights).sin().float().to(value.dtype).view_as(value)
@@ -252,16 +273,16 @@ def copy_speed() -> float:
 
 def time_case(case: Case, speed: float) -> dict[str, dict[str, tuple[float, str]]]:
     """Cells of the rows "forward" and "backward"."""
-    planes = [plane.clone().requires_grad_() for plane in case.planes]
+    leaves = [leaf.clone().requires_grad_() for leaf in case.leaves]
     spent = {}
     for name, function in (("kernels", case.kernels), ("twin", case.twin)):
         with torch.no_grad():
-            forward = microseconds(lambda function=function: function(planes))
-        value = function(planes)
+            forward = microseconds(lambda function=function: function(leaves))
+        value = function(leaves)
         upstream = torch.randn_like(value)
 
         def back(value: Tensor = value, upstream: Tensor = upstream) -> object:
-            return torch.autograd.grad(value, planes, upstream, retain_graph=True)
+            return torch.autograd.grad(value, leaves, upstream, retain_graph=True)
 
         spent[name] = forward, microseconds(back)
     return {
@@ -282,7 +303,7 @@ Make = Callable[[Sizes], Case]
 
 def compare(record: Record, name: str, make: Make, sizes: Sizes) -> None:
     """Add a row of errors; a kernel that is wrong is the part's error."""
-    row = f"{name}, {sizes.words}"
+    row = f"{name}{sizes.words}"
     found = errors(make(sizes))
     ours = {what: value for what, (value, _) in found.items() if "kernels" in what}
     if not all(value <= TOLERANCE for value in ours.values()):
@@ -300,12 +321,13 @@ def measure_kernels(
         record: Where figures go.
         part: The part.
         kinds: Name and maker of cases.
-        full: Channels, texels and rows of time on a GPU.
+        full: Channels, texels and rows of time on a GPU; zeros where there are no planes.
     """
     torch.manual_seed(0)
     if not torch.cuda.is_available():
         for name, make in kinds:
-            small = Sizes(FEW, 8, 16, 6, torch.device("cpu"), reach=1.2)
+            channels, texels, rows = (min(a, b) for a, b in zip(full[0], (8, 16, 6), strict=True))
+            small = Sizes(FEW, channels, texels, rows, torch.device("cpu"), reach=1.2)
             compare(record, name, make, small)
         return
     device = torch.device("cuda")
@@ -321,7 +343,7 @@ def measure_kernels(
             for points in POINTS:
                 sizes = Sizes(points, *numbers, device)
                 for label, cells in time_case(make(sizes), speed).items():
-                    row = f"{name}, {sizes.words}, {points} points, {label}"
+                    row = f"{name}{sizes.words}, {points} points, {label}"
                     record.add("kernel time", row, cells)
 
 
@@ -335,6 +357,17 @@ def measure_lookup(record: Record, part: "Part", args: argparse.Namespace) -> No
 
 def measure_products(record: Record, part: "Part", args: argparse.Namespace) -> None:
     measure_kernels(record, part, [("products", product_case)], [(8, 64, 50), (32, 128, 25)])
+
+
+def measure_compositing(record: Record, part: "Part", args: argparse.Namespace) -> None:
+    kinds = [
+        (
+            f"compositing, {samples} samples a ray",
+            lambda sizes, samples=samples: compositing_case(sizes, samples),
+        )
+        for samples in (8, RAY)
+    ]
+    measure_kernels(record, part, kinds, [(0, 0, 0)])
 
 
 # Preparation
@@ -394,9 +427,8 @@ def measure_step(
 ) -> None:
     """Where the time of a step goes, by what runs on the device."""
     device = device or found_device()
-    large = LARGE if device.type == "cuda" else ()
     where = ("data=demo", f"data.root={args.work / 'demo'}", "data.resolution=64")
-    config = compose_plain("train", [*where, *large, *part.overrides])
+    config = compose_plain("train", [*where, *part.overrides])
     settled, seen = (200, 20) if device.type == "cuda" else (5, 5)
     profiler = StepProfile(settled, seen, device)
     module, data = RadianceModule(config), SceneDataModule(config["data"])
@@ -562,7 +594,7 @@ def training(
     steps = (f"trainer.max_steps={STEPS}", "trainer.max_seconds=null")
     budget = (*steps, "callbacks.evaluation.at=[]")
     # On the CPU some samples pass no gradients on, on a GPU all do.
-    equal = (f"model.precision={precision}", "model.sampler.thinning=0")
+    equal = (f"model.precision={precision}", "model.sampler.thinning=0", *SMALL)
     given = (initialisation, f"trainer.accelerator={device}", *equal, *budget)
     return Part("training", row, overrides=given, **options)
 
@@ -576,10 +608,10 @@ def throughput(row: str, *overrides: str, **options: Any) -> Part:
 
 
 NONE, TINY, NINE = "lrm=none", "lrm=tiny", "model=nine_planes"
-LARGE = ("model.rays.per_batch=8192", "model.rays.samples_per_batch=262144")
+SMALL = ("model.rays.per_batch=1024", "model.rays.samples_per_batch=8192")
+"""The CPU's batch; on a GPU X-Planes has a larger one of its own."""
 LOOKS = [round(second / LEGO_SECONDS, 4) for second in (1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 45)]
 LEGO = (
-    *LARGE,
     NONE,
     f"trainer.max_seconds={LEGO_SECONDS}",
     f"callbacks.evaluation.at={LOOKS}".replace(" ", ""),
@@ -590,19 +622,20 @@ NO_KERNELS = (("XPLANES_GPU_KERNELS", "0"),)
 PARTS = (
     Part("kernels", "plane lookup", measure_lookup, needs_gpu=False, need=60, limit=150),
     Part("kernels", "products of planes", measure_products, needs_gpu=False),
+    Part("kernels", "compositing", measure_compositing, needs_gpu=False),
     training("random, GPU", NONE, "gpu", rays_of_the_cpu=True),
     training("random, CPU", NONE, "cpu", needs_gpu=False, need=60, limit=120),
     throughput("six planes", NONE),
-    throughput("six planes, large batches", *LARGE, NONE),
+    throughput("six planes, small batches", *SMALL, NONE),
     throughput("nine planes", NINE, NONE),
-    throughput("nine planes, large batches", *LARGE, NINE, NONE),
+    throughput("nine planes, small batches", *SMALL, NINE, NONE),
     Part("lego", "six planes", overrides=LEGO, need=110, limit=180),
     Part("step", "six planes", measure_step, needs_gpu=False, overrides=(NONE,)),
     Part("preparation", "LRM and decomposition", measure_preparation, needs_gpu=False),
     training("tiny, GPU", TINY, "gpu", rays_of_the_cpu=True),
     training("tiny, CPU", TINY, "cpu", need=60, limit=120),
     training("random, GPU, rays drawn there", NONE, "gpu"),
-    throughput("six planes, large batches, torch", *LARGE, NONE, environment=NO_KERNELS),
+    throughput("six planes, torch", NONE, environment=NO_KERNELS),
     training("random, GPU, bfloat16 decoder", NONE, "gpu", "bf16"),
     throughput("K-Planes", "model=kplanes"),
 )
@@ -730,15 +763,16 @@ TABLES = {
     "accuracy": (
         "Kernels against float64",
         "The largest difference from the readable twin in float64, over its largest value; "
-        '"twin" is the same twin in float32. Gradients are those of the planes. Kernels count as '
-        f"wrong above {TOLERANCE:g}.",
+        '"twin" is the same twin in float32. Gradients are those of the planes; in compositing, '
+        f"those of optical depths and colours. Kernels count as wrong above {TOLERANCE:g}.",
     ),
     "kernel time": (
         "Time of the kernels",
-        f"Medians of {ROUNDS} runs by CUDA events, float32, points along rays of {RAY} samples. "
-        '"Twin" is torch\'s `grid_sample` in float32. "Of the copy": the bytes that must be moved '
-        "(points, features, each plane once; in the backward gradients, and planes of gradients "
-        "twice) at the speed of a large copy, over the time taken.",
+        f"Medians of {ROUNDS} runs by CUDA events, float32, planes at points along rays of {RAY} "
+        'samples. "Twin" is plain torch in float32, for planes its `grid_sample`. "Of the copy": '
+        "the bytes that must be moved (points, features, each plane once; in the backward "
+        "gradients, and planes of gradients twice; in compositing each sample once) at the speed "
+        "of a large copy, over the time taken.",
     ),
     "training": (
         f"{STEPS} steps on the GPU and on the CPU",
@@ -752,22 +786,22 @@ TABLES = {
         "Steps per second",
         f"Excavator at 64 px, {SETTLED} s of training, random initialisation, default precision. "
         f"Steps/s leave the first {SHARE * SETTLED:g} s out; rays/s and samples/s are of the whole "
-        "run. A step has 8192 samples, large batches 262,144 at most "
-        f"(`{' '.join(LARGE)}`); K-Planes has 4096 rays. "
+        "run. X-Planes has the batches of `model.rays.per_batch=auto` on a GPU, in small batches "
+        f"those of the CPU (`{' '.join(SMALL)}`); K-Planes has 4096 rays. "
         '"torch": without Triton kernels.',
     ),
     "lego": (
         "lego at 400 px",
-        f"D-NeRF's lego, val split, random initialisation, {LEGO_SECONDS} s of training, "
-        f'`{" ".join(LARGE)}`; PSNR and SSIM are means over the views. "To {GOAL:g} dB": '
+        f"D-NeRF's lego, val split, random initialisation, {LEGO_SECONDS} s of training; PSNR and "
+        f'SSIM are means over the views. "To {GOAL:g} dB": '
         "seconds of training until the mean of 8 views, looked at after each second at first, "
         "reaches it.",
     ),
     "step": (
         "A training step",
-        f"Six planes, `{' '.join(LARGE)}` on a GPU: its {KERNELS} longest kernels, by torch's "
+        f"Six planes with default batches: the {KERNELS} longest kernels on a GPU, by torch's "
         "profiler. What is missing from the whole is the time in which the GPU waits. Without a "
-        "GPU: operations on the CPU, default batches.",
+        "GPU: operations on the CPU.",
     ),
     "preparation": (
         "Before training",

@@ -177,7 +177,7 @@ def test_errors_of_kernels_are_seen(gpu, tmp_path):
 
     def broken(sizes):
         case = gpu.product_case(sizes)
-        return gpu.Case(case.planes, lambda planes: 1.01 * case.twin(planes), case.twin, case.least)
+        return gpu.Case(case.leaves, lambda leaves: 1.01 * case.twin(leaves), case.twin, case.least)
 
     gpu.compare(record, "products", broken, sizes)
     assert "products, 2 channels, 8 texels" in record.error
@@ -187,8 +187,8 @@ def test_errors_of_kernels_are_seen(gpu, tmp_path):
 def test_a_kernel_that_gives_nan_is_wrong(gpu, tmp_path):
     def broken(sizes):
         case = gpu.product_case(sizes)
-        empty = case.planes[0].new_tensor(torch.nan)
-        return gpu.Case(case.planes, lambda planes: empty * case.twin(planes), case.twin, (1, 1))
+        empty = case.leaves[0].new_tensor(torch.nan)
+        return gpu.Case(case.leaves, lambda leaves: empty * case.twin(leaves), case.twin, (1, 1))
 
     record = gpu.Record(tmp_path / "record.json")
     gpu.compare(record, "products", broken, gpu.Sizes(gpu.RAY, 2, 8, 4, torch.device("cpu")))

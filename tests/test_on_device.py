@@ -32,6 +32,8 @@ from xplanes.models.base import LossTerm
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.encode import encode
 from xplanes.rendering.behind import behind
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.scenes import batches
 from xplanes.scenes.batches import DeviceBatches
 from xplanes.training.clock import TrainingClock
 from xplanes.training.evaluation import score_view
@@ -54,13 +56,14 @@ CONFIGS = {
 }
 
 
-def trained(name, steps, *more, trainer=on_device.trainer, losses=None):
+def trained(name, steps, *more, trainer=on_device.trainer, losses=None, watch=()):
     """A module after some steps, its data, and the counts of each step."""
     module = RadianceModule(CONFIGS[name](*more))
     module.method = replace(module.method, losses=losses or {})
     data = SceneDataModule.of(ball_scene(6, 16))
     counts = on_device.StepCounts()
-    trainer(max_steps=steps, callbacks=[counts], limit_val_batches=0).fit(module, data)
+    callbacks = [counts, *watch]
+    trainer(max_steps=steps, callbacks=callbacks, limit_val_batches=0).fit(module, data)
     return module, data, counts.steps
 
 
@@ -287,3 +290,60 @@ def test_steps_keep_to_their_budget_and_views_are_scored(fake_gpu, name):
     score, images = score_view(module.field, module.renderer, module.frame, views, 0, background)
     assert 0 < score.psnr < 60
     assert images.colour.device.type == "cpu"
+
+
+class Upkeep(Callback):
+    """Steps after which the grid was swept, or looked at here and there, and learning rates."""
+
+    def __init__(self, monkeypatch):
+        self.sweeps, self.looks, self.rates, self.coarse = [], [], [], []
+        self.step = 0
+        for name, steps in (("sweep", self.sweeps), ("update", self.looks)):
+            monkeypatch.setattr(OccupancyGrid, name, self.noting(name, steps))
+        monkeypatch.setattr(OccupancyGrid, "update_by", self.noting("update_by", self.looks))
+
+    def noting(self, name, steps):
+        real = getattr(OccupancyGrid, name)
+
+        def noted(grid, *given):
+            steps.append(self.step)
+            return real(grid, *given)
+
+        return noted
+
+    def on_train_batch_end(self, trainer, module, *rest):
+        self.step = trainer.global_step
+        self.rates.append(module.optimizers().param_groups[0]["lr"])
+        self.coarse.append(module.sampler._is_coarse)
+
+
+@pytest.mark.parametrize(
+    ("trainer", "size", "sweeps", "looks", "coarse", "warm", "rays"),
+    [
+        (on_device.trainer, "auto", [2, 5, 10], [0, 6], 3, 4, 512),
+        pytest.param(
+            *(on_device.trainer, "256", [4, 10], [0, 6], 5, 7, 256), marks=pytest.mark.slow
+        ),
+        (on_the_cpu, "auto", [4, 10], [0, 6], 5, 7, 256),
+    ],
+)
+def test_larger_batches_shorten_the_schedules(
+    fake_gpu, monkeypatch, trainer, size, sweeps, looks, coarse, warm, rays
+):
+    """On a GPU, where nobody has chosen a size; here with batches twice as large as the CPU's."""
+    monkeypatch.setattr(batches, "CPU_RAYS", 256)
+    monkeypatch.setattr(batches, "GPU_RAYS", 512)
+    upkeep = Upkeep(monkeypatch)
+    options = (
+        *(f"model.rays.per_batch={size}", "model.rays.samples_per_batch=16384"),
+        "model.sampler.samples=24",
+        *("model.sampler.sweep_at=[4]", "model.sampler.sweep_every=10"),
+        *("model.sampler.coarse_steps=5", "model.sampler.update_every=6"),
+        *("model.warmup_steps=7", "model.final_lr=1.0"),
+    )
+    module, _, _ = trained("six", 11, *options, trainer=trainer, watch=[upkeep])
+    assert upkeep.sweeps == sweeps
+    assert upkeep.looks == looks
+    assert sum(upkeep.coarse) == coarse
+    assert upkeep.rates.index(max(upkeep.rates)) == warm - 1
+    assert module.rays == rays

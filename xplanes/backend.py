@@ -121,9 +121,9 @@ _refused: set[str] = set()
 def proven(
     what: str,
     device: torch.device,
-    attempt: Callable[[Callable[..., Tensor], torch.dtype], Sequence[Tensor]],
-    kernels: Callable[..., Tensor],
-    plain: Callable[..., Tensor],
+    attempt: Callable[[Callable[..., Any], torch.dtype], Sequence[Tensor]],
+    kernels: Callable[..., Any],
+    plain: Callable[..., Any],
     dtype: torch.dtype,
 ) -> bool:
     """Whether kernels compile, run and come to the numbers of their readable twin.

@@ -57,8 +57,8 @@ tensor4d:
 
 
 OURS = (
-    "model.rays.per_batch=1024",
-    "model.rays.samples_per_batch=8192",
+    "model.rays.per_batch=auto",
+    "model.rays.samples_per_batch=auto",
     "model.rays.skip_background=true",
     "model.rays.background=white",
 )

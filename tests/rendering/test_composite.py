@@ -1,5 +1,6 @@
 """Compositing: values and gradients against Beer and Lambert, at every density."""
 
+import functools
 import itertools
 import math
 
@@ -11,9 +12,30 @@ from hypothesis import strategies as st
 
 from tests.oracles import composite as oracle
 from tests.oracles import composite_gradient
-from xplanes.rendering.compositing import composite, composite_reference, depth_before
+from xplanes.rendering import compositing
+from xplanes.rendering.compositing import (
+    composite,
+    composite_gpu,
+    composite_reference,
+    depth_before,
+)
 
-BOTH = (composite, composite_reference)
+try:
+    import triton
+except ImportError:
+    triton = None
+
+
+def kernels(depth, colour, distances, ray, starts, number=None):
+    """The Triton kernels: on a GPU if there is one, else in triton's interpreter."""
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    given = (depth, colour, distances, starts, number)
+    given = (None if tensor is None else tensor.to(device) for tensor in given)
+    return tuple(found.cpu() for found in composite_gpu(*given))
+
+
+PLAIN = (composite, composite_reference)
+ALL = (*PLAIN, *([kernels] if triton else []))
 FLOATS = (torch.float32, torch.float64)
 COUNTS = (0, 3, 1, 0, 0, 7, 12, 0)
 """Samples of each ray: none at the ends and in the middle."""
@@ -35,7 +57,7 @@ def expected_of(depth, colour, distances, ray, starts):
     return oracle(*arrays, ray.tolist(), len(starts))
 
 
-@pytest.mark.parametrize("merge", BOTH)
+@pytest.mark.parametrize("merge", ALL)
 def test_values_equal_the_loops_of_the_oracle(merge):
     for dtype, scale in itertools.product(FLOATS, (0.0, 1e-8, 1e-3, 1.0, 30.0)):
         case = f"{dtype}, depths up to {scale}"
@@ -60,7 +82,7 @@ def test_thin_media_keep_their_digits():
 
 
 def test_gradients_follow_the_product_rule():
-    for merge, scale in itertools.product(BOTH, (1e-3, 1.0, 20.0)):
+    for merge, scale in itertools.product(ALL, (1e-3, 1.0, 20.0)):
         depth, colour, *rest = rays_of(scale=scale)
         depth.requires_grad_()
         colour.requires_grad_()
@@ -74,7 +96,7 @@ def test_gradients_follow_the_product_rule():
 
 
 def test_thick_media_keep_their_digits_in_the_gradient():
-    for merge in BOTH:
+    for merge in ALL:
         depth = torch.tensor([20.0], requires_grad=True)
         nothing = torch.zeros(1, dtype=torch.long)
         total, _ = merge(depth, torch.ones(1, 3), torch.ones(1), nothing, nothing)
@@ -86,8 +108,28 @@ def test_gradients_are_finite_differences():
     depth, colour, *rest = rays_of((0, 2, 0, 4, 1))
     depth.requires_grad_()
     colour.requires_grad_()
-    for merge in BOTH:
+    for merge in PLAIN:
         assert torch.autograd.gradcheck(lambda d, c, f=merge: f(d, c, *rest)[0], (depth, colour))
+
+
+def values_and_gradients(merge, depth, colour, *rest):
+    """Sums, weights, and gradients of depths and colours."""
+    leaves = [tensor.clone().requires_grad_() for tensor in (depth, colour)]
+    total, weights = merge(*leaves, *rest)
+    upstream = torch.linspace(-1, 1.3, total.numel(), dtype=total.dtype).view_as(total)
+    gradients = torch.autograd.grad((total * upstream).sum(), leaves)
+    return [found.detach() for found in (total, weights, *gradients)]
+
+
+def agree(ours, theirs, *, case, **tolerance):
+    for a, b in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(
+            a, b, check_dtype=False, equal_nan=True, msg=lambda m: f"{case}: {m}", **tolerance
+        )
+
+
+def doubled(inputs):
+    return [t.double() if t.is_floating_point() else t for t in inputs]
 
 
 DENSITIES = [0.0, 1e-30, 1e-8, 1e-3, 1.0, 30.0, 79.9, 80.1, 1e3, 1e8, 3e38, math.inf]
@@ -118,24 +160,14 @@ def test_no_density_makes_a_nan(loops, monkeypatch):
 @pytest.mark.parametrize("dtype", FLOATS)
 def test_loops_and_twin_agree_at_every_density(dtype):
     for value in (*DENSITIES, -1e-9, -1.0, -math.inf):
-        results = []
-        for merge in BOTH:
-            depth, colour, *rest = rays_of(dtype=dtype)
-            depth = depth.clone()
-            depth[::3] = value
-            depth.requires_grad_()
-            colour.requires_grad_()
-            total, weights = merge(depth, colour, *rest)
-            gradients = torch.autograd.grad((total * torch.arange(5)).sum(), (depth, colour))
-            results.append((total.detach(), weights, *gradients))
-        for ours, theirs in zip(*results, strict=True):
-            torch.testing.assert_close(
-                ours, theirs, atol=2e-5, rtol=1e-5, msg=lambda m, v=value: f"density {v}: {m}"
-            )
+        depth, colour, *rest = rays_of(dtype=dtype)
+        depth[::3] = value
+        found = [values_and_gradients(merge, depth, colour, *rest) for merge in PLAIN]
+        agree(*found, atol=2e-5, rtol=1e-5, case=f"density {value}")
 
 
 def test_a_nan_stays_on_its_ray():
-    for merge in BOTH:
+    for merge in ALL:
         depth, colour, distances, ray, starts = rays_of()
         clean, _ = merge(depth, colour, distances, ray, starts)
         depth = depth.clone()
@@ -148,7 +180,7 @@ def test_a_nan_stays_on_its_ray():
 
 
 def test_no_rays_and_rays_without_samples_see_nothing():
-    for merge in BOTH:
+    for merge in ALL:
         depth, colour, *rest = rays_of((0, 0, 0))
         depth.requires_grad_()
         total, weights = merge(depth, colour, *rest)
@@ -162,7 +194,7 @@ def test_no_rays_and_rays_without_samples_see_nothing():
 
 
 def test_an_opaque_sample_hides_all_behind_it():
-    for merge in BOTH:
+    for merge in ALL:
         inputs = list(rays_of((6,)))
         inputs[0] = torch.tensor([0.0, 0.0, math.inf, 5.0, 1e8, 1.0]).double()
         total, weights = merge(*inputs)
@@ -172,7 +204,7 @@ def test_an_opaque_sample_hides_all_behind_it():
 
 
 def test_weights_carry_no_gradient_and_only_what_asks_gets_one():
-    for merge in BOTH:
+    for merge in ALL:
         depth, colour, *rest = rays_of()
         _, weights = merge(depth.requires_grad_(), colour, *rest)
         assert not weights.requires_grad, merge.__name__
@@ -222,10 +254,127 @@ def test_weights_are_shares_of_the_light(depth, split):
     colour, distances = torch.ones(len(depth), 3), torch.arange(len(depth)).float()
     ray = (torch.arange(len(depth)) >= split).long()
     starts = torch.tensor([0, split])
-    for merge in BOTH:
+    for merge in PLAIN:
         total, weights = merge(tau, colour, distances, ray, starts)
         assert (weights >= 0).all()
         assert (total[:, :4] <= 1 + 1e-6).all()
         for r in (0, 1):
             through = math.exp(-min(700.0, float(tau[ray == r].double().sum())))
             assert float(total[r, 3]) == pytest.approx(1 - through, abs=1e-6)
+
+
+# Kernels alone
+
+
+needs_triton = pytest.mark.skipif(triton is None, reason="triton is not installed")
+
+LENGTHS = (1000, 0, 1, 31, 32, 33, 64, 65, 0)
+"""Samples of rays of one, and of many blocks, whole ones and not."""
+
+
+@needs_triton
+def test_sums_in_float32_keep_their_digits_on_long_rays():
+    for scale in (0.01, 0.3, 20.0):
+        inputs = rays_of(LENGTHS, torch.float32, scale=scale)
+        exact = values_and_gradients(composite_reference, *doubled(inputs))
+        ours, twins = (values_and_gradients(f, *inputs) for f in (kernels, composite_reference))
+        for found, twin, truth in zip(ours, twins, exact, strict=True):
+            errors = [float((t - truth).abs().max() / truth.abs().max()) for t in (found, twin)]
+            assert errors[0] < max(1e-6, 2 * errors[1]), (scale, errors)
+
+
+@needs_triton
+def test_faint_gradients_keep_their_digits_too():
+    """An optimiser scales them up: what is left of much light less much light would be noise."""
+    depth, colour, distances, ray, starts = rays_of((70,), torch.float32)
+    depth[::10] = 7.0
+    found = values_and_gradients(kernels, depth, colour, distances, ray, starts)
+    inputs = doubled((depth, colour, distances, ray, starts))
+    exact = values_and_gradients(composite_reference, *inputs)
+    assert exact[2].abs().min() < 1e-15
+    torch.testing.assert_close(found[2].double(), exact[2], atol=1e-28, rtol=1e-3)
+
+
+@needs_triton
+def test_places_without_a_sample_change_nothing_and_get_nothing():
+    room = 50
+    for counts in (COUNTS, (*COUNTS[:-1], 2)):
+        depth, colour, distances, ray, starts = filled = rays_of(counts)
+        given = len(ray)
+        more = room - given
+        padded = (
+            torch.cat([depth, torch.zeros(more)]),
+            torch.cat([colour, torch.rand(more, 3)]),
+            torch.cat([distances, torch.zeros(more)]),
+            torch.cat([ray, torch.full((more,), len(starts) - 1)]),
+            starts,
+        )
+        expected = values_and_gradients(composite_reference, *filled)
+        some = functools.partial(kernels, number=torch.tensor(given))
+        for merge in (some, composite_reference):
+            found = values_and_gradients(merge, *padded)
+            kept = [found[0], *(part[:given] for part in found[1:])]
+            agree(kept, expected, atol=1e-12, rtol=0, case=counts)
+            assert not any(part[given:].any() for part in (found[1], found[3]))
+        assert not values_and_gradients(some, *padded)[2][given:].any()
+
+
+@needs_triton
+def test_kernels_agree_with_the_twin_at_every_density():
+    depth, colour, *rest = rays_of((15, 1, 15), torch.float32)
+    values = torch.tensor((*DENSITIES, -1e-9, -1.0, -math.inf))
+    depth[:15], depth[16:] = values, values.flip(0)
+    found = values_and_gradients(kernels, depth, colour, *rest)
+    expected = values_and_gradients(composite_reference, *doubled((depth, colour, *rest)))
+    assert all(part.isfinite().all() for part in found)
+    agree(found, expected, atol=1e-6, rtol=1e-6, case="all densities")
+
+
+@needs_triton
+def test_a_nan_stays_on_its_ray_in_the_gradients_too():
+    depth, colour, *rest = rays_of()
+    expected = values_and_gradients(kernels, depth, colour, *rest)
+    depth[5] = math.nan
+    found = values_and_gradients(kernels, depth, colour, *rest)
+    others = rest[1] != rest[1][5]
+    for ours, clean in zip(found[2:], expected[2:], strict=True):
+        assert torch.equal(ours[others], clean[others])
+        assert ours[~others].isnan().any()
+
+
+@pytest.fixture
+def as_on_a_gpu(monkeypatch):
+    """Tensors of this machine are taken for ones on a GPU."""
+    monkeypatch.setattr(compositing, "cpu_loops", lambda tensor: False)
+    monkeypatch.setattr(compositing, "gpu_kernels", lambda tensor: True)
+    compositing._kernels_hold.cache_clear()
+    yield
+    compositing._kernels_hold.cache_clear()
+
+
+@needs_triton
+def test_kernels_are_used_once_they_have_proved_themselves(as_on_a_gpu, monkeypatch, caplog):
+    calls = []
+    real = compositing.composite_gpu
+    monkeypatch.setattr(
+        compositing, "composite_gpu", lambda *given: calls.append(len(given[3])) or real(*given)
+    )
+    for _ in range(2):
+        inputs = rays_of(dtype=torch.float32)
+        agree(composite(*inputs), composite_reference(*inputs), atol=1e-6, rtol=1e-5, case="used")
+    assert calls == [4, len(COUNTS), len(COUNTS)]  # One trial, two uses.
+    assert not caplog.records
+
+
+@needs_triton
+def test_kernels_that_come_to_other_numbers_are_not_used(as_on_a_gpu, monkeypatch, caplog):
+    def broken(optical_depth, *given):
+        total, weights = composite_gpu(optical_depth, *given)
+        return total * 1.01, weights
+
+    monkeypatch.setattr(compositing, "composite_gpu", broken)
+    inputs = rays_of(dtype=torch.float32)
+    for _ in range(2):
+        agree(composite(*inputs), composite_reference(*inputs), atol=0, rtol=0, case="refused")
+    (record,) = caplog.records
+    assert "compositing (torch.float32)" in record.getMessage()

@@ -9,6 +9,7 @@ import torch
 
 from tests.oracles import project
 from tests.synthetic import ball_views
+from xplanes.errors import ConfigError
 from xplanes.scenes.batches import NEAR_SILHOUETTE, RayBatches, RaySettings
 from xplanes.scenes.frame import Frame, cube_frame
 from xplanes.scenes.silhouettes import foreground
@@ -237,3 +238,19 @@ def test_only_rays_far_from_silhouettes_move_in_time_and_not_far():
 def test_a_static_scene_has_no_other_times():
     static = replace(VIEWS, times=torch.zeros(len(VIEWS)))
     assert not batches_of(static, background_jitter=0.2).draw(0)["times"].any()
+
+
+def test_batches_of_open_size_follow_the_device():
+    cpu, gpu = torch.device("cpu"), torch.device("cuda")
+    left_open = replace(SETTINGS, per_batch="auto", samples_per_batch="auto")
+    assert (left_open.most, left_open.most_samples) == (1024, 8192)
+    assert left_open.on(cpu) is left_open
+    assert len(batches_of(per_batch="auto").draw(0)["times"]) == 1024
+    large = left_open.on(gpu)
+    assert (large.per_batch, large.samples_per_batch) == (32768, 524288)
+    assert (large.fitting(256, 4096), left_open.fitting(256, 4096)) == (32768, 512)
+    assert SETTINGS.on(gpu) == SETTINGS
+    one_given = replace(left_open, per_batch=2048).on(gpu)
+    assert (one_given.per_batch, one_given.samples_per_batch) == (2048, 524288)
+    with pytest.raises(ConfigError, match="per_batch=many"):
+        replace(SETTINGS, per_batch="many")

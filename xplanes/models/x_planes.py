@@ -189,7 +189,8 @@ class XPlanesModel(Model):
         self._field, self.settings, self.weights = field, settings, settings.loss
         views = len(site.times)
         steps = self.weights.initial_steps
-        self.fade = None if steps is None else steps / views
+        self.fade = None if steps is None else steps / views / site.batch_scale
+        self.warmup = site.steps(settings.warmup_steps)
         self.opacity = self.weights.opacity
         self.total_variation = self.weights.total_variation
         if field.background is not None:
@@ -244,8 +245,7 @@ class XPlanesModel(Model):
         return terms
 
     def rate(self, step: int, progress: float) -> float:
-        settings = self.settings
-        return warm_cosine(step, progress, warmup=settings.warmup_steps, final=settings.final_lr)
+        return warm_cosine(step, progress, warmup=self.warmup, final=self.settings.final_lr)
 
     def regularise(self, state: TrainingState) -> None:
         every, field, weights = self.weights.every, self._field, self.weights

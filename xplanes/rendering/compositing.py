@@ -1,25 +1,33 @@
 """From densities and colours along rays to pixels."""
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from xplanes.backend import compiled, cpu_loops
+from xplanes.backend import compiled, cpu_loops, gpu_kernels, gpu_module, proven, waves
 
 OPAQUE = 80.0
 """Optical depth beyond which nothing is seen: exp(-80) is 2e-35."""
 
 
 def composite(
-    optical_depth: Tensor, colour: Tensor, distances: Tensor, ray: Tensor, starts: Tensor
+    optical_depth: Tensor,
+    colour: Tensor,
+    distances: Tensor,
+    ray: Tensor,
+    starts: Tensor,
+    number: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Merge the samples of each ray, by Beer and Lambert.
 
     ``w_i = exp(-sum_{j<i} tau_j) (1 - exp(-tau_i))`` within each ray, from sums of optical depths,
     so that no depth from 0 to the largest number makes a NaN or an infinity. A depth that is NaN
-    makes its ray NaN. Gradients reach depths and colours.
+    makes its ray NaN. Gradients reach depths and colours. On the CPU compiled loops do the work, on
+    CUDA Triton kernels where they prove themselves, elsewhere `composite_reference`.
 
     Args:
         optical_depth: Density times length of each sample, samples of a ray side by side from front
@@ -28,6 +36,8 @@ def composite(
         distances: Distance of each sample from the ray's origin. [N]
         ray: Ray of each sample, ascending. [N]
         starts: Index of each ray's first sample; of the next ray's where it has none. [R]
+        number: Samples that there are, where the tensors have room for more; None if they have not.
+            The places behind belong to the last ray and hold depths of 0. int64 []
 
     Returns:
         For each ray the sums of weight times (colour, 1, distance) in float32 or better, and the
@@ -38,6 +48,8 @@ def composite(
     colour, distances = colour.to(optical_depth.dtype), distances.to(optical_depth.dtype)
     if cpu_loops(optical_depth):
         return _Composite.apply(optical_depth, colour, distances, starts)  # type: ignore[return-value]
+    if gpu_kernels(optical_depth) and _kernels_hold(optical_depth.device, optical_depth.dtype):
+        return composite_gpu(optical_depth, colour, distances, starts, number)
     return composite_reference(optical_depth, colour, distances, ray, starts)
 
 
@@ -52,6 +64,17 @@ def composite_reference(
     values = torch.cat([colour, torch.ones_like(distances)[:, None], distances[:, None]], dim=1)
     total = torch.zeros(len(starts), 5, dtype=depth.dtype, device=depth.device)
     return total.index_add(0, ray, weights[:, None] * values), weights.detach()
+
+
+def composite_gpu(
+    optical_depth: Tensor,
+    colour: Tensor,
+    distances: Tensor,
+    starts: Tensor,
+    number: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """The same as `composite`, in Triton kernels: one for the values, one for the gradients."""
+    return _Kernels.apply(optical_depth, colour, distances, starts, number)  # type: ignore[return-value]
 
 
 def stopped(optical_depth: Tensor) -> Tensor:
@@ -107,3 +130,64 @@ class _Composite(torch.autograd.Function):
             d_colour.numpy(),
         )
         return d_depth, d_colour, None, None
+
+
+class _Kernels(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        optical_depth: Tensor,
+        colour: Tensor,
+        distances: Tensor,
+        starts: Tensor,
+        number: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        gpu = gpu_module("xplanes.rendering.gpu")
+        if number is None:
+            number = starts.new_full((), len(optical_depth))
+        inputs = [t.contiguous() for t in (optical_depth, colour, distances, starts, number)]
+        # Places behind the last sample are not written to.
+        weights, light = torch.zeros_like(inputs[0]), torch.empty_like(inputs[0])
+        total = optical_depth.new_empty(len(starts), 5)
+        gpu.launch(gpu.forward, len(starts), inputs, (weights, light, total), OPAQUE)
+        ctx.save_for_backward(*inputs, weights, light)
+        ctx.mark_non_differentiable(weights)
+        return total, weights
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        gpu = gpu_module("xplanes.rendering.gpu")
+        *inputs, weights, light = ctx.saved_tensors
+        d_depth, d_colour = torch.zeros_like(inputs[0]), torch.zeros_like(inputs[1])
+        gradient = gradients[0].to(weights.dtype).contiguous()
+        results = weights, light, gradient, d_depth, d_colour
+        gpu.launch(gpu.backward, len(gradient), inputs, results, OPAQUE)
+        return d_depth, d_colour, None, None, None
+
+
+@functools.cache
+def _kernels_hold(device: torch.device, dtype: torch.dtype) -> bool:
+    """Whether the kernels prove themselves on rays of several lengths, gradients included."""
+
+    def attempt(function: Callable[..., Any], precision: torch.dtype) -> list[Tensor]:
+        # A ray of many samples, one of none, and one of a single sample.
+        ray = torch.zeros(50, dtype=torch.int64, device=device)
+        ray[-1] = 2
+        starts = torch.searchsorted(ray, torch.arange(4, device=device))
+        leaves = [0.2 + waves(device, 50).abs(), waves(device, 50, 3)]
+        leaves = [leaf.to(precision).requires_grad_() for leaf in leaves]
+        distances = waves(device, 50).to(precision)
+        total, weights = function(*leaves, distances, ray, starts)
+        upstream = waves(device, 4, 5).to(precision)
+        return [total, weights, *torch.autograd.grad((total * upstream).sum(), leaves)]
+
+    def kernels(
+        optical_depth: Tensor, colour: Tensor, distances: Tensor, ray: Tensor, starts: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        return composite_gpu(optical_depth, colour, distances, starts)
+
+    what = f"compositing ({dtype})"
+    return proven(what, device, attempt, kernels, composite_reference, dtype)

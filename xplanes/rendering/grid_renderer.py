@@ -127,7 +127,12 @@ class GridRenderer(RayRenderer):
         if samples.live is not None:
             density = torch.where(samples.live, density, 0)
         total, weights = composite(
-            density * self.step, colour, samples.distances, samples.ray, samples.starts
+            density * self.step,
+            colour,
+            samples.distances,
+            samples.ray,
+            samples.starts,
+            samples.number,
         )
         opacity = total[:, 3]
         background = behind(field, origins, directions, opacity, background, jitter)
@@ -201,7 +206,24 @@ class OccupancySettings(SamplerSettings):
                 carve(grid, site.views, site.frame)
             if site.initialised and self.fill:
                 _fill(renderer, field, site)
-        return OccupancySampler(renderer, self, site.samples_per_batch)
+        return OccupancySampler(
+            renderer,
+            self.scaled(site),
+            site.samples_per_batch,
+            unseen_from=site.steps(UNSEEN_FROM),
+        )
+
+    def scaled(self, site: Site) -> "OccupancySettings":
+        """The same schedule in steps of the batches of a site.
+
+        Random cells are looked at as often as before, for rays of large batches meet more cells.
+        """
+        return replace(
+            self,
+            coarse_steps=site.steps(self.coarse_steps),
+            sweep_at=[site.steps(step) for step in self.sweep_at],
+            sweep_every=site.steps(self.sweep_every),
+        )
 
     def for_video(self) -> "OccupancySettings":
         return replace(self, render_samples=self.samples)
@@ -227,12 +249,18 @@ class OccupancySampler(Sampler):
         renderer: Its grid is changed in place.
         settings: Upkeep of the grid.
         samples: Samples of a batch on average at most; None if not known.
+        unseen_from: Step of the first sweep after which a cell may count as unseen.
     """
 
     def __init__(
-        self, renderer: GridRenderer, settings: OccupancySettings, samples: int | None = None
+        self,
+        renderer: GridRenderer,
+        settings: OccupancySettings,
+        samples: int | None = None,
+        unseen_from: int = UNSEEN_FROM,
     ) -> None:
         self.settings, self.grid, self.samples = settings, renderer.grid, samples
+        self.unseen_from = unseen_from
         room = None if samples is None else self._room(samples)
         self._training = replace(renderer, thinning=settings.thinning, room=room)
         self._coarse = replace(self._training, samples=math.ceil(renderer.samples / 2))
@@ -291,7 +319,7 @@ class OccupancySampler(Sampler):
         self._agree()
         generator = step_generator(state.seed, step, Stream.GRID)
         if sweeping:
-            if step >= UNSEEN_FROM:
+            if step >= self.unseen_from:
                 self.grid.forget_light()
             self.grid.sweep(field, generator)
         elif (device := self.grid.density.device).type != "cpu":

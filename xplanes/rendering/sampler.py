@@ -44,6 +44,7 @@ class Site:
             something to see behind the field's cube.
         device: Where it is going to be trained; the CPU when None.
         samples_per_batch: Samples of a training batch on average; None if not known.
+        batch_scale: Size of a batch over that for which schedules are made, see `steps`.
     """
 
     frame: Frame
@@ -56,6 +57,11 @@ class Site:
     surrounded: bool = False
     device: torch.device | None = None
     samples_per_batch: int | None = None
+    batch_scale: float = 1.0
+
+    def steps(self, count: int) -> int:
+        """Steps that show as many rays as so many steps of the batches of the schedules."""
+        return math.ceil(count / self.batch_scale)
 
     @property
     def unit(self) -> float:

@@ -2,7 +2,7 @@
 
 import copy
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -47,6 +47,12 @@ LARGEST_SHARE = 0.25
 AHEAD = 8
 """Batches whose tiles the system is told to read in advance."""
 
+CPU_RAYS, CPU_SAMPLES = 1024, 8192
+"""Largest batch on the CPU where the settings leave it open; schedules in steps are made for it."""
+
+GPU_RAYS, GPU_SAMPLES = 2**15, 2**19
+"""The same on a GPU, which a small batch leaves idle."""
+
 
 class Batches(ABC):
     """Training batches as a function of (seed, step, rank).
@@ -71,6 +77,10 @@ class BatchSettings(Settings, ABC):
     """What a training step gets to see."""
 
     accumulate: Count  # Batches per optimiser step.
+
+    def on(self, device: torch.device) -> "BatchSettings":
+        """The same with sizes that suit a device, where these are open."""
+        return self
 
     @property
     @abstractmethod
@@ -106,20 +116,30 @@ class BatchSettings(Settings, ABC):
 class RaySettings(BatchSettings):
     """Which rays a training step gets."""
 
-    per_batch: Count  # Maximum number of rays per batch.
-    samples_per_batch: Count  # Maximum number of samples per batch, on average.
+    # Maximum number of rays per batch. auto: 1024 on the CPU, 32768 on a GPU, where schedules of
+    # X-Planes and of the occupancy grid take 1/32 of their steps.
+    per_batch: Count | Literal["auto"]
+    # Maximum number of samples per batch, on average. auto: 8192 on the CPU, 524288 on a GPU.
+    samples_per_batch: Count | Literal["auto"]
     background: Literal["white", "random", "one"]  # random: per ray; one: random per batch.
     skip_background: bool  # Sample rays near silhouettes, and where something changes, more often.
     background_share: Share  # Share of rays far from the silhouettes.
     background_jitter: Share  # Maximum random offset of the times of these rays.
 
+    def on(self, device: torch.device) -> "RaySettings":
+        if device.type == "cpu":
+            return self
+        rays = GPU_RAYS if self.per_batch == "auto" else self.per_batch
+        samples = GPU_SAMPLES if self.samples_per_batch == "auto" else self.samples_per_batch
+        return replace(self, per_batch=rays, samples_per_batch=samples)
+
     @property
     def most(self) -> int:
-        return self.per_batch
+        return CPU_RAYS if self.per_batch == "auto" else self.per_batch
 
     @property
     def most_samples(self) -> int:
-        return self.samples_per_batch
+        return CPU_SAMPLES if self.samples_per_batch == "auto" else self.samples_per_batch
 
     def batches(self, views: Views, frame: Frame, *, seed: int, rank: int) -> "RayBatches":
         return RayBatches(views, frame, self, seed=seed, rank=rank)
@@ -129,8 +149,8 @@ class RaySettings(BatchSettings):
 
     def fitting(self, rays: int, samples: int) -> int:
         """As many as keep the samples near their maximum."""
-        room = self.samples_per_batch * rays / max(1, samples)
-        return max(64, min(self.per_batch, int(room)))
+        room = self.most_samples * rays / max(1, samples)
+        return max(64, min(self.most, int(room)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,7 +243,7 @@ class RayBatches(Batches):
         self, views: Views, frame: Frame, settings: RaySettings, *, seed: int, rank: int = 0
     ) -> None:
         self.views, self.frame = views, frame
-        self.rays, self.seed, self.rank = settings.per_batch, seed, rank
+        self.rays, self.seed, self.rank = settings.most, seed, rank
         self.background = settings.background
         widths = views.intrinsics.size[:, 1].tolist()
         margins = [max(1, round(NEAR_SILHOUETTE * width)) for width in widths]

@@ -78,6 +78,8 @@ class RadianceModule(LightningModule):
         # Not the plug-ins: a file from somebody else must not choose what is imported.
         self.save_hyperparameters({"config": kept})
         self._plugins = tuple(plugins)
+        self.ray_settings: BatchSettings = self.method.model.rays
+        """What a training step gets to see; once the field is built, on its device."""
         self.model: Model | None = None
         self.sampler: Sampler | None = None
         self.site: Site | None = None
@@ -169,6 +171,8 @@ class RadianceModule(LightningModule):
         found = Initialisation(method.model, frame)
         if initialise is not None:
             found = initialise(method, Place(scene, frame, device, devices, say))
+        rays = self.method.model.rays
+        self.ray_settings = rays.on(device)
         site = Site(
             frame=found.frame,
             # In a field without time planes all views are of one timestep.
@@ -180,7 +184,8 @@ class RadianceModule(LightningModule):
             initialised=found.values is not None,
             surrounded=scene.is_surrounded,
             device=device,
-            samples_per_batch=found.model.rays.most_samples,
+            samples_per_batch=self.ray_settings.most_samples,
+            batch_scale=self.ray_settings.most / rays.most if rays.most else 1.0,
         )
         self.initialisation = found
         self._assemble(found.model, site)
@@ -194,17 +199,12 @@ class RadianceModule(LightningModule):
         for name, part in self.sampler.parts.items():
             self.add_module(name, part)
         self.site, self._settings = site, settings
-        self.rays = self.sampler.first_rays(settings.rays.most)
+        self.rays = self.sampler.first_rays(self.ray_settings.most)
 
     @property
     def frame(self) -> Frame | None:
         """The field's frame; None before it is built."""
         return None if self.site is None else self.site.frame
-
-    @property
-    def ray_settings(self) -> BatchSettings:
-        """What a training step gets to see."""
-        return self.method.model.rays
 
     @property
     def renderer(self) -> Renderer:
@@ -612,7 +612,7 @@ class RadianceModule(LightningModule):
             precision=_precision(settings, torch.device("cpu")),
             bounds=content["bounds"],
             surrounded=content.get("surrounded", False),  # Not in older checkpoints.
-            samples_per_batch=settings.rays.most_samples,
+            samples_per_batch=self.ray_settings.most_samples,
         )
         self._assemble(settings, site)
 

@@ -177,6 +177,14 @@ def test_seeds_are_averaged(tmp_path):
     assert "seed" not in rows[0]
 
 
+def test_a_repetition_with_the_same_seed_is_no_second_seed(tmp_path):
+    for name, seed in (("0", 0), ("1", 0), ("2", 1)):
+        make(tmp_path / name, seed=seed, psnr=20.0 + seed)
+    assert "20.50 ± 0.71" in write_tables(tmp_path)
+    shutil.rmtree(tmp_path / "2")
+    assert "standard deviation" not in write_tables(tmp_path)
+
+
 def test_without_two_seeds_there_are_no_means(tmp_path):
     make(tmp_path / "0", resolution=32)
     make(tmp_path / "1", resolution=64)

@@ -116,14 +116,18 @@ def _measures(rows: Iterable[RunRow]) -> list[str]:
 
 
 def seed_groups(rows: Sequence[RunRow]) -> list[list[RunRow]]:
-    """Finished runs that differ in nothing but their seed, if there are two such runs at all."""
-    groups: dict[str, list[RunRow]] = {}
+    """Finished runs that differ in nothing but their seed, if there are two such runs at all.
+
+    Of runs with the same settings and the same seed, which a repetition is, the first counts.
+    """
+    groups: dict[str, dict[str, RunRow]] = {}
     for row in rows:
         if row.status == "finished" and row.settings and {"psnr", "ssim"} <= row.scores.keys():
             rest = {k: v for k, v in row.settings.items() if k not in (SEED, *UNLISTED)}
-            groups.setdefault(json.dumps(rest, sort_keys=True, default=str), []).append(row)
+            group = groups.setdefault(json.dumps(rest, sort_keys=True, default=str), {})
+            group.setdefault(_text(row.settings.get(SEED)), row)
     several = any(len(group) > 1 for group in groups.values())
-    return list(groups.values()) if several else []
+    return [list(group.values()) for group in groups.values()] if several else []
 
 
 def seed_table(

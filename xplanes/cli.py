@@ -432,7 +432,12 @@ def _add_sheet(commands: "argparse._SubParsersAction") -> None:
     parser.add_argument(
         "--size", type=int, default=160, help="pixels of a picture; default: %(default)s"
     )
-    parser.add_argument("--out", type=Path, metavar="FILE.png", help="default: sheet.png in FOLDER")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="FILE.png, or with --what steps FILE.webp, a film; default: sheet.png in FOLDER",
+    )
     parser.set_defaults(command=_sheet)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from tests.evaluation.test_table import make
 from xplanes.cli import main
@@ -70,6 +70,28 @@ def test_steps_stand_side_by_side_a_row_per_run(tmp_path: Path) -> None:
     assert areas(path) == {TRUE: 2 * 40 * 40, DEPTH: 2 * 40 * 40}
 
 
+def test_a_film_shows_a_step_after_the_other_beside_the_truth(tmp_path: Path) -> None:
+    for number, steps in enumerate([(0, 20, 50), (0, 80)]):
+        pictured(tmp_path / f"{number}", model=f"{number}", steps=steps)
+    film = write_sheet(tmp_path, tmp_path / "film.webp", what="steps", size=40)
+    frames, milliseconds = [], []
+    with Image.open(film) as picture:
+        for frame in ImageSequence.Iterator(picture):
+            frames.append(np.asarray(frame.convert("RGB")).reshape(-1, 3).astype(int))
+            milliseconds.append(frame.info["duration"])
+
+    def area(frame: int, colour: tuple[int, int, int]) -> int:
+        # Of a lossy picture; the greens of two steps are at least 20 apart.
+        return int((np.abs(frames[frame] - colour).max(axis=1) < 8).sum())
+
+    for frame, shown in enumerate([(0, 0), (20, 80), (50, 80)]):
+        for step in {0, 20, 50, 80}:
+            expected = shown.count(step) * 40 * 40
+            assert area(frame, green(step)) == pytest.approx(expected, abs=400), (frame, step)
+        assert area(frame, TRUE) == pytest.approx(2 * 40 * 40, abs=400)
+    assert milliseconds == [500, 500, 2000]
+
+
 def test_parts_are_shown_whole(tmp_path: Path) -> None:
     run = pictured(tmp_path / "0")
     with pytest.raises(ConfigError, match=r"no run has media/decomposition\.png: only runs that"):
@@ -97,7 +119,8 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
         ({"show": "truth"}, r"^show=truth: must be one of colour, error, depth$"),
         ({"what": "all"}, r"^sheet=all: must be null or one of runs, steps, parts$"),
         ({"size": 3}, r"^size=3"),
-        ({"out": tmp_path / "x.jpg"}, r"x\.jpg: a contact sheet must end in \.png"),
+        ({"out": tmp_path / "x.jpg"}, r"x\.jpg: a contact sheet must end in \.png, or with"),
+        ({"out": tmp_path / "x.webp"}, r"x\.webp: a contact sheet must end in \.png, or with"),
     ]
     for options, words in cases:
         with pytest.raises(ConfigError, match=words):

@@ -4,15 +4,17 @@ Everything comes from the pictures that runs write while they train (``media/``)
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from xplanes.errors import ConfigError
 from xplanes.evaluation.curves import SCENE, run_label
+from xplanes.evaluation.render import write_video
 from xplanes.evaluation.sweep import RunRow, read_rows
 from xplanes.evaluation.tabulate import SEED, align, differing
 from xplanes.files import replacing
@@ -25,6 +27,12 @@ and sparse part of each run's triplanes."""
 
 LINE, GAP = 16, 4
 """Pixels of a line of text, and between tiles."""
+
+FPS, HELD = 2, 4
+"""Frames of a film per second, and how often its last one is shown."""
+
+Line = tuple[str, Sequence["Tile"]]
+"""A row of tiles with its title."""
 
 _STEP = re.compile(r"step(\d+)")
 
@@ -51,7 +59,8 @@ def write_sheet(
 
     Args:
         folder: A run, a sweep, or any folder of runs.
-        out: The picture, a PNG; ``folder/sheet.png`` when None.
+        out: The picture, a PNG, or for steps a film, a WebP with a frame per step;
+            ``folder/sheet.png`` when None.
         what: One of `WHAT`.
         show: One of `xplanes.rendering.pictures.STRIP`: what is shown of a view.
         view: Name of the view, as in ``media``; the middle one of those that all runs of a scene
@@ -64,8 +73,10 @@ def write_sheet(
     """
     out = out or folder / "sheet.png"
     check_what(what)
-    if out.suffix != ".png":
-        raise ConfigError(f"{out}: a contact sheet must end in .png")
+    if out.suffix not in ((".png", ".webp") if what == "steps" else (".png",)):
+        raise ConfigError(
+            f"{out}: a contact sheet must end in .png, or with --what steps in .webp for a film"
+        )
     if size < 16:
         raise ConfigError(f"size={size}: a tile must have 16 pixels at least")
     if not folder.is_dir():
@@ -79,8 +90,11 @@ def write_sheet(
         lines = _parts(found, over)
     else:
         lines = _views(found, over, what, show, view, steps, size)
+    if out.suffix == ".webp":
+        frames = (torch.from_numpy(np.array(sheet)) for sheet in _film(lines))
+        return write_video(out, frames, fps=FPS)
     with replacing(out) as temporary:
-        _assemble(lines).save(temporary, format="PNG", optimize=True)
+        _assemble(lines, _cell(lines)).save(temporary, format="PNG", optimize=True)
     return out
 
 
@@ -218,19 +232,32 @@ def _score(strip: Image.Image) -> float:
     return psnr(both[:, width : 2 * width], both[:, :width])
 
 
-def _assemble(lines: Sequence[tuple[str, Sequence[Tile]]]) -> Image.Image:
+def _film(lines: Sequence[Line]) -> Iterator[Image.Image]:
+    """Sheets of the truth beside one step after another; runs with fewer steps wait at the end."""
+    last = max(len(tiles) for _, tiles in lines) - 1
+    for step in [*range(1, last), *[last] * HELD]:
+        shown = [(title, [tiles[0], tiles[min(step, len(tiles) - 1)]]) for title, tiles in lines]
+        yield _assemble(shown, _cell(lines))
+
+
+def _cell(lines: Sequence[Line]) -> int:
+    """Pixels from one column to the next: what the widest picture or caption takes."""
+    font = ImageFont.load_default(11)
+    wide = [
+        max(tile.picture.width, max(font.getlength(line) for line in tile.caption.split("\n")))
+        for _, tiles in lines
+        for tile in tiles
+    ]
+    return int(max(wide)) + GAP
+
+
+def _assemble(lines: Sequence[Line], cell: int) -> Image.Image:
     """Titled rows of tiles with captions, on white."""
     font = ImageFont.load_default(11)
     boxes = []
     for _, tiles in lines:
         text = LINE * max(tile.caption.count("\n") + 1 for tile in tiles)
         boxes.append((LINE, max(tile.picture.height for tile in tiles), text))
-    wide = [
-        max(tile.picture.width, max(font.getlength(line) for line in tile.caption.split("\n")))
-        for _, tiles in lines
-        for tile in tiles
-    ]
-    cell = int(max(wide)) + GAP
     columns = max(len(tiles) for _, tiles in lines)
     width = max(cell * columns, *(int(font.getlength(title)) + GAP for title, _ in lines)) + GAP
     height = sum(map(sum, boxes)) + GAP * (2 * len(lines) + 1)

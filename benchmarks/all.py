@@ -65,7 +65,7 @@ def scripts(folder: Path) -> dict[str, list[list[str]]]:
         ["--together", "2"],
         [*models, "--name", "captures_models"],
         [*models, "--name", "captures_test", "--scenes", "phone_test,rig_test", "--seeds", "3"],
-        [*models, "--name", "suite_models", "--scenes", "dark_test,topology_test,off_centre_test"],
+        [*models, "--name", "suite_models", "--scenes", "dark_test,topology_test,occlusion_test"],
     ]
     given["where_time_goes"] = [[], ["--name", "lego", *lego(folder.resolve())]]
     return {name: given.get(name, [[]]) for name in PARTS}

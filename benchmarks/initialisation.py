@@ -4,12 +4,12 @@
         [--seeds 3] [--resolution 100] [--together 1] [--work FOLDER]
 
 Writes docs/results/initialisation.md, .csv and .png. Each scene is trained from random
-initialisation and from the bundled `tiny`: with all views for --seconds, and with five of them for
---few-seconds. The preparation of `tiny` is part of its time: it is measured first, and training
-gets what is left. Demo scenes bring a video of a fixed camera, whose frames the LRM sees and random
-initialisation does not; lego and the suite's scenes have none, so a field is trained to film them,
-and both see the same images. Each run is a process of its own with one thread, and seconds are
-those of its CPU time (cpu_clock.py); ``--together`` so many run side by side.
+initialisation and from the bundled `tiny`: with all views for --seconds, demo scenes also with five
+of them for --few-seconds. The preparation of `tiny` is part of its time: it is measured first, and
+training gets what is left. Demo scenes bring a video of a fixed camera, whose frames the LRM sees
+and random initialisation does not; lego and the suite's scenes have none, so a field is trained to
+film them, and both see the same images. Each run is a process of its own with one thread, and
+seconds are those of its CPU time (cpu_clock.py); ``--together`` so many run side by side.
 """
 
 import argparse

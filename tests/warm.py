@@ -62,6 +62,12 @@ class Running:
 
 
 @cache
+def outputs() -> tempfile.TemporaryDirectory[str]:
+    """Where the commands' outputs go, until the tests end."""
+    return tempfile.TemporaryDirectory()
+
+
+@cache
 def server() -> subprocess.Popen[str]:
     """The process that has loaded everything; one for all tests of a worker."""
     environment = os.environ | waiting(os.environ)
@@ -81,7 +87,7 @@ def server() -> subprocess.Popen[str]:
 
 def start(*arguments: str, cwd: Path = ROOT) -> Running:
     """Begin ``python ARGUMENTS``, of which the first is a script or -m; one at a time."""
-    warm, folder = server(), Path(tempfile.mkdtemp())
+    warm, folder = server(), Path(tempfile.mkdtemp(dir=outputs().name))
     job: dict[str, Any] = {"arguments": arguments, "cwd": str(cwd), "environment": {**os.environ}}
     job |= {stream: str(folder / stream) for stream in ("out", "err")}
     assert warm.stdin is not None

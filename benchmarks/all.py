@@ -41,6 +41,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "gaussians": (*TRAINING, "xplanes/preparation"),
     "captures": (*TRAINING, "xplanes/scenes"),
     "initialisation": (*TRAINING, *START[1:]),
+    "lrm_quality": (*TRAINING, *START[1:], "xplanes/pretraining"),
     "stages": START,
     "pareto": (*TRAINING, *START[1:]),
     "lrm_sizes": ("xplanes/lrm",),
@@ -57,9 +58,9 @@ PARTS: dict[str, tuple[str, ...]] = {
 def scripts(folder: Path) -> dict[str, list[list[str]]]:
     """The arguments of each script's runs, by its name; ``folder`` is that of lego."""
     scene = ["--lego", str(folder)]
-    given = {name: [scene] for name in ("lego_curves", "skips", "rendering", "gaussians", "pareto")}
+    given = {name: [scene] for name in ("lego_curves", "skips", "rendering", "pareto")}
     # CPU seconds: runs side by side do not disturb one another.
-    given["initialisation"] = [[*scene, "--together", "2"]]
+    given["initialisation"] = given["gaussians"] = [[*scene, "--together", "2"]]
     models = ["--variants", "world,kplanes,tineuvox_s", "--seconds", "30", "--together", "2"]
     given["captures"] = [
         ["--together", "2"],
@@ -67,6 +68,7 @@ def scripts(folder: Path) -> dict[str, list[list[str]]]:
         [*models, "--name", "captures_test", "--scenes", "phone_test,rig_test", "--seeds", "3"],
         [*models, "--name", "suite_models", "--scenes", "dark_test,topology_test,occlusion_test"],
     ]
+    given["lrm_quality"] = [["--together", "2"]]
     given["where_time_goes"] = [[], ["--name", "lego", *lego(folder.resolve())]]
     return {name: given.get(name, [[]]) for name in PARTS}
 

@@ -1,12 +1,13 @@
-"""Gaussians and their initialisations against six planes, after equal seconds of one core.
+"""Gaussians against six planes, and their initialisations, after equal seconds of one core.
 
-    python benchmarks/gaussians.py [--lego FOLDER] [--seconds 12 24] [--work FOLDER] [--only CASE]
+    python benchmarks/gaussians.py [--lego FOLDER] [--seconds 24] [--large 60] [--seeds 3]
+        [--together 1] [--work FOLDER]
 
-Writes docs/results/gaussians.md and gaussians.csv. Seconds are those that the process
-has computed on one thread, so that other programs on the machine do not count; the initialisation's
-are among them; after the second number of seconds, 4D-GS on the hull and from a field alone are
-compared. Runs kept in the work folder are not repeated; ``--only`` makes the runs of one case
-and no tables.
+Writes docs/results/gaussians.md and gaussians.csv. Seconds are those that a process has computed on
+one thread, so that others do not count, and the initialisation's are among them; scenes of 400
+pixels get --large. Models are compared on all scenes with one seed, initialisations on two demo
+scenes with --seeds. ``--together`` so many run side by side; what the work folder holds is not
+repeated.
 """
 
 import os
@@ -14,11 +15,14 @@ import os
 os.environ.update(OMP_NUM_THREADS="1", NUMBA_NUM_THREADS="1")
 
 import argparse
-import json
+import gc
+import statistics
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from lightning.pytorch.callbacks import Callback
@@ -26,29 +30,44 @@ from runner import RESULTS, command, lego, machine, markdown
 
 from xplanes.config import compose_plain
 from xplanes.fields.gaussians import Gaussians
-from xplanes.files import write_json, write_rows, write_text
+from xplanes.files import read_json, write_json, write_rows, write_text
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Views
 from xplanes.training.evaluation import ViewScore, mean_scores, render_view, score_view
 from xplanes.training.fit import Trainer
 from xplanes.training.module import RadianceModule
 
+GAUSSIANS = ("gaussians_hexplane", "gaussians_deform", "gaussians_spacetime")
+MODELS = {"six_planes": ("model=six_planes", "lrm=none")}
+MODELS |= {model: (f"model={model}", "model.points=silhouettes") for model in GAUSSIANS}
+
 INITIALISATIONS = {
     "hull": ("model.points=silhouettes",),
     "random points": ("model.points=random",),
     "field": ("lrm=field",),
 }
-MODELS = {
-    "six_planes, random planes": ("model=six_planes", "lrm=none"),
-    **{
-        f"{model}, {name}": (f"model={model}", *how)
-        for model in ("gaussians_hexplane", "gaussians_deform", "gaussians_spacetime")
-        for name, how in INITIALISATIONS.items()
-    },
-}
-LONGER = ("gaussians_hexplane, hull", "gaussians_hexplane, field")
+DEMOS = ("excavator", "walker", "balls", "windmill")
+SUITE = ("dark_test", "topology_test", "wires_test", "occlusion_test", "texture_test")
+LEGO = (100, 200, 400)
+
 COLUMNS = ("scene", "model", "psnr", "ssim", "first psnr", "initialisation s", "seconds", "steps")
-COLUMNS += ("gaussians", "ms per view")
+COLUMNS += ("gaussians", "ms per view", "peak GB")
+DIGITS = {"psnr": 2, "ssim": 3, "first psnr": 2, "initialisation s": 1, "seconds": 0}
+DIGITS |= {"ms per view": 0, "peak GB": 1}
+
+
+class Case(NamedTuple):
+    """A run: what it is called, its overrides and its seconds."""
+
+    scene: str
+    model: str
+    overrides: tuple[str, ...]
+    seconds: float
+    seed: int = 0
+
+    @property
+    def name(self) -> str:
+        return f"{self.scene}, {self.model}, {self.seconds:g} s, seed {self.seed}"
 
 
 class Computed(Callback):
@@ -73,10 +92,11 @@ class Computed(Callback):
         trainer.should_stop = self.spent >= self.budget
 
 
-def measure(overrides: list[str], seconds: float) -> dict[str, Any]:
+def measure(overrides: list[str], seconds: float, seed: int = 0) -> dict[str, Any]:
     """Train once, and score all views of the split."""
-    config = compose_plain("train", overrides)
-    data, module = SceneDataModule(config["data"], seed=0), RadianceModule(config)
+    forget_peak()
+    config = compose_plain("train", [*overrides, f"seed={seed}"])
+    data, module = SceneDataModule(config["data"], seed=seed), RadianceModule(config)
     clock = Computed(seconds)
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(
@@ -111,6 +131,7 @@ def measure(overrides: list[str], seconds: float) -> dict[str, Any]:
         "seconds": spent,
         "ms per view": 1000 * (time.process_time() - began) / len(views),
         "gaussians": len(module.field) if isinstance(module.field, Gaussians) else None,
+        "peak GB": None if (peak := peak_memory()) is None else peak / 1e9,
     }
 
 
@@ -120,77 +141,133 @@ def _scores(module: RadianceModule, data: SceneDataModule, views: Views) -> list
     return [score_view(*seen, index, data.scene.background)[0] for index in range(len(views))]
 
 
-def cases(folder: Path | None) -> dict[str, list[str]]:
-    """Overrides of the scenes by name."""
-    found = {}
-    if folder is not None:
-        found |= {f"lego, {px} px": [*lego(folder), f"data.resolution={px}"] for px in (100, 200)}
-    for scene in ("excavator", "walker"):
-        found[f"{scene}, 100 px"] = [f"data.scene={scene}", "data.resolution=100"]
+def peak_memory() -> int | None:
+    """Bytes that this process has held at most since `forget_peak`; None where Linux is not."""
+    status = Path("/proc/self/status")
+    if not status.is_file():
+        return None
+    lines = dict(line.split(":", 1) for line in status.read_text(encoding="utf-8").splitlines())
+    return 1024 * int(lines["VmHWM"].split()[0])
+
+
+def forget_peak() -> None:
+    """Let `peak_memory` begin with what is held now."""
+    gc.collect()
+    if (file := Path("/proc/self/clear_refs")).is_file():
+        file.write_text("5", encoding="utf-8")
+
+
+def comparison(args: argparse.Namespace) -> list[Case]:
+    """Each model on each scene."""
+    scenes: dict[str, tuple[str, ...]] = {}
+    for name in DEMOS:
+        scenes[f"{name}, 100 px"] = (f"data.scene={name}", "data.resolution=100")
+    for name in SUITE:
+        scenes[f"{name}, 100 px"] = ("data=suite", f"data.scene={name}", "data.resolution=100")
+    if args.lego is not None:
+        for px in LEGO:
+            scenes[f"lego (val), {px} px"] = (*lego(args.lego.resolve()), f"data.resolution={px}")
+    return [
+        Case(scene, model, (*where, *how), args.large if "400 px" in scene else args.seconds)
+        for scene, where in scenes.items()
+        for model, how in MODELS.items()
+    ]
+
+
+def beginnings(args: argparse.Namespace) -> list[Case]:
+    """Each initialisation of Gaussians on two scenes."""
+    found = []
+    for scene in DEMOS[:2]:
+        where = (f"data.scene={scene}", "data.resolution=100")
+        for model in GAUSSIANS:
+            for name, how in INITIALISATIONS.items():
+                # The hull's first seed is a row of the comparison.
+                title = model if name == "hull" else f"{model}, {name}"
+                given = (*where, f"model={model}", *how)
+                found += [
+                    Case(f"{scene}, 100 px", title, given, args.seconds, seed)
+                    for seed in range(args.seeds)
+                ]
     return found
 
 
-def _begins(rows: list[dict[str, Any]]) -> str:
-    """A table of what the hull's alternatives give, scene by scene and model by model."""
-    found = {(row["budget"], row["scene"], row["model"]): row["psnr"] for row in rows}
+def warm() -> None:
+    """What a process does before its first run: loops are compiled on first use."""
+    torch.set_num_threads(1)
+    measure(["model=six_planes", "lrm=none", "data.resolution=16"], 0.2)
+    measure(["model=gaussians_hexplane", "data.resolution=16"], 0.2)
+
+
+def result(case: Case, work: Path) -> dict[str, Any]:
+    """What a case measured, now or before."""
+    path = work / f"{case.name}.json"
+    if not path.is_file():
+        print(case.name, flush=True)
+        made = [*case.overrides, "preparation.cache=null"]
+        write_json(path, measure(made, case.seconds, case.seed))
+    return read_json(path)
+
+
+def shown(case: Case, row: dict[str, Any]) -> tuple[str, ...]:
+    named = {"scene": case.scene, "model": case.model} | row
+    return tuple(
+        "" if named[c] is None else f"{named[c]:.{DIGITS[c]}f}" if c in DIGITS else f"{named[c]}"
+        for c in COLUMNS
+    )
+
+
+def begins(found: dict[Case, dict[str, Any]]) -> str:
+    """PSNR of each initialisation: mean and standard deviation over the seeds."""
+    groups: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for case, row in found.items():
+        model, _, name = case.model.partition(", ")
+        group = groups.setdefault((case.scene, model), {})
+        group.setdefault(name or "hull", []).append(row["psnr"])
     lines = []
-    for seconds, scene, name in found:
-        model, _, begin = name.rpartition(", ")
-        if begin == "hull":
-            hull = found[seconds, scene, name]
-            others = [
-                found.get((seconds, scene, f"{model}, {n}")) for n in list(INITIALISATIONS)[1:]
-            ]
-            gains = ["" if psnr is None else f"{psnr - hull:+.2f}" for psnr in others]
-            lines.append((seconds, scene, model, f"{hull:.2f}", *gains))
-    return markdown(("seconds", "scene", "model", *INITIALISATIONS), lines)
+    for key, group in groups.items():
+        cells = []
+        for name in INITIALISATIONS:
+            spread = f" ± {statistics.stdev(group[name]):.2f}" if len(group[name]) > 1 else ""
+            cells.append(f"{statistics.mean(group[name]):.2f}{spread}")
+        lines.append((*key, *cells))
+    return markdown(("scene", "model", *INITIALISATIONS), lines)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--lego", type=Path)
-    parser.add_argument("--seconds", type=float, nargs="+", default=[12.0, 24.0])
-    parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "gaussians")
-    parser.add_argument("--only")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    # Loops are compiled on first use.
-    measure(["model=six_planes", "lrm=none", "data.resolution=16"], 0.2)
-    rows = []
-    for number, seconds in enumerate(options.seconds):
-        for scene, where in cases(options.lego).items():
-            for model, how in MODELS.items():
-                case = f"{scene}, {model}"
-                if options.only not in (None, case) or (number and model not in LONGER):
-                    continue
-                path = options.work / f"{case}, {seconds:g} s.json"
-                if not path.is_file():
-                    made = [*where, *how, "preparation.cache=null"]
-                    write_json(path, measure(made, seconds))
-                named = {"scene": scene, "model": model, "budget": f"{seconds:g}"}
-                rows.append(named | json.loads(path.read_text()))
-    if options.only is not None:
-        return
-    digits = {"psnr": 2, "ssim": 4, "first psnr": 2, "initialisation s": 1, "seconds": 1}
-    digits["ms per view"] = 0
-    table = [
-        tuple(
-            f"{row[c]:.{digits[c]}f}" if c in digits else "" if row[c] is None else f"{row[c]}"
-            for c in COLUMNS
-        )
-        for row in rows
-    ]
-    begins = _begins(rows)
-    write_rows(RESULTS / "gaussians.csv", COLUMNS, table)
-    text = (
-        "# Gaussians against six planes\n\nSeconds are of one core, and each run's "
-        "initialisation is among them; seed 0; scored on the test split of demo scenes and the val "
-        "split of lego. Gaussians begin on the silhouettes' hull (`model.points=silhouettes`, the "
-        "default), anywhere (`model.points=random`), or on the surfaces of a six-plane field that "
-        "is trained first (`lrm=field`). `first psnr` is that of the initial model.\n\n"
-        f"{markdown(COLUMNS, table)}\n\n## PSNR of each initialisation\n\n"
-        f"Differences in dB from the hull.\n\n{begins}\n\n{machine()}\n\n    {command()}\n"
-    )
+    parser.add_argument("--seconds", type=float, default=24.0)
+    parser.add_argument("--large", type=float, default=60.0)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--together", type=int, default=1, help="runs side by side")
+    parser.add_argument("--work", type=Path, default=Path("outputs/benchmarks/gaussians"))
+    args = parser.parse_args()
+    models, starts = comparison(args), beginnings(args)
+    cases = list(dict.fromkeys([*models, *starts]))
+    with ProcessPoolExecutor(args.together, get_context("spawn"), initializer=warm) as pool:
+        done = pool.map(result, cases, [args.work] * len(cases))
+        found = dict(zip(cases, done, strict=True))
+    rows = [shown(case, found[case]) for case in models]
+    write_rows(RESULTS / "gaussians.csv", COLUMNS, rows)
+    text = f"""# Gaussians against six planes
+
+    {command()}
+
+Seconds are CPU time of one core, and each run's initialisation is among them; one seed; scored on
+the test split of demo scenes and of the suite, and on the val split of lego. Six planes begin with
+random planes, Gaussians on the silhouettes' hull; `first psnr` is that of the initial model.
+{machine()}.
+
+{markdown(COLUMNS, rows)}
+
+## Initialisations of Gaussians
+
+PSNR in dB after {args.seconds:g} s, means of {args.seeds} seeds. Gaussians begin on the hull
+(`model.points=silhouettes`, the default), anywhere (`model.points=random`), or on the surfaces
+of a six-plane field that is trained first (`lrm=field`).
+
+{begins({case: found[case] for case in starts})}
+"""
     write_text(RESULTS / "gaussians.md", text)
 
 

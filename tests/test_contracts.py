@@ -465,6 +465,14 @@ def test_values_that_cannot_work_are_refused_by_their_full_key(group):
         assert said.startswith(f"{key}={shown}"), f"{key}={value}: {said}"
 
 
+@pytest.mark.parametrize("name", ["kplanes", "six_planes"])
+def test_nodes_of_omegaconf_are_as_good_as_plain_ones(name):
+    config = composed(f"model={name}")
+    plain = to_plain(config)
+    built = build(config.model, ModelSettings, "model")
+    assert built == build(plain["model"], ModelSettings, "model")
+
+
 OTHERS = [
     ("seed", -1),
     ("seed", 2**32),

@@ -60,7 +60,10 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
     """
     from hydra.errors import InstantiationException
     from hydra.utils import instantiate
+    from omegaconf import OmegaConf
 
+    if OmegaConf.is_dict(node):
+        node = OmegaConf.to_container(node, resolve=True)
     if not isinstance(node, Mapping):
         raise ConfigError(f"{key}={node}: must be a mapping")
     target = node.get("_target_")
@@ -74,7 +77,9 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
     try:
         if issubclass(cls, Settings):
             cls.require_names([*arguments, *more])
-        elif cls.__module__.startswith("xplanes."):
+            # Their values are plain and build themselves: what `instantiate` would do takes longer.
+            return cls(**arguments, **more)
+        if cls.__module__.startswith("xplanes."):
             check_arguments(cls.__init__, arguments)
         # Arguments may be called as those of `instantiate` are, such as config.
         whole = {**arguments, "_target_": cls, "_recursive_": False, "_convert_": "all"}

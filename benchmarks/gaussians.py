@@ -69,6 +69,11 @@ class Case(NamedTuple):
     def name(self) -> str:
         return f"{self.scene}, {self.model}, {self.seconds:g} s, seed {self.seed}"
 
+    @property
+    def alone(self) -> bool:
+        """Whether memory is measured, in a process of its own."""
+        return self.scene.startswith("lego")
+
 
 class Computed(Callback):
     """Ends training after so many seconds of this process; schedules follow its ``progress``."""
@@ -88,7 +93,7 @@ class Computed(Callback):
         """Count from now on."""
         self.begun = time.process_time()
 
-    def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
+    def on_train_batch_end(self, trainer: Any, *_: Any, **__: Any) -> None:
         trainer.should_stop = self.spent >= self.budget
 
 
@@ -204,7 +209,8 @@ def result(case: Case, work: Path) -> dict[str, Any]:
     if not path.is_file():
         print(case.name, flush=True)
         made = [*case.overrides, "preparation.cache=null"]
-        write_json(path, measure(made, case.seconds, case.seed))
+        measured = measure(made, case.seconds, case.seed)
+        write_json(path, measured if case.alone else measured | {"peak GB": None})
     return read_json(path)
 
 
@@ -244,9 +250,17 @@ def main() -> None:
     args = parser.parse_args()
     models, starts = comparison(args), beginnings(args)
     cases = list(dict.fromkeys([*models, *starts]))
-    with ProcessPoolExecutor(args.together, get_context("spawn"), initializer=warm) as pool:
-        done = pool.map(result, cases, [args.work] * len(cases))
-        found = dict(zip(cases, done, strict=True))
+    found: dict[Case, dict[str, Any]] = {}
+    # Processes keep what runs leave behind: those whose memory is shown have one of their own.
+    for alone in (False, True):
+        some = [case for case in cases if case.alone == alone]
+        with ProcessPoolExecutor(
+            args.together,
+            get_context("spawn"),
+            initializer=warm,
+            max_tasks_per_child=1 if alone else None,
+        ) as pool:
+            found |= zip(some, pool.map(result, some, [args.work] * len(some)), strict=True)
     rows = [shown(case, found[case]) for case in models]
     write_rows(RESULTS / "gaussians.csv", COLUMNS, rows)
     text = f"""# Gaussians against six planes
@@ -255,7 +269,8 @@ def main() -> None:
 
 Seconds are CPU time of one core, and each run's initialisation is among them; one seed; scored on
 the test split of demo scenes and of the suite, and on the val split of lego. Six planes begin with
-random planes, Gaussians on the silhouettes' hull; `first psnr` is that of the initial model.
+random planes, Gaussians on the silhouettes' hull; `first psnr` is that of the initial model, and
+`peak GB` is shown for runs that had a process of their own.
 {machine()}.
 
 {markdown(COLUMNS, rows)}

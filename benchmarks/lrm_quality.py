@@ -134,7 +134,7 @@ def main() -> None:
     starts += [Start(name, "", (f"lrm={name}",), scores(name, args)) for name in ("tiny", "mini")]
     jobs = [(s, scene, seed) for s in starts for seed in range(args.seeds) for scene in args.scenes]
     with ThreadPoolExecutor(args.together) as pool:
-        runs = iter(list(pool.map(lambda job: train(*job, args), jobs)))
+        runs = iter(list(pool.map(lambda job: train(job[0], job[1], job[2], args), jobs)))
     rows, trained = [], []
     for start in starts:
         seeds = [[next(runs) for _ in args.scenes] for _ in range(args.seeds)]

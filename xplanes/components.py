@@ -5,8 +5,9 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
+from xplanes.config import to_plain
 from xplanes.errors import ConfigError
 from xplanes.settings import Settings, check_arguments
 
@@ -60,10 +61,10 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
     """
     from hydra.errors import InstantiationException
     from hydra.utils import instantiate
-    from omegaconf import OmegaConf
+    from omegaconf import DictConfig
 
-    if OmegaConf.is_dict(node):
-        node = OmegaConf.to_container(node, resolve=True)
+    if isinstance(node, DictConfig):
+        node = to_plain(node)
     if not isinstance(node, Mapping):
         raise ConfigError(f"{key}={node}: must be a mapping")
     target = node.get("_target_")
@@ -78,7 +79,7 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
         if issubclass(cls, Settings):
             cls.require_names([*arguments, *more])
             # Their values are plain and build themselves: what `instantiate` would do takes longer.
-            return cls(**arguments, **more)
+            return cast(T, cls(**arguments, **more))
         if cls.__module__.startswith("xplanes."):
             check_arguments(cls.__init__, arguments)
         # Arguments may be called as those of `instantiate` are, such as config.

@@ -101,7 +101,8 @@ def plot(starts: list[Start], trained: list[tuple[float, float]]) -> None:
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=(6, 3.8))
-    for start, (mean, spread) in zip(starts, trained, strict=True):
+    axes.margins(x=0.1)
+    for number, (start, (mean, spread)) in enumerate(zip(starts, trained, strict=True)):
         if start.scores is None:
             axes.axhline(mean, color="0.5", linewidth=1)
             axes.axhspan(mean - spread, mean + spread, color="0.5", alpha=0.2)
@@ -110,7 +111,9 @@ def plot(starts: list[Start], trained: list[tuple[float, float]]) -> None:
         novel = start.scores["psnr_novel"]
         axes.errorbar(novel, mean, yerr=spread, fmt="o", color="C0", capsize=3)
         label = start.name if start.steps == "" else f"{start.steps} steps"
-        axes.annotate(label, (novel, mean), xytext=(4, 5), textcoords="offset points")
+        # Neighbours may be close: labels stand above and below in turns.
+        where = (5, 6 if number % 2 else -14)
+        axes.annotate(label, (novel, mean), xytext=where, textcoords="offset points")
     axes.set(xlabel="novel views of the LRM alone, dB", ylabel="field after training, dB")
     axes.grid(alpha=0.3)
     figure.tight_layout()
@@ -153,10 +156,10 @@ def main() -> None:
     {command()}
 
 Six planes on {", ".join(args.scenes)} at 100 pixels, {args.seconds:g} s of one core's CPU time
-without the preparation; means over the scenes, ± the standard deviation of {args.seeds} seeds;
-{machine()}. The LRM alone is scored on {args.held_out} held-out objects, each seen from one side.
-The first models are one, kept while it is pretrained on {args.objects} objects; `tiny` and `mini`
-were pretrained on 16,384 for hours.
+without the preparation; means over the scenes, ± the standard deviation of {args.seeds} seeds. The
+LRM alone is scored on {args.held_out} held-out objects, each seen from one side. The first models
+are one, kept while it is pretrained on {args.objects} objects; `tiny` and `mini` were pretrained on
+16,384 for hours. {machine()}.
 
 ![PSNR after training against the LRM's own](lrm_quality.png)
 

@@ -7,9 +7,9 @@ Writes docs/results/faults.md. Some minutes; a few tests mount a small disk and 
 
 import os
 
-from xplanes.process import waiting
+from xplanes.process import defaults
 
-os.environ.update(waiting(os.environ))
+os.environ.update(defaults(os.environ))
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 

@@ -9,9 +9,9 @@ Compiled loops and plain torch take turns.
 
 import os
 
-from xplanes.process import waiting
+from xplanes.process import defaults
 
-os.environ.update(waiting(os.environ))
+os.environ.update(defaults(os.environ))
 
 import argparse
 import statistics

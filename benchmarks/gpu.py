@@ -11,9 +11,9 @@ Triton's interpreter and the training steps on the CPU.
 
 import os
 
-from xplanes.process import waiting
+from xplanes.process import defaults
 
-os.environ.update(waiting(os.environ))
+os.environ.update(defaults(os.environ))
 
 import argparse
 import importlib.util

@@ -8,9 +8,9 @@ published names, then loaded strictly and shown one picture, in a process of its
 
 import os
 
-from xplanes.process import waiting
+from xplanes.process import defaults
 
-os.environ.update(waiting(os.environ))
+os.environ.update(defaults(os.environ))
 
 import argparse
 import json

@@ -8,9 +8,9 @@ is a process of its own, with nothing else running; runs kept in the work folder
 
 import os
 
-from xplanes.process import waiting
+from xplanes.process import defaults
 
-os.environ.update(waiting(os.environ))
+os.environ.update(defaults(os.environ))
 
 import argparse
 import re

@@ -9,9 +9,9 @@ system reads what was announced; "cold" drops the file from the system's cache a
 
 import os
 
-from xplanes.process import waiting
+from xplanes.process import defaults
 
-os.environ.update(waiting(os.environ))
+os.environ.update(defaults(os.environ))
 
 import argparse
 import statistics

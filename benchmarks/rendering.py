@@ -7,9 +7,9 @@ Writes results/rendering.md and rendering.csv beside this file.
 
 import os
 
-from xplanes.process import waiting
+from xplanes.process import defaults
 
-os.environ.update(waiting(os.environ))
+os.environ.update(defaults(os.environ))
 
 import argparse
 import statistics

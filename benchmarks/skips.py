@@ -9,9 +9,9 @@ one process with nothing else running; compare them within one scene only.
 
 import os
 
-from xplanes.process import waiting
+from xplanes.process import defaults
 
-os.environ.update(waiting(os.environ))
+os.environ.update(defaults(os.environ))
 
 import argparse
 import tempfile

@@ -7,9 +7,9 @@ Writes docs/results/stability.md. One process, one thread, some minutes.
 
 import os
 
-from xplanes.process import waiting
+from xplanes.process import defaults
 
-os.environ.update(waiting(os.environ))
+os.environ.update(defaults(os.environ))
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 

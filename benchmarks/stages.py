@@ -10,9 +10,9 @@ both as logarithms.
 
 import os
 
-from xplanes.process import waiting
+from xplanes.process import defaults
 
-os.environ.update(waiting(os.environ))
+os.environ.update(defaults(os.environ))
 
 import argparse
 import math

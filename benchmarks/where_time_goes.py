@@ -9,9 +9,9 @@ called, without what they call in other stages; what no stage claims is shown to
 import os
 import time
 
-from xplanes.process import waiting
+from xplanes.process import defaults
 
-os.environ.update(waiting(os.environ))
+os.environ.update(defaults(os.environ))
 
 import argparse
 import functools

@@ -281,6 +281,7 @@ SETS = {
 ENVIRONMENT = {
     "OMP_NUM_THREADS": "The most threads that torch and the compiled loops use.",
     "OMP_WAIT_POLICY, GOMP_SPINCOUNT": "How threads wait; set unless one of them is.",
+    "ONEDNN_PRIMITIVE_CACHE_CAPACITY": "Compiled bfloat16 products that are kept; 256 unless set.",
     "XPLANES_CPU_LOOPS=0": "Plain torch instead of compiled loops on the CPU.",
     "XPLANES_GPU_KERNELS=0": "Plain torch instead of Triton kernels on a GPU.",
 }

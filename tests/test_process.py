@@ -1,4 +1,4 @@
-"""How OpenMP's threads are told to wait."""
+"""What the environment tells OpenMP and oneDNN."""
 
 import os
 import subprocess
@@ -7,15 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from xplanes.process import WAIT, waiting
+from xplanes.process import KEEP, WAIT, defaults
 
 ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize("own", [{"OMP_WAIT_POLICY": "ACTIVE"}, {"GOMP_SPINCOUNT": "0"}])
 def test_a_users_own_setting_stands_alone(own):
-    assert waiting({"HOME": "/", **own}) == {}
-    assert waiting({"HOME": "/"}) == WAIT
+    assert defaults({"HOME": "/", **own}) == KEEP
+    assert defaults({"HOME": "/"}) == WAIT | KEEP
+    assert defaults(dict.fromkeys(KEEP, "7")) == WAIT
 
 
 @pytest.mark.parametrize(
@@ -27,7 +28,7 @@ import os, runpy, sys
 class Watch:
     def find_spec(self, name, path=None, target=None):
         if name == "torch":
-            print(os.environ["GOMP_SPINCOUNT"])
+            print(*(os.environ[name] for name in {sorted(WAIT | KEEP)!r}))
             sys.stdout.flush()
             os._exit(0)
 sys.meta_path.insert(0, Watch())
@@ -35,8 +36,10 @@ sys.argv = {list(command)!r}
 sys.path.insert(0, {str(ROOT)!r})
 runpy.run_path({str(ROOT / command[0])!r}, run_name="__main__")
 """
-    clean = {name: value for name, value in os.environ.items() if name not in WAIT}
+    added = WAIT | KEEP
+    clean = {name: value for name, value in os.environ.items() if name not in added}
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, cwd=tmp_path, env=clean
     )
-    assert done.stdout.split() == [WAIT["GOMP_SPINCOUNT"].encode()], done.stderr.decode()
+    printed = done.stdout.decode().split()
+    assert printed == [added[name] for name in sorted(added)], done.stderr.decode()

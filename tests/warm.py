@@ -19,7 +19,7 @@ from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
-from xplanes.process import waiting
+from xplanes.process import defaults
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -70,7 +70,7 @@ def outputs() -> tempfile.TemporaryDirectory[str]:
 @cache
 def server() -> subprocess.Popen[str]:
     """The process that has loaded everything; one for all tests of a worker."""
-    environment = os.environ | waiting(os.environ)
+    environment = os.environ | defaults(os.environ)
     started = subprocess.Popen(
         [sys.executable, "-m", "tests.warm"],
         cwd=ROOT,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xplanes import __version__
-from xplanes.process import train_command, waiting
+from xplanes.process import defaults, train_command
 
 if TYPE_CHECKING:
     from xplanes.evaluation.runs import TrainedRun
@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit code: 0, 1 after a reported error, 130 after Ctrl-C.
     """
-    os.environ.update(waiting(os.environ))  # before torch is loaded
+    os.environ.update(defaults(os.environ))  # before torch is loaded
     words = sys.argv[1:] if arguments is None else list(arguments)
     if words[:1] == ["train"]:
         from xplanes.launch import train

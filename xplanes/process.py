@@ -1,6 +1,6 @@
-"""This process: how OpenMP's threads wait, and the command that started it.
+"""This process: how OpenMP's threads wait, what oneDNN keeps, and the command that started it.
 
-Must stay quick: its caller has yet to import torch, whose OpenMP reads the environment once.
+Must stay quick: its caller has yet to import torch, whose libraries read the environment once.
 """
 
 import sys
@@ -11,9 +11,22 @@ WAIT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "10000"}
 """Threads spin briefly, then sleep: spinning for long wastes the cores of a shared machine."""
 
 
-def waiting(environment: Mapping[str, str]) -> dict[str, str]:
-    """The variables to add: none where one of them is set, since they only work together."""
-    return {} if WAIT.keys() & environment.keys() else dict(WAIT)
+KEEP = {"ONEDNN_PRIMITIVE_CACHE_CAPACITY": "256"}
+"""Compiled products that are kept, of 0.4 MB each, scattered over memory that is free in between.
+
+Every number of samples has its own. With oneDNN's 1024 a process grows by 150 MB at each evaluation
+of eleven 400 px images; from 64 on training is as fast.
+"""
+
+
+def defaults(environment: Mapping[str, str]) -> dict[str, str]:
+    """The variables to add. Of `WAIT` none where one is set, since they only work together."""
+    return {
+        name: value
+        for group in (WAIT, KEEP)
+        if not group.keys() & environment.keys()
+        for name, value in group.items()
+    }
 
 
 def train_command() -> str:

@@ -65,10 +65,10 @@ class RayRenderer(Renderer):
     """Renders rays through a field, in a way of its own.
 
     Attributes:
-        rays_at_once: Rays of an image rendered together.
+        rays_at_once: Rays of an image rendered together on the CPU; a GPU takes twice as many.
     """
 
-    rays_at_once = 8192
+    rays_at_once = 4096
 
     def view(
         self, field: Any, frame: Frame, camera: PosedCamera, time: float, background: Tensor
@@ -119,7 +119,7 @@ class RayRenderer(Renderer):
             ``colour`` [R, 3], ``opacity`` [R] and ``depth`` [R], on the rays' device.
         """
         parts = []
-        chunk = chunk or self.rays_at_once
+        chunk = chunk or self.rays_at_once * (1 if self.device.type == "cpu" else 2)
         for start in range(0, max(len(origins), 1), chunk):
             rays = origins[start : start + chunk], directions[start : start + chunk]
             times = torch.full_like(rays[0][:, 0], time)

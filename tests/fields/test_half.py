@@ -11,7 +11,7 @@ NETWORKS = {
     "decoder": lambda: Decoder(4, precision="bf16"),
     "padded": lambda: PaddedMLP([12, 64, 4], precision="bf16"),
 }
-COUNTS = [0, 1, ROWS - 1, ROWS, ROWS + 1, 1000]
+COUNTS = [0, 1, ROWS - 1, ROWS, ROWS + 1, 1000, 40 * ROWS + 1]
 
 
 def test_rows_of_zeros_fill_up_the_last_block():
@@ -20,9 +20,15 @@ def test_rows_of_zeros_fill_up_the_last_block():
         rows = half_rows(values)
         assert rows.dtype == torch.bfloat16, count
         assert len(rows) % ROWS == 0, count
-        assert 0 <= len(rows) - count < ROWS, count
+        assert 0 <= len(rows) - count < max(ROWS, count / 16), count
         assert torch.equal(rows[:count], values.bfloat16()), count
         assert not rows[count:].any(), count
+
+
+def test_many_values_have_few_numbers_of_rows():
+    values = torch.zeros(2**17, 1)
+    numbers = {len(half_rows(values[:count])) for count in range(2**14, 2**17, 100)}
+    assert len(numbers) <= 3 * 16 + 1
 
 
 def outcome(network, features, count):

@@ -10,19 +10,23 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 ROWS = 256
-"""On the CPU products have a multiple of so many rows.
+"""On the CPU products have a multiple of so many rows, and of more where there are many rows.
 
-There each number of rows has a kernel that is compiled at its first use, which takes longer than a
-product, and the samples of every training step are another number.
+There each number of rows has a kernel that is compiled at its first use and kept, and every batch
+has another number of samples.
 """
 
 
 def half_rows(values: Tensor) -> Tensor:
-    """The values in bfloat16, on the CPU with rows of zeros below. [N, C] -> [at least N, C]"""
+    """The values in bfloat16, on the CPU with rows of zeros below. [N, C] -> [at least N, C]
+
+    Those are fewer than `ROWS` or than a sixteenth of the values.
+    """
     values = values.to(torch.bfloat16)
     if values.device.type != "cpu":
         return values
-    return F.pad(values, (0, 0, 0, -len(values) % ROWS))
+    step = max(ROWS, 2 ** (len(values).bit_length() - 1) // 16)
+    return F.pad(values, (0, 0, 0, -len(values) % step))
 
 
 def octaves(values: Tensor, count: int) -> Tensor:

@@ -58,9 +58,10 @@ PARTS: dict[str, tuple[str, ...]] = {
 def scripts(folder: Path) -> dict[str, list[list[str]]]:
     """The arguments of each script's runs, by its name; ``folder`` is that of lego."""
     scene = ["--lego", str(folder)]
-    given = {name: [scene] for name in ("lego_curves", "skips", "rendering", "pareto")}
+    given = {name: [scene] for name in ("lego_curves", "skips", "rendering")}
     # CPU seconds: runs side by side do not disturb one another.
-    given["initialisation"] = given["gaussians"] = [[*scene, "--together", "2"]]
+    for name in ("initialisation", "gaussians", "pareto"):
+        given[name] = [[*scene, "--together", "2"]]
     models = ["--variants", "world,kplanes,tineuvox_s", "--seconds", "30", "--together", "2"]
     given["captures"] = [
         ["--together", "2"],
@@ -69,7 +70,8 @@ def scripts(folder: Path) -> dict[str, list[list[str]]]:
         [*models, "--name", "suite_models", "--scenes", "dark_test,topology_test,occlusion_test"],
     ]
     given["lrm_quality"] = [["--together", "2"]]
-    given["where_time_goes"] = [[], ["--name", "lego", *lego(folder.resolve())]]
+    apart = "preparation.cache=null"
+    given["where_time_goes"] = [[apart], ["--name", "lego", apart, *lego(folder.resolve())]]
     return {name: given.get(name, [[]]) for name in PARTS}
 
 

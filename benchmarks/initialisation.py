@@ -9,7 +9,8 @@ of them for --few-seconds. The preparation of `tiny` is part of its time: it is 
 training gets what is left. Demo scenes bring a video of a fixed camera, whose frames the LRM sees
 and random initialisation does not; lego and the suite's scenes have none, so a field is trained to
 film them, and both see the same images. Each run is a process of its own with one thread, and
-seconds are those of its CPU time (cpu_clock.py); ``--together`` so many run side by side.
+seconds are those of its CPU time (cpu_clock.py); ``--together`` so many run side by side. On demo
+scenes a third start is random and trains on the frames of the video as well.
 """
 
 import argparse
@@ -25,7 +26,12 @@ from xplanes.files import replacing, write_rows, write_text
 
 DEMOS = ("excavator", "balls")
 SUITE = ("half_circle_test",)
-STARTS = ("none", "tiny")
+WITH_VIDEO = "none, with the video"
+STARTS = {
+    "none": ("lrm=none",),
+    WITH_VIDEO: ("lrm=none", "data.train_on_video=true"),
+    "tiny": ("lrm=tiny",),
+}
 FEW = 5
 COLUMNS = (
     *("scene", "views", "initialisation", "preparation, s", "before the first step, dB"),
@@ -56,12 +62,13 @@ def train(case: Case, start: str, seed: int, seconds: float, args: argparse.Name
     """One run; without seconds, what comes before its first step alone."""
     # A stage taken from the cache would cost its run nothing.
     given = [*case.overrides, f"data.resolution={args.resolution}", "preparation.cache=null"]
-    given += [f"lrm={start}", f"data.views={case.views or 'null'}", f"seed={seed}"]
+    given += [*STARTS[start], f"data.views={case.views or 'null'}", f"seed={seed}"]
     given += [f"trainer.max_seconds={seconds:.2f}" if seconds else "trainer.max_seconds=null"]
     given += [f"trainer.max_steps={1000000 if seconds else 1}"]
     given += ["callbacks.evaluation.at=[0.0]" if seconds else "callbacks.evaluation.at=[]"]
     given += ["media=false", "logger=none", "trainer.accelerator=cpu"]
-    name = f"{case.scene.split()[0]}_{case.views or 'all'}_{start}_{seed}_{seconds:.2f}"
+    words = start.replace(", ", " ").replace(" ", "_")
+    name = f"{case.scene.split()[0]}_{case.views or 'all'}_{words}_{seed}_{seconds:.2f}"
     return run_apart(given, args.work.absolute() / name, CPU_CLOCK)
 
 
@@ -71,7 +78,7 @@ def preparation(run: Measured) -> float:
 
 
 def measure(case: Case, start: str, seed: int, args: argparse.Namespace) -> Measured:
-    if start == "none":
+    if start != "tiny":
         return train(case, start, seed, case.seconds, args)
     before = preparation(train(case, start, seed, 0, args))
     return train(case, start, seed, case.seconds - before, args)
@@ -84,7 +91,7 @@ def row(case: Case, start: str, runs: list[Measured]) -> tuple:
     first = statistics.mean(float(run.curve[0]["psnr"]) for run in runs)
     return (
         *(case.scene, case.views or "all", start),
-        f"{statistics.mean(map(preparation, runs)) if start != 'none' else 0:.1f}",
+        f"{statistics.mean(map(preparation, runs)) if start == 'tiny' else 0:.1f}",
         f"{first:.2f}",
         f"{statistics.mean(psnr):.2f}{spread}",
         f"{statistics.mean(run.metrics['test']['ssim'] for run in runs):.3f}",
@@ -92,8 +99,14 @@ def row(case: Case, start: str, runs: list[Measured]) -> tuple:
     )
 
 
+def leads(found: dict[tuple[Case, str], list[Measured]], case: Case, start: str) -> list[float]:
+    """How far `tiny` is ahead of another start, in dB, seed by seed."""
+    pairs = zip(found[case, "tiny"], found[case, start], strict=True)
+    return [a.metrics["test"]["psnr"] - b.metrics["test"]["psnr"] for a, b in pairs]
+
+
 def plot(found: dict[tuple[Case, str], list[Measured]]) -> None:
-    """Lead of `tiny` in each scene, with all views and with few of them."""
+    """Lead of `tiny` in each scene: with all views and with few, over each random start."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -101,19 +114,19 @@ def plot(found: dict[tuple[Case, str], list[Measured]]) -> None:
 
     figure, axes = pyplot.subplots(figsize=(7, 3.6))
     scenes = list(dict.fromkeys(case.scene for case, _ in found))
-    for offset, few in ((-0.2, False), (0.2, True)):
-        rows = [case for case, start in found if start == "none" and (case.views == FEW) == few]
-        for case in rows:
-            pairs = zip(found[case, "tiny"], found[case, "none"], strict=True)
-            lead = [a.metrics["test"]["psnr"] - b.metrics["test"]["psnr"] for a, b in pairs]
-            axes.bar(
-                scenes.index(case.scene) + offset,
-                statistics.mean(lead),
-                0.38,
-                yerr=statistics.stdev(lead) if len(lead) > 1 else None,
-                color="C1" if few else "C0",
-                label=None if case is not rows[0] else f"{FEW} views" if few else "all views",
-            )
+    bars = [(views, start) for views in (None, FEW) for start in STARTS if start != "tiny"]
+    for place, (views, start) in enumerate(bars):
+        cases = [case for case, name in found if name == start and case.views == views]
+        lead = [leads(found, case, start) for case in cases]
+        axes.bar(
+            [scenes.index(case.scene) + (place - 1.5) * 0.2 for case in cases],
+            [statistics.mean(values) for values in lead],
+            0.19,
+            yerr=[statistics.stdev(values) if len(values) > 1 else 0 for values in lead],
+            color=f"C{0 if views is None else 1}",
+            alpha=0.5 if start == WITH_VIDEO else 1,
+            label=f"{views or 'all'} views" + (", video for both" if start == WITH_VIDEO else ""),
+        )
     axes.axhline(0, color="0.3", linewidth=0.8)
     axes.set_xticks(range(len(scenes)), scenes, rotation=20, ha="right")
     axes.set(ylabel="lead of tiny, dB")
@@ -135,7 +148,12 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("outputs/benchmarks/initialisation"))
     args = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"
-    pairs = [(case, start) for case in cases(args) for start in STARTS]
+    pairs = [
+        (case, start)
+        for case in cases(args)
+        for start in STARTS
+        if start != WITH_VIDEO or case.scene in DEMOS
+    ]
     jobs = [(case, start, seed) for case, start in pairs for seed in range(args.seeds)]
     found: dict[tuple[Case, str], list[Measured]] = {}
     with ThreadPoolExecutor(args.together) as pool:
@@ -156,8 +174,9 @@ def main() -> None:
 Six planes at {args.resolution} pixels; {seeds}; {machine()}. The budget is {args.seconds:g} s of
 one core's CPU time with all views and {args.few_seconds:g} s with {FEW}; **it includes the
 preparation**, which is what `tiny` takes before its first step. Demo scenes (the first two) have a
-video of a fixed camera, which the LRM sees and random initialisation does not. The others have
-none: the preparation trains a field that films them, and both starts see the same images.
+video of a fixed camera, whose frames the LRM sees; "{WITH_VIDEO}" trains on them too, as on views
+like any other, and `none` does not have them. The other scenes have no such video: the preparation
+trains a field that films them, and both starts see the same images.
 
 ![Lead of tiny over random initialisation](initialisation.png)
 

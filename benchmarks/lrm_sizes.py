@@ -83,8 +83,8 @@ def main() -> None:
             path = Path(folder) / "model.safetensors"
             count = write_random(name, path)
             size = path.stat().st_size
-            command = [sys.executable, __file__, name, str(path)]
-            told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+            child = [sys.executable, __file__, name, str(path)]
+            told = subprocess.run(child, check=True, capture_output=True, text=True).stdout
         found = json.loads(told)
         rows.append(
             (

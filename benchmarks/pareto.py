@@ -1,23 +1,24 @@
 """PSNR against seconds and memory: planes, starts, resolutions, samples, precision, baselines.
 
-    python benchmarks/pareto.py [--lego FOLDER] [--seconds 20] [--resolution 100] [--work FOLDER]
+    python benchmarks/pareto.py [--lego FOLDER] [--seconds 20] [--resolution 100] [--together 1]
+        [--work FOLDER]
 
-Writes results/pareto.md, pareto.csv, pareto_points.csv and pareto.png beside this file. Every run
-is a process of its own, with nothing else running; runs kept in the work folder are not repeated.
+Writes docs/results/pareto.md, pareto.csv, pareto_points.csv and pareto.png. Every run is a process
+of its own with one thread, and seconds are those of its CPU time (cpu_clock.py); ``--together`` so
+many run side by side, and those kept in the work folder are not repeated.
 """
 
 import os
 
-from xplanes.process import defaults
-
-os.environ.update(defaults(os.environ))
+os.environ["OMP_NUM_THREADS"] = "1"
 
 import argparse
 import re
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-from runner import RESULTS, Measured, command, lego, machine, markdown, run_apart
+from runner import CPU_CLOCK, RESULTS, Measured, command, lego, machine, markdown, run_apart
 
 from xplanes.files import replacing, write_rows, write_text
 
@@ -59,6 +60,10 @@ CASES: dict[str, tuple[str, ...]] = {
     "K-Planes, our grid": ("model=kplanes", "model/sampler=occupancy", *SELDOM),
     "TiNeuVox-S": ("model=tineuvox_s", *SELDOM),
     "Tensor4D, density": ("model=tensor4d_density", *SELDOM),
+    "4D-GS": ("model=gaussians_hexplane", "lrm=none"),
+    "4D-GS, from a field": ("model=gaussians_hexplane", "lrm=field"),
+    "Deformable 3DGS": ("model=gaussians_deform", "lrm=none"),
+    "Spacetime GS": ("model=gaussians_spacetime", "lrm=none"),
 }
 
 COLUMNS = (
@@ -149,8 +154,8 @@ def line(scene: str, name: str, result: Measured, front: bool) -> tuple:
         f"{sum(metrics['seconds']['prepare'].values()):.1f}",
         f"{metrics['seconds']['train']:.1f}",
         metrics["step"],
-        f"{metrics['rays_per_second'] / 1000:.1f}k",
-        f"{metrics['samples_per_ray']:.1f}",
+        f"{metrics['rays_per_second'] / 1000:.1f}k" if metrics["rays_per_second"] else "",
+        f"{metrics['samples_per_ray']:.1f}" if metrics["samples_per_ray"] else "",
         f"{metrics['parameters'] / 1e6:.1f} M",
         f"{metrics['peak_memory_bytes'] / 2**20:.0f}",
     )
@@ -161,31 +166,39 @@ def main() -> None:
     parser.add_argument("--lego", type=Path, default=Path("data/dnerf/lego"))
     parser.add_argument("--seconds", type=float, default=20)
     parser.add_argument("--resolution", type=int, default=100)
+    parser.add_argument("--together", type=int, default=1, help="runs side by side")
     parser.add_argument("--work", type=Path, default=Path("outputs/benchmarks/pareto"))
     args = parser.parse_args()
     scenes = {"excavator": ["data.scene=excavator"], "balls": ["data.scene=balls"]}
     if args.lego.is_dir():
         scenes = {"lego": lego(args.lego.resolve())} | scenes
-    rows, curves = [], {}
-    for scene, overrides in scenes.items():
-        results = {}
-        for name, case in CASES.items():
-            common = [
-                f"data.resolution={args.resolution}",
-                f"trainer.max_seconds={args.seconds}",
-                "trainer.max_steps=1000000",
-                "trainer.accelerator=cpu",
-                "media=false",
-                "callbacks.evaluation.views=4",
-                "data.eval_views=5",
-                # A stage taken from the cache would cost its run nothing.
-                "preparation.cache=null",
-            ]
-            folder = args.work / f"{scene}_{args.resolution}px_{args.seconds:g}s" / slug(name)
-            print(f"{scene}: {name}", flush=True)
-            results[name] = run_apart([*overrides, *common, *case], folder.absolute())
-        curves[scene] = {name: points(result) for name, result in results.items()}
-        rows += [line(scene, n, r, on_front(n, curves[scene])) for n, r in results.items()]
+    common = [
+        f"data.resolution={args.resolution}",
+        f"trainer.max_seconds={args.seconds}",
+        "trainer.max_steps=1000000",
+        "trainer.accelerator=cpu",
+        "media=false",
+        "callbacks.evaluation.views=4",
+        "data.eval_views=5",
+        # A stage taken from the cache would cost its run nothing.
+        "preparation.cache=null",
+    ]
+
+    def train(scene: str, name: str) -> Measured:
+        print(f"{scene}: {name}", flush=True)
+        folder = args.work / f"{scene}_{args.resolution}px_{args.seconds:g}s" / slug(name)
+        overrides = [*scenes[scene], *common, *CASES[name]]
+        return run_apart(overrides, folder.absolute(), CPU_CLOCK)
+
+    with ThreadPoolExecutor(args.together) as pool:
+        runs = {scene: {n: pool.submit(train, scene, n) for n in CASES} for scene in scenes}
+        results = {s: {n: run.result() for n, run in named.items()} for s, named in runs.items()}
+    curves = {s: {n: points(run) for n, run in named.items()} for s, named in results.items()}
+    rows = [
+        line(scene, name, result, on_front(name, curves[scene]))
+        for scene, named in results.items()
+        for name, result in named.items()
+    ]
     write_rows(RESULTS / "pareto.csv", COLUMNS, rows)
     along = [
         (scene, name, f"{second:.2f}", f"{value:.3f}")
@@ -196,8 +209,8 @@ def main() -> None:
     write_rows(RESULTS / "pareto_points.csv", ("scene", "run", "seconds", "psnr"), along)
     page = f"""# PSNR against seconds
 
-{args.seconds:g} s of training clock for each run, {args.resolution} px, five views of the test
-split (lego: val); {machine()}. "front": at some moment, preparation included, as good as the best
+{args.seconds:g} s of training for each run, in CPU time of one core, {args.resolution} px, five views of the
+test split (lego: val), one seed; {machine()}. "front": at some moment, preparation included, as good as the best
 (to {MARGIN:g} dB), between scores on the line between them. On the way four views are scored; of
 the baselines two, and seldom.
 

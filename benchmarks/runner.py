@@ -6,6 +6,7 @@ import platform
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -58,8 +59,16 @@ def command() -> str:
     named = (name for name in ("OMP_NUM_THREADS", "XPLANES_CPU_LOOPS") if name in os.environ)
     given = [f"{name}={os.environ[name]}" for name in named]
     script = f"benchmarks/{Path(sys.argv[0]).name}"
-    words = ["FOLDER" if Path(word).is_absolute() else word for word in sys.argv[1:]]
-    return " ".join([*given, "python", script, *words])
+    return " ".join([*given, "python", script, *without_folders(sys.argv[1:])])
+
+
+def without_folders(words: Iterable[str]) -> list[str]:
+    """Words of a command line; absolute paths, also those behind ``KEY=``, become FOLDER."""
+    found = []
+    for word in words:
+        key, equals, value = word.rpartition("=")
+        found.append(f"{key}{equals}FOLDER" if Path(value).is_absolute() else word)
+    return found
 
 
 def markdown(columns: tuple[str, ...], rows: list[tuple]) -> str:

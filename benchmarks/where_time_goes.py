@@ -97,7 +97,7 @@ def main() -> None:
     parser.add_argument("overrides", nargs="*")
     args = parser.parse_args()
 
-    from runner import RESULTS, machine, markdown, measure
+    from runner import RESULTS, machine, markdown, measure, without_folders
 
     from xplanes.files import write_text
 
@@ -114,7 +114,7 @@ def main() -> None:
         (name, f"{spent:.2f}", f"{100 * spent / whole:.1f}%", watch.calls.get(name, ""))
         for name, spent in sorted(found.items(), key=lambda item: -item[1])
     ]
-    command = " ".join(["python train.py", *args.overrides])
+    command = " ".join(["python train.py", *without_folders(args.overrides)])
     page = f"""# Where the time goes: {args.name}
 
 `{command}`: {whole:.1f} s in all, {metrics["step"]} steps, PSNR

@@ -47,6 +47,12 @@ def test_what_has_changed_is_said(every) -> None:
     assert "conf" in every.why_stale(now, {**now, "parts": {"xplanes/lrm": "a"}})
 
 
+def test_printed_commands_name_no_folder(every) -> None:
+    words = ["--lego", "/there/lego", "data.root=/there", "data.scene=lego", "--seeds", "3"]
+    printed = ["--lego", "FOLDER", "data.root=FOLDER", "data.scene=lego", "--seeds", "3"]
+    assert sys.modules["runner"].without_folders(words) == printed
+
+
 def test_every_part_and_script_exists(every) -> None:
     for name, parts in every.PARTS.items():
         assert (FOLDER / f"{name}.py").is_file(), name

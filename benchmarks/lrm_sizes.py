@@ -22,7 +22,7 @@ import time
 from pathlib import Path
 
 import torch
-from runner import RESULTS, machine, markdown
+from runner import RESULTS, command, machine, markdown
 from safetensors.torch import save_file
 
 from xplanes.files import write_text

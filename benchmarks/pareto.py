@@ -209,10 +209,12 @@ def main() -> None:
     write_rows(RESULTS / "pareto_points.csv", ("scene", "run", "seconds", "psnr"), along)
     page = f"""# PSNR against seconds
 
-{args.seconds:g} s of training for each run, in CPU time of one core, {args.resolution} px, five views of the
-test split (lego: val), one seed; {machine()}. "front": at some moment, preparation included, as good as the best
-(to {MARGIN:g} dB), between scores on the line between them. On the way four views are scored; of
-the baselines two, and seldom.
+{args.seconds:g} s of training for each run, in CPU time of one core, {args.resolution} px, five
+views of the test split (lego: val), one seed; {machine()}.
+"front": at some moment, preparation included, as good as the best (to {MARGIN:g} dB), between
+scores on the line between them. On the way four views are scored; of the baselines two, and seldom.
+The LRM's starts see the frames of a video that others do not (not on lego, which has none):
+[what that is worth](initialisation.md).
 
     {command()}
 

@@ -159,7 +159,8 @@ Six planes on {", ".join(args.scenes)} at 100 pixels, {args.seconds:g} s of one 
 without the preparation; means over the scenes, ± the standard deviation of {args.seeds} seeds. The
 LRM alone is scored on {args.held_out} held-out objects, each seen from one side. The first models
 are one, kept while it is pretrained on {args.objects} objects; `tiny` and `mini` were pretrained on
-16,384 for hours. {machine()}.
+16,384 objects at 32 x 32, for hours and with another schedule. All of them see 16 frames of a fixed
+camera's video, which `none` does not: [what that is worth](initialisation.md). {machine()}.
 
 ![PSNR after training against the LRM's own](lrm_quality.png)
 

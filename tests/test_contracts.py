@@ -49,7 +49,8 @@ OPTIONS = sorted(
     (path.parent.relative_to(CONF).as_posix(), path.stem)
     for path in CONF.rglob("*.yaml")
     if path.parent != CONF and not {"hydra", "pretrain"} & set(path.relative_to(CONF).parts)
-    if path.parent.parent not in (CONF / "recipe", CONF / "scale")  # Chosen by two groups together.
+    # Chosen by two groups together, or by an option.
+    if path.parent.parent not in (CONF / "recipe", CONF / "scale", CONF / "entry")
 )
 """Every option of every group that train.py knows; tests/pretraining looks after the other."""
 

@@ -140,11 +140,13 @@ def test_fair_means_equal_rays_samples_and_terms() -> None:
     assert losses == {(0.0, 0.0)}
 
 
-def test_the_ablation_changes_one_thing_at_a_time() -> None:
+@pytest.mark.parametrize("chosen", [["recipe=paper", "lrm=tiny"], ["recipe=paper"], []])
+def test_the_ablation_changes_one_thing_at_a_time(chosen: list[str]) -> None:
     params, _ = sweep("experiment=ablation")
-    entries = [entry for entry in params["entry"] if entry != "ablation_whole"]
-    whole = compose_plain("train", ["recipe=paper", "lrm=tiny"])
-    for entry in entries:
-        plain = compose_plain("train", ["recipe=paper", "lrm=tiny", f"entry={entry}"])
+    whole = compose_plain("train", chosen)
+    for entry in params["entry"]:
+        plain = compose_plain("train", [*chosen, f"entry={entry}"])
         changed = {group for group in whole if plain[group] != whole[group]}
+        assert ("lrm" in changed) == ("random" in entry), entry
+        assert plain["lrm"]["name"] == ("none" if "random" in entry else whole["lrm"]["name"])
         assert len(changed - {"lrm"}) <= 1, entry

@@ -291,8 +291,8 @@ def head(path: Path) -> str:
     """The first sentence of the comment in a file that says what it is."""
     text = path.read_text(encoding="utf-8")
     lines = [line[2:] for line in text.splitlines() if line.startswith("# ")]
-    first = next(line for line in lines if not line.startswith("@"))
-    return first.split(". ")[0].rstrip(".") + "."
+    words = " ".join(line for line in lines if not line.startswith("@"))
+    return words.split(". ")[0].rstrip(".") + "."
 
 
 def command_line() -> str:

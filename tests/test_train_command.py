@@ -16,6 +16,7 @@ from tests import warm
 from tests.training.runs import SMALL
 from tests.warm import train
 from xplanes.config import CONF
+from xplanes.errors import ConfigError
 from xplanes.launch import SettingsCheck, prepare
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -85,12 +86,19 @@ def test_devices_in_a_sweep_are_refused(tmp_path: Path) -> None:
     assert "one device per job" in (result.stdout + result.stderr)
 
 
-def test_an_experiment_says_itself_that_it_is_a_multirun() -> None:
-    assert prepare(["experiment=planes"]) == ["experiment=planes", "--multirun"]
-    for already in ("-m", "--multirun", "hydra.mode=MULTIRUN"):
-        assert prepare([already, "experiment=planes"]) == [already, "experiment=planes"]
-    assert prepare(["experiment=published"]) == ["experiment=published"]
-    assert prepare(["seed=1"]) == ["seed=1"]
+def test_sweeps_of_experiments_are_resumed_job_by_job() -> None:
+    for sweep in (["experiment=planes"], ["-m"], ["--multirun"], ["hydra.mode=MULTIRUN"]):
+        with pytest.raises(ConfigError, match="one run at a time"):
+            prepare([*sweep, "resume=somewhere"])
+    for single in (["experiment=published"], ["seed=1"], ["experiment=planes", "hydra.mode=RUN"]):
+        with pytest.raises(ConfigError, match="not a run directory"):
+            prepare([*single, "resume=somewhere"])
+
+
+def test_the_configuration_of_an_experiment_is_shown_as_hydra_shows_it(tmp_path: Path) -> None:
+    result = train("experiment=fair", "scale=demo", "--cfg", "job", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "max_steps: 300" in result.stdout
 
 
 @pytest.mark.slow

@@ -132,9 +132,6 @@ def prepare(arguments: list[str]) -> list[str]:
         StorageError: If the folder of the run cannot be written.
     """
     values = {key: value for key, value in map(_split, arguments) if key}
-    if not _is_multirun(arguments) and _is_sweep(values.get("experiment", "")):
-        # Hydra from 1.4 on takes the mode from here, not from the experiment's file.
-        arguments = [*arguments, "--multirun"]
     resume = values.get("resume", "null")
     if resume in ("null", "", "None", "auto"):
         # Before Hydra makes the folder, whose errors are tracebacks.
@@ -223,7 +220,13 @@ def _split(argument: str) -> tuple[str, str]:
 
 
 def _is_multirun(arguments: list[str]) -> bool:
-    return not {"-m", "--multirun", "hydra.mode=MULTIRUN"}.isdisjoint(arguments)
+    """Whether Hydra will run several jobs, by an option, by its mode or by the experiment."""
+    values = dict(map(_split, arguments))
+    if not {"-m", "--multirun"}.isdisjoint(arguments):
+        return True
+    if "hydra.mode" in values:
+        return values["hydra.mode"] == "MULTIRUN"
+    return _is_sweep(values.get("experiment", ""))
 
 
 def _is_sweep(experiment: str) -> bool:

@@ -44,6 +44,7 @@ REFUSED = (
     "trainer.max_seconds=-1",
     "trainer.accelerator=tpu",
     "callbacks.evaluation.at=[2]",
+    "data.scene=excavatr",
     "+trainer.foo=1",
     "logger.tensorboard._target_=os.system",
     "model.name=${no.such}",

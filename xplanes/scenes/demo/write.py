@@ -20,6 +20,7 @@ from PIL import Image
 from torch import Tensor
 
 from xplanes.backend import threads
+from xplanes.errors import ConfigError
 from xplanes.scenes.demo.assembly import Assembly
 from xplanes.scenes.demo.capture import Capture, even_times, held_out_times
 from xplanes.scenes.demo.motions import Variation
@@ -297,7 +298,14 @@ class ProceduralSettings(SceneSettings, ABC):
     test_views: Count  # Test views, at other timesteps than the training views.
     val_views: Count  # Validation views.
 
+    find: ClassVar[Callable[[str], object]]
     ensure: ClassVar[Callable[..., Path]]
+
+    def check(self) -> None:
+        try:
+            type(self).find(self.scene)
+        except SceneError as error:
+            raise ConfigError(f"scene={self.scene}: {error}") from None
 
     @property
     def folder(self) -> Path:
@@ -347,6 +355,7 @@ def _with_masks(scene: Scene, folder: Path) -> Scene:
 class DemoSettings(ProceduralSettings):
     """A procedural scene, rendered on first use."""
 
+    find = staticmethod(demo_scene)
     ensure = staticmethod(ensure_demo_scene)
 
 
@@ -354,6 +363,7 @@ class DemoSettings(ProceduralSettings):
 class SuiteSettings(ProceduralSettings):
     """A scene of the suite, rendered on first use."""
 
+    find = staticmethod(suite_scene)
     ensure = staticmethod(ensure_suite_scene)
 
     # Masks of a thing in a world: for scores alone, alpha of the training images, or for LRMs, too.

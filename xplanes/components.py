@@ -73,7 +73,7 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
             raise ConfigError(f"{key}._target_: it is not set; name a class as module.Class")
         cls: type = kind
     else:
-        cls = _class(target, kind, f"{key}._target_")
+        cls = class_of(target, kind, f"{key}._target_")
     arguments = {name: value for name, value in node.items() if name != "_target_"}
     try:
         if issubclass(cls, Settings):
@@ -99,8 +99,17 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
         raise ConfigError(f"{key}: {cause or error}") from error
 
 
-def _class(target: Any, kind: type, key: str) -> type:
-    """The class of a dotted name, if it may stand in its place."""
+def class_of(target: Any, kind: type, key: str) -> type:
+    """The class of a dotted name, if it may stand in its place.
+
+    Args:
+        target: The name, as module.Class.
+        kind: The class that it must derive from.
+        key: Where the name stands, for messages.
+
+    Raises:
+        ConfigError: If there is no such class, or it may not stand there.
+    """
     name = str(target)
     allowed = (*TRUSTED, *_plugins.get())
     if not any(name == root or name.startswith(f"{root}.") for root in allowed):

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from xplanes.components import build, plugins
+from xplanes.components import build, class_of, plugins
 from xplanes.config import compose_plain, group_options
 from xplanes.errors import ConfigError
 from xplanes.evaluation.findings import (
@@ -156,7 +156,7 @@ def _recognised(folder: Path, changed: Sequence[str]) -> str:
     with plugins(modules):
         for option in group_options("data", search):
             node = compose_plain(None, [f"+data={option}", *_place(folder), *search])["data"]
-            known.setdefault(type(build(node, SceneSettings, "data")), option)
+            known.setdefault(class_of(node["_target_"], SceneSettings, "data._target_"), option)
     found = [option for cls, option in known.items() if cls.recognises(folder)]
     if len(found) == 1:
         return found[0]

@@ -1,6 +1,7 @@
 """Files are written atomically; write errors are reported with a message."""
 
 import errno
+import math
 import os
 from pathlib import Path
 
@@ -9,9 +10,11 @@ import pytest
 from xplanes.files import (
     StorageError,
     clear_unfinished,
+    read_json,
     replacing,
     require_writable,
     storage_error,
+    write_json,
     write_text,
 )
 
@@ -74,6 +77,12 @@ def test_a_file_in_the_place_of_a_folder_is_named(tmp_path: Path) -> None:
 def test_a_folder_that_can_be_written_stays_as_it_is(tmp_path: Path) -> None:
     require_writable(tmp_path / "new" / "run")
     assert listed(tmp_path) == []
+
+
+def test_numbers_that_json_does_not_know_become_null(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.json"
+    write_json(path, {"ssim": math.nan, "views": [{"psnr": math.inf}, 1.5, None, "nan"]})
+    assert read_json(path) == {"ssim": None, "views": [{"psnr": None}, 1.5, None, "nan"]}
 
 
 def test_only_unfinished_files_are_cleared(tmp_path: Path) -> None:

@@ -88,6 +88,27 @@ def test_validate_and_test_score_their_own_splits(fitted: tuple) -> None:
     assert [image["colour"].shape for image in images] == [(32, 32, 3)] * 3
 
 
+def test_pixels_without_rays_are_background_in_every_score(fitted: tuple) -> None:
+    """As fisheye images have them at their corners."""
+    _, module, data, _ = fitted
+    batch = next(iter(data.test_dataloader()))
+    assert "shown" not in batch
+    whole = module.predict_step(batch, 0)
+    shown = torch.ones(32, 32, dtype=torch.bool)
+    shown[:9, :9] = False
+    part = module.predict_step({**batch, "shown": shown}, 0)
+    assert torch.equal(part["colour"][shown], whole["colour"][shown])
+    assert bool((part["colour"][~shown] == batch["background"]).all())
+    assert not part["opacity"][~shown].any()
+
+
+def test_no_number_of_steps_is_no_limit(tmp_path: Path) -> None:
+    """Lightning's own Trainer ends after 1000 epochs."""
+    options = {"accelerator": "cpu", "default_root_dir": tmp_path, "logger": False}
+    assert Trainer(**options, max_steps=-1, max_seconds=5.0).max_epochs == -1
+    assert Trainer(**options, max_steps=-1, max_seconds=5.0, max_epochs=3).max_epochs == 3
+
+
 def test_a_checkpoint_alone_gives_the_field_back(fitted: tuple) -> None:
     folder, _, data, used = fitted
     path = folder / "last.ckpt"

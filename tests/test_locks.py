@@ -15,7 +15,7 @@ from pathlib import Path
 from xplanes.locks import alone_in
 from xplanes.training.record import RunRecord
 with alone_in(Path(sys.argv[1])):
-    RunRecord(Path(sys.argv[1]), seed=0)
+    RunRecord(Path(sys.argv[1]), seed=0, resume=False)
     print("held", flush=True)
     time.sleep(60)
 """

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from tests.warm import train
 from xplanes.config import CONF
 from xplanes.errors import ConfigError
 from xplanes.launch import SettingsCheck, prepare
+from xplanes.process import resume_command
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -94,6 +96,43 @@ def test_sweeps_of_experiments_are_resumed_job_by_job() -> None:
     for single in (["experiment=published"], ["seed=1"], ["experiment=planes", "hydra.mode=RUN"]):
         with pytest.raises(ConfigError, match="not a run directory"):
             prepare([*single, "resume=somewhere"])
+
+
+def test_auto_goes_on_with_the_newest_run_of_the_same_settings(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    own = ["model.resolution=8", "data.scene=a/b"]
+    assert prepare([*own, "resume=auto"]) == [*own, "resume=null"]
+    run = tmp_path / "outputs" / "today_demo-a" / "b_six_planes"
+    run.mkdir(parents=True)
+    (run / "run.json").write_text('{"status": "interrupted"}')
+    for written in ("resume=null", f"resume={run}", ""):
+        (run / "overrides.txt").write_text("\n".join([*own, written]) + "\n")
+        found = prepare([*own, "resume=auto"])
+        assert found[-1] == f"resume={run.relative_to(tmp_path)}", written
+    assert prepare(["model.resolution=9", "resume=auto"])[-1] == "resume=null"
+    (run / "run.json").write_text('{"status": "finished"}')
+    assert prepare([*own, "resume=auto"])[-1] == "resume=null"
+
+
+def test_runs_in_folders_of_any_name_are_resumed(tmp_path: Path) -> None:
+    run = tmp_path / "my scene (1), a=b & c"
+    run.mkdir()
+    (run / "overrides.txt").write_text("seed=3\n")
+    for text in (f"resume={run}", f"resume='{run}'"):
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose("train", prepare([text]), return_hydra_config=True)
+        assert (config.resume, config.hydra.run.dir, config.seed) == (str(run), str(run), 3)
+    assert shlex.split(resume_command(run))[-1] == f"resume={run}"
+
+
+def test_names_of_scenes_may_look_like_numbers() -> None:
+    for name in ("2024_05_01", "1e3", "007", "1.0", "12"):
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose("train", prepare([f"data.scene={name}", f"data.root={name}"]))
+        assert (config.data.scene, config.data.root) == (name, name)
+    assert prepare(["-m", "data.scene=001,lego,1_0"]) == ["-m", "data.scene='001',lego,'1_0'"]
+    for plain in ("data.scene=lego", "data.scene='1'", "seed=1_0", "data.scene=[1,2]"):
+        assert prepare([plain]) == [plain]
 
 
 def test_the_configuration_of_an_experiment_is_shown_as_hydra_shows_it(tmp_path: Path) -> None:

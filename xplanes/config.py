@@ -1,6 +1,7 @@
 """The configuration files and what Hydra makes of them. Must stay quick: it imports no torch."""
 
 import difflib
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -86,6 +87,14 @@ def to_plain(config: Any) -> dict[str, Any]:
     assert isinstance(plain, dict)
     plain.pop("hydra", None)
     return {str(key): value for key, value in plain.items()}
+
+
+def quoted(text: str) -> str:
+    """Text as Hydra reads it in an override."""
+    if re.fullmatch(r"[A-Za-z_./][\w./-]*", text):
+        return text
+    escaped = re.sub(r"(\\*)'", r"\1\1\'", text)
+    return f"'{escaped}'"
 
 
 def near_names(message: str, conf: Path = CONF) -> str:

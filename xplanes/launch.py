@@ -5,8 +5,9 @@ Must stay quick: it imports neither torch nor lightning before the job begins.
 
 import contextlib
 import io
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,14 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from xplanes import __version__
-from xplanes.config import CONF, near_names, to_plain
+from xplanes.config import CONF, near_names, quoted, to_plain
 from xplanes.errors import ConfigError
 from xplanes.files import StorageError, read_json, require_writable
+
+NAMES = ("data.root", "data.scene")
+"""Settings whose values are names, even where they look like numbers."""
+
+_NUMBER = re.compile(r"[+-]?[\d._]+(?:[eE][+-]?\d+)?")
 
 
 def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
@@ -131,8 +137,9 @@ def prepare(arguments: list[str]) -> list[str]:
         ConfigError: If the run cannot be resumed.
         StorageError: If the folder of the run cannot be written.
     """
+    arguments = [_with_names(text) for text in arguments]
     values = {key: value for key, value in map(_split, arguments) if key}
-    resume = values.get("resume", "null")
+    resume = values.get("resume", "null").strip("\"'")
     if resume in ("null", "", "None", "auto"):
         # Before Hydra makes the folder, whose errors are tracebacks.
         place = "hydra.sweep.dir" if _is_multirun(arguments) else "hydra.run.dir"
@@ -176,7 +183,7 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
     new = [a for a in arguments if not a.startswith(("resume=", "hydra.run.dir="))]
     changed = {key for key, _ in map(_split, new) if key}
     old = [line for line in text.splitlines() if line and _split(line)[0] not in changed]
-    return [*old, *new, f"hydra.run.dir={run}", f"resume={run}"]
+    return [*old, *new, f"hydra.run.dir={quoted(str(run))}", f"resume={quoted(str(run))}"]
 
 
 def _require_version(run: Path) -> None:
@@ -194,12 +201,14 @@ def _require_version(run: Path) -> None:
 
 def _latest(outputs: Path, overrides: list[str]) -> Path | None:
     """The newest unfinished run with the same overrides."""
-    wanted = sorted(overrides)
-    for record in sorted(outputs.glob("*/run.json"), key=_mtime, reverse=True):
+    wanted = _without_resume(overrides)
+    # Names of scenes may have slashes, and their runs lie deeper then.
+    records = [path for path in outputs.rglob("run.json") if "sweeps" not in path.parts]
+    for record in sorted(records, key=_mtime, reverse=True):
         listed = record.parent / "overrides.txt"
         try:
             done = read_json(record).get("status") == "finished"
-            same = sorted(filter(None, listed.read_text().splitlines())) == wanted
+            same = _without_resume(listed.read_text(encoding="utf-8").splitlines()) == wanted
         except (OSError, ValueError):
             continue
         if same and not done:
@@ -207,8 +216,24 @@ def _latest(outputs: Path, overrides: list[str]) -> Path | None:
     return None
 
 
+def _without_resume(overrides: Iterable[str]) -> list[str]:
+    """Overrides in order, but for what the command line alone says of the run that it continues."""
+    mine = ("resume=", "hydra.run.dir=")
+    return sorted(text for text in overrides if text and not text.startswith(mine))
+
+
 def _mtime(path: Path) -> float:
     return path.stat().st_mtime
+
+
+def _with_names(argument: str) -> str:
+    """An override, in quotes where Hydra would make a number of a name: 2024_05_01 is 20240501."""
+    key, value = _split(argument)
+    names = value.split(",")
+    if key not in NAMES or not any(map(_NUMBER.fullmatch, names)):
+        return argument
+    found = [f"'{name}'" if _NUMBER.fullmatch(name) else name for name in names]
+    return f"{argument.partition('=')[0]}={','.join(found)}"
 
 
 def _split(argument: str) -> tuple[str, str]:

@@ -35,7 +35,7 @@ from xplanes.locks import alone_in
 from xplanes.lrm import LRMError
 from xplanes.models.initialisation import Initialisation, Place
 from xplanes.optional import MissingExtraError
-from xplanes.process import train_command
+from xplanes.process import resume_command
 from xplanes.rendering.gaussians.rasteriser import GaussianError
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.errors import SceneError
@@ -151,13 +151,13 @@ def _require_same(folder: Path, config: dict[str, Any]) -> None:
 def _recorded(experiment: Experiment, folder: Path, overrides: list[str], *, resume: bool) -> float:
     """Train with run.json and train.log kept, and give PSNR."""
     with _logged(folder / "train.log"):
-        record = RunRecord(folder, experiment.method.seed)
+        record = RunRecord(folder, experiment.method.seed, resume=resume)
         try:
             metrics = train(experiment, folder, resume=resume, record=record, overrides=overrides)
             record.end("finished")
         except KeyboardInterrupt:
             record.end("interrupted")
-            say(f"\nstopped. Go on with: {train_command()} resume={folder}")
+            say(f"\nstopped. Go on with: {resume_command(folder)}")
             raise
         except BaseException as error:
             logger.error("failed\n%s", traceback.format_exc())
@@ -165,7 +165,7 @@ def _recorded(experiment: Experiment, folder: Path, overrides: list[str], *, res
             with suppress(StorageError):
                 record.end("failed", f"{type(error).__name__}: {error}")
             if isinstance(error, OSError | TrainingError | GaussianError):
-                say(f"\nstopped. Once that is fixed: {train_command()} resume={folder}")
+                say(f"\nstopped. Once that is fixed: {resume_command(folder)}")
             raise
     return metrics["test"]["psnr"]
 
@@ -201,7 +201,7 @@ def train(
     loaded = time.monotonic() - started
     found = Initialisation(method.model, frame)
     if source is not None:
-        place = Place(scene, frame, device, experiment.devices, say)
+        place = Place(scene, frame, device, experiment.devices, say, settings.half_side)
         found = source.initialise(method, place)
     del source
     began = time.monotonic() - warm_up.seconds

@@ -3,6 +3,7 @@
 Must stay quick: its caller has yet to import torch, whose libraries read the environment once.
 """
 
+import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -32,3 +33,8 @@ def defaults(environment: Mapping[str, str]) -> dict[str, str]:
 def train_command() -> str:
     """The command that trains, as this process was started: for messages that name it."""
     return "python train.py" if Path(sys.argv[0]).name == "train.py" else "xplanes train"
+
+
+def resume_command(run: Path) -> str:
+    """What a user types in a shell to go on with a run."""
+    return f"{train_command()} {shlex.quote(f'resume={run}')}"

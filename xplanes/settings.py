@@ -150,7 +150,10 @@ def _converted(name: str, value: Any, hint: Any) -> Any:
         choices = [choice for kind in kinds for choice in get_args(kind)]
         if str in kinds or str(value) in choices:
             return str(value)
-    return list(value) if isinstance(value, tuple) else value
+    if isinstance(value, list | tuple):
+        items = [get_args(kind)[0] for kind in kinds if get_origin(kind) in (list, Sequence)]
+        return [_converted(name, item, items[0]) for item in value] if items else list(value)
+    return value
 
 
 def _kinds(hint: Any) -> tuple[list[Any], list[Range]]:

@@ -313,6 +313,8 @@ def test_learning_rates_decay_in_each_stage():
     farthest = max(np.linalg.norm(place - places.mean(axis=0)) for place in places)
     site = Site(FRAME, views.times, 0, "32", views=views)
     assert camera_extent(site) == pytest.approx(1.1 * farthest * FRAME.scale, rel=1e-5)
+    alone = replace(site, views=views.subset(torch.zeros(3, dtype=torch.long)))
+    assert camera_extent(alone) == 1.0
 
 
 def test_gradients_of_the_planes_terms_are_those_of_their_values():

@@ -203,6 +203,19 @@ def test_kplanes_render(tmp_path: Path, small_fields):
 
 
 @pytest.mark.slow
+def test_the_field_that_renders_has_the_users_cube(tmp_path: Path, monkeypatch):
+    frames = []
+    monkeypatch.setattr(
+        module, "trained_field", lambda method, place, *_, **__: frames.append(place)
+    )
+    monkeypatch.setattr(module, "_render", lambda *_: torch.zeros(4, 24, 24, 4, dtype=torch.uint8))
+    scene = Scene("ball", {"train": ball_views(6, 0.6)})
+    frame = scene_frame(scene.splits["train"], 0.9)
+    place = Place(scene, frame, torch.device("cpu"), say=lambda _: None, half_side=0.9)
+    fixed_view(settings(tmp_path), place, OPENLRM_VIEW, 24, StageCache(tmp_path))
+    assert [1 / place.frame.scale for place in frames] == [pytest.approx(0.9)]
+
+
 def test_kplanes_render_in_their_own_cube(tmp_path: Path, small_fields):
     options = ("preparation.fixed_view_model=kplanes", "preparation.fixed_view_steps=200")
     made, _ = video_of(

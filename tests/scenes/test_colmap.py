@@ -19,12 +19,15 @@ import torch
 from tests.captures import HEIGHT, WIDTH, picture, poses, save, settings, write_colmap
 from tests.lens_oracle import direction
 from tests.refusals import assert_refused
+from xplanes.components import build
+from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.scenes.cameras import cast_rays
 from xplanes.scenes.colmap import ColmapSettings
 from xplanes.scenes.colmap_model import LENSES, read_model
 from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses
+from xplanes.scenes.source import SceneSettings
 
 PYCOLMAP = Path(__file__).parents[1] / "data" / "colmap"
 OPENCV = (36.0, 34.0, 20.5, 14.25, -0.11, 0.03, 0.004, -0.003)
@@ -360,10 +363,15 @@ def test_one_camera_and_time_twice(capture):
 # Splits
 
 
+def test_folders_of_cameras_may_be_numbers():
+    plain = compose_plain("train", ["data=colmap", "data.test_cameras=[1,2]"])
+    assert build(plain["data"], SceneSettings, "data").test_cameras == ["1", "2"]
+
+
 def test_views_are_held_out_by_time_and_by_camera(tmp_path):
     capture = Capture(tmp_path / "rig", [f"cam{c}/{i}.png" for c in (1, 2, 11) for i in range(9)])
     splits = capture.read("train", "val", eval_every=4).splits
-    assert [len(splits[name]) for name in ("train", "val")] == [21, 6]
+    assert [len(splits[name]) for name in ("train", "val")] == [20, 7]
     assert not set(splits["train"].files) & set(splits["val"].files)
     assert {0.0, 1.0} <= set(splits["train"].times.tolist())
     scene = capture.read("train", "val", "test", test_cameras=["cam1/"], views=5, eval_views=3)

@@ -1,5 +1,6 @@
 """The data module: resuming from a checkpoint, and evaluation views."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -10,6 +11,7 @@ from xplanes.errors import ConfigError
 from xplanes.scenes.batches import RayBatches, RaySettings
 from xplanes.scenes.datamodule import UNIFORM, SceneDataModule
 from xplanes.scenes.frame import cube_frame, scene_frame
+from xplanes.scenes.listing import held_out_places
 
 FRAME = cube_frame(1.4, torch.zeros(3))
 RAYS = RaySettings(
@@ -87,6 +89,32 @@ def test_no_rays_of_held_out_views_are_trained_on():
     held_out, views = data.scene.splits["val"], data.batches(0).views
     assert len(held_out) + len(views) == 16
     assert not set(held_out.files) & set(views.files)
+
+
+@pytest.mark.parametrize("cameras", [2, 4, 8, 16, 24])
+def test_held_out_views_are_of_many_cameras(cameras):
+    """Views of a timestep follow one another in the order of their cameras."""
+    times = [step / 80 for step in range(80) for _ in range(cameras)]
+    places = held_out_places(times, 8)
+    assert [place // 8 for place in places] == list(range(10 * cameras))
+    counts = torch.tensor([place % cameras for place in places]).bincount(minlength=cameras)
+    assert counts.min() >= 5, counts
+    assert counts.max() <= 20, counts
+
+
+def test_held_out_views_of_one_camera_are_spread_evenly():
+    assert held_out_places([step / 30 for step in range(30)], 8) == [4, 12, 20, 28]
+    assert held_out_places([0.0], 8) == []
+
+
+def test_the_video_does_not_show_what_is_held_out():
+    scene = ball_scene(count=16)
+    train = scene.splits["train"]
+    data = SceneDataModule.of(replace(scene, video=train))
+    data.setup("fit")
+    video = data.scene.video
+    assert video is not None
+    assert set(video.files) == set(data.scene.splits["train"].files)
 
 
 def test_a_module_that_says_nothing_gets_rays_over_all_pixels_in_the_scenes_cube():

@@ -193,10 +193,12 @@ def test_images_of_several_sizes_and_widths(capture):
         path = capture.path / capture.frames[index]["file_path"]
         with Image.open(path) as picture:
             picture.resize((48, 36)).save(path)
+    assert "another aspect ratio" in capture.refused("EXIF", resolution=12)
+    for index in (1, 4):
+        capture.frames[index] |= {"h": 18, "cy": 9.0}
     views = capture.read(resolution=12, eval_every=100).splits["train"]
     assert [views.size(index) for index in range(3)] == [(12, 12), (9, 12), (12, 12)]
-    # The file tells of images of 24 x 24: each axis has its own ratio.
-    assert views.intrinsics.focal[1].tolist() == pytest.approx([FOCAL / 2, FOCAL * 9 / 24])
+    assert views.intrinsics.focal[1].tolist() == pytest.approx([FOCAL / 2, FOCAL / 2])
 
 
 def test_masks_bound_the_scene(capture):
@@ -208,6 +210,62 @@ def test_masks_bound_the_scene(capture):
     for index in range(10):
         expected = capture.views.image(index) * torch.ones(SIZE, SIZE).tril()[..., None]
         assert torch.equal(views.image(index), expected.byte())
+
+
+def label_masks():
+    """Masks as programs write them; all mean the lower triangle."""
+    inside = np.tri(SIZE, dtype=np.uint8)
+    palette = Image.fromarray(inside, "P")
+    palette.putpalette([0, 0, 0, 128, 0, 0])
+    cut = np.full((SIZE, SIZE, 4), 90, np.uint8)
+    cut[..., 3] = 255 * inside
+    colours = np.zeros((SIZE, SIZE, 3), np.uint8)
+    colours[inside > 0] = 220, 20, 60
+    return {
+        "black and white": Image.fromarray(inside * 255),
+        "0 and 1": Image.fromarray(inside),
+        "numbers of things": Image.fromarray(inside * 3),
+        "16 bits": Image.fromarray(inside.astype(np.uint16) * 65535),
+        "numbers in 16 bits": Image.fromarray(inside.astype(np.uint16) * 2),
+        "palette": palette,
+        "colours": Image.fromarray(colours),
+        "alpha": Image.fromarray(cut),
+    }
+
+
+@pytest.mark.parametrize("kind", label_masks())
+def test_masks_of_labels_colours_and_alpha_mean_what_they_show(capture, kind):
+    label_masks()[kind].save(capture.path / "mask.png")
+    for frame in capture.frames:
+        frame["mask_path"] = "mask.png"
+    views = capture.read(eval_every=100).splits["train"]
+    expected = capture.views.image(0) * torch.ones(SIZE, SIZE).tril()[..., None]
+    assert torch.equal(views.image(0), expected.byte())
+
+
+def test_soft_masks_stay_soft(capture):
+    values = np.linspace(0, 255, SIZE * SIZE).reshape(SIZE, SIZE).astype(np.uint8)
+    Image.fromarray(values).convert("RGB").save(capture.path / "mask.jpg", quality=100)
+    for frame in capture.frames:
+        frame["mask_path"] = "mask.jpg"
+    alpha = capture.read(eval_every=100).splits["train"].image(0)[..., 3].float()
+    expected = torch.from_numpy(values) * (capture.views.image(0)[..., 3] > 0)
+    assert float((alpha - expected).abs().max()) <= 3
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_of_very_few_frames_none_can_be_held_out(tmp_path, count):
+    capture = Capture(tmp_path / "few", count)
+    message = capture.refused("never held out", splits=("val",), error=MissingSplitError)
+    assert "data.eval_every" not in message
+
+
+def test_names_without_ending_find_upper_case_files(capture):
+    for frame in capture.frames:
+        path = capture.path / frame["file_path"]
+        path.rename(path.with_suffix(".PNG"))
+        frame["file_path"] = frame["file_path"].removesuffix(".png")
+    assert len(capture.read(eval_every=100).splits["train"]) == 10
 
 
 def test_keys_of_other_programs_change_nothing(capture):

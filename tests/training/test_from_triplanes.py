@@ -25,7 +25,7 @@ from xplanes.preparation import stages as stages_module
 from xplanes.scenes.frame import Frame
 from xplanes.streams import TrainingState
 from xplanes.training.clock import TrainingClock
-from xplanes.training.module import RadianceModule, TrainingError
+from xplanes.training.module import RadianceModule
 
 OPTIONS = {
     "width": 16,
@@ -174,7 +174,7 @@ def test_planes_are_not_resumed_in_another_frame(empty_place: Path, tmp_path: Pa
     run(config(2), tmp_path / "run", [], resume=False)
     before = (tmp_path / "run" / "checkpoints" / "last.ckpt").read_bytes()
     save(0.6)
-    with pytest.raises(TrainingError, match=r"frame is not the checkpoint's \(scale .*0\.5.*0\.6"):
+    with pytest.raises(ConfigError, match=r"frame is not the checkpoint's \(scale .*0\.5.*0\.6"):
         run(config(4), tmp_path / "run", [], resume=True)
     assert (tmp_path / "run" / "checkpoints" / "last.ckpt").read_bytes() == before
 

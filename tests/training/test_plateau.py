@@ -11,6 +11,7 @@ import torch
 
 from tests.training.runs import small_config
 from xplanes.errors import ConfigError
+from xplanes.evaluation.runs import load_run
 from xplanes.models.x_planes import XPlanesModel
 from xplanes.pipeline import run
 from xplanes.training import plateau
@@ -44,6 +45,17 @@ def test_too_little_is_not_judged():
 def test_errors_of_zero_and_rising_errors_are_convergence():
     assert converged([0.0] * LEAST, 0.1)
     assert converged([1.0 + n for n in range(LEAST)], 0.1)
+
+
+def test_a_resumed_run_remembers_its_last_batch(tmp_path: Path):
+    config = small_config(tmp_path, "trainer.max_steps=3", "media=false", "lrm=none")
+    run(config, tmp_path / "run", [], resume=False)
+    trained = load_run(tmp_path / "run").module
+    assert trained.last["psnr"] > 0
+    # The limit that was reached is the one that a longer run must raise.
+    said = (tmp_path / "run" / "train.log").read_text()
+    assert "trainer.max_steps=6" in said
+    assert "trainer.max_seconds=" not in said.split("resume=")[-1]
 
 
 def outcome(folder: Path) -> dict:

@@ -19,7 +19,7 @@ from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.training import evaluation
 from xplanes.training.checkpoints import Checkpoints
 from xplanes.training.evaluation import Evaluation
-from xplanes.training.record import KEPT, require_same_settings
+from xplanes.training.record import KEPT, RunRecord, require_same_settings
 
 FEW = ("trainer.max_steps=6", "callbacks.evaluation.at=[]")
 PAGES = ("config.yaml", "overrides.txt", "metrics.json")
@@ -148,6 +148,20 @@ def test_a_signal_after_the_last_step_is_heard(
     monkeypatch.undo()
     run(small_config(scenes, *FEW), tmp_path / "run", [], resume=True)
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["step"] == 6
+
+
+def test_another_start_in_a_folder_begins_its_own_record(tmp_path: Path) -> None:
+    first = RunRecord(tmp_path, 0, resume=False)
+    first.note(files={"train": ["a.png"]})
+    first.content["started"] = "long ago"
+    first.end("failed", "no such scene")
+    again = RunRecord(tmp_path, 0, resume=True)
+    assert (again.content["started"], again.content["resumed"]) == ("long ago", 1)
+    assert again.content["files"] == {"train": ["a.png"]}
+    anew = RunRecord(tmp_path, 0, resume=False)
+    assert anew.content["started"] != "long ago"
+    assert (anew.content["resumed"], anew.content["total_seconds"]) == (0, 0.0)
+    assert "files" not in anew.content
 
 
 def test_without_a_validation_split_training_views_are_held_out_or_nothing_is_the_best(

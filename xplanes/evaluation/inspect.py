@@ -1,7 +1,6 @@
 """`xplanes inspect`: what is read of a capture, as a table and a picture, with warnings."""
 
 import math
-import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +10,7 @@ from typing import Any
 import torch
 
 from xplanes.components import build, class_of, plugins
-from xplanes.config import compose_plain, group_options
+from xplanes.config import compose_plain, group_options, quoted
 from xplanes.errors import ConfigError
 from xplanes.evaluation.findings import (
     Finding,
@@ -136,15 +135,7 @@ def choose(arguments: Sequence[str]) -> Choice:
 def _place(folder: Path) -> list[str]:
     """Where a scene is, as settings."""
     parts = {"data.root": str(folder.parent), "data.scene": folder.name}
-    return [f"{key}={_quoted(text)}" for key, text in parts.items()]
-
-
-def _quoted(text: str) -> str:
-    """Text as Hydra reads it."""
-    if re.fullmatch(r"[A-Za-z_./][\w./-]*", text):
-        return text
-    escaped = re.sub(r"(\\*)'", r"\1\1\'", text)
-    return f"'{escaped}'"
+    return [f"{key}={quoted(text)}" for key, text in parts.items()]
 
 
 def _recognised(folder: Path, changed: Sequence[str]) -> str:

@@ -1,6 +1,7 @@
 """What a run says of itself: its first lines, metrics.json, TensorBoard, its last lines."""
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from torch.utils.tensorboard.writer import SummaryWriter
 
 from xplanes import __version__, backend
 from xplanes.experiment import Experiment
-from xplanes.process import train_command
+from xplanes.process import resume_command
 from xplanes.rendering.pictures import write_png
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.training.clock import TrainingClock, find_callback, training_seconds
@@ -63,9 +64,10 @@ def header(
     if not module.field.moves:
         reason = scene.static_reason or "one timestep only"
         moving = f" · trains as a static one, without time planes: {reason}"
-    budget = f"{trainer.get('max_steps')} steps"
-    if trainer.get("max_seconds") is not None:
-        budget += f" or {trainer['max_seconds']:g} s, whichever comes first"
+    steps, seconds = trainer.get("max_steps", -1), trainer.get("max_seconds")
+    limits = [f"{steps} steps"] if steps >= 0 else []
+    limits += [] if seconds is None else [f"{seconds:g} s"]
+    budget = " or ".join(limits) + ", whichever comes first" * (len(limits) > 1)
     lines = {
         "xplanes": f"{__version__} · torch {torch.__version__} · {device} · "
         f"{torch.get_num_threads()} threads · decoder {module.field.precision} · "
@@ -198,12 +200,14 @@ def log_hparams(trainer: Trainer, experiment: Experiment, metrics: dict[str, Any
 def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
     """The lines printed at the end: scores, time, paths, and what to do next."""
     seconds, skipped = metrics["seconds"], metrics["skipped"]
-    more = f"trainer.max_steps={2 * metrics['step']}"
-    if (most := experiment.trainer.get("max_seconds")) is not None:
-        more = f"trainer.max_seconds={2 * most:g}"
+    limits, more = experiment.trainer, ""
+    if 0 <= limits.get("max_steps", -1) <= 2 * metrics["step"]:
+        more += f" trainer.max_steps={2 * metrics['step']}"
+    if (most := limits.get("max_seconds")) is not None and 2 * seconds["train"] > most:
+        more += f" trainer.max_seconds={2 * most:g}"
     plateau = ""
     if metrics["converged"] is not None:
-        more = "callbacks.plateau.gain=null"
+        more = " callbacks.plateau.gain=null"
         plateau = (
             f"; {100 * skipped['budget']:.0f}% of the budget, as training had converged at step "
             f"{metrics['converged']}"
@@ -220,7 +224,8 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             f"warning  hardly better than images of background alone ({metrics['blank_psnr']:.2f} "
             "dB): this run shows nothing yet"
         )
-    curves = [f"tensorboard --logdir {run}"] if any(run.rglob("events.out.tfevents.*")) else []
+    place = shlex.quote(str(run))
+    curves = [f"tensorboard --logdir {place}"] * any(run.rglob("events.out.tfevents.*"))
     skips = (
         f"skipped  {100 * skipped['empty']:.0f}% of samples in empty space, "
         f"{100 * skipped['occluded']:.0f}% behind surfaces, "
@@ -244,7 +249,7 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             f"wrote    {run}",
             f"         metrics.json  curve.csv  checkpoints/last.ckpt  {metrics.get('media', '')}",
             *(f"next     {line}" for line in curves),
-            f"{'' if curves else 'next':<9}xplanes render {run}",
-            f"         {train_command()} resume={run} {more}",
+            f"{'' if curves else 'next':<9}xplanes render {place}",
+            f"         {resume_command(run)}{more}",
         ]
     )

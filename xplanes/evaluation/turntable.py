@@ -98,6 +98,7 @@ def find_pictures(paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         if path.is_dir():
             inside = sorted(p for p in path.iterdir() if p.suffix.lower() in KINDS)
+            inside = [p for p in inside if not p.name.startswith(".")]
             if not inside:
                 raise SceneError(f"{path} holds no pictures ({', '.join(KINDS)})")
             found += inside

@@ -154,8 +154,12 @@ class GaussiansModel(Model):
 
 
 def camera_extent(site: Site) -> float:
-    """How far the cameras stand from their mean at most, 1.1 times, in units of the frame."""
+    """How far the cameras stand from their mean at most, 1.1 times, in units of the frame.
+
+    At least 1, half the cube: cameras may all stand in one place.
+    """
     if site.views is None:
         return 1.0
     places = site.views.camera_to_world[:, :3, 3]
-    return EXTENT * float((places - places.mean(dim=0)).norm(dim=1).max()) * site.frame.scale
+    farthest = float((places - places.mean(dim=0)).norm(dim=1).max())
+    return max(1.0, EXTENT * farthest * site.frame.scale)

@@ -41,7 +41,7 @@ class HexPlaneGaussiansSettings(GaussiansSettings):
     static_share: Share  # Share of the budget before the deformation begins.
     resolution: Count  # Texels along each space axis at the first scale.
     scales: list[Count]  # Factors on the space resolution.
-    time_resolution: Count | None  # Rows of time; null: half the training views.
+    time_resolution: Count | None  # Rows of time; null: half the timesteps.
     channels: Count  # Channels of each plane and scale.
     width: Count  # Neurons of the hidden layers.
     plane_lr: Positive  # Learning rate of planes.

@@ -71,6 +71,7 @@ class Place:
         device: Where it is computed.
         devices: Processes that share the run.
         say: Takes a line before something slow begins.
+        half_side: Half the side of the scene's cube, where the user sets it.
     """
 
     scene: Scene
@@ -78,6 +79,7 @@ class Place:
     device: torch.device
     devices: int = 1
     say: Callable[[str], None] = print
+    half_side: float | None = None
 
 
 class Initialiser(ABC):

@@ -221,7 +221,7 @@ def _rendered(
     side = min(size, max(train.height, train.width))
     focal = view.focal * side
     rendering = rendering_method(method)
-    own_frame = rendering.model.frame(train, None, scene.points)
+    own_frame = rendering.model.frame(train, place.half_side, scene.points)
     # Samplers may have a fixed near bound. The LRM's camera is closer than the training cameras, so
     # its ray origins are moved back.
     away = (train.camera_to_world[:, :3, 3] - frame.centre).norm(dim=-1).mean()

@@ -61,6 +61,18 @@ class Renderer(ABC):
         """
 
 
+def leave_empty(image: dict[str, Tensor], where: Tensor, background: Tensor) -> None:
+    """Make pixels background, with opacity and depth of 0.
+
+    Args:
+        image: What `Renderer.view` gives; changed in place.
+        where: The pixels, such as those that a fisheye lens has no ray for. bool [H, W]
+        background: Colour behind the scene. [3]
+    """
+    for name, value in image.items():
+        value[where.to(value.device)] = background.to(value) if name == "colour" else 0
+
+
 class RayRenderer(Renderer):
     """Renders rays through a field, in a way of its own.
 

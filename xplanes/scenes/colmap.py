@@ -121,7 +121,7 @@ class ColmapSettings(SceneSettings):
         present = {
             path.relative_to(root).as_posix()
             for path in root.rglob("*")
-            if path.suffix.lower() in KINDS and path.is_file()
+            if path.suffix.lower() in KINDS and path.is_file() and path.name[0] != "."
         }
         _warn_of_unregistered(sorted(present - set(model.names)), len(present), images)
         times = self._times(model.names, labels, present)

@@ -19,6 +19,7 @@ from xplanes.files import read_json
 from xplanes.scenes.batches import Batch, Batches, DeviceBatches, RayBatches, RaySettings
 from xplanes.scenes.errors import MissingSplitError
 from xplanes.scenes.frame import scene_frame
+from xplanes.scenes.listing import held_out_places
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
 
@@ -180,12 +181,17 @@ class SceneDataModule(LightningDataModule):
         if len(train) < 2 * HELD_OUT:
             return
         chosen = torch.zeros(len(train), dtype=torch.bool)
-        chosen[train.times.argsort(stable=True)[HELD_OUT // 2 :: HELD_OUT]] = True
+        times, order = train.times.sort(stable=True)
+        chosen[order[held_out_places(times.tolist(), HELD_OUT)]] = True
         parts = {
             "train": train.subset((~chosen).nonzero()[:, 0]),
             "val": train.subset(chosen.nonzero()[:, 0]),
         }
-        self._scene = replace(self.scene, splits=self.scene.splits | parts)
+        video = self.scene.video
+        if video is not None and (shared := set(video.files) & set(parts["val"].files)):
+            kept = [index for index, file in enumerate(video.files) if file not in shared]
+            video = video.subset(torch.tensor(kept))
+        self._scene = replace(self.scene, splits=self.scene.splits | parts, video=video)
         self._batches = {}  # Those before held all of them.
         self.held_out = len(parts["val"])
 
@@ -271,6 +277,7 @@ class _WholeViews(Dataset):
             "target": self.views.composite(index, self.background),
             "background": self.background,
             "index": index,
+            **({} if (shown := self.views.intrinsics.has_ray(index)) is None else {"shown": shown}),
         }
 
 

@@ -18,6 +18,15 @@ Size = tuple[int, int]
 FORMATS = ("PNG", "JPEG")
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "P", "PA", "1")
 SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I")
+LABELS = 15
+"""Largest value of masks that number things; brighter ones go from black to white."""
+
+COLOURED = 16
+"""Difference of channels above which a mask is coloured; what JPEG makes of grey stays below."""
+
+MASKS = 2
+"""Version of what masks mean; increase it whenever decoded images change."""
+
 UNREADABLE = (
     OSError,
     SyntaxError,
@@ -108,7 +117,7 @@ def read_images(
     cut = any(masks) or any(shown is not None for shown in has_ray)
     channels = 4 if cut or any(read_header(path)[1] for path in paths) else 3
     sources = [*paths, *(mask for mask in masks if mask is not None)]
-    recipe = ["images", [mask is not None for mask in masks], digests(has_ray)]
+    recipe = ["images", MASKS, [mask is not None for mask in masks], digests(has_ray)]
     return store.decoded(sources, recipe, sizes, channels, jobs, cache)
 
 
@@ -156,13 +165,14 @@ def read_image(path: Path, size: Size, mask: Path | None = None) -> np.ndarray:
 
 
 def _read_mask(path: Path, image: Path, size: tuple[int, ...]) -> np.ndarray:
-    """A mask as factors from 0, where it is black, to 1. float32 [H, W]"""
+    """A mask as factors from 0, where it is black, to 1. float32 [H, W]
+
+    Transparent masks count by their alpha. Colours and small numbers are labels of things, of which
+    all but 0 or black belong to the mask.
+    """
     try:
         with Image.open(path, formats=FORMATS) as picture:
-            if picture.mode in SIXTEEN_BIT_MODES:
-                values = np.asarray(picture, np.float32) / 257
-            else:
-                values = np.asarray(picture.convert("L"), np.float32)
+            values = _mask_values(picture)
     except UNREADABLE as problem:
         raise _unreadable(path, problem) from problem
     if values.shape != size:
@@ -170,8 +180,23 @@ def _read_mask(path: Path, image: Path, size: tuple[int, ...]) -> np.ndarray:
             f"{path} has {values.shape[1]}x{values.shape[0]} pixels, but {image}, whose mask it "
             f"is, has {size[1]}x{size[0]}. Export the mask at the size of the image."
         )
-    # Zeros and ones are meant as black and white.
-    return values if values.max() == 1 else values / 255
+    return values
+
+
+def _mask_values(picture: Image.Image) -> np.ndarray:
+    if picture.mode in SIXTEEN_BIT_MODES:
+        values, white = np.asarray(picture, np.float32), 65535
+    else:
+        colours = np.asarray(picture.convert("RGBA"))
+        if colours[..., 3].min() < 255:
+            return np.divide(colours[..., 3], 255, dtype=np.float32)
+        channels = colours[..., :3].astype(np.int16)
+        if np.ptp(channels, axis=-1).max() > COLOURED:
+            return channels.any(axis=-1).astype(np.float32)
+        values, white = np.asarray(picture.convert("L"), np.float32), 255
+    if values.max() <= LABELS:
+        return (values > 0).astype(np.float32)
+    return np.divide(values, white, dtype=np.float32)
 
 
 def common_size(paths: Sequence[Path]) -> tuple[int, int]:

@@ -170,6 +170,24 @@ class Listing:
         return self.subset(sorted(by_time[rank] for rank in ranks))
 
 
+def held_out_places(times: Sequence[float], every: int) -> list[int]:
+    """One place in each ``every`` of views in the order of their times.
+
+    They are evenly spread. Where several cameras see a timestep, their views follow one another in
+    turn, and the same place would always be the same camera's: places then move on from group to
+    group.
+
+    Args:
+        times: Times of the views, in order.
+        every: Views of which one is held out.
+    """
+    # Multiples of the golden ratio spread evenly, too.
+    step = 0.5 * (math.sqrt(5) - 1) if 1 < len(set(times)) < len(times) else 0.0
+    groups = range(-(-len(times) // every))
+    places = (every * group + int(every * ((0.5 + step * group) % 1)) for group in groups)
+    return [place for place in places if place < len(times)]
+
+
 def held_out(listing: Listing, every: int) -> dict[str, list[int]]:
     """Places of the images to train on, and of those held out as val.
 
@@ -177,7 +195,8 @@ def held_out(listing: Listing, every: int) -> dict[str, list[int]]:
     """
     times = listing.times.tolist()
     order = sorted(range(len(listing)), key=lambda index: (times[index], listing.files[index]))
-    chosen = set(order[max(1, every // 2) : -1 : every])
+    places = held_out_places(sorted(times), every)
+    chosen = {order[place] for place in places if 0 < place < len(order) - 1}
     return {
         "train": [index for index in range(len(listing)) if index not in chosen],
         "val": sorted(chosen),
@@ -327,8 +346,9 @@ def require_shape(path: Path, size: Size, camera: Calibration) -> None:
     if off > max(1.5 * max(camera.w, camera.h), SHAPE_TOLERANCE * width * camera.h):
         raise SceneError(
             f"{path} has {width}x{height} pixels, but its camera was calibrated for images of "
-            f"{camera.w:g}x{camera.h:g}, of another aspect ratio. Perhaps the image was turned "
-            "or cut: take the one that the camera was calibrated with."
+            f"{camera.w:g}x{camera.h:g}, of another aspect ratio. Perhaps the image was cut, "
+            "or turned (orientations in EXIF are not followed): take the one that the camera was "
+            "calibrated with."
         )
 
 
@@ -470,7 +490,7 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
         raise SceneError(
             f"{label}: {key} is absolute. Write it relative to {folder}, as in {example}."
         )
-    for suffix in SUFFIXES:
+    for suffix in (*SUFFIXES, *(suffix.upper() for suffix in SUFFIXES[1:])):
         path = (folder / f"{relative}{suffix}").resolve()
         if not path.is_relative_to(folder):
             raise SceneError(

@@ -150,6 +150,8 @@ def _no_split(
         "Leave data.eval_split out, set it to val, or list "
         if split == "test" and parts.get("val")
         else f"Set data.eval_every below {eval_every}, or list "
+        if "val" in parts and len(parts["train"]) > 2 and eval_every > 1
+        else "The first and the last frame are never held out. List "
         if "val" in parts
         else "List "
     )

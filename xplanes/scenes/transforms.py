@@ -23,6 +23,7 @@ from xplanes.scenes.listing import (
     read_object,
     refuse_repeats,
     require_precision,
+    require_shapes,
     short,
     unit_times,
 )
@@ -79,7 +80,7 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
     times = _times(path, named, any_unit)
     require_precision(path, poses[:, :3, 3])
     refuse_repeats(labels, paths, poses, times)
-    return Listing(
+    listing = Listing(
         paths=tuple(paths),
         files=tuple(image.relative_to(folder).as_posix() for image in paths),
         camera_to_world=torch.from_numpy(poses).float(),
@@ -88,6 +89,8 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
         timed=bool(times),
         masks=masks if any(masks) else (),
     )
+    require_shapes(listing)
+    return listing
 
 
 def read_frames(path: Path) -> dict[str, Any]:

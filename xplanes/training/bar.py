@@ -70,7 +70,7 @@ class StepBar(ProgressBar):
         rate = (rays - self._seen[1]) / max(seconds - self._seen[0], 1e-9)
         left = seconds * (1 / max(module.progress, 1e-6) - 1)
         parts = [
-            f"step {trainer.global_step}/{trainer.max_steps}",
+            f"step {trainer.global_step}" + f"/{trainer.max_steps}" * (trainer.max_steps >= 0),
             f"{seconds:.0f}/{most:.0f} s" if most else f"{seconds:.0f} s",
             f"{100 * module.progress:.0f}%",
             f"{rate / 1000:.1f}k rays/s",

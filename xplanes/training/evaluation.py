@@ -18,7 +18,7 @@ from xplanes.errors import ConfigError
 from xplanes.fields.base import Representation
 from xplanes.files import read_rows, write_rows
 from xplanes.metrics import psnr, ssim
-from xplanes.rendering.base import Renderer
+from xplanes.rendering.base import Renderer, leave_empty
 from xplanes.rendering.pictures import plane_sheet, strip, write_png
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
@@ -96,9 +96,8 @@ def render_view(
     time = float(views.times[index])
     image = renderer.view(field, frame, views.camera(index), time, background)
     found = {name: value.cpu() for name, value in image.items()}
-    if (has_ray := views.intrinsics.has_ray(index)) is not None:
-        for name, value in found.items():
-            value[~has_ray] = background.cpu() if name == "colour" else 0
+    if (shown := views.intrinsics.has_ray(index)) is not None:
+        leave_empty(found, ~shown, background)
     return found
 
 

@@ -96,6 +96,8 @@ class Trainer(lightning.Trainer):
         if others.get("strategy") == "ddp":
             # The processes agree on the occupancy grid themselves, before it is maintained.
             others["strategy"] = DDPStrategy(broadcast_buffers=False)
+        # Lightning ends after 1000 epochs where no number of steps is given.
+        others.setdefault("max_epochs", -1)
         self.interrupt = Interrupt()
         quiet_lightning()
         super().__init__(

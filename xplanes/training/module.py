@@ -19,7 +19,7 @@ from xplanes.fields.base import Representation
 from xplanes.metrics import psnr, ssim
 from xplanes.models.base import Model, ModelSettings, colour_error
 from xplanes.models.initialisation import Initialisation, Method, Place
-from xplanes.rendering.base import Renderer, Rendering
+from xplanes.rendering.base import Renderer, Rendering, leave_empty
 from xplanes.rendering.sampler import Sampler, Site
 from xplanes.scenes.batches import Batch, BatchSettings
 from xplanes.scenes.frame import Frame, frame_content, read_frame
@@ -170,7 +170,7 @@ class RadianceModule(LightningModule):
             initialise = source.initialise
         found = Initialisation(method.model, frame)
         if initialise is not None:
-            found = initialise(method, Place(scene, frame, device, devices, say))
+            found = initialise(method, Place(scene, frame, device, devices, say, half_side))
         rays = self.method.model.rays
         self.ray_settings = rays.on(device)
         site = Site(
@@ -554,7 +554,10 @@ class RadianceModule(LightningModule):
     def _view(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         assert self.frame is not None
         seen = (batch["camera"], float(batch["time"]), batch["background"])
-        return self.renderer_now.view(self.field, self.frame, *seen)
+        image = self.renderer_now.view(self.field, self.frame, *seen)
+        if (shown := batch.get("shown")) is not None:
+            leave_empty(image, ~shown, batch["background"])
+        return image
 
     # Checkpoints
 
@@ -566,6 +569,7 @@ class RadianceModule(LightningModule):
             "counts": dict(self.counts),
             "unusable": self.unusable,
             "restarts": self.restarts,
+            "last": dict(self.last),
         }
         if self.site is not None:
             checkpoint["site"] = {
@@ -591,7 +595,7 @@ class RadianceModule(LightningModule):
             self.restarts = progress["restarts"]
             self._loaded_step = checkpoint["global_step"]
             self.batches, self.unusable = progress["batches"], progress["unusable"]
-            self.rays = progress["rays"]
+            self.rays, self.last = progress["rays"], dict(progress.get("last", {}))
             self.counts = dict.fromkeys(COUNTS, 0) | progress["counts"]
         except (KeyError, TypeError, AttributeError) as error:
             raise ConfigError(
@@ -624,7 +628,7 @@ class RadianceModule(LightningModule):
         for name, now in frame_content(self.site.frame).items():
             before = torch.as_tensor(getattr(trained, name))
             if not torch.allclose(before, torch.as_tensor(now), rtol=1e-4, atol=1e-5):
-                raise TrainingError(
+                raise ConfigError(
                     f"the initialisation was made anew, and its frame is not the checkpoint's "
                     f"({name} {before.tolist()}, now {torch.as_tensor(now).tolist()}): what "
                     "preparation.cache kept is gone. Bring it back, or train anew in another folder"

@@ -14,13 +14,14 @@ from typing import Any, Literal
 from xplanes import __version__
 from xplanes.errors import ConfigError
 from xplanes.files import read_json, write_json
-from xplanes.process import train_command
+from xplanes.process import resume_command
 from xplanes.scenes.views import Views
 
 logger = logging.getLogger(__name__)
 
 KEPT = """model.name lrm.name model.sampler.name data.name data.scene data.seed data.resolution
-data.views data.train_views data.train_on_video data.static data.half_side""".split()
+data.views data.train_views data.train_on_video data.static data.half_side data.eval_split
+data.eval_every data.test_cameras data.frames data.protocol data.mask_use""".split()
 """Settings on which the planes, their frame and what they show depend. Files may have moved."""
 
 
@@ -93,12 +94,13 @@ class RunRecord:
     Args:
         run: The run directory.
         seed: The run's seed.
+        resume: Whether the run goes on; what a folder says of another start is left out else.
     """
 
-    def __init__(self, run: Path, seed: int) -> None:
+    def __init__(self, run: Path, seed: int, *, resume: bool) -> None:
         self.path = run / "run.json"
         self._began = time.monotonic()
-        earlier = _earlier(self.path)
+        earlier = _earlier(self.path) if resume else {}
         self._before = float(earlier.get("total_seconds", 0.0))
         self.content: dict[str, Any] = {
             "status": "running",
@@ -160,7 +162,7 @@ def claim(run: Path, *, resume: bool) -> None:
         return  # It ended before its first checkpoint: nothing would be lost.
     if status is not None and not resume:
         raise ConfigError(
-            f"{run} holds a run already ({status}). Go on with it: {train_command()} resume={run}; "
+            f"{run} holds a run already ({status}). Go on with it: {resume_command(run)}; "
             "or choose another hydra.run.dir"
         )
     if status is None and resume:

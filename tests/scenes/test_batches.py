@@ -12,7 +12,7 @@ from tests.synthetic import ball_views
 from xplanes.errors import ConfigError
 from xplanes.scenes.batches import NEAR_SILHOUETTE, RayBatches, RaySettings
 from xplanes.scenes.frame import Frame, cube_frame
-from xplanes.scenes.silhouettes import foreground
+from xplanes.scenes.silhouettes import foreground, plain
 from xplanes.streams import step_generator
 
 SQUARE = ball_views(5, 0.5, size=24)
@@ -210,6 +210,64 @@ def test_images_that_are_all_background_or_all_content_are_drawn_evenly():
         assert len(batch["times"].unique()) == 5, alpha
         assert (batch["target"] == 1).all(), alpha
         assert batch["directions"].unique(dim=0).shape[0] > 1000, alpha
+
+
+def floor_views(side=120):
+    """A coloured square that moves over an opaque white floor, before background above it."""
+    views = ball_views(6, 0.5, size=side)
+    images = torch.full_like(views.images, 255)
+    images[:, :30] = 0
+    for index in range(6):
+        images[index, 60:80, 10 + 10 * index : 40 + 10 * index, :3] = torch.tensor(
+            [200, 30, 60], dtype=torch.uint8
+        )
+    return replace(views, images=images)
+
+
+def test_pixels_of_one_colour_with_all_around_them_are_plain():
+    views = floor_views()
+    images = views.images.clone()
+    images[2, 100, 100, 0] = 251  # As even as JPEG leaves it.
+    images[3, 100, 100, 0] = 240
+    images[4, 100, 100, 3] = 254
+    views, reach = replace(views, images=images), 4
+    found = plain(views, [reach] * 6)
+    assert found.any()
+    for view, row, column in found.nonzero()[::37].tolist():
+        around = images[view, max(0, row - reach) : row + reach + 1]
+        around = around[:, max(0, column - reach) : column + reach + 1].flatten(0, 1).int()
+        assert (around.amax(dim=0) - around.amin(dim=0)).max() <= 4, (view, row, column)
+        assert (around[:, 3] == 255).all(), (view, row, column)
+    # What is two blocks away from any change is found.
+    assert found[:, 92:96, 40:60].all()
+    assert bool(found[2, 100, 100])
+    assert not found[3:5, 100, 100].any()
+
+
+def test_plain_pixels_have_the_share_of_the_background_and_their_own_times():
+    views = floor_views()
+    batches = batches_of(views, per_batch=20_000, background_share=0.1, background_jitter=0.2)
+    batch = batches.draw(0)
+    even = plain(views, [2] * 6)
+    natural = float(even.float().mean())
+    assert natural > 0.3
+    near = foreground(views, 2) & ~even
+    red = views.images[..., 1] == 30
+    expected = 0.7 * float((near & red).sum() / near.sum())
+    expected += 0.2 * float((even & red).sum() / even.sum())
+    assert expected > 3 * float(red.float().mean())
+    found = float((batch["target"][:, 1] < 0.5).float().mean())
+    assert found == pytest.approx(expected, abs=0.015)
+    assert float((batch["alpha"] == 0).float().mean()) == pytest.approx(
+        0.1 + 0.7 * float((near & (views.images[..., 3] == 0)).sum() / near.sum()), abs=0.015
+    )
+    assert set(batch["times"][batch["alpha"] == 1].tolist()) <= set(views.times.tolist())
+    assert batches.skipped == pytest.approx(
+        float((views.images[..., 3] == 0).float().mean()) + natural - 0.3, abs=0.05
+    )
+    alike = batches_of(views, per_batch=20_000, skip_background=False)
+    assert alike.plain is None
+    assert alike.skipped == 0
 
 
 def test_jitter_is_even():

@@ -12,7 +12,7 @@ from torch import Tensor
 from xplanes.backend import memory_left
 from xplanes.scenes.changes import changing
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.silhouettes import foreground
+from xplanes.scenes.silhouettes import foreground, plain
 from xplanes.scenes.store import (
     CELL,
     TILE,
@@ -31,6 +31,9 @@ Batch = dict[str, Any]
 
 NEAR_SILHOUETTE = 0.02
 """Share of the image's side around silhouettes that counts as near."""
+
+PLAIN_SHARE = 0.2
+"""Share of rays at opaque pixels of one colour with all around them."""
 
 STILL_SHARE = 0.5
 """Share of rays at pixels of fixed cameras where nothing changes."""
@@ -122,7 +125,8 @@ class RaySettings(BatchSettings):
     # Maximum number of samples per batch, on average. auto: 8192 on the CPU, 524288 on a GPU.
     samples_per_batch: Count | Literal["auto"]
     background: Literal["white", "random", "one"]  # random: per ray; one: random per batch.
-    skip_background: bool  # Sample rays near silhouettes, and where something changes, more often.
+    # Sample rays near silhouettes, at texture, and where something changes, more often.
+    skip_background: bool
     background_share: Share  # Share of rays far from the silhouettes.
     background_jitter: Share  # Maximum random offset of the times of these rays.
 
@@ -224,8 +228,9 @@ class RayBatches(Batches):
     With ``skip_background`` rays far from the silhouettes are drawn at ``background_share`` instead
     of at their share of the pixels. They show nothing but background; a few keep the air clear of
     floaters. Space far from a silhouette counts as empty shortly before and after, too. Opaque
-    images of fixed cameras have no silhouettes, but pixels that change: the others are drawn at
-    `STILL_SHARE`, at their own times.
+    pixels of one colour with all around them, such as those of a white floor, have `PLAIN_SHARE`.
+    Opaque images of fixed cameras have no silhouettes, but pixels that change: the others are drawn
+    at `STILL_SHARE`, at their own times.
 
     Of images in a file of tiles each batch takes `PER_TILE` pixels of each of some tiles, so that
     it reads few places of the disk; every pixel is still as likely as any other. Near and far are
@@ -247,7 +252,7 @@ class RayBatches(Batches):
         self.background = settings.background
         widths = views.intrinsics.size[:, 1].tolist()
         margins = [max(1, round(NEAR_SILHOUETTE * width)) for width in widths]
-        changes = None
+        changes, even = None, None
         if isinstance(views.images, StoredImages):
             self.near, self.far = _tile_pools(views, views.images, margins)
         else:
@@ -258,15 +263,23 @@ class RayBatches(Batches):
             if views.is_cut:
                 valid = views.valid()
                 near, far = near & valid, far & valid
+            if settings.skip_background and changes is None:
+                even = near & plain(views, margins)
+                even &= (near & ~even).any()  # Where there is nothing else, nothing is preferred.
+                near &= ~even
             self.near, self.far = (_PixelPool(pool) for pool in (near, far))
+        self.plain = _PixelPool(even) if even is not None and even.any() else None
         self._prefetched = -1
-        natural = len(self.far) / (len(self.near) + len(self.far))
-        skip = settings.skip_background and 0 < natural < 1
+        plain_pixels = 0 if self.plain is None else len(self.plain)
+        pixels = len(self.near) + len(self.far) + plain_pixels
+        natural, plain_natural = len(self.far) / pixels, plain_pixels / pixels
+        skip = settings.skip_background and len(self.near) > 0
         share = settings.background_share if changes is None else STILL_SHARE
         self.far_share = min(share, natural) if skip else natural
-        jitter = skip and not views.is_static and changes is None
+        self.plain_share = min(PLAIN_SHARE, plain_natural) if skip else plain_natural
+        jitter = skip and natural > 0 and not views.is_static and changes is None
         self.background_jitter = settings.background_jitter if jitter else 0.0
-        self.skipped = max(0.0, 1 - self.far_share / natural) * natural if skip else 0.0
+        self.skipped = natural + plain_natural - self.far_share - self.plain_share
 
     def draw(self, step: int) -> Batch:
         """The batch of a step.
@@ -315,11 +328,16 @@ class RayBatches(Batches):
 
     def _choose(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Which choices are far from silhouettes, and the place of each. [K, 3] -> [K], [K, 2]"""
-        far = uniform[:, 0] < self.far_share
+        kind, where = uniform[:, 0], uniform[:, 1]
+        far = kind < self.far_share
         if not (len(self.near) and len(self.far)):
-            return far, (self.near if len(self.near) else self.far).pick(uniform[:, 1])
-        near_place, far_place = self.near.pick(uniform[:, 1]), self.far.pick(uniform[:, 1])
-        return far, torch.where(far[:, None], far_place, near_place)
+            place = (self.near if len(self.near) else self.far).pick(where)
+        else:
+            place = torch.where(far[:, None], self.far.pick(where), self.near.pick(where))
+        if self.plain is not None:
+            even = ~far & (kind < self.far_share + self.plain_share)
+            place = torch.where(even[:, None], self.plain.pick(where), place)
+        return far, place
 
     def _from_memory(self, images: Tensor, uniform: Tensor) -> tuple[Tensor, ...]:
         """Far, view, row, column and colour of rays through scattered pixels. [R], [R, 4]"""
@@ -414,9 +432,9 @@ class DeviceBatches(RayBatches):
         self.device = device
         self.views = batches.views.to(device)
         self.frame = batches.frame.to(device)
-        self.near, self.far = (
+        self.near, self.far, self.plain = (
             pool.to(device) if isinstance(pool, _PixelPool) else pool
-            for pool in (batches.near, batches.far)
+            for pool in (batches.near, batches.far, batches.plain)
         )
 
     @staticmethod

@@ -13,6 +13,9 @@ from xplanes.scenes.views import Views
 WINDOW = 0.06
 """Share of the time span over which content counts as static when silhouettes are joined."""
 
+SAME_COLOUR = 4
+"""Steps of 255 by which pixels of one colour differ at most."""
+
 MOST_VIEWS = 5
 """Views of such a span at most: more rule out little empty space, but ever more of what moves."""
 
@@ -30,6 +33,30 @@ def foreground(views: Views, margin: int | Sequence[int]) -> Tensor:
         alpha = views.image(index)[..., 3]
         near[index, : alpha.shape[0], : alpha.shape[1]] = widened(alpha > 0, reach)
     return near
+
+
+def plain(views: Views, margins: Sequence[int]) -> Tensor:
+    """Opaque pixels around which all have one colour: walls and floors without texture.
+
+    Args:
+        views: Images in memory.
+        margins: Pixels around that have the same colour at least, for each image. [V]
+
+    Returns:
+        bool [V, H, W]
+    """
+    found = torch.zeros(views.images.shape[:3], dtype=torch.bool)
+    for index, reach in enumerate(margins):
+        image = views.image(index)
+        height, width = image.shape[0] // reach * reach, image.shape[1] // reach * reach
+        blocks = image[:height, :width].view(height // reach, reach, width // reach, reach, 4)
+        # Of each block and the eight around it; blocks at the rim have fewer.
+        most = F.max_pool2d(blocks.amax(dim=(1, 3)).permute(2, 0, 1).float(), 3, 1, 1)
+        least = -F.max_pool2d(-blocks.amin(dim=(1, 3)).permute(2, 0, 1).float(), 3, 1, 1)
+        even = ((most - least).amax(dim=0) <= SAME_COLOUR) & (least[3] == 255)
+        even = even.repeat_interleave(reach, 0).repeat_interleave(reach, 1)
+        found[index, :height, :width] = even
+    return found
 
 
 def widened(mask: Tensor, reach: int) -> Tensor:

@@ -33,7 +33,7 @@ from xplanes.scenes.datamodule import SceneDataModule
 RESULTS = Path(__file__).parent.parent / "docs" / "results"
 PUBLISHED, LAMBDA, MU = 2.53, 0.009, 0.05
 LAMBDAS = (0.001, 0.002, 0.0025, 0.003, 0.0035, 0.004, 0.006, 0.009, 0.02)
-SCALES = (0.0001, 0.0003, 0.001, 0.002, 0.003, 0.01, 0.1, 1.0, 10.0)
+SCALES = (0.0001, 0.0003, 0.001, 0.0014, 0.002, 0.003, 0.01, 0.1, 1.0, 10.0)
 TOLERANCE = 3e-3
 """Relative residual at which the paper's ADMM stops in recipe=paper."""
 

@@ -1,6 +1,7 @@
 """With nothing but Lightning: its own Trainer, loggers, callbacks and checkpoints."""
 
 import csv
+import json
 import re
 import shutil
 from pathlib import Path
@@ -10,16 +11,19 @@ import pytest
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
-from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.strategies import DDPStrategy
 
 from tests.training.runs import small_config
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError
+from xplanes.experiment import Experiment
+from xplanes.pipeline import run
 from xplanes.scenes.errors import SceneError
 from xplanes.training.fit import Trainer
 
 ROOT = Path(__file__).resolve().parents[1]
+CALLBACKS = "lightning.pytorch.callbacks"
 
 
 @pytest.fixture(scope="module")
@@ -151,6 +155,49 @@ def test_a_resumed_fit_ends_with_the_same_numbers(config: dict, tmp_path: Path) 
     assert whole.keys() == resumed.keys()
     for name, value in whole.items():
         assert torch.equal(resumed[name], value), name
+
+
+def test_callbacks_that_watch_a_metric_see_every_evaluation(tmp_path: Path) -> None:
+    config = small_config(
+        tmp_path, "trainer.max_steps=60", "callbacks.evaluation.at=[0,0.2,0.4,0.6]"
+    )
+    watched = {"monitor": "val/psnr", "mode": "max"}
+    config["callbacks"] |= {
+        "stop": watched
+        | {"_target_": f"{CALLBACKS}.EarlyStopping", "patience": 1, "min_delta": 99},
+        "keep": watched
+        | {
+            "_target_": f"{CALLBACKS}.ModelCheckpoint",
+            "dirpath": str(tmp_path),
+            "filename": "mine",
+        },
+    }
+    run(config, tmp_path / "run", [], resume=False)
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    # The evaluation after a fifth of the steps is not 99 dB better than the one before.
+    assert found["step"] == 12
+    kept = torch.load(tmp_path / "mine.ckpt", weights_only=True)
+    assert kept["global_step"] == 12
+
+
+class Lines(Logger):
+    """A logger that takes no folder."""
+
+    name, version = "lines", 0
+
+    def log_metrics(self, metrics, step=None) -> None:
+        pass
+
+    def log_hyperparams(self, params, *rest) -> None:
+        pass
+
+
+def test_loggers_need_no_folder(tmp_path: Path) -> None:
+    config = small_config(tmp_path, "trainer.max_steps=2")
+    config["logger"] = {"lines": {"_target_": "tests.test_lightning.Lines"}}
+    config["plugins"] = ["tests.test_lightning"]
+    trainer = Experiment.read(config, config["plugins"]).build_trainer(tmp_path)
+    assert type(trainer.logger).__name__ == "Lines"
 
 
 def test_clipping_and_accumulation_are_refused_with_a_message(config: dict, tmp_path: Path) -> None:

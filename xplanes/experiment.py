@@ -11,7 +11,7 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 
-from xplanes.components import build, plugins
+from xplanes.components import build, class_of, plugins
 from xplanes.errors import ConfigError
 from xplanes.models.initialisation import Method
 from xplanes.scenes.source import SceneSettings
@@ -142,7 +142,11 @@ def _logger(name: str, node: Mapping[str, Any], run: Path) -> Logger:
     Raises:
         ConfigError: If it refuses its arguments.
     """
-    logger = build(node, Logger, f"logger.{name}", save_dir=str(run))
+    key = f"logger.{name}"
+    cls = class_of(node.get("_target_"), Logger, f"{key}._target_")
+    taken = inspect.signature(cls).parameters.values()
+    known = any(each.name == "save_dir" or each.kind is each.VAR_KEYWORD for each in taken)
+    logger = build(node, Logger, key, **({"save_dir": str(run)} if known else {}))
     if isinstance(logger, TensorBoardLogger):
         from torch.utils.tensorboard import SummaryWriter
 

@@ -16,6 +16,7 @@ from xplanes.files import read_rows
 from xplanes.pipeline import run
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.dnerf import BlenderSettings
+from xplanes.scenes.errors import SceneError
 from xplanes.training import evaluation
 from xplanes.training.checkpoints import Checkpoints
 from xplanes.training.evaluation import Evaluation
@@ -162,6 +163,34 @@ def test_another_start_in_a_folder_begins_its_own_record(tmp_path: Path) -> None
     assert anew.content["started"] != "long ago"
     assert (anew.content["resumed"], anew.content["total_seconds"]) == (0, 0.0)
     assert "files" not in anew.content
+
+
+def test_a_scene_of_training_views_alone_is_scored_on_views_held_out(tmp_path: Path) -> None:
+    few = (*FEW, "callbacks.evaluation.at=[0]", "media=false", "lrm=none")
+    for count in (10, 20):
+        options = (f"data.train_views={count}", "data.val_views=1", "data.test_views=1")
+        demo = small_config(tmp_path / "demo", *few, *options)
+        made = SceneDataModule(demo["data"]).settings.folder
+        folder = Path(shutil.copytree(made, tmp_path / "scenes" / str(count)))
+        for split in ("val", "test"):
+            (folder / f"transforms_{split}.json").unlink()
+        known = {field.name for field in fields(BlenderSettings)}
+        data = {name: value for name, value in demo["data"].items() if name in known}
+        target = "xplanes.scenes.dnerf.BlenderSettings"
+        data |= {"_target_": target, "root": str(tmp_path / "scenes"), "scene": str(count)}
+        done = tmp_path / f"run{count}"
+        if count == 10:
+            with pytest.raises(SceneError, match=r"transforms_test\.json does not exist"):
+                run(demo | {"data": data}, done, [], resume=False)
+            continue
+        run(demo | {"data": data}, done, [], resume=False)
+        metrics = json.loads((done / "metrics.json").read_text())
+        assert (metrics["split"], len(metrics["views"])) == ("val", 2)
+        trained = load_run(done)
+        assert (len(trained.scene.splits["train"]), trained.split) == (18, "val")
+        alone = SceneDataModule(data)
+        alone.setup("test")
+        assert len(alone.scene.splits["val"]) == 2
 
 
 def test_without_a_validation_split_training_views_are_held_out_or_nothing_is_the_best(

@@ -20,11 +20,8 @@ from xplanes.scenes.batches import Batch, Batches, DeviceBatches, RayBatches, Ra
 from xplanes.scenes.errors import MissingSplitError
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.listing import held_out_places
-from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.source import HELD_OUT, SceneSettings, may_hold_out
 from xplanes.scenes.views import Scene, Views
-
-HELD_OUT = 8
-"""Where a scene has no validation split, one training view in so many is held out."""
 
 UNIFORM = RaySettings(
     per_batch=1024,
@@ -147,6 +144,8 @@ class SceneDataModule(LightningDataModule):
             else:
                 self.read_split(split)
         if stage in ("test", "predict"):
+            if not {"test", "val"} & self.scene.splits.keys():
+                self._hold_out()
             self.read_split(self.test_split)
 
     @property
@@ -178,7 +177,7 @@ class SceneDataModule(LightningDataModule):
     def _hold_out(self) -> None:
         """Make a validation split of training views, if there are enough of them."""
         train = self.scene.splits["train"]
-        if len(train) < 2 * HELD_OUT:
+        if not may_hold_out(train):
             return
         chosen = torch.zeros(len(train), dtype=torch.bool)
         times, order = train.times.sort(stable=True)

@@ -17,6 +17,15 @@ SAME = 2
 """Largest difference of a static pixel between frames, in steps of 1/255."""
 
 
+HELD_OUT = 8
+"""Where a scene has no validation split, one training view in so many is held out."""
+
+
+def may_hold_out(train: Views) -> bool:
+    """Whether there are training views enough to hold some out."""
+    return len(train) >= 2 * HELD_OUT
+
+
 def frames_are_equal(video: Views) -> bool:
     """Whether all frames of a fixed-camera video (two timesteps or more) are equal."""
     first = video.image(0).to(torch.int16)
@@ -130,4 +139,10 @@ class SceneSettings(Settings, ABC):
         for splits in (("train", "val", "test"), ("train", "val")):
             with suppress(MissingSplitError):
                 return self.load(splits)
-        return self.load(("train", "test"))
+        try:
+            return self.load(("train", "test"))
+        except MissingSplitError:
+            scene = self.load(("train",))
+            if not may_hold_out(scene.splits["train"]):
+                raise
+            return scene

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 from lightning import LightningModule, Trainer
-from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint
 from torch import Tensor
 
 from xplanes.errors import ConfigError
@@ -217,7 +217,8 @@ class Evaluation(Callback):
     views, and no evaluation counts as the best.
 
     Writes curve.csv and images into the trainer's ``default_root_dir``, and gives scalars and
-    images to its loggers. All rows of the curve score the same views.
+    images to its loggers. All rows of the curve score the same views. Lightning's EarlyStopping and
+    ModelCheckpoint see ``val/psnr`` and ``val/ssim`` after each evaluation.
 
     Args:
         at: Shares of the budget, from 0 to 1; 1 is always scored.
@@ -277,12 +278,17 @@ class Evaluation(Callback):
         """Score the views now; only the first process does."""
         self.step = trainer.global_step
         with off_clock(trainer):
-            if trainer.is_global_zero:
-                self._score(trainer, module, renderer)
+            scores = self._score(trainer, module, renderer) if trainer.is_global_zero else {}
             if trainer.world_size > 1:
-                trainer.strategy.barrier()  # The others wait off the clock.
+                scores = trainer.strategy.broadcast(scores)  # The others wait off the clock.
+            trainer.callback_metrics.update({n: torch.tensor(v) for n, v in scores.items()})
+            for callback in trainer.callbacks:  # type: ignore[attr-defined]
+                if isinstance(callback, EarlyStopping | ModelCheckpoint):
+                    callback.on_validation_end(trainer, module)
 
-    def _score(self, trainer: Trainer, module: RadianceModule, renderer: Renderer) -> None:
+    def _score(
+        self, trainer: Trainer, module: RadianceModule, renderer: Renderer
+    ) -> dict[str, float]:
         data: Any = trainer.datamodule  # type: ignore[attr-defined]
         split = data.validation_split or data.test_split
         views, step, run = data.scene.splits[split], trainer.global_step, _folder(trainer)
@@ -314,6 +320,7 @@ class Evaluation(Callback):
             self.best, self.best_step = psnr_now, step
         self._write(trainer, module, run, split, scores, pictures)
         self.seconds += time.perf_counter() - began
+        return scores
 
     def _write(
         self,

@@ -1,6 +1,7 @@
 """Lightning's Trainer with our budget, and fields that are trained on the way to something else."""
 
 import logging
+import sys
 import time
 import warnings
 from collections.abc import Sequence
@@ -96,6 +97,10 @@ class Trainer(lightning.Trainer):
         if others.get("strategy") == "ddp":
             # The processes agree on the occupancy grid themselves, before it is maintained.
             others["strategy"] = DDPStrategy(broadcast_buffers=False)
+        if others.get("limit_val_batches") == 0:
+            # Scores come from `Evaluation`, at any step: callbacks wait for them, not for epochs.
+            others.setdefault("check_val_every_n_epoch", None)
+            others.setdefault("val_check_interval", sys.maxsize)
         # Lightning ends after 1000 epochs where no number of steps is given.
         others.setdefault("max_epochs", -1)
         self.interrupt = Interrupt()

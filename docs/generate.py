@@ -264,7 +264,8 @@ def pretraining() -> list[str]:
 NODES = {
     "callbacks": "What runs beside training. `callbacks.NAME=null` leaves one out; any callback of "
     "Lightning is added with `+callbacks.NAME={_target_: MODULE.CLASS, ...}`. EarlyStopping and "
-    "ModelCheckpoint see `val/psnr` and `val/ssim` after each evaluation (`callbacks.evaluation.at`).",
+    "ModelCheckpoint see `val/psnr` and `val/ssim` after each evaluation "
+    "(`callbacks.evaluation.at`).",
     "logger": "Where scalars and images go; any logger of Lightning is added with "
     "`+logger.NAME={_target_: MODULE.CLASS, ...}`. `save_dir` is the run directory, where a logger "
     "takes one.",

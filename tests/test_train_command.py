@@ -16,9 +16,9 @@ from hydra import compose, initialize_config_dir
 from tests import warm
 from tests.training.runs import SMALL
 from tests.warm import train
-from xplanes.config import CONF
+from xplanes.config import CONF, quoted
 from xplanes.errors import ConfigError
-from xplanes.launch import SettingsCheck, prepare
+from xplanes.launch import SettingsCheck, file_name, prepare
 from xplanes.process import resume_command
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -123,6 +123,19 @@ def test_runs_in_folders_of_any_name_are_resumed(tmp_path: Path) -> None:
             config = compose("train", prepare([text]), return_hydra_config=True)
         assert (config.resume, config.hydra.run.dir, config.seed) == (str(run), str(run), 3)
     assert shlex.split(resume_command(run))[-1] == f"resume={run}"
+
+
+@pytest.mark.parametrize(
+    ("scene", "name"),
+    [("lego", "lego"), ("my scene (1)", "my-scene-1"), ("/data/people/anna", "anna"), ("..", "..")],
+)
+def test_run_directories_have_names_that_need_no_quotes(scene: str, name: str) -> None:
+    assert file_name(scene) == name
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        overrides = [f"data.scene={quoted(scene)}", "hydra.job.num=3"]
+        config = compose("train", overrides, return_hydra_config=True)
+    assert config.hydra.run.dir.endswith(f"demo-{name}_six_planes_tiny_s0")
+    assert config.hydra.sweep.subdir == f"3_{name}_six_planes_tiny_s0"
 
 
 def test_names_of_scenes_may_look_like_numbers() -> None:

@@ -115,7 +115,7 @@ def class_of(target: Any, kind: type, key: str) -> type:
     if not any(name == root or name.startswith(f"{root}.") for root in allowed):
         raise ConfigError(
             f"{key}={name}: only classes of {', '.join(allowed)} may stand here; name a module of "
-            "your own with plugins=[MODULE]"
+            "your own with plugins=[MODULE], or --plugin MODULE for commands that read a run"
         )
     module, _, attribute = name.rpartition(".")
     try:

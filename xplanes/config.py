@@ -13,6 +13,7 @@ _PACKAGE = Path(__file__).resolve().parent
 CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
 """The configuration files: inside an installed package, beside it in a checkout."""
 
+
 CHOICES = ("experiment", "entry", "recipe", "scale")
 """Groups whose files set keys of other groups."""
 

@@ -26,6 +26,14 @@ from xplanes.files import StorageError, read_json, require_writable
 NAMES = ("data.root", "data.scene")
 """Settings whose values are names, even where they look like numbers."""
 
+
+def file_name(scene: Any) -> str:
+    """The name of a scene as a part of a run directory's: no folders, and nothing to quote."""
+    return re.sub(r"[^\w.+-]+", "-", Path(str(scene)).name).strip("-") or "scene"
+
+
+OmegaConf.register_new_resolver("file_name", file_name, replace=True)
+
 _NUMBER = re.compile(r"[+-]?[\d._]+(?:[eE][+-]?\d+)?")
 
 
@@ -115,7 +123,8 @@ def _job(config: DictConfig) -> float:
         resume = auto or plain["resume"] not in (None, "auto")
         # A run that goes on must find the user's own groups again.
         own = [text for text in settings.overrides.hydra if _split(text)[0] == "hydra.searchpath"]
-        return run(plain, folder, [*own, *settings.overrides.task], resume=resume)
+        task = [text for text in settings.overrides.task if _split(text)[0] != "resume"]
+        return run(plain, folder, [*own, *task], resume=resume)
     except KNOWN_ERRORS as error:
         if sweep:
             raise
@@ -155,6 +164,7 @@ def prepare(arguments: list[str]) -> list[str]:
         own = [a for a in arguments if not a.startswith("resume=")]
         found = Path(folder) if folder else _latest(Path("outputs"), own)
         if found is None or not (found / "run.json").is_file():
+            print("resume=auto: no unfinished run with these settings, so a new one begins")
             return [*own, "resume=null"]
         resume = str(found)
     if _is_multirun(arguments):

@@ -41,7 +41,7 @@ from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene
-from xplanes.training.checkpoints import LAST, find_resumable
+from xplanes.training.checkpoints import LAST, find_resumable, load_checkpoint
 from xplanes.training.clock import find_callback, training_seconds
 from xplanes.training.evaluation import Evaluation, final_scores
 from xplanes.training.fit import estimate
@@ -93,6 +93,7 @@ def run(config: dict[str, Any], folder: Path, overrides: list[str], *, resume: b
             claim(folder, resume=resume)
             if resume and _has_checkpoint(folder):
                 _require_same(folder, config)
+                _require_steps(folder, experiment)
             clear_unfinished(folder)
             with _settings(folder, config, overrides):
                 return _recorded(experiment, folder, overrides, resume=resume)
@@ -146,6 +147,20 @@ def _require_same(folder: Path, config: dict[str, Any]) -> None:
     except ConfigError:
         return  # Damaged: it is written anew, and what does not fit is refused later.
     require_same_settings(folder, before, config)
+
+
+def _require_steps(folder: Path, experiment: Experiment) -> None:
+    """Refuse a limit that the run has passed: nothing would be trained, now or later."""
+    most = experiment.trainer.get("max_steps", -1)
+    try:
+        done = load_checkpoint(folder / "checkpoints" / LAST)["global_step"]
+    except (ConfigError, KeyError):
+        return  # Damaged: what takes its place is found later.
+    if 0 <= most < done:
+        raise ConfigError(
+            f"trainer.max_steps={most}: {folder} has done {done} steps already. Give more, or "
+            "leave it out"
+        )
 
 
 def _recorded(experiment: Experiment, folder: Path, overrides: list[str], *, resume: bool) -> float:

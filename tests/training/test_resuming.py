@@ -151,6 +151,16 @@ def test_a_signal_after_the_last_step_is_heard(
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["step"] == 6
 
 
+def test_a_limit_that_a_run_has_passed_is_refused(tmp_path: Path) -> None:
+    config = small_config(tmp_path, *FEW, "media=false", "lrm=none", "trainer.max_steps=4")
+    run(config, tmp_path / "run", [], resume=False)
+    before = (tmp_path / "run" / "config.yaml").read_bytes()
+    config["trainer"]["max_steps"] = 3
+    with pytest.raises(ConfigError, match=r"max_steps=3: .*has done 4 steps already"):
+        run(config, tmp_path / "run", [], resume=True)
+    assert (tmp_path / "run" / "config.yaml").read_bytes() == before
+
+
 def test_another_start_in_a_folder_begins_its_own_record(tmp_path: Path) -> None:
     first = RunRecord(tmp_path, 0, resume=False)
     first.note(files={"train": ["a.png"]})

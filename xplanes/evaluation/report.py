@@ -225,6 +225,7 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             "dB): this run shows nothing yet"
         )
     place = shlex.quote(str(run))
+    named = "".join(f" --plugin {name}" for name in experiment.config.get("plugins") or [])
     curves = [f"tensorboard --logdir {place}"] * any(run.rglob("events.out.tfevents.*"))
     skips = (
         f"skipped  {100 * skipped['empty']:.0f}% of samples in empty space, "
@@ -249,7 +250,7 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             f"wrote    {run}",
             f"         metrics.json  curve.csv  checkpoints/last.ckpt  {metrics.get('media', '')}",
             *(f"next     {line}" for line in curves),
-            f"{'' if curves else 'next':<9}xplanes render {place}",
+            f"{'' if curves else 'next':<9}xplanes render {place}{named}",
             f"         {resume_command(run)}{more}",
         ]
     )

@@ -16,7 +16,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from xplanes.backend import warm_up
 from xplanes.errors import ConfigError, DeviceError
-from xplanes.evaluation.findings import camera_findings
+from xplanes.evaluation.findings import camera_findings, opaque_findings
 from xplanes.evaluation.published import check_published
 from xplanes.evaluation.render import orbit_poses, render_path, video_times, write_video
 from xplanes.evaluation.report import closing, header, log_hparams, summary, write_pictures
@@ -211,8 +211,9 @@ def train(
     if resume and record is not None and _has_checkpoint(folder):
         require_same_views(folder, record.content, views)
     frame = method.model.frame(views, settings.half_side, scene.points)
-    for finding in camera_findings(scene, frame) if record is not None else ():
-        logger.warning("%s", finding.text)
+    if record is not None:
+        for finding in (*camera_findings(scene, frame), *opaque_findings(scene)):
+            logger.warning("%s", finding.text)
     loaded = time.monotonic() - started
     found = Initialisation(method.model, frame)
     if source is not None:

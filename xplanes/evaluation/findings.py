@@ -71,7 +71,6 @@ class Look:
         middle: The same in the middle, a tenth as wide and high as the image.
         pale_edge: Share of the opaque pixels next to transparent ones that look like the
             background; None where there are too few to say.
-        pale_border: Share of the pixels along the image's edges that do and are opaque.
         cut: Share of the foreground whose rays miss the cube.
         digest: Hash of the pixels; None where all are alike.
     """
@@ -80,7 +79,6 @@ class Look:
     border: float
     middle: float
     pale_edge: float | None
-    pale_border: float
     cut: float
     digest: bytes | None
 
@@ -121,7 +119,6 @@ def look(views: Views, index: int, background: Tensor, frame: Frame | None) -> L
         border=_share(opaque, ring),
         middle=_share(opaque[rows, columns], valid[rows, columns]),
         pale_edge=_share(pale, edge) if int(edge.sum()) >= 0.1 * (height + width) else None,
-        pale_border=_share(pale, ring),
         cut=0.0 if frame is None else _cut(views, index, opaque, frame),
         digest=None if plain else hashlib.sha256(image.contiguous().numpy().data).digest(),
     )
@@ -192,13 +189,16 @@ def image_findings(scene: Scene, looks: Mapping[str, list[Look]]) -> Iterator[Fi
                 "Raise data.half_side, or mask what does not belong to the scene",
             )
         return
-    bordered = [each for each in seen if each.pale_border > 0.9]
-    if 2 * len(bordered) > len(seen):
+    yield from opaque_findings(scene)
+
+
+def opaque_findings(scene: Scene) -> Iterator[Finding]:
+    """Whether opaque training images show things before a plain background."""
+    if scene.splits["train"].is_opaque and not scene.is_surrounded:
         yield Finding(
             "white",
-            f"{len(bordered)} of {len(seen)} images are opaque and end in the background's colour: "
-            "a field that is empty there and one that is filled look the same. Write RGBA images "
-            "or masks",
+            "the images are opaque and end in the background's colour: a field that is empty there "
+            "and one that is filled look the same. Write RGBA images or masks",
         )
 
 

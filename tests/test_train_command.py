@@ -12,10 +12,13 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
 
 from tests import warm
 from tests.training.runs import SMALL
 from tests.warm import train
+from xplanes import launch, pipeline
 from xplanes.config import CONF, quoted
 from xplanes.errors import ConfigError
 from xplanes.launch import SettingsCheck, file_name, prepare
@@ -123,6 +126,24 @@ def test_runs_in_folders_of_any_name_are_resumed(tmp_path: Path) -> None:
             config = compose("train", prepare([text]), return_hydra_config=True)
         assert (config.resume, config.hydra.run.dir, config.seed) == (str(run), str(run), 3)
     assert shlex.split(resume_command(run))[-1] == f"resume={run}"
+
+
+def test_a_stopped_sweep_says_how_the_whole_of_it_goes_on(tmp_path, monkeypatch, capsys) -> None:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        chosen = ["hydra.mode=MULTIRUN", f"hydra.sweep.dir={tmp_path}", "hydra.job.num=0"]
+        chosen += [f"hydra.runtime.output_dir={tmp_path}", "hydra.job.id=0"]
+        config = compose("train", chosen, return_hydra_config=True)
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "run", stop)
+    own = [name for name in config if name != "hydra"]
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", OmegaConf.masked_copy(config, ["hydra"]))
+    config = OmegaConf.masked_copy(config, own)
+    with pytest.raises(SystemExit, match="130"):
+        launch._job(config)
+    assert f"hydra.sweep.dir={tmp_path} resume=auto" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

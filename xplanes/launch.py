@@ -6,6 +6,7 @@ Must stay quick: it imports neither torch nor lightning before the job begins.
 import contextlib
 import io
 import re
+import shlex
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -130,6 +131,9 @@ def _job(config: DictConfig) -> float:
             raise
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
+        if sweep:
+            place = shlex.quote(f"hydra.sweep.dir={settings.sweep.dir}")
+            print(f"the whole sweep: the same command with {place} resume=auto")
         sys.exit(130)
 
 

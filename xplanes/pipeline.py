@@ -179,7 +179,7 @@ def _recorded(experiment: Experiment, folder: Path, overrides: list[str], *, res
             # On a full disk the record stays "running", as after a power cut; resume= takes both.
             with suppress(StorageError):
                 record.end("failed", f"{type(error).__name__}: {error}")
-            if isinstance(error, OSError | TrainingError | GaussianError):
+            if not isinstance(error, ConfigError | SceneError | LRMError | MissingExtraError):
                 say(f"\nstopped. Once that is fixed: {resume_command(folder)}")
             raise
     return metrics["test"]["psnr"]

@@ -445,3 +445,14 @@ def test_published_figures_name_their_source_and_models_that_exist() -> None:
         assert bool(entry["psnr"]) != bool(entry["rank"])
         assert 10 < float(entry["psnr"] or 20) < 50
         assert not entry["ssim"] or 0.5 < float(entry["ssim"]) < 1
+
+
+def test_settings_of_jobs_that_never_began_are_no_columns(tmp_path: Path) -> None:
+    for number, enabled in enumerate((False, "${viewer}")):
+        run = make(tmp_path / f"{number}_lego", resolution=64 + number)
+        config = yaml.safe_load((run / "config.yaml").read_text())
+        config["callbacks"] = {"viewer": {"enabled": enabled}}
+        (run / "config.yaml").write_text(yaml.safe_dump(config))
+    header = table(tmp_path)[0].keys()
+    assert "model.resolution" in header
+    assert not [name for name in header if "viewer" in name]

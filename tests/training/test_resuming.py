@@ -8,12 +8,14 @@ from pathlib import Path
 
 import pytest
 from lightning import Trainer
+from lightning.pytorch.callbacks import Callback
 
 from tests.training.runs import small_config
 from xplanes.errors import ConfigError
 from xplanes.evaluation.runs import load_run
 from xplanes.files import read_rows
 from xplanes.pipeline import run
+from xplanes.process import resume_command
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.scenes.errors import SceneError
@@ -149,6 +151,25 @@ def test_a_signal_after_the_last_step_is_heard(
     monkeypatch.undo()
     run(small_config(scenes, *FEW), tmp_path / "run", [], resume=True)
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["step"] == 6
+
+
+class Fails(Callback):
+    """A user's callback with a fault."""
+
+    def on_train_batch_end(self, trainer, *rest) -> None:
+        if trainer.global_step == 3:
+            raise RuntimeError("a fault of one's own")
+
+
+def test_a_fault_of_ones_own_says_how_to_go_on(tmp_path: Path, capsys) -> None:
+    config = small_config(tmp_path, *FEW, "media=false", "lrm=none", "trainer.max_steps=5")
+    config["callbacks"] |= {"fails": {"_target_": f"{__name__}.Fails"}}
+    config["plugins"] = [__name__]
+    with pytest.raises(RuntimeError, match="a fault of one's own"):
+        run(config, tmp_path / "run", [], resume=False)
+    assert f"Once that is fixed: {resume_command(tmp_path / 'run')}" in capsys.readouterr().out
+    config["callbacks"].pop("fails")
+    run(config, tmp_path / "run", [], resume=True)
 
 
 def test_a_limit_that_a_run_has_passed_is_refused(tmp_path: Path) -> None:

@@ -154,7 +154,7 @@ def read_run(run: Path, name: str) -> RunRow:
         status = f"{status if ended else 'damaged'}; {', '.join(problems)}"
     return RunRow(
         name=name,
-        settings=flatten(config) if isinstance(config, dict) else {},
+        settings=_resolved(flatten(config)) if isinstance(config, dict) else {},
         overridden=frozenset(_key(line) for line in run_overrides(run)),
         scores=scores,
         status=status,
@@ -238,6 +238,11 @@ def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         name = f"{prefix}{key}"
         flat.update(flatten(value, f"{name}.") if isinstance(value, dict) else {name: value})
     return flat
+
+
+def _resolved(settings: dict[str, Any]) -> dict[str, Any]:
+    """Without references to other settings, which jobs that never began still have."""
+    return {name: value for name, value in settings.items() if "${" not in str(value)}
 
 
 def run_overrides(run: Path) -> list[str]:

@@ -65,6 +65,15 @@ def test_all_four_train_log_and_load_again(config: dict, tmp_path: Path) -> None
     assert json.loads((folder / "metrics.json").read_text())["step"] == 40
 
 
+def test_data_of_ones_own_is_composed_in_python() -> None:
+    own = ["data._target_=tests.plugins.shell_format.DiscSettings", "+data.count=6"]
+    own += [f"~data.{name}" for name in ("seed", "train_views", "test_views", "val_views")]
+    data = SceneDataModule.compose("plugins=[tests.plugins]", *own, "data.scene=disc")
+    assert len(data.scene.splits["train"]) == 6
+    with pytest.raises(ConfigError, match="plugins"):
+        SceneDataModule.compose(*own)
+
+
 def test_a_run_of_somebody_else_names_no_classes_by_itself(config: dict, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     folder.mkdir()

@@ -92,8 +92,17 @@ class SceneDataModule(LightningDataModule):
 
     @classmethod
     def compose(cls, *overrides: str, seed: int = 0) -> "SceneDataModule":
-        """The data of the command line's settings: ``compose("data=dnerf", "data.scene=hook")``."""
-        return cls(compose_plain("train", overrides)["data"], seed=seed)
+        """The data of the command line's settings: ``compose("data=dnerf", "data.scene=hook")``.
+
+        Args:
+            overrides: ``key=value`` each; ``plugins=[MODULE]`` makes classes of one's own known.
+            seed: Source of the rays' randomness.
+
+        Raises:
+            ConfigError: If a setting does not exist or cannot work.
+        """
+        config = compose_plain("train", overrides)
+        return cls(config["data"], seed=seed, plugins=config["plugins"] or ())
 
     @classmethod
     def from_run(cls, run: str | Path, plugins: Sequence[str] = ()) -> "SceneDataModule":

@@ -189,14 +189,14 @@ def _mask_values(picture: Image.Image) -> np.ndarray:
     else:
         colours = np.asarray(picture.convert("RGBA"))
         if colours[..., 3].min() < 255:
-            return np.divide(colours[..., 3], 255, dtype=np.float32)
+            return np.asarray(colours[..., 3], np.float32) / 255
         channels = colours[..., :3].astype(np.int16)
         if np.ptp(channels, axis=-1).max() > COLOURED:
-            return channels.any(axis=-1).astype(np.float32)
+            return np.asarray(channels.any(axis=-1), np.float32)
         values, white = np.asarray(picture.convert("L"), np.float32), 255
     if values.max() <= LABELS:
         return (values > 0).astype(np.float32)
-    return np.divide(values, white, dtype=np.float32)
+    return values / white
 
 
 def common_size(paths: Sequence[Path]) -> tuple[int, int]:

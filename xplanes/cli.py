@@ -427,7 +427,10 @@ def _add_sheet(commands: "argparse._SubParsersAction") -> None:
         default="colour",
         help="what is shown of a view; default: %(default)s",
     )
-    parser.add_argument("--view", help="a view, as named in RUN/media; default: one that all show")
+    parser.add_argument(
+        "--view",
+        help="a view, as named in RUN/media, or the end of its name; default: one that all show",
+    )
     parser.add_argument("--steps", help="steps, separated by commas; default: all, or the last")
     parser.add_argument(
         "--size", type=int, default=160, help="pixels of a picture; default: %(default)s"
@@ -436,7 +439,7 @@ def _add_sheet(commands: "argparse._SubParsersAction") -> None:
         "--out",
         type=Path,
         metavar="FILE",
-        help="FILE.png, or with --what steps FILE.webp, a film; default: sheet.png in FOLDER",
+        help="FILE.png, or with --what steps FILE.webp, a film; default: sheet_WHAT.png in FOLDER",
     )
     parser.set_defaults(command=_sheet)
 

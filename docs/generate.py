@@ -1,13 +1,16 @@
 """Write the pages that follow from the code: `python docs/generate.py`.
 
 docs/configuration.md comes from conf/ and the classes it names, docs/command_line.md from the
-parser of the command line.
+parser of the command line, docs/api.md from the signatures and docstrings of what it lists.
 """
 
 import argparse
+import ast
 import importlib
 import inspect
+import pkgutil
 import re
+import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -337,7 +340,167 @@ def command_line() -> str:
     return "\n".join(lines) + "\n"
 
 
-PAGES = {"configuration.md": document, "command_line.md": command_line}
+API = """\
+# Python API
+
+Training in any Lightning Trainer, robust PCA alone, and LRMs alone. Written by
+`python docs/generate.py`. [Recipes](recipes.md#lightning-alone) has a script that trains, tests and
+reloads.
+
+## Training
+
+::: xplanes.scenes.datamodule.SceneDataModule
+    options:
+      members: [compose, of, from_run]
+
+::: xplanes.training.module.RadianceModule
+    options:
+      members: [compose, of, load_from_checkpoint, build]
+
+## The field
+
+::: xplanes.fields.xplanes.XPlanes
+    options:
+      members: [forward]
+
+## Decomposition
+
+::: xplanes.decomposition.rpca.robust_pca
+
+::: xplanes.decomposition.rpca.RobustPCA
+
+::: xplanes.decomposition.decompose.decompose
+
+::: xplanes.decomposition.decompose.Decomposition
+
+::: xplanes.decomposition.conversion.space_planes
+
+::: xplanes.decomposition.conversion.time_planes
+
+::: xplanes.decomposition.sparse_loss.sparse_product_loss
+
+## Large Reconstruction Models
+
+::: xplanes.lrm.checkpoint.load
+
+::: xplanes.lrm.model.LRM
+    options:
+      members: [encode, prepare]
+
+## Cameras and scenes
+
+::: xplanes.scenes.views.Scene
+
+::: xplanes.scenes.views.Views
+    options:
+      members: [image, image_rays, subset]
+
+## Base classes of plug-ins
+
+[Contributing](CONTRIBUTING.md#adding-things) says which files a component needs.
+
+::: xplanes.models.base.LossTerm
+
+::: xplanes.models.base.ModelSettings
+
+::: xplanes.models.base.Model
+
+::: xplanes.fields.base.Representation
+
+::: xplanes.fields.base.RadianceField
+
+::: xplanes.rendering.sampler.Sampler
+
+::: xplanes.rendering.sampler.SamplerSettings
+
+::: xplanes.rendering.sampler.Site
+
+::: xplanes.scenes.source.SceneSettings
+
+## Rasterising Gaussians
+
+::: xplanes.rendering.gaussians.rasteriser.rasterise
+
+::: xplanes.rendering.gaussians.rasteriser.RasterisedImage
+
+::: xplanes.rendering.gaussians.camera.Camera
+
+::: xplanes.rendering.gaussians.harmonics.spherical_harmonics
+"""
+"""The page of the Python API before `api` adds headings, sentences and signatures."""
+
+_DIRECTIVE = re.compile(r"^::: ([\w.]+)(?:\n    options:\n      members: \[(.+)\])?$", re.MULTILINE)
+
+
+def api() -> str:
+    """The page of the Python API, which says what there is without the site's own directives."""
+
+    def written(match: re.Match[str]) -> str:
+        path, members = match[1], match[2]
+        module, _, name = path.rpartition(".")
+        thing = pkgutil.resolve_name(path)
+        first = " ".join((inspect.getdoc(thing) or "").split("\n\n")[0].split())
+        lines = [f"### {name}", "", first.replace("``", "`"), "", "```python"]
+        lines += [f"from {shortest(module, name)} import {name}", "", ""]
+        lines += stub(thing, members.split(", ") if members else None)
+        return "\n".join([*lines, "```", "", match[0]])
+
+    return _DIRECTIVE.sub(written, API)
+
+
+def shortest(module: str, name: str) -> str:
+    """The shortest path of a package that has the same thing by this name."""
+    thing, parts = getattr(importlib.import_module(module), name), module.split(".")
+    packages = [".".join(parts[:count]) for count in range(1, len(parts) + 1)]
+    return next(p for p in packages if getattr(importlib.import_module(p), name, None) is thing)
+
+
+def stub(thing: Any, members: Iterable[str] | None) -> list[str]:
+    """The signature of a function; of a class, its attributes and the signatures of methods.
+
+    Args:
+        thing: A class or a function.
+        members: The methods; all public ones when None.
+    """
+    source = textwrap.dedent(inspect.getsource(thing))
+    lines, node = source.splitlines(), ast.parse(source).body[0]
+    parts = signature(lines, node)
+    if not isinstance(node, ast.ClassDef):
+        return [*parts[:-1], f"{parts[-1]} ..."]
+    for below, after in zip(node.body, [*node.body[1:], None], strict=True):
+        if isinstance(below, ast.FunctionDef):
+            chosen = members or [below.name]
+            if below.name == "__init__" or (below.name[0] != "_" and below.name in chosen):
+                if not parts[-1].startswith("class "):
+                    parts.append("")
+                parts += signature(lines, below)
+                said = (ast.get_docstring(below) or "").split("\n")[0]
+                if said:
+                    parts.append(f'        """{said}"""')
+                else:
+                    parts[-1] += " ..."
+        elif isinstance(below, ast.AnnAssign | ast.Assign):
+            first = below.lineno - 1
+            while lines[first - 1].startswith("    # "):
+                first -= 1
+            told = isinstance(after, ast.Expr)
+            parts += lines[first : after.end_lineno if told else below.end_lineno]
+    return parts
+
+
+def signature(lines: list[str], node: Any) -> list[str]:
+    """The lines of a definition up to its colon, with its decorators."""
+    first = min([node.lineno, *(each.lineno for each in node.decorator_list)]) - 1
+    body = node.body[0]
+    above = [each.lineno for each in getattr(body, "decorator_list", [])]
+    last = min([body.lineno, *above]) - 1
+    head = lines[first:last]
+    while not head[-1].endswith(":"):  # Comments and empty lines before the body.
+        head.pop()
+    return head
+
+
+PAGES = {"configuration.md": document, "command_line.md": command_line, "api.md": api}
 """The pages that are written, and what writes them."""
 
 

@@ -1,5 +1,7 @@
 """Pages that are generated are up to date, and the pages' commands and keys are real."""
 
+import ast
+import inspect
 import os
 import pkgutil
 import re
@@ -22,7 +24,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 def test_generated_pages_are_what_the_generator_writes() -> None:
     pages = runpy.run_path(str(ROOT / "docs" / "generate.py"))["PAGES"]
-    assert set(pages) == {"configuration.md", "command_line.md"}
+    assert set(pages) == {"configuration.md", "command_line.md", "api.md"}
     for name, write in pages.items():
         page = (ROOT / "docs" / name).read_text(encoding="utf-8")
         assert page == write(), "run: python docs/generate.py"
@@ -59,6 +61,26 @@ def test_links_between_pages_lead_somewhere() -> None:
     for page in PAGES:
         for link in re.findall(r"\]\((?!https?:)([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
             assert (page.parent / link).exists(), f"{page.name}: {link}"
+
+
+def test_the_api_page_has_the_signatures_of_all_that_it_lists() -> None:
+    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    found = re.findall(r"```python\n((?:(?!```).)+)```\n\n::: ([\w.]+)", text, re.DOTALL)
+    assert len(found) == len(re.findall(r"^::: ", text, re.MULTILINE)) > 20
+    for code, path in found:
+        line, definition = ast.parse(code).body
+        assert isinstance(line, ast.ImportFrom), path
+        assert isinstance(definition, ast.ClassDef | ast.FunctionDef), path
+        named = pkgutil.resolve_name(path)
+        assert pkgutil.resolve_name(f"{line.module}:{definition.name}") is named, path
+        members = [each for each in ast.walk(definition) if isinstance(each, ast.FunctionDef)]
+        for each in members:
+            thing = named if each is definition else inspect.getattr_static(named, each.name)
+            thing = getattr(thing, "fget", None) or getattr(thing, "func", thing)
+            expected = list(inspect.signature(inspect.unwrap(thing)).parameters)
+            written = [*each.args.posonlyargs, *each.args.args, each.args.vararg]
+            written += [*each.args.kwonlyargs, each.args.kwarg]
+            assert [word.arg for word in written if word] == expected, f"{path}: {each.name}"
 
 
 CALL = re.compile(

@@ -227,13 +227,13 @@ def _add_render(commands: "argparse._SubParsersAction") -> None:
     parser.add_argument(
         "--path",
         default="orbit",
-        help="orbit, fixed, view:FILE (camera of a view), or FILE.json (camera_path.json of "
-        "nerfstudio, or a transforms file); default: %(default)s",
+        help="orbit or fixed (square frames), view:FILE (camera of a view, in its shape), or "
+        "FILE.json (camera_path.json of nerfstudio, or a transforms file); default: %(default)s",
     )
     parser.add_argument(
         "--time",
-        help="sweep, back-and-forth, or a number from 0 to 1; default: back-and-forth, or the "
-        "times of FILE.json",
+        help="sweep, back-and-forth, own (that of view:FILE), or a number from 0 to 1; default: "
+        "back-and-forth, own for an image of view:FILE, or the times of FILE.json",
     )
     parser.add_argument(
         "--frames",
@@ -246,7 +246,8 @@ def _add_render(commands: "argparse._SubParsersAction") -> None:
     parser.add_argument(
         "--size",
         type=int,
-        help="pixels of the longer side; default: that of the training views, or as FILE.json says",
+        help="pixels of the longer side; default: that of the training views, of the view, or as "
+        "FILE.json says",
     )
     parser.add_argument(
         "--elevation",
@@ -261,7 +262,9 @@ def _add_render(commands: "argparse._SubParsersAction") -> None:
         help="rendered quantity; default: %(default)s",
     )
     parser.add_argument(
-        "--out", help="FILE.webp, FILE.mp4, FILE.png, or FOLDER/ for one PNG per frame"
+        "--out",
+        help="FILE.webp, FILE.mp4, FILE.png or FILE.jpg for one frame, or FOLDER/ for one PNG per "
+        "frame",
     )
     parser.set_defaults(command=_render)
 
@@ -277,14 +280,13 @@ def _render(options: argparse.Namespace) -> None:
         size=options.size,
         elevation=options.elevation,
         what=options.what,
-    )
+    ).written_to(options.out)
     wanted.check()
     check_out(options.out, wanted)
     trained = _load(options)
-    views = trained.scene.splits["train"]
-    height, width = wanted.shape(views)
+    height, width = wanted.shape(trained.scene.splits)
     written = "as written" if wanted.cameras is not None else "back-and-forth"
-    camera = f"{options.path} camera, time {options.time or written}"
+    camera = f"{options.path} camera, time {wanted.time or written}"
     _say(f"frames      {wanted.count} of {width}x{height} px, {options.what}, {camera}\n")
     _say(f"wrote {render_video(trained, wanted, options.out)}")
 
@@ -427,7 +429,10 @@ def _add_sheet(commands: "argparse._SubParsersAction") -> None:
         default="colour",
         help="what is shown of a view; default: %(default)s",
     )
-    parser.add_argument("--view", help="a view, as named in RUN/media; default: one that all show")
+    parser.add_argument(
+        "--view",
+        help="a view, as named in RUN/media, or the end of its name; default: one that all show",
+    )
     parser.add_argument("--steps", help="steps, separated by commas; default: all, or the last")
     parser.add_argument(
         "--size", type=int, default=160, help="pixels of a picture; default: %(default)s"
@@ -436,7 +441,7 @@ def _add_sheet(commands: "argparse._SubParsersAction") -> None:
         "--out",
         type=Path,
         metavar="FILE",
-        help="FILE.png, or with --what steps FILE.webp, a film; default: sheet.png in FOLDER",
+        help="FILE.png, or with --what steps FILE.webp, a film; default: sheet_WHAT.png in FOLDER",
     )
     parser.set_defaults(command=_sheet)
 

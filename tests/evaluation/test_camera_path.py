@@ -88,8 +88,8 @@ def test_a_transforms_file_is_a_path(views: Views, tmp_path: Path):
 def test_sizes_rates_and_times_can_be_set(views: Views, tmp_path: Path):
     path = str(write(tmp_path / "a.json", nerfstudio(views)))
     written, changed = VideoOptions(path=path), VideoOptions(path=path, size=10, fps=9, time="0.5")
-    assert (written.shape(views), written.rate) == ((12, 20), 4)
-    assert (changed.shape(views), changed.rate) == ((6, 10), 9)
+    assert (written.shape({"train": views}), written.rate) == ((12, 20), 4)
+    assert (changed.shape({"train": views}), changed.rate) == ((6, 10), 9)
     assert written.times.tolist() == [0.75, 0.25]
     assert changed.times.tolist() == [0.5, 0.5]
 

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 from hydra.types import RunMode
 
+from tests.evaluation.test_sheet import areas, pictured
 from tests.training.runs import SMALL
 from tests.warm import train
 from xplanes.evaluation.table import SweepTable, choose_gpu
@@ -61,6 +62,16 @@ def test_the_table_comes_once(tmp_path: Path, capsys):
     callback.on_multirun_end(settings(tmp_path))  # type: ignore[arg-type]
     callback._finish()
     assert capsys.readouterr().out.count("failed: x") == 1
+
+
+def test_a_sheet_of_any_kind_has_the_name_that_pages_link_to(tmp_path: Path, capsys):
+    pictured(tmp_path / "0")
+    callback, sweep = SweepTable(), settings(tmp_path)
+    sweep.sheet = "steps"
+    callback.on_multirun_start(sweep)  # type: ignore[arg-type]
+    callback.on_multirun_end(sweep)  # type: ignore[arg-type]
+    assert f"wrote {tmp_path / 'sheet.png'}\n" in capsys.readouterr().out
+    assert len(areas(tmp_path / "sheet.png")) == 3  # The truth and two steps.
 
 
 def test_jobs_take_the_gpus_in_turn():

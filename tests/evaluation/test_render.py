@@ -64,13 +64,35 @@ def test_a_view_is_found_by_its_name(trained: TrainedRun):
 
 def test_the_camera_of_a_view_renders_that_view(trained: TrainedRun, tmp_path: Path):
     views = trained.views
-    options = VideoOptions(path="view:test/r_001", time=str(float(views.times[1])))
-    assert options.count == 1
-    path = render_video(trained, options, str(tmp_path / "view.png"))
-    expected = render_view(
-        trained.module.field, trained.module.renderer, trained.frame, views, 1, torch.ones(3)
-    )
-    assert np.array_equal(np.asarray(Image.open(path)), to_bytes(expected["colour"]).numpy())
+    parts = (trained.module.field, trained.module.renderer, trained.frame)
+    expected = to_bytes(render_view(*parts, views, 1, torch.ones(3))["colour"]).numpy()
+    own = str(float(views.times[1]))
+    for name, time in (("a.png", None), ("b.png", "own"), ("c.png", own), ("d.webp", "own")):
+        path = render_video(trained, VideoOptions("view:test/r_001", time), str(tmp_path / name))
+        picture = np.asarray(Image.open(path).convert("RGB")).astype(int)
+        if path.suffix == ".png":
+            assert np.array_equal(picture, expected), name
+    jpeg = render_video(trained, VideoOptions("view:test/r_001"), str(tmp_path / "e.jpg"))
+    with Image.open(jpeg) as picture:
+        assert picture.format == "JPEG"
+        assert np.abs(np.asarray(picture).astype(int) - expected).mean() < 4
+    # A folder or a video of several frames lets time pass.
+    assert VideoOptions("view:test/r_001").written_to("video.webp").count == 48
+    assert VideoOptions("view:test/r_001", frames=3).written_to("a.png").count == 3
+
+
+def test_pictures_from_a_view_have_its_shape(trained: TrainedRun, tmp_path: Path):
+    views = trained.views
+    upper, focal = views.images[:, : views.height // 2], float(views.intrinsics.focal[0, 0])
+    wide = replace(views, images=upper, intrinsics=focal)
+    scene = replace(trained.scene, splits=trained.scene.splits | {"test": wide})
+    here = replace(trained, scene=scene)
+    path = render_video(here, VideoOptions("view:test/r_001"), str(tmp_path / "wide.png"))
+    parts = (trained.module.field, trained.module.renderer, trained.frame)
+    expected = render_view(*parts, wide, 1, torch.ones(3))["colour"]
+    assert np.array_equal(np.asarray(Image.open(path)), to_bytes(expected).numpy())
+    assert VideoOptions("view:test/r_001", size=10).shape(scene.splits) == (5, 10)
+    assert VideoOptions().shape(scene.splits) == (views.height, views.height)
 
 
 def test_a_webp_is_the_default(trained: TrainedRun):
@@ -129,6 +151,7 @@ def test_options_out_of_range_are_refused():
     refused = {
         VideoOptions(path="spiral"): "--path spiral",
         VideoOptions(time="2"): "--time 2",
+        VideoOptions(time="own"): "--time own: only the camera of a view",
         VideoOptions(frames=0): "--frames 0",
         VideoOptions(fps=0): "--fps 0",
         VideoOptions(size=-4): "--size -4",

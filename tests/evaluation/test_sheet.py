@@ -10,7 +10,7 @@ from PIL import Image, ImageSequence
 from tests.evaluation.test_table import make
 from xplanes.cli import main
 from xplanes.errors import ConfigError
-from xplanes.evaluation.sheet import check_what, write_sheet
+from xplanes.evaluation.sheet import WHAT, check_what, write_sheet
 
 TRUE, ERROR, DEPTH = (255, 0, 0), (0, 0, 255), (255, 0, 255)
 SIDE = 20
@@ -103,10 +103,32 @@ def test_parts_are_shown_whole(tmp_path: Path) -> None:
 def test_a_single_run_is_a_sheet_of_itself_and_the_command_writes_it(tmp_path: Path, capsys):
     run = pictured(tmp_path / "run")
     assert main(["sheet", str(run), "--what", "steps", "--steps", "0,50", "--view", "v1"]) == 0
-    assert capsys.readouterr().out == f"wrote {run / 'sheet.png'}\n"
-    assert set(areas(run / "sheet.png")) == {TRUE, green(0), green(50)}
+    assert capsys.readouterr().out == f"wrote {run / 'sheet_steps.png'}\n"
+    assert set(areas(run / "sheet_steps.png")) == {TRUE, green(0), green(50)}
     assert main(["sheet", str(run), "--steps", "x"]) == 1
     assert "--steps x: must be numbers" in capsys.readouterr().err
+
+
+def test_each_kind_of_sheet_has_a_file_of_its_own(tmp_path: Path) -> None:
+    run = pictured(tmp_path / "run")
+    Image.new("RGB", (60, 30), (1, 2, 3)).save(run / "media" / "decomposition.png")
+    written = [write_sheet(run, what=what).name for what in WHAT]
+    assert written == ["sheet_runs.png", "sheet_steps.png", "sheet_parts.png"]
+
+
+def test_a_view_is_found_by_the_end_of_its_name(tmp_path: Path) -> None:
+    pictured(tmp_path / "new", views=("val_r_003", "val_r_013"))
+    # Earlier runs wrote the split twice before images in a folder of its name.
+    pictured(tmp_path / "old", model="b", views=("val_val_r_003", "val_val_r_013"))
+    expected = write_sheet(tmp_path, view="val_r_003").read_bytes()
+    for name in ("r_003", "003", "val/r_003.png", "val_val_r_003"):
+        assert write_sheet(tmp_path, view=name).read_bytes() == expected, name
+    assert write_sheet(tmp_path, view="13").read_bytes() != expected
+    words = r"^view=3: val_r_003 and val_r_013 end with it; name one of them$"
+    with pytest.raises(ConfigError, match=words):
+        write_sheet(tmp_path, view="3")
+    with pytest.raises(ConfigError, match=r"^view=r_9: the runs of lego show val_r_003, val_r_013"):
+        write_sheet(tmp_path, view="r_9")
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from PIL import Image
 
 from tests.refusals import assert_refused
 from tests.synthetic import ball_views, inside_ball, surrounding
-from xplanes.evaluation.render import lens
+from xplanes.evaluation.render import VideoOptions, lens
 from xplanes.metrics import psnr
 from xplanes.models.tineuvox import frusta_box
 from xplanes.preparation.fixed_view import check_camera
@@ -483,7 +483,11 @@ def test_a_video_has_the_field_of_view_of_the_training_views():
     square = ball_views(3, RADIUS, size=20, angle=0.7)
     assert square.intrinsics.focal_at(50) == pytest.approx(focal_length(0.7, 50))
     assert square.intrinsics.fov_y == pytest.approx(0.7)
-    assert lens({"train": square}, "orbit", 50) == (square.intrinsics.focal_at(50), None, None)
+    assert lens({"train": square}, "orbit", (50, 50)) == (
+        square.intrinsics.focal_at(50),
+        None,
+        None,
+    )
     views = mixed(5)  # three of them wide
     assert views.intrinsics.focal_at(88) == pytest.approx((41.0 + 36.5) / 2 * 2)
     assert views.intrinsics.fov_y == pytest.approx(2 * math.atan(15 / 36.5))
@@ -493,16 +497,16 @@ def test_an_image_from_a_view_shows_it_whole():
     views = mixed(4)
     for index in (0, 1):
         height, width = views.size(index)
-        longer = max(height, width)
+        path = f"view:{views.files[index]}"
         for factor in (1, 3):
-            size = factor * longer
-            focal, centre, own = lens({"train": views}, f"view:{views.files[index]}", size)
+            size = VideoOptions(path, size=factor * max(height, width)).shape({"train": views})
+            assert size == (factor * height, factor * width)
+            focal, centre, own = lens({"train": views}, path, size)
             assert own is None
-            _, found = camera_rays(views.camera_to_world[index], focal, size, size, centre)
-            found = found.view(size, size, 3)[factor // 2 :: factor, factor // 2 :: factor]
-            top, left = (longer - height) // 2, (longer - width) // 2
-            inside = found[top : top + height, left : left + width].reshape(-1, 3)
-            torch.testing.assert_close(inside, views.image_rays(index)[1], atol=1e-6, rtol=0)
+            _, found = camera_rays(views.camera_to_world[index], focal, *size, centre)
+            found = found.view(*size, 3)[factor // 2 :: factor, factor // 2 :: factor]
+            found = found.reshape(-1, 3)
+            torch.testing.assert_close(found, views.image_rays(index)[1], atol=1e-6, rtol=0)
 
 
 def test_a_video_that_models_cannot_take_is_refused():

@@ -317,12 +317,11 @@ def test_pinholes_that_stand_for_lenses_see_as_wide():
 def test_a_picture_from_a_view_has_its_lens():
     views = seen_ball(["barrel", "fisheye"], surrounding(2, 4.0), 0.5, skew=0.5)
     for index in (0, 1):
-        focal, centre, lens = lens_of_picture({"train": views}, f"view:{index}", 2 * WIDTH)
-        pose = views.camera_to_world[index]
-        _, found = camera_rays(pose, focal, 2 * WIDTH, 2 * WIDTH, centre, lens)
+        size = (2 * HEIGHT, 2 * WIDTH)
+        focal, centre, lens = lens_of_picture({"train": views}, f"view:{index}", size)
+        _, found = camera_rays(views.camera_to_world[index], focal, *size, centre, lens)
         # The middle of four pixels is the centre of one of the view.
-        found = found.view(WIDTH, 2, WIDTH, 2, 3).mean(dim=(1, 3))
-        found = found[(WIDTH - HEIGHT) // 2 : (WIDTH + HEIGHT) // 2].reshape(-1, 3)
+        found = found.view(HEIGHT, 2, WIDTH, 2, 3).mean(dim=(1, 3)).reshape(-1, 3)
         torch.testing.assert_close(found, views.image_rays(index)[1], atol=1e-3, rtol=0)
 
 

@@ -104,8 +104,8 @@ def check_video(path: Path, *, frames: int, folder: bool = False) -> None:
         folder: Whether ``path`` is a folder for one PNG per frame.
 
     Raises:
-        ConfigError: If the suffix is unknown, the folder is not empty, or a .png would get several
-            frames.
+        ConfigError: If the suffix is unknown, the folder is not empty, or an image would get
+            several frames.
         ImportError: For .mp4 without the extra ``video``, naming it.
     """
     if folder:
@@ -114,14 +114,14 @@ def check_video(path: Path, *, frames: int, folder: bool = False) -> None:
     elif path.suffix == ".mp4":
         require("imageio_ffmpeg", extra="video")
         require("imageio.v2", extra="video")
-    elif path.suffix == ".png" and frames > 1:
+    elif path.suffix in IMAGES and frames > 1:
         raise ConfigError(
             f"{path} is one image, not {frames}: to write one PNG per frame, name a folder "
             f"with / at its end ({path.with_suffix('')}/)"
         )
-    elif path.suffix not in (".webp", ".png"):
+    elif path.suffix not in (".webp", *IMAGES):
         raise ConfigError(
-            f"{path}: a video must end in .webp or .mp4, an image in .png, a folder in /"
+            f"{path}: a video must end in .webp or .mp4, an image in .png or .jpg, a folder in /"
         )
 
 
@@ -129,7 +129,8 @@ def write_video(path: Path, frames: Iterable[Tensor], *, fps: int, folder: bool 
     """Write frames as a video, atomically.
 
     Args:
-        path: Its suffix sets the format: .webp, .mp4 (extra ``video``), or .png (one frame).
+        path: Its suffix sets the format: .webp, .mp4 (extra ``video``), or .png and .jpg (one
+            frame).
         frames: uint8 [H, W, 3] each.
         fps: Frames per second.
         folder: Write one PNG per frame into the folder ``path`` instead.
@@ -141,19 +142,20 @@ def write_video(path: Path, frames: Iterable[Tensor], *, fps: int, folder: bool 
     check_video(path, frames=1, folder=folder)
     if folder:
         for number, frame in enumerate(frames):
-            _write_png(path / f"frame_{number:04d}.png", frame)
+            _write_image(path / f"frame_{number:04d}.png", frame)
     elif path.suffix == ".mp4":
         _write_mp4(path, frames, fps)
-    elif path.suffix == ".png":
-        _write_png(path, next(iter(frames)))
+    elif path.suffix in IMAGES:
+        _write_image(path, next(iter(frames)))
     else:
         _write_webp(path, frames, fps)
     return path
 
 
-def _write_png(path: Path, frame: Tensor) -> None:
+def _write_image(path: Path, frame: Tensor) -> None:
     with replacing(path) as temporary:
-        Image.fromarray(frame.numpy()).save(temporary, format="PNG")
+        # The quality is that of JPEG files.
+        Image.fromarray(frame.numpy()).save(temporary, format=IMAGES[path.suffix], quality=95)
 
 
 def _write_webp(path: Path, frames: Iterable[Tensor], fps: int) -> None:
@@ -181,6 +183,12 @@ def _write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> None:
             writer.append_data(frame[:height, :width].numpy())
 
 
+IMAGES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
+"""Formats of files with one frame, as Pillow calls them."""
+
+OWN = "own"
+"""The time of a view, for its camera."""
+
 FRAMES, FPS = 48, 16
 LARGEST = 8192
 """Pixels per side; WebP ends at twice as many."""
@@ -193,13 +201,14 @@ class VideoOptions:
     Attributes:
         path: Camera: ``orbit``, ``fixed`` (the first camera of the orbit), ``view:FILE``, or a
             camera path, FILE.json.
-        time: ``sweep`` (from 0 to 1), ``back-and-forth``, or a number from 0 to 1; None for
-            back-and-forth, or the times of a camera path.
+        time: ``sweep`` (from 0 to 1), ``back-and-forth``, ``own`` (that of ``view:FILE``), or a
+            number from 0 to 1; None for back-and-forth, or the times of a camera path.
         frames: Number of frames; None for 48, for 1 where neither camera nor time moves, or for
             those of a camera path.
         fps: Frames per second; None for 16, or as a camera path says.
-        size: Pixels of the longer side; None for those of the training views, or as a camera path
-            says.
+        size: Pixels of the longer side; None for those of the training views, of the view that
+            ``path`` names, or as a camera path says. Frames of an orbit or a fixed camera are
+            square.
         elevation: Height angle of orbit and fixed camera, in degrees.
         what: ``colour`` or ``depth``.
     """
@@ -211,6 +220,12 @@ class VideoOptions:
     size: int | None = None
     elevation: float = ELEVATION
     what: str = "colour"
+
+    def written_to(self, out: str | None) -> "VideoOptions":
+        """These options where the frames go to ``out``: an image of a view shows its own time."""
+        one = self.frames in (None, 1) and self.path.startswith("view:") and self.time is None
+        image = out is not None and Path(out).suffix in IMAGES and not Path(out).is_dir()
+        return replace(self, time=OWN) if one and image else self
 
     @cached_property
     def cameras(self) -> CameraPath | None:
@@ -242,19 +257,27 @@ class VideoOptions:
         """Time of each frame, from 0 to 1. [F]
 
         Raises:
-            ConfigError: As `times`.
+            ConfigError: As `times`, and for ``own``, which only a scene can tell.
         """
         if self.cameras is not None and self.time is None:
             return self.cameras.times
         return times(self.time or "back-and-forth", self.count)
 
-    def shape(self, views: Views) -> tuple[int, int]:
-        """Rows and columns of a frame, where ``views`` are the training views."""
-        side = max(views.height, views.width)
-        if self.cameras is None:
+    def shape(self, splits: dict[str, Views]) -> tuple[int, int]:
+        """Rows and columns of a frame of a scene with these splits.
+
+        Raises:
+            ConfigError: As `find_view`.
+        """
+        side = max(splits["train"].height, splits["train"].width)
+        if self.path.startswith("view:"):
+            views, index = find_view(splits, self.path.removeprefix("view:"))
+            height, width = views.size(index)
+        elif self.cameras is None:
             return self.size or side, self.size or side
-        height = self.cameras.height or self.cameras.width or side
-        width = self.cameras.width or height
+        else:
+            height = self.cameras.height or self.cameras.width or side
+            width = self.cameras.width or height
         if self.size is None:
             return height, width
         scale = self.size / max(height, width)
@@ -267,7 +290,10 @@ class VideoOptions:
             ConfigError: With the option, its value and what is allowed.
             SceneError: If a camera path cannot be used.
         """
-        times(self.time or "back-and-forth", 1)
+        if self.time != OWN:
+            times(self.time or "back-and-forth", 1)
+        elif not self.path.startswith("view:"):
+            raise ConfigError(f"--time {OWN}: only the camera of a view has one, --path view:FILE")
         named = self.path in ("orbit", "fixed") or self.path.startswith("view:")
         if not named and self.cameras is None:
             raise ConfigError(
@@ -304,8 +330,8 @@ def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = N
     Args:
         trained: The run.
         options: What to render.
-        out: A file (.webp, .mp4, .png), or a folder if it ends in /; by default a file in the run's
-            media/ that is named after the paths.
+        out: A file (.webp, .mp4, .png, .jpg), or a folder if it ends in /; by default a file in the
+            run's media/ that is named after the paths.
 
     Returns:
         The file or folder that was written.
@@ -314,13 +340,17 @@ def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = N
         ConfigError: If options are out of range or contradict one another.
         ImportError: For .mp4 without the extra ``video``.
     """
+    options = options.written_to(out)
     options.check()
     check_out(out, options)
     target, folder = destination(trained.path, options, out, trained.checkpoint)
     require_writable(target.parent)
-    size = options.shape(trained.scene.splits["train"])
+    size = options.shape(trained.scene.splits)
+    if options.time == OWN:
+        views, index = find_view(trained.scene.splits, options.path.removeprefix("view:"))
+        options = replace(options, time=str(float(views.times[index])))
     if options.cameras is None:
-        focal, centre, distortion = lens(trained.scene.splits, options.path, size[0])
+        focal, centre, distortion = lens(trained.scene.splits, options.path, size)
     else:
         focal, centre, distortion = options.cameras.focal(*size)[:, None], None, None
     frames = render_path(
@@ -347,6 +377,7 @@ def check_out(out: str | None, options: VideoOptions) -> None:
         ConfigError: As `xplanes.evaluation.render.check_video`.
         ImportError: For .mp4 without the extra ``video``.
     """
+    options = options.written_to(out)
     target, folder = destination(Path(), options, out, "last")
     check_video(target, frames=options.count, folder=folder)
 
@@ -382,23 +413,26 @@ def poses(trained: TrainedRun, options: VideoOptions) -> Tensor:
 
 
 def lens(
-    splits: dict[str, Views], path: str, size: int
+    splits: dict[str, Views], path: str, size: tuple[int, int]
 ) -> tuple[float | Tensor, Tensor | None, Lenses | None]:
-    """Focal length, principal point and lens of square pictures along a path, for `render_path`.
+    """Focal length, principal point and lens of pictures along a path, for `render_path`.
 
-    Those of a view show that view whole; the others show as much as the training views.
+    Those of a view show exactly what it shows; the others show as much as the training views.
+
+    Args:
+        splits: The views of the scene.
+        path: As in `VideoOptions`, but no file.
+        size: Rows and columns of the pictures.
     """
     if not path.startswith("view:"):
-        return splits["train"].intrinsics.focal_at(size), None, None
+        return splits["train"].intrinsics.focal_at(max(size)), None, None
     views, index = find_view(splits, path.removeprefix("view:"))
     height, width = views.size(index)
-    longer = max(height, width)
-    room = torch.tensor([longer - width, longer - height]) / 2
-    intrinsics, scale = views.intrinsics, size / longer
+    intrinsics, scale = views.intrinsics, torch.tensor([size[1] / width, size[0] / height])
     own = intrinsics.lens(index)
     if own is not None:
-        own = replace(own, skew=own.skew * scale)
-    return intrinsics.focal[index] * scale, (intrinsics.centre[index] + room) * scale, own
+        own = replace(own, skew=own.skew * scale[0])
+    return intrinsics.focal[index] * scale, intrinsics.centre[index] * scale, own
 
 
 def view_pose(splits: dict[str, Views], name: str) -> Tensor:
@@ -434,7 +468,7 @@ def times(name: str, count: int) -> Tensor:
     """Time of each frame, from 0 to 1. [F]
 
     Raises:
-        ConfigError: If ``name`` is neither sweep, back-and-forth nor a number from 0 to 1.
+        ConfigError: If ``name`` is neither ``sweep``, ``back-and-forth`` nor a number from 0 to 1.
     """
     if name == "sweep":
         return torch.linspace(0, 1, count)

@@ -35,6 +35,8 @@ Line = tuple[str, Sequence["Tile"]]
 """A row of tiles with its title."""
 
 _STEP = re.compile(r"step(\d+)")
+_TWICE = re.compile(r"^(train|val|test)_(?=\1_)")
+"""The split before a name that begins with it, as earlier runs wrote it."""
 
 
 @dataclass(frozen=True)
@@ -60,19 +62,19 @@ def write_sheet(
     Args:
         folder: A run, a sweep, or any folder of runs.
         out: The picture, a PNG, or for steps a film, a WebP with a frame per step;
-            ``folder/sheet.png`` when None.
+            ``folder/sheet_WHAT.png`` when None.
         what: One of `WHAT`.
         show: One of `xplanes.rendering.pictures.STRIP`: what is shown of a view.
-        view: Name of the view, as in ``media``; the middle one of those that all runs of a scene
-            show when None.
+        view: Name of the view, as in ``media``, or an ending that no other view has; the middle
+            one of those that all runs of a scene show when None.
         steps: Steps to show; all, or with "runs" the last, when None.
         size: Pixels of a tile's longer side.
 
     Raises:
-        ConfigError: If there are no runs or pictures, or no such view or step.
+        ConfigError: If there are no runs or pictures, no such view or step, or several such views.
     """
-    out = out or folder / "sheet.png"
     check_what(what)
+    out = out or folder / f"sheet_{what}.png"
     if out.suffix not in ((".png", ".webp") if what == "steps" else (".png",)):
         raise ConfigError(
             f"{out}: a contact sheet must end in .png, or with --what steps in .webp for a film"
@@ -179,7 +181,7 @@ def _pictures(run: Path) -> dict[int, dict[str, Path]]:
     taken: dict[int, dict[str, Path]] = {}
     for folder in sorted((run / "media").glob("step*")):
         if (match := _STEP.fullmatch(folder.name)) is not None:
-            named = {path.stem: path for path in sorted(folder.glob("*.png"))}
+            named = {_TWICE.sub("", path.stem): path for path in sorted(folder.glob("*.png"))}
             if named:
                 taken[int(match[1])] = named
     return taken
@@ -190,9 +192,17 @@ def _view(scene: str, runs: Sequence[dict[int, dict[str, Path]]], wanted: str | 
     common = set.intersection(*(set(named) for taken in runs for named in taken.values()))
     if not common:
         raise ConfigError(f"the runs of {scene} have no view in common: train them on equal data")
-    if wanted is not None and wanted not in common:
-        raise ConfigError(f"view={wanted}: the runs of {scene} show {', '.join(sorted(common))}")
-    return wanted or sorted(common)[len(common) // 2]
+    if wanted is None:
+        return sorted(common)[len(common) // 2]
+    name = _TWICE.sub("", wanted.replace("/", "_").removesuffix(".png"))
+    if name in common:
+        return name
+    found = sorted(known for known in common if known.endswith(name))
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise ConfigError(f"view={wanted}: {' and '.join(found)} end with it; name one of them")
+    raise ConfigError(f"view={wanted}: the runs of {scene} show {', '.join(sorted(common))}")
 
 
 def _steps(

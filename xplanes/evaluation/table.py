@@ -167,7 +167,7 @@ class SweepTable(Callback):
         if self._sheet is None:
             return
         try:
-            _say(f"wrote {write_sheet(folder, what=self._sheet)}")
+            _say(f"wrote {write_sheet(folder, folder / 'sheet.png', what=self._sheet)}")
         except ConfigError as error:
             _say(f"no sheet: {error}")
 

@@ -66,7 +66,8 @@ class XPlanesLoss(Settings):
     # over planes, along time too.
     variation: Literal["mean", "coded"]
     total_variation: Weight  # Weight of total variation.
-    world_variation: Weight  # The same in front of a background, in place of it.
+    # Replaces `model.loss.total_variation` where a background is learnt.
+    world_variation: Weight
     time_smoothness: Weight  # Weight of time smoothness (squared second differences).
     time_magnitude: Weight  # Weight of the squared values of time planes.
     time_identity: Weight  # Weight of the time planes' mean distance from 1, as in K-Planes.
@@ -74,7 +75,9 @@ class XPlanesLoss(Settings):
     sparse_reduction: Literal["mean", "sum"]  # Over entries: sum as in the paper.
     sparse_frames: Count | None  # Random timesteps per evaluation of L_r; null: all.
     initial_weight: Weight  # Weight of the distance to the initial planes; divided by views^2.
-    initial_steps: Count | None  # Steps times views over which both fade out; null: never.
+    # L_r and the distance to the initial planes fade out over this number divided by the number of
+    # training views, in steps; null: never.
+    initial_steps: Count | None
     every: Count  # Steps between evaluations of these terms; weights are scaled to match.
 
 
@@ -88,8 +91,8 @@ class XPlanesSettings(ModelSettings):
 
     plane_set: Literal["six", "nine", "three"]
     resolution: Count  # Texels along each space axis.
-    # Rows of time. half: half the number of distinct times, as in K-Planes; null: the same, or all
-    # of them where each is seen often, and as many as the LRM has timesteps if these are more.
+    # Rows of time. half: half the number of distinct times, as in K-Planes, or all of them where
+    # each is seen by four or more views; null: the same, but never fewer than the LRM's timesteps.
     time_resolution: Count | Literal["half"] | None
     channels: Count  # Channels of each plane.
     space_scale: Weight  # Standard deviation of randomly initialised space planes.

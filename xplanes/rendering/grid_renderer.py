@@ -159,7 +159,8 @@ class OccupancySettings(SamplerSettings):
     grid_resolution: Count  # Cells of the occupancy grid along each side.
     time_bins: Count  # Bins of the occupancy grid along time.
     threshold: Fraction  # Opacity of one step below which a cell is empty.
-    world_threshold: Fraction  # The same in front of a background, in place of it.
+    # Replaces `model.sampler.threshold` where a background is learnt.
+    world_threshold: Fraction
     decay: Share  # Decay of the density of a cell at each update.
     skip_empty: bool  # Skip samples in empty cells.
     skip_unseen: bool  # Images show no cell that no training ray has seen.

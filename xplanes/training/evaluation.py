@@ -337,9 +337,10 @@ class Evaluation(Callback):
             write_png(run / "media" / "planes.png", sheet)
             log_image(trainer, "planes", sheet, step)
         for file, picture in pictures.items():
-            name = f"{split}_{file.replace('/', '_').removesuffix('.png')}"
+            path = file if file.startswith(f"{split}/") else f"{split}/{file}"
+            name = path.replace("/", "_").removesuffix(".png")
             write_png(run / "media" / f"step{step:06d}" / f"{name}.png", picture)
-            log_image(trainer, f"{split}/{file}", picture, step)
+            log_image(trainer, path, picture, step)
         for log in trainer.loggers:
             log.log_metrics({**scores, "time/train_s": training_seconds(trainer)}, step)
 

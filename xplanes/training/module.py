@@ -193,9 +193,10 @@ class RadianceModule(LightningModule):
     def _assemble(self, settings: ModelSettings, site: Site) -> None:
         values = None if self.initialisation is None else self.initialisation.values
         self.model = settings.build(site, values)
-        self.field = self.model.field
+        self.field = require_field(self.model)
         settings.sampler.require_kind(type(self.field))
         self.sampler = settings.sampler.build(self.field, site)
+        require_groups(self.model, self.sampler)
         for name, part in self.sampler.parts.items():
             self.add_module(name, part)
         self.site, self._settings = site, settings
@@ -686,6 +687,48 @@ def mean_opacities(rendering: Rendering, rays: Batch) -> dict[str, Tensor]:
 def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
     """Mean of some values, without a list of which; NaN for none. [N], bool [N] -> []"""
     return values.mean() if mask is None else (values * mask).sum() / mask.sum()
+
+
+def require_field(model: Model) -> Representation:
+    """The field of a model, if it is one.
+
+    Raises:
+        ConfigError: If it is of another class.
+    """
+    field: Any = model.field
+    if not isinstance(field, Representation):
+        raise ConfigError(
+            f"{type(model).__name__}.field: {type(field).__name__} must be derived from "
+            "xplanes.fields.base.RadianceField"
+        )
+    return field
+
+
+def require_groups(model: Model, sampler: Sampler) -> None:
+    """Refuse parameter groups that training cannot work with.
+
+    Raises:
+        ConfigError: With what a group consists of.
+    """
+    wanted = ("params", "lr", "name")
+    whole = '{"params": list(field.parameters()), "lr": 0.001, "name": "field"}'
+    for owner in (model, sampler):
+        place = f"{type(owner).__name__}.groups"
+        for group in owner.groups():
+            if missing := [key for key in wanted if key not in group]:
+                raise ConfigError(f"{place}: a group lacks {' and '.join(missing)}; write {whole}")
+    groups = [*model.groups(), *sampler.groups()]
+    names = [group["name"] for group in groups]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ConfigError(f"{type(model).__name__}.groups: two groups have the name {twice[0]}")
+    keys = [(group["name"], key) for group in groups for key in group if key not in wanted]
+    optimizer = model.optimizer(groups)
+    for name, key in keys:
+        if key not in optimizer.defaults:
+            raise ConfigError(
+                f"{type(model).__name__}.groups: {type(optimizer).__name__} takes no {key!r}, "
+                f"which the group {name} has; it takes {', '.join(optimizer.defaults)}"
+            )
 
 
 def _takes_flags(optimizer: torch.optim.Optimizer) -> bool:

@@ -285,7 +285,7 @@ class RadianceModule(LightningModule):
         usable = self.trainer.strategy.reduce_boolean_decision(math.isfinite(value), all=True)
         if not usable:
             optimizer.zero_grad()  # Of the batches before it, for the same update.
-            self._refuse(f"the loss was {value}", not_finite(self.named_parameters()), rendering)
+            self._refuse(f"the loss was {value}", rendering, terms)
             return
         self.manual_backward(loss / self.ray_settings.accumulate)
         self.counts["passed"] += int(sampler.pass_on(rendering, state))
@@ -301,7 +301,7 @@ class RadianceModule(LightningModule):
             self.last |= {n: float(value) for n, value in mean_opacities(rendering, rays).items()}
         self._log_terms(terms, state)
         if self.between_updates:
-            self._update(optimizer, state, rendering)
+            self._update(optimizer, state, rendering, terms)
 
     def _go_on_without_waiting(
         self,
@@ -342,8 +342,7 @@ class RadianceModule(LightningModule):
         if due(self.batches) or self._logs_now:
             self._read_meters()
             if self.unusable_in_a_row >= PATIENCE:
-                broken = not_finite(self.named_parameters())
-                self._give_up("the loss or a gradient was not finite", broken, rendering)
+                self._give_up("the loss or a gradient was not finite", rendering, terms)
         self._log_terms(terms, state)
 
     def _update_by_flag(self, optimizer: LightningOptimizer, state: TrainingState) -> Tensor:
@@ -413,7 +412,11 @@ class RadianceModule(LightningModule):
         return terms
 
     def _update(
-        self, optimizer: LightningOptimizer, state: TrainingState, rendering: Rendering
+        self,
+        optimizer: LightningOptimizer,
+        state: TrainingState,
+        rendering: Rendering,
+        terms: Mapping[str, Tensor],
     ) -> None:
         model, sampler = self._parts
         model.regularise(state)
@@ -422,7 +425,8 @@ class RadianceModule(LightningModule):
         if not self.trainer.strategy.reduce_boolean_decision(usable, all=True):
             broken = [f"gradient of {name}" for name in unusable_gradients(self.named_parameters())]
             optimizer.zero_grad()
-            self._refuse("a gradient was infinite, NaN or too large to square", broken, rendering)
+            what = "a gradient was infinite, NaN or too large to square"
+            self._refuse(what, rendering, terms, broken)
             return
         self.unusable_in_a_row = 0
         optimizer.step()
@@ -461,20 +465,41 @@ class RadianceModule(LightningModule):
         self.counts["rays"] += rays
         self.rays = self.ray_settings.fitting(rays, shown["samples"])
 
-    def _refuse(self, what: str, broken: list[str], rendering: Rendering) -> None:
+    def _refuse(
+        self,
+        what: str,
+        rendering: Rendering,
+        terms: Mapping[str, Tensor],
+        gradients: Sequence[str] = (),
+    ) -> None:
         """Leave a step out, and give up after `PATIENCE` of them in a row."""
         self.unusable += 1
         self.unusable_in_a_row += 1
         if self.unusable_in_a_row >= PATIENCE:
-            self._give_up(what, broken, rendering)
+            self._give_up(what, rendering, terms, gradients)
 
-    def _give_up(self, what: str, broken: list[str], rendering: Rendering) -> None:
-        density = rendering.density
+    def _give_up(
+        self,
+        what: str,
+        rendering: Rendering,
+        terms: Mapping[str, Tensor],
+        gradients: Sequence[str] = (),
+    ) -> None:
+        density, parameters = rendering.density, not_finite(self.named_parameters())
+        seen = {"colour": rendering.colour, "opacity": rendering.opacity, "density": density}
+        rays = [f"rendered {name}" for name in not_finite(seen.items())]
+        losses = [self._key_of(name) for name in not_finite(terms.items())]
+        broken = parameters or [*gradients] or [*rays, *losses]
         raise TrainingError(
             f"{what} for {PATIENCE} steps in a row, at step {self.global_step}; not finite: "
-            f"{', '.join(broken) or 'the rendered rays alone'}; largest density "
-            f"{float(density.max()) if len(density) else 0:.3g}. {self._way_out}"
+            f"{', '.join(broken) or 'gradients, or something in another process'}; largest density "
+            f"{float(density.max()) if len(density) else 0:.3g}. "
+            f"{self._way_out(losses, rendered=not (parameters or rays))}"
         )
+
+    def _key_of(self, term: str) -> str:
+        """A term of the loss as the configuration names it, or as one of the model's."""
+        return f"losses.{term}" if term in self.method.losses else f"loss term {term}"
 
     def require_finite(self) -> None:
         """Refuse to go on with, or to keep, parameters that are not finite.
@@ -485,19 +510,34 @@ class RadianceModule(LightningModule):
         if broken := not_finite(self.named_parameters()):
             raise TrainingError(
                 f"not finite at step {self.global_step}: {', '.join(broken)}. No checkpoint was "
-                f"written over the last sound one. {self._way_out}"
+                f"written over the last sound one. {self._way_out()}"
             )
 
-    @property
-    def _way_out(self) -> str:
-        if self.global_step == 0:
+    def _way_out(self, broken: Sequence[str] = (), *, rendered: bool = False) -> str:
+        """What to change.
+
+        Args:
+            broken: Terms of the loss that are not finite.
+            rendered: Whether parameters and rendering are finite nevertheless.
+        """
+        added = [f"losses.{name}" for name in self.method.losses] if rendered else []
+        begun = self.global_step > 0
+        resume = "; resume= continues from the last checkpoint" if begun else ""
+        if culprits := [name for name in added if name in broken]:
+            return f"The rendering is finite: correct {' and '.join(culprits)} or omit it{resume}"
+        precision = "" if self.field.precision == "32" else ", or set model.precision=32"
+        if begun:
+            more = f", or omit {' and '.join(added)}" if added else ""
+            return f"{self._parts[0].advice}{more}{precision}{resume}"
+        initialised = self.site is not None and self.site.initialised
+        if initialised and not added and not (rendered and broken):
             largest = max(float(p.detach().abs().max()) for p in self.field.parameters())
             return (
                 f"No step was done yet, so the initialisation is to blame, whose largest value is "
                 f"{largest:.3g}: set lrm=none, or make it anew"
             )
-        precision = "" if self.field.precision == "32" else ", or set model.precision=32"
-        return f"{self._parts[0].advice}{precision}; resume= continues from the last checkpoint"
+        checked = " and ".join([type(self.field).__name__, *added])
+        return f"No step was done yet: check the values and gradients of {checked}{precision}"
 
     @property
     def can_restart(self) -> bool:

@@ -6,6 +6,7 @@ import re
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -117,9 +118,26 @@ class Spoiled(LossTerm):
         return rendering.opacity.mean() * (math.nan if state.step >= self.first else 1.0)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Shaped(LossTerm):
+    """The rays' opacity in some shape."""
+
+    form: str
+
+    def value(self, field, rendering, rays, state) -> Any:
+        forms = {
+            "rays": rendering.opacity,
+            "list": [rendering.opacity],
+            "one": rendering.opacity.mean()[None],
+            "number": 0.5,
+        }
+        return forms[self.form]
+
+
 def with_loss(scenes: Path, **settings) -> dict:
     config = small_config(scenes, *FEW)
-    term = {"_target_": f"{__name__}.Spoiled", "weight": 1.0, **settings}
+    name = "Spoiled" if "first" in settings else "Shaped"
+    term = {"_target_": f"{__name__}.{name}", "weight": 1.0, **settings}
     return config | {"losses": {"mine": term}, "plugins": [__name__]}
 
 
@@ -129,6 +147,19 @@ def test_an_added_loss_that_is_not_finite_is_named(scenes, tmp_path, first, more
     assert re.search(rf"the loss was nan.*step {first}; not finite: losses\.mine; largest", said)
     assert re.search(rf"The rendering is finite: correct losses\.mine or {more}", said)
     assert "initialisation" not in said
+
+
+def test_a_term_of_the_loss_must_be_one_number(scenes, tmp_path, monkeypatch) -> None:
+    for form in ("one", "number"):
+        run(with_loss(scenes, form=form), tmp_path / form, [], resume=False)
+    said = refused(with_loss(scenes, form="rays"), tmp_path / "rays")
+    words = r"losses\.mine: returned a tensor of shape \[\d+\]; return one number, such as its mean"
+    assert re.fullmatch(words, said)
+    said = refused(with_loss(scenes, form="list"), tmp_path / "list")
+    assert said.startswith("losses.mine: returned list; ")
+    monkeypatch.setattr(XPlanesModel, "losses", lambda *_: {"own": torch.ones(3)})
+    said = refused(small_config(scenes, *FEW), tmp_path / "own")
+    assert said.startswith("loss term own: returned a tensor of shape [3]; ")
 
 
 def test_the_initialisation_is_blamed_if_there_was_one_and_it_renders_nothing_finite(

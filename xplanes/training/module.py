@@ -390,11 +390,11 @@ class RadianceModule(LightningModule):
 
     def rehearse(self, rays: Batch) -> None:
         """Do all that a step does on a copy of the field, so that its kernels are compiled."""
-        model, sampler = copy.deepcopy(self._parts)
+        model, sampler = parts = copy.deepcopy(self._parts)
         state = self.state
         optimizer = model.optimizer([*model.groups(), *sampler.groups()])
         rendering = sampler.render(model.field, rays, state)
-        terms = model.losses(rendering, rays, state) | sampler.losses(rendering)
+        terms = self._terms(rendering, rays, state, parts)
         torch.stack(list(terms.values())).sum().backward()
         sampler.pass_on(rendering, state)
         sampler.observe(rendering)
@@ -403,12 +403,21 @@ class RadianceModule(LightningModule):
         optimizer.step()
         sampler.update(model.field, state)
 
-    def _terms(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
-        """All terms of the loss that need the rays, weighted, by name."""
-        model, sampler = self._parts
-        terms = model.losses(rendering, rays, state) | sampler.losses(rendering)
+    def _terms(
+        self,
+        rendering: Rendering,
+        rays: Batch,
+        state: TrainingState,
+        parts: tuple[Model, Sampler] | None = None,
+    ) -> dict[str, Tensor]:
+        """All terms of the loss that need the rays, weighted, by name; of a copy, if given. []"""
+        model, sampler = parts or self._parts
+        device = rendering.colour.device
+        found = model.losses(rendering, rays, state) | sampler.losses(rendering)
+        terms = {name: _number(term, f"loss term {name}", device) for name, term in found.items()}
         for name, term in self.method.losses.items():
-            terms[name] = term.weight * term.value(self.field, rendering, rays, state)
+            value = term.value(model.field, rendering, rays, state)
+            terms[name] = term.weight * _number(value, f"losses.{name}", device)
         return terms
 
     def _update(
@@ -699,6 +708,22 @@ def _read(config: Mapping[str, Any], modules: Sequence[str]) -> Method:
             return Method.read(config)
         except KeyError as error:
             raise ConfigError(f"the configuration lacks the group {error}") from error
+
+
+def _number(term: Any, name: str, device: torch.device) -> Tensor:
+    """A term of the loss as a tensor without dimensions. []
+
+    Raises:
+        TrainingError: If it is not one number.
+    """
+    if isinstance(term, int | float):
+        return torch.tensor(float(term), device=device)
+    if isinstance(term, Tensor) and term.numel() == 1:
+        return term.reshape(()) if term.ndim else term
+    shape = f"a tensor of shape {list(term.shape)}" if isinstance(term, Tensor) else None
+    raise TrainingError(
+        f"{name}: returned {shape or type(term).__name__}; return one number, such as its mean"
+    )
 
 
 def _precision(settings: ModelSettings, device: torch.device) -> str:

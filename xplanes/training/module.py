@@ -103,8 +103,22 @@ class RadianceModule(LightningModule):
 
     @classmethod
     def compose(cls, *overrides: str) -> "RadianceModule":
-        """The module of the command line's settings: ``compose("model=nine_planes")``."""
-        return cls(compose_plain("train", overrides))
+        """The module of the command line's settings: ``compose("model=nine_planes")``.
+
+        Args:
+            *overrides: ``key=value`` each; ``plugins=[MODULE]`` makes classes of one's own known.
+
+        Raises:
+            ConfigError: If a setting does not exist or cannot work.
+        """
+        for override in overrides:
+            if not isinstance(override, str):
+                raise ConfigError(
+                    f"compose({override!r}): takes settings one by one, as "
+                    'compose("model=nine_planes", "lrm=none")'
+                )
+        config = compose_plain("train", overrides)
+        return cls(config, plugins=config["plugins"] or ())
 
     @classmethod
     def of(cls, method: Method) -> "RadianceModule":
@@ -115,10 +129,21 @@ class RadianceModule(LightningModule):
     def load_from_checkpoint(
         cls, checkpoint_path: Any, *args: Any, weights_only: bool = True, **kwargs: Any
     ) -> "RadianceModule":
-        """As Lightning does, of tensors and builtins alone: no code in the file is run."""
-        return super().load_from_checkpoint(
-            checkpoint_path, *args, weights_only=weights_only, **kwargs
-        )
+        """As Lightning does, of tensors and builtins alone: no code in the file is run.
+
+        Classes of one's own, which a file cannot make known by itself, take ``plugins=[MODULE]``.
+
+        Raises:
+            ConfigError: If the file needs such classes, or does not fit.
+        """
+        try:
+            return super().load_from_checkpoint(
+                checkpoint_path, *args, weights_only=weights_only, **kwargs
+            )
+        except ConfigError as error:
+            if not str(error).endswith(ask := "plugins=[MODULE]"):
+                raise
+            raise ConfigError(f"{error}: load_from_checkpoint(path, {ask})") from error
 
     # Building
 

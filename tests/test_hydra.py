@@ -80,11 +80,52 @@ def test_unknown_keys_get_hydras_error_and_near_names(override, near, tmp_path: 
         compose_plain("train", [override])
 
 
-def test_unknown_options_are_listed_by_hydra(tmp_path: Path) -> None:
-    done = train("model=six_plane", cwd=tmp_path)
+@pytest.mark.parametrize(
+    ("override", "near"),
+    [
+        ("model=six_plane", "model=six_planes"),
+        ("lrm=tinny", "lrm=tiny"),
+        ("data=demos", "data=demo"),
+        ("model/sampler=ocupancy", "model/sampler=occupancy"),
+    ],
+)
+def test_unknown_options_are_listed_by_hydra_and_the_nearest_is_named(
+    override, near, tmp_path: Path
+) -> None:
+    done = train(override, cwd=tmp_path)
     assert done.returncode == 1
-    assert "Could not find 'model/six_plane'" in done.stderr
-    assert "nine_planes" in done.stderr
+    assert f"Could not find '{override.replace('=', '/')}'" in done.stderr
+    assert f"\t{near.rpartition('=')[2]}\n" in done.stderr
+    assert done.stderr.endswith(f"Did you mean {near}?\n")
+    with pytest.raises(ConfigError, match=f"Did you mean {near}\\?$"):
+        compose_plain("train", [override])
+
+
+def test_the_command_line_suggests_no_keys_of_other_commands(tmp_path: Path) -> None:
+    done = train("max_seconds=3", cwd=tmp_path)
+    assert done.stderr.endswith("Did you mean trainer.max_seconds?\n")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "near"),
+    [
+        (["trainer.max_second=3"], "trainer.max_seconds or trainer.max_steps"),
+        (["max_seconds=3"], "trainer.max_seconds"),
+        (["schedule.max_seconds=3"], "trainer.max_seconds"),  # It belongs to pretrain_lrm.
+        (["model=kplanes", "model.learning_rat=3"], "model.learning_rate"),
+        (["data=colmap", "data.test_camera=3"], "data.test_cameras"),
+        (["callback=threads"], "callbacks"),
+    ],
+    ids=str,
+)
+def test_keys_that_this_run_does_not_have_are_not_suggested(overrides, near) -> None:
+    with pytest.raises(ConfigError, match=rf"\nDid you mean {near}\?$"):
+        compose_plain("train", overrides)
+
+
+def test_other_configurations_have_suggestions_of_their_own() -> None:
+    with pytest.raises(ConfigError, match=r"\nDid you mean schedule\.max_seconds or .*schedule"):
+        compose_plain("pretrain_lrm", ["schedule.max_second=3"])
 
 
 @pytest.mark.parametrize(

@@ -303,6 +303,28 @@ def test_the_script_of_the_docs_runs(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert (tmp_path / "view.png").is_file()
 
 
+def test_plugins_of_the_docs_are_composed_and_loaded_again(
+    config: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
+    (script,) = re.findall(r"```python\n(module = .*?)```", page, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    script = script.replace("my_package.extras", "tests.plugins.opacity_loss")
+    script = script.replace("my_package", "tests.plugins").replace("max_steps=2000", "max_steps=3")
+    data = SceneDataModule(config["data"])
+    names = {"lightning": lightning, "RadianceModule": RadianceModule, "data": data}
+    exec(compile(script, "recipes.md", "exec"), names)
+    assert names["again"].method.losses["op"].weight == 0.1
+    words = r"plugins=\[MODULE\]: load_from_checkpoint\(path, plugins=\[MODULE\]\)$"
+    with pytest.raises(ConfigError, match=rf"^losses\.op\._target_=tests\.plugins.*{words}"):
+        RadianceModule.load_from_checkpoint("field.ckpt")
+
+
+def test_a_list_of_settings_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"^compose\(\['seed=1'\]\): takes settings one by one"):
+        RadianceModule.compose(["seed=1"])  # type: ignore[arg-type]
+
+
 def test_what_a_trainer_of_ours_settles_for_gpus(tmp_path: Path) -> None:
     """TF32 is asked for, and processes do not send each other the grid before each step."""
     before = torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32

@@ -2,6 +2,8 @@
 
 import csv
 import json
+import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,8 +12,10 @@ import yaml
 
 from tests.training.runs import small_config
 from xplanes import RadianceModule, SceneDataModule
+from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.evaluation.runs import load_run
+from xplanes.fields.base import RadianceField
 from xplanes.pipeline import run
 
 BLOB = {
@@ -120,3 +124,89 @@ def test_settings_of_plugins_are_checked_alike(config: dict, tmp_path: Path) -> 
 def test_a_module_that_is_not_there_is_said(config: dict, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"plugins: not_here cannot be imported.*PYTHONPATH"):
         run(config | {"plugins": ["not_here"]}, tmp_path / "run", [], resume=False)
+
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "CONTRIBUTING.md"
+
+
+@pytest.fixture
+def small_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict:
+    """The model of the docs, written to files as they say; its configuration."""
+    section = PAGE.read_text(encoding="utf-8").split("### A model\n")[1].split("\n### ")[0]
+    (code,) = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
+    (settings,) = re.findall(r"```yaml\n(.*?)```", section, re.DOTALL)
+    package, group = tmp_path / "my_project" / "my_package", tmp_path / "my_project/conf/model"
+    package.mkdir(parents=True)
+    group.mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    (package / "mlp.py").write_text(code)
+    (group / "mlp.yaml").write_text(settings)
+    monkeypatch.syspath_prepend(package.parent)
+    yield compose_plain(
+        "train",
+        [
+            f"hydra.searchpath=[file://{package.parent}/conf]",
+            "plugins=[my_package]",
+            "model=mlp",
+            f"data.root={tmp_path}",
+            "data.resolution=24",
+            "data.train_views=8",
+            "data.test_views=2",
+            "data.val_views=2",
+            "model.sampler.grid_resolution=24",
+            "trainer.accelerator=cpu",
+            "trainer.max_seconds=null",
+            "trainer.max_steps=60",
+            "callbacks.evaluation.at=[0]",
+            "media=false",
+        ],
+    )
+    for name in [name for name in sys.modules if name.split(".")[0] == "my_package"]:
+        del sys.modules[name]
+
+
+def test_the_model_of_the_docs_trains(small_model: dict, tmp_path: Path) -> None:
+    assert small_model["lrm"]["name"] == "none"
+    run(small_model, tmp_path / "run", [], resume=False)
+    curve = list(csv.DictReader((tmp_path / "run" / "curve.csv").open()))
+    assert float(curve[-1]["psnr"]) > float(curve[0]["psnr"]) + 1
+    field = load_run(tmp_path / "run", plugins=["my_package"]).module.field
+    assert (dict(field.planes), field.moves) == ({}, True)
+    assert (field.precision, field.outline) == ("32", "MLPField")
+
+
+@pytest.mark.parametrize(
+    ("groups", "words"),
+    [
+        ([{"params": [], "lr": 0.1}], 'MLPModel.groups: a group lacks name; write {"params": '),
+        ([{"name": "mlp"}], "a group lacks params and lr; write"),
+        ([{"params": [], "lr": 0.1, "name": "mlp"}] * 2, "two groups have the name mlp"),
+        (
+            [{"params": [], "lr": 0.1, "name": "mlp", "learning_rate": 1}],
+            "Adam takes no 'learning_rate', which the group mlp has; it takes lr, betas",
+        ),
+    ],
+)
+def test_groups_that_cannot_be_trained_are_refused_when_the_model_is_built(
+    small_model: dict, groups: list, words: str
+) -> None:
+    module = RadianceModule(small_model, plugins=["my_package"])
+    scene = SceneDataModule(small_model["data"]).scene
+    model = sys.modules["my_package.mlp"].MLPModel
+    model.groups = lambda self: [dict(group) for group in groups]
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        module.build(scene)
+
+
+def test_a_field_of_another_class_is_refused(small_model: dict) -> None:
+    module = RadianceModule(small_model, plugins=["my_package"])
+    scene = SceneDataModule(small_model["data"]).scene
+    sys.modules["my_package.mlp"].MLPModel.field = torch.nn.Linear(4, 4)
+    with pytest.raises(ConfigError, match=r"MLPModel\.field: Linear must be derived from .*Radia"):
+        module.build(scene)
+
+
+def test_a_part_of_a_field_may_not_hide_behind_a_property() -> None:
+    field = RadianceField()
+    with pytest.raises(AttributeError, match=r"RadianceField\.planes is a property; rename"):
+        field.planes = torch.nn.ParameterDict()

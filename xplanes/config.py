@@ -17,6 +17,9 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / 
 CHOICES = ("experiment", "entry", "recipe", "scale")
 """Groups whose files set keys of other groups."""
 
+_UNKNOWN_OPTION = re.compile(r"Could not find '(\S+)/(\S+)'\s+Available options.*:\n((?:\t.*\n)+)")
+"""Hydra's message: group, what was asked for, and what there is."""
+
 
 def compose_plain(name: str | None, overrides: Sequence[str], conf: Path = CONF) -> dict[str, Any]:
     """A configuration with some settings changed, resolved to builtins.
@@ -31,7 +34,7 @@ def compose_plain(name: str | None, overrides: Sequence[str], conf: Path = CONF)
     """
     from hydra import compose
 
-    with _hydra(conf):
+    with _hydra(conf, name, overrides):
         return to_plain(compose(name, list(overrides)))
 
 
@@ -51,18 +54,29 @@ def group_options(
     """
     from hydra.core.global_hydra import GlobalHydra
 
-    with _hydra(conf):
+    with _hydra(conf, name, overrides):
         loader = GlobalHydra.instance().config_loader()
         return loader.get_group_options(group, config_name=name, overrides=list(overrides))
 
 
 @contextmanager
-def _hydra(conf: Path) -> Iterator[None]:
+def _hydra(conf: Path, name: str | None, overrides: Sequence[str]) -> Iterator[None]:
     """A Hydra of our own, whose errors say what is nearest to an unknown name."""
+    from hydra.errors import HydraException
+
+    try:
+        with _initialized(conf):
+            yield
+    except HydraException as error:
+        near = near_names(str(error), conf, name, overrides)
+        raise ConfigError(f"{error}{near}") from error
+
+
+@contextmanager
+def _initialized(conf: Path) -> Iterator[None]:
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.singleton import Singleton
-    from hydra.errors import HydraException
 
     # Inside a job there is a Hydra already, which must be there again afterwards.
     outer = Singleton.get_state()
@@ -70,8 +84,6 @@ def _hydra(conf: Path) -> Iterator[None]:
     try:
         with initialize_config_dir(str(conf), version_base="1.3"):
             yield
-    except HydraException as error:
-        raise ConfigError(f"{error}{near_names(str(error), conf)}") from error
     finally:
         Singleton.set_state(outer)
 
@@ -98,25 +110,78 @@ def quoted(text: str) -> str:
     return f"'{escaped}'"
 
 
-def near_names(message: str, conf: Path = CONF) -> str:
-    """Names that Hydra's message about an unknown key may have meant, as a sentence; or nothing."""
+def near_names(
+    message: str,
+    conf: Path = CONF,
+    name: str | None = "train",
+    overrides: Sequence[str] | None = None,
+) -> str:
+    """What Hydra's message about an unknown key or option may have meant; or nothing.
+
+    Args:
+        message: Hydra's.
+        conf: The configuration folder.
+        name: File of the configuration in ``conf``, without ending.
+        overrides: What was chosen, if that is known: keys of other options are not suggested.
+    """
+    if found := _UNKNOWN_OPTION.search(message):
+        group, option, options = found[1], found[2], found[3].split()
+        near = difflib.get_close_matches(option, options, n=1, cutoff=0.5)
+        return f"\nDid you mean {group}={near[0]}?" if near else ""
     key = next((word.strip("'\"") for word in message.split() if word.startswith("'")), "")
     marker = "Could not override '"
     if marker in message:
         key = message.split(marker, 1)[1].split("'", 1)[0]
     if not key or not ("." in key or "Key" in message or "override" in message):
         return ""
-    names = _keys(conf)
-    if (options := names.pop(key, set())) and "Could not override" in message:
+    known = _keys(conf, name)
+    if (options := known.pop(key, set())) and "Could not override" in message:
         return f"\n{key} belongs to {' and '.join(sorted(options))}, not to what is chosen"
-    near = difflib.get_close_matches(key, sorted(names), n=3, cutoff=0.6)
-    last = key.rsplit(".", 1)[-1]
-    near = near or [name for name in sorted(names) if name.rsplit(".", 1)[-1] == last][:5]
+    here = None if overrides is None else _composed_keys(conf, name, overrides)
+    if here:
+        known = {key: options for key, options in known.items() if key in here or not options}
+    prefix, _, last = key.rpartition(".")
+    beside = [each for each in known if each.rpartition(".")[0] == prefix]
+    alike = [each for each in known if each.rpartition(".")[2] == last]
+    near = (
+        difflib.get_close_matches(key, beside, n=3, cutoff=0.75)
+        or difflib.get_close_matches(key, alike, n=3, cutoff=0)
+        or difflib.get_close_matches(key, sorted(known), n=3, cutoff=0.6)
+    )
     return f"\nDid you mean {' or '.join(near)}?" if near else ""
 
 
-def _keys(conf: Path) -> dict[str, set[str]]:
-    """Dotted names of the settings of all files, each with the options that set it."""
+def _composed_keys(conf: Path, name: str | None, overrides: Sequence[str]) -> set[str]:
+    """Dotted names of the settings that the chosen options bring; none if they do not exist."""
+    from hydra import compose
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+
+    def chooses(override: str) -> bool:
+        key = override.lstrip("+~").partition("=")[0].partition("@")[0]
+        return key == "hydra.searchpath" or (conf / key).is_dir()
+
+    try:
+        with _initialized(conf):
+            config = compose(name, [override for override in overrides if chooses(override)])
+    except HydraException:
+        return set()
+    found: set[str] = set()
+    waiting = [("", OmegaConf.to_container(config))]
+    while waiting:
+        prefix, node = waiting.pop()
+        if prefix:
+            found.add(prefix)
+        if isinstance(node, dict):
+            waiting += [(f"{prefix}.{key}" if prefix else str(key), node[key]) for key in node]
+    return found
+
+
+def _keys(conf: Path, name: str | None) -> dict[str, set[str]]:
+    """Dotted names of the settings that a configuration may have, each with its options' names.
+
+    Groups are among them, without options.
+    """
     import yaml
 
     found: dict[str, set[str]] = {}
@@ -129,8 +194,19 @@ def _keys(conf: Path) -> dict[str, set[str]]:
         elif prefix:
             found.setdefault(prefix, set()).update([option] if option else [])
 
+    roots = {path.stem: yaml.safe_load(path.read_text("utf-8")) for path in conf.glob("*.yaml")}
+    others = {
+        key
+        for root, content in roots.items()
+        if name in roots and root != name
+        for entry in content.get("defaults", [])
+        if isinstance(entry, dict)
+        for key in entry
+    }
     for path in conf.rglob("*.yaml"):
         groups = path.relative_to(conf).parts[:-1]
+        if (groups and groups[0] in others) or (not groups and name in roots and path.stem != name):
+            continue
         if groups and groups[0] in CHOICES:
             found.setdefault(groups[0], set())
             continue

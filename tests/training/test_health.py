@@ -2,8 +2,11 @@
 
 import json
 import math
+import re
 import shutil
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -11,6 +14,7 @@ from torch import nn
 
 from tests.training.runs import small_config
 from xplanes.errors import ConfigError
+from xplanes.models.base import LossTerm
 from xplanes.models.x_planes import XPlanesModel
 from xplanes.pipeline import run
 from xplanes.training.checkpoints import find_resumable
@@ -86,10 +90,103 @@ def test_gradients_that_stay_bad_end_training_with_a_message(scenes, tmp_path, m
     assert state(tmp_path / "all")["global_step"] == 5
 
 
-def test_an_initialisation_that_cannot_be_trained_is_named(scenes, tmp_path, monkeypatch) -> None:
+def test_gradients_that_are_bad_from_the_first_step_on(scenes, tmp_path, monkeypatch) -> None:
     spoil_gradient(monkeypatch, 1e30, range(1000))
+    words = r"step 0.*gradient of field\.space.*check the values and gradients of XPlanes"
+    with pytest.raises(TrainingError, match=words):
+        run(small_config(scenes, *FEW), tmp_path / "random", [], resume=False)
+    with pytest.raises(TrainingError, match=r"step 0.*of XPlanes and losses\.mine"):
+        run(with_loss(scenes, first=99), tmp_path / "loss", [], resume=False)
+    build = RadianceModule.build
+
+    def initialise(self, *rest, **options) -> None:
+        build(self, *rest, **options)
+        self.site = replace(self.site, initialised=True)
+
+    monkeypatch.setattr(RadianceModule, "build", initialise)
     with pytest.raises(TrainingError, match=r"step 0.*initialisation is to blame.*lrm=none"):
         run(small_config(scenes, *FEW), tmp_path / "start", [], resume=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spoiled(LossTerm):
+    """NaN from some step on."""
+
+    first: int
+
+    def value(self, field, rendering, rays, state) -> torch.Tensor:
+        return rendering.opacity.mean() * (math.nan if state.step >= self.first else 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shaped(LossTerm):
+    """The rays' opacity in some shape."""
+
+    form: str
+
+    def value(self, field, rendering, rays, state) -> Any:
+        forms = {
+            "rays": rendering.opacity,
+            "list": [rendering.opacity],
+            "one": rendering.opacity.mean()[None],
+            "number": 0.5,
+        }
+        return forms[self.form]
+
+
+def with_loss(scenes: Path, **settings) -> dict:
+    config = small_config(scenes, *FEW)
+    name = "Spoiled" if "first" in settings else "Shaped"
+    term = {"_target_": f"{__name__}.{name}", "weight": 1.0, **settings}
+    return config | {"losses": {"mine": term}, "plugins": [__name__]}
+
+
+@pytest.mark.parametrize(("first", "more"), [(0, r"omit it$"), (7, r"omit it; resume=")])
+def test_an_added_loss_that_is_not_finite_is_named(scenes, tmp_path, first, more) -> None:
+    said = refused(with_loss(scenes, first=first), tmp_path / "run")
+    assert re.search(rf"the loss was nan.*step {first}; not finite: losses\.mine; largest", said)
+    assert re.search(rf"The rendering is finite: correct losses\.mine or {more}", said)
+    assert "initialisation" not in said
+
+
+def test_a_term_of_the_loss_must_be_one_number(scenes, tmp_path, monkeypatch) -> None:
+    for form in ("one", "number"):
+        run(with_loss(scenes, form=form), tmp_path / form, [], resume=False)
+    said = refused(with_loss(scenes, form="rays"), tmp_path / "rays")
+    words = r"losses\.mine: returned a tensor of shape \[\d+\]; return one number, such as its mean"
+    assert re.fullmatch(words, said)
+    said = refused(with_loss(scenes, form="list"), tmp_path / "list")
+    assert said.startswith("losses.mine: returned list; ")
+    monkeypatch.setattr(XPlanesModel, "losses", lambda *_: {"own": torch.ones(3)})
+    said = refused(small_config(scenes, *FEW), tmp_path / "own")
+    assert said.startswith("loss term own: returned a tensor of shape [3]; ")
+
+
+def test_the_initialisation_is_blamed_if_there_was_one_and_it_renders_nothing_finite(
+    scenes, tmp_path, monkeypatch
+) -> None:
+    built = RadianceModule.build
+
+    def spoil(self, *rest, **options) -> None:
+        built(self, *rest, **options)
+        self.site = replace(self.site, initialised=initialised)
+        with torch.no_grad():
+            self.field.decoder.layers[0].bias.fill_(math.nan)
+
+    monkeypatch.setattr(RadianceModule, "build", spoil)
+    for initialised, words in (
+        (True, "initialisation is to blame.*set lrm=none"),
+        (False, r"No step was done yet: check the values and gradients of XPlanes"),
+    ):
+        said = refused(small_config(scenes, *FEW), tmp_path / f"{initialised}")
+        assert re.search(words, said), said
+        assert ("initialisation" in said) == initialised
+
+
+def refused(config: dict, folder: Path) -> str:
+    with pytest.raises(TrainingError) as caught:
+        run(config, folder, [], resume=False)
+    return str(caught.value)
 
 
 def test_a_checkpoint_never_holds_what_is_not_finite(scenes, tmp_path, monkeypatch) -> None:

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -9,28 +10,35 @@ from torch import Tensor, nn
 class Representation(nn.Module, ABC):
     """What is trained: a scene in time that a renderer turns into images.
 
-    It lives in the cube [-1, 1]^3 of its frame.
+    It lives in the cube [-1, 1]^3 of its frame. Parameters and parts of a field may not take the
+    names of the properties below; a field overrides those that do not describe it.
     """
 
     @property
-    @abstractmethod
     def planes(self) -> Mapping[str, Tensor]:
         """Feature planes, or slices of a feature grid, to look at. [C, rows, columns] each"""
+        return {}
 
     @property
-    @abstractmethod
     def moves(self) -> bool:
         """Whether the field depends on time."""
+        return True
 
     @property
-    @abstractmethod
     def precision(self) -> str:
         """Number format of its matrix products: "32" or "bf16"."""
+        return "32"
 
     @property
-    @abstractmethod
     def outline(self) -> str:
         """Its size in a few words."""
+        return type(self).__name__
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # torch would keep the part, and the property would go on hiding it.
+        if isinstance(value, nn.Module) and isinstance(getattr(type(self), name, None), property):
+            raise AttributeError(f"{type(self).__name__}.{name} is a property; rename the part")
+        super().__setattr__(name, value)
 
 
 class RadianceField(Representation):

@@ -45,7 +45,7 @@ class Model(ABC):
         advice: What to change when the loss is not finite.
     """
 
-    advice: str
+    advice: str = "Lower the model's learning rates"
 
     @property
     @abstractmethod
@@ -54,7 +54,10 @@ class Model(ABC):
 
     @abstractmethod
     def groups(self) -> list[Group]:
-        """The field's trainable parameters."""
+        """The field's trainable parameters: ``params``, ``lr`` and ``name`` of each group.
+
+        A group may hold arguments of the optimiser besides.
+        """
 
     def optimizer(self, groups: list[Group]) -> torch.optim.Optimizer:
         """The optimiser of the field's and the sampler's parameters."""

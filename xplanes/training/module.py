@@ -103,8 +103,22 @@ class RadianceModule(LightningModule):
 
     @classmethod
     def compose(cls, *overrides: str) -> "RadianceModule":
-        """The module of the command line's settings: ``compose("model=nine_planes")``."""
-        return cls(compose_plain("train", overrides))
+        """The module of the command line's settings: ``compose("model=nine_planes")``.
+
+        Args:
+            *overrides: ``key=value`` each; ``plugins=[MODULE]`` makes classes of one's own known.
+
+        Raises:
+            ConfigError: If a setting does not exist or cannot work.
+        """
+        for override in overrides:
+            if not isinstance(override, str):
+                raise ConfigError(
+                    f"compose({override!r}): takes settings one by one, as "
+                    'compose("model=nine_planes", "lrm=none")'
+                )
+        config = compose_plain("train", overrides)
+        return cls(config, plugins=config["plugins"] or ())
 
     @classmethod
     def of(cls, method: Method) -> "RadianceModule":
@@ -115,10 +129,21 @@ class RadianceModule(LightningModule):
     def load_from_checkpoint(
         cls, checkpoint_path: Any, *args: Any, weights_only: bool = True, **kwargs: Any
     ) -> "RadianceModule":
-        """As Lightning does, of tensors and builtins alone: no code in the file is run."""
-        return super().load_from_checkpoint(
-            checkpoint_path, *args, weights_only=weights_only, **kwargs
-        )
+        """As Lightning does, of tensors and builtins alone: no code in the file is run.
+
+        Classes of one's own, which a file cannot make known by itself, take ``plugins=[MODULE]``.
+
+        Raises:
+            ConfigError: If the file needs such classes, or does not fit.
+        """
+        try:
+            return super().load_from_checkpoint(
+                checkpoint_path, *args, weights_only=weights_only, **kwargs
+            )
+        except ConfigError as error:
+            if (ask := "plugins=[MODULE]") not in str(error):
+                raise
+            raise ConfigError(f"{error}; here: load_from_checkpoint(path, {ask})") from error
 
     # Building
 
@@ -193,9 +218,10 @@ class RadianceModule(LightningModule):
     def _assemble(self, settings: ModelSettings, site: Site) -> None:
         values = None if self.initialisation is None else self.initialisation.values
         self.model = settings.build(site, values)
-        self.field = self.model.field
+        self.field = require_field(self.model)
         settings.sampler.require_kind(type(self.field))
         self.sampler = settings.sampler.build(self.field, site)
+        require_groups(self.model, self.sampler)
         for name, part in self.sampler.parts.items():
             self.add_module(name, part)
         self.site, self._settings = site, settings
@@ -284,7 +310,7 @@ class RadianceModule(LightningModule):
         usable = self.trainer.strategy.reduce_boolean_decision(math.isfinite(value), all=True)
         if not usable:
             optimizer.zero_grad()  # Of the batches before it, for the same update.
-            self._refuse(f"the loss was {value}", not_finite(self.named_parameters()), rendering)
+            self._refuse(f"the loss was {value}", rendering, terms)
             return
         self.manual_backward(loss / self.ray_settings.accumulate)
         self.counts["passed"] += int(sampler.pass_on(rendering, state))
@@ -300,7 +326,7 @@ class RadianceModule(LightningModule):
             self.last |= {n: float(value) for n, value in mean_opacities(rendering, rays).items()}
         self._log_terms(terms, state)
         if self.between_updates:
-            self._update(optimizer, state, rendering)
+            self._update(optimizer, state, rendering, terms)
 
     def _go_on_without_waiting(
         self,
@@ -341,8 +367,7 @@ class RadianceModule(LightningModule):
         if due(self.batches) or self._logs_now:
             self._read_meters()
             if self.unusable_in_a_row >= PATIENCE:
-                broken = not_finite(self.named_parameters())
-                self._give_up("the loss or a gradient was not finite", broken, rendering)
+                self._give_up("the loss or a gradient was not finite", rendering, terms)
         self._log_terms(terms, state)
 
     def _update_by_flag(self, optimizer: LightningOptimizer, state: TrainingState) -> Tensor:
@@ -390,11 +415,11 @@ class RadianceModule(LightningModule):
 
     def rehearse(self, rays: Batch) -> None:
         """Do all that a step does on a copy of the field, so that its kernels are compiled."""
-        model, sampler = copy.deepcopy(self._parts)
+        model, sampler = parts = copy.deepcopy(self._parts)
         state = self.state
         optimizer = model.optimizer([*model.groups(), *sampler.groups()])
         rendering = sampler.render(model.field, rays, state)
-        terms = model.losses(rendering, rays, state) | sampler.losses(rendering)
+        terms = self._terms(rendering, rays, state, parts)
         torch.stack(list(terms.values())).sum().backward()
         sampler.pass_on(rendering, state)
         sampler.observe(rendering)
@@ -403,16 +428,29 @@ class RadianceModule(LightningModule):
         optimizer.step()
         sampler.update(model.field, state)
 
-    def _terms(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
-        """All terms of the loss that need the rays, weighted, by name."""
-        model, sampler = self._parts
-        terms = model.losses(rendering, rays, state) | sampler.losses(rendering)
+    def _terms(
+        self,
+        rendering: Rendering,
+        rays: Batch,
+        state: TrainingState,
+        parts: tuple[Model, Sampler] | None = None,
+    ) -> dict[str, Tensor]:
+        """All terms of the loss that need the rays, weighted, by name; of a copy, if given. []"""
+        model, sampler = parts or self._parts
+        device = rendering.colour.device
+        found = model.losses(rendering, rays, state) | sampler.losses(rendering)
+        terms = {name: _number(term, f"loss term {name}", device) for name, term in found.items()}
         for name, term in self.method.losses.items():
-            terms[name] = term.weight * term.value(self.field, rendering, rays, state)
+            value = term.value(model.field, rendering, rays, state)
+            terms[name] = term.weight * _number(value, f"losses.{name}", device)
         return terms
 
     def _update(
-        self, optimizer: LightningOptimizer, state: TrainingState, rendering: Rendering
+        self,
+        optimizer: LightningOptimizer,
+        state: TrainingState,
+        rendering: Rendering,
+        terms: Mapping[str, Tensor],
     ) -> None:
         model, sampler = self._parts
         model.regularise(state)
@@ -421,7 +459,8 @@ class RadianceModule(LightningModule):
         if not self.trainer.strategy.reduce_boolean_decision(usable, all=True):
             broken = [f"gradient of {name}" for name in unusable_gradients(self.named_parameters())]
             optimizer.zero_grad()
-            self._refuse("a gradient was infinite, NaN or too large to square", broken, rendering)
+            what = "a gradient was infinite, NaN or too large to square"
+            self._refuse(what, rendering, terms, broken)
             return
         self.unusable_in_a_row = 0
         optimizer.step()
@@ -460,20 +499,41 @@ class RadianceModule(LightningModule):
         self.counts["rays"] += rays
         self.rays = self.ray_settings.fitting(rays, shown["samples"])
 
-    def _refuse(self, what: str, broken: list[str], rendering: Rendering) -> None:
+    def _refuse(
+        self,
+        what: str,
+        rendering: Rendering,
+        terms: Mapping[str, Tensor],
+        gradients: Sequence[str] = (),
+    ) -> None:
         """Leave a step out, and give up after `PATIENCE` of them in a row."""
         self.unusable += 1
         self.unusable_in_a_row += 1
         if self.unusable_in_a_row >= PATIENCE:
-            self._give_up(what, broken, rendering)
+            self._give_up(what, rendering, terms, gradients)
 
-    def _give_up(self, what: str, broken: list[str], rendering: Rendering) -> None:
-        density = rendering.density
+    def _give_up(
+        self,
+        what: str,
+        rendering: Rendering,
+        terms: Mapping[str, Tensor],
+        gradients: Sequence[str] = (),
+    ) -> None:
+        density, parameters = rendering.density, not_finite(self.named_parameters())
+        seen = {"colour": rendering.colour, "opacity": rendering.opacity, "density": density}
+        rays = [f"rendered {name}" for name in not_finite(seen.items())]
+        losses = [self._key_of(name) for name in not_finite(terms.items())]
+        broken = parameters or [*gradients] or [*rays, *losses]
         raise TrainingError(
             f"{what} for {PATIENCE} steps in a row, at step {self.global_step}; not finite: "
-            f"{', '.join(broken) or 'the rendered rays alone'}; largest density "
-            f"{float(density.max()) if len(density) else 0:.3g}. {self._way_out}"
+            f"{', '.join(broken) or 'gradients, or something in another process'}; largest density "
+            f"{float(density.max()) if len(density) else 0:.3g}. "
+            f"{self._way_out(losses, rendered=not (parameters or rays))}"
         )
+
+    def _key_of(self, term: str) -> str:
+        """A term of the loss as the configuration names it, or as one of the model's."""
+        return f"losses.{term}" if term in self.method.losses else f"loss term {term}"
 
     def require_finite(self) -> None:
         """Refuse to go on with, or to keep, parameters that are not finite.
@@ -484,19 +544,34 @@ class RadianceModule(LightningModule):
         if broken := not_finite(self.named_parameters()):
             raise TrainingError(
                 f"not finite at step {self.global_step}: {', '.join(broken)}. No checkpoint was "
-                f"written over the last sound one. {self._way_out}"
+                f"written over the last sound one. {self._way_out()}"
             )
 
-    @property
-    def _way_out(self) -> str:
-        if self.global_step == 0:
+    def _way_out(self, broken: Sequence[str] = (), *, rendered: bool = False) -> str:
+        """What to change.
+
+        Args:
+            broken: Terms of the loss that are not finite.
+            rendered: Whether parameters and rendering are finite nevertheless.
+        """
+        added = [f"losses.{name}" for name in self.method.losses] if rendered else []
+        begun = self.global_step > 0
+        resume = "; resume= continues from the last checkpoint" if begun else ""
+        if culprits := [name for name in added if name in broken]:
+            return f"The rendering is finite: correct {' and '.join(culprits)} or omit it{resume}"
+        precision = "" if self.field.precision == "32" else ", or set model.precision=32"
+        if begun:
+            more = f", or omit {' and '.join(added)}" if added else ""
+            return f"{self._parts[0].advice}{more}{precision}{resume}"
+        initialised = self.site is not None and self.site.initialised
+        if initialised and not added and not (rendered and broken):
             largest = max(float(p.detach().abs().max()) for p in self.field.parameters())
             return (
                 f"No step was done yet, so the initialisation is to blame, whose largest value is "
                 f"{largest:.3g}: set lrm=none, or make it anew"
             )
-        precision = "" if self.field.precision == "32" else ", or set model.precision=32"
-        return f"{self._parts[0].advice}{precision}; resume= continues from the last checkpoint"
+        checked = " and ".join([type(self.field).__name__, *added])
+        return f"No step was done yet: check the values and gradients of {checked}{precision}"
 
     @property
     def can_restart(self) -> bool:
@@ -660,6 +735,22 @@ def _read(config: Mapping[str, Any], modules: Sequence[str]) -> Method:
             raise ConfigError(f"the configuration lacks the group {error}") from error
 
 
+def _number(term: Any, name: str, device: torch.device) -> Tensor:
+    """A term of the loss as a tensor without dimensions. []
+
+    Raises:
+        TrainingError: If it is not one number.
+    """
+    if isinstance(term, int | float):
+        return torch.tensor(float(term), device=device)
+    if isinstance(term, Tensor) and term.numel() == 1:
+        return term.reshape(()) if term.ndim else term
+    shape = f"a tensor of shape {list(term.shape)}" if isinstance(term, Tensor) else None
+    raise TrainingError(
+        f"{name}: returned {shape or type(term).__name__}; return one number, such as its mean"
+    )
+
+
 def _precision(settings: ModelSettings, device: torch.device) -> str:
     """The precision of products, settled for a device where the settings say auto."""
     if settings.precision == "auto":
@@ -686,6 +777,48 @@ def mean_opacities(rendering: Rendering, rays: Batch) -> dict[str, Tensor]:
 def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
     """Mean of some values, without a list of which; NaN for none. [N], bool [N] -> []"""
     return values.mean() if mask is None else (values * mask).sum() / mask.sum()
+
+
+def require_field(model: Model) -> Representation:
+    """The field of a model, if it is one.
+
+    Raises:
+        ConfigError: If it is of another class.
+    """
+    field: Any = model.field
+    if not isinstance(field, Representation):
+        raise ConfigError(
+            f"{type(model).__name__}.field: {type(field).__name__} must be derived from "
+            "xplanes.fields.base.RadianceField"
+        )
+    return field
+
+
+def require_groups(model: Model, sampler: Sampler) -> None:
+    """Refuse parameter groups that training cannot work with.
+
+    Raises:
+        ConfigError: With what a group consists of.
+    """
+    wanted = ("params", "lr", "name")
+    whole = '{"params": list(field.parameters()), "lr": 0.001, "name": "field"}'
+    for owner in (model, sampler):
+        place = f"{type(owner).__name__}.groups"
+        for group in owner.groups():
+            if missing := [key for key in wanted if key not in group]:
+                raise ConfigError(f"{place}: a group lacks {' and '.join(missing)}; write {whole}")
+    groups = [*model.groups(), *sampler.groups()]
+    names = [group["name"] for group in groups]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ConfigError(f"{type(model).__name__}.groups: two groups have the name {twice[0]}")
+    keys = [(group["name"], key) for group in groups for key in group if key not in wanted]
+    optimizer = model.optimizer(groups)
+    for name, key in keys:
+        if key not in optimizer.defaults:
+            raise ConfigError(
+                f"{type(model).__name__}.groups: {type(optimizer).__name__} takes no {key!r}, "
+                f"which the group {name} has; it takes {', '.join(optimizer.defaults)}"
+            )
 
 
 def _takes_flags(optimizer: torch.optim.Optimizer) -> bool:

@@ -87,6 +87,7 @@ def test_unknown_keys_get_hydras_error_and_near_names(override, near, tmp_path: 
         ("lrm=tinny", "lrm=tiny"),
         ("data=demos", "data=demo"),
         ("model/sampler=ocupancy", "model/sampler=occupancy"),
+        ("experiment=tabel1", "experiment=table1"),
     ],
 )
 def test_unknown_options_are_listed_by_hydra_and_the_nearest_is_named(

@@ -68,7 +68,8 @@ def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
             hydra.main(config_path=str(CONF), config_name="train", version_base="1.3")(job)()
     except SystemExit as end:
         if isinstance(end.code, int) and end.code and not begun:  # A text is our own message.
-            print(near_names(printed.copy.getvalue()).strip(), file=sys.stderr)
+            chosen = [text for text in prepared if _split(text)[0]]
+            print(near_names(printed.copy.getvalue(), overrides=chosen).strip(), file=sys.stderr)
         raise
 
 

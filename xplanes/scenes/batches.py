@@ -252,7 +252,8 @@ class RayBatches(Batches):
         self.background = settings.background
         widths = views.intrinsics.size[:, 1].tolist()
         margins = [max(1, round(NEAR_SILHOUETTE * width)) for width in widths]
-        changes, even = None, None
+        changes = None
+        plain_pixels = 0
         if isinstance(views.images, StoredImages):
             self.near, self.far = _tile_pools(views, views.images, margins)
         else:
@@ -263,15 +264,11 @@ class RayBatches(Batches):
             if views.is_cut:
                 valid = views.valid()
                 near, far = near & valid, far & valid
-            if settings.skip_background and changes is None:
-                even = near & plain(views, margins)
-                even &= (near & ~even).any()  # Where there is nothing else, nothing is preferred.
-                near &= ~even
             self.near, self.far = (_PixelPool(pool) for pool in (near, far))
-        self.plain = _PixelPool(even) if even is not None and even.any() else None
+            if settings.skip_background and changes is None:
+                plain_pixels = self.near.put_first(plain(views, margins))
         self._prefetched = -1
-        plain_pixels = 0 if self.plain is None else len(self.plain)
-        pixels = len(self.near) + len(self.far) + plain_pixels
+        pixels = len(self.near) + len(self.far)
         natural, plain_natural = len(self.far) / pixels, plain_pixels / pixels
         skip = settings.skip_background and len(self.near) > 0
         share = settings.background_share if changes is None else STILL_SHARE
@@ -280,6 +277,10 @@ class RayBatches(Batches):
         jitter = skip and natural > 0 and not views.is_static and changes is None
         self.background_jitter = settings.background_jitter if jitter else 0.0
         self.skipped = natural + plain_natural - self.far_share - self.plain_share
+        self.pools = None
+        if isinstance(self.near, _PixelPool) and isinstance(self.far, _PixelPool):
+            shares = (self.far_share, self.plain_share)
+            self.pools = _PixelPools(self.far, self.near, plain_pixels, shares)
 
     def draw(self, step: int) -> Batch:
         """The batch of a step.
@@ -328,21 +329,16 @@ class RayBatches(Batches):
 
     def _choose(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Which choices are far from silhouettes, and the place of each. [K, 3] -> [K], [K, 2]"""
-        kind, where = uniform[:, 0], uniform[:, 1]
-        far = kind < self.far_share
+        far = uniform[:, 0] < self.far_share
         if not (len(self.near) and len(self.far)):
-            place = (self.near if len(self.near) else self.far).pick(where)
-        else:
-            place = torch.where(far[:, None], self.far.pick(where), self.near.pick(where))
-        if self.plain is not None:
-            even = ~far & (kind < self.far_share + self.plain_share)
-            place = torch.where(even[:, None], self.plain.pick(where), place)
-        return far, place
+            return far, (self.near if len(self.near) else self.far).pick(uniform[:, 1])
+        near_place, far_place = self.near.pick(uniform[:, 1]), self.far.pick(uniform[:, 1])
+        return far, torch.where(far[:, None], far_place, near_place)
 
     def _from_memory(self, images: Tensor, uniform: Tensor) -> tuple[Tensor, ...]:
         """Far, view, row, column and colour of rays through scattered pixels. [R], [R, 4]"""
-        far, place = self._choose(uniform)
-        pixel = place[:, 0]
+        assert self.pools is not None
+        far, pixel = self.pools.pick(uniform[:, 0], uniform[:, 1])
         height, width = self.views.height, self.views.width
         view, row, column = pixel // (height * width), pixel // width % height, pixel % width
         return far, view, row, column, images.view(-1, 4)[pixel]
@@ -432,10 +428,8 @@ class DeviceBatches(RayBatches):
         self.device = device
         self.views = batches.views.to(device)
         self.frame = batches.frame.to(device)
-        self.near, self.far, self.plain = (
-            pool.to(device) if isinstance(pool, _PixelPool) else pool
-            for pool in (batches.near, batches.far, batches.plain)
-        )
+        assert batches.pools is not None
+        self.pools = batches.pools.to(device)
 
     @staticmethod
     def can_serve(batches: RayBatches, device: torch.device) -> bool:
@@ -477,16 +471,66 @@ class _PixelPool:
     def __len__(self) -> int:
         return self.count
 
-    def to(self, device: torch.device) -> "_PixelPool":
-        """The same on another device."""
-        moved = copy.copy(self)
-        moved.pixels = None if self.pixels is None else self.pixels.to(device)
-        return moved
+    def put_first(self, some: Tensor) -> int:
+        """Reorder: some of the images' pixels first. Says how many; none if there are no others."""
+        if not self.count or not some.any():
+            return 0
+        pixels = (
+            torch.arange(some.numel(), dtype=torch.int32) if self.pixels is None else self.pixels
+        )
+        first = some.flatten()[pixels]
+        found = int(first.sum())
+        if not 0 < found < self.count:
+            return 0
+        self.pixels = torch.cat([pixels[first], pixels[~first]])
+        return found
 
     def pick(self, uniform: Tensor) -> Tensor:
         """Pixels at places given by numbers from 0 to 1. [K] -> [K, 1]"""
         place = (uniform * len(self)).long().clamp_(max=len(self) - 1)[:, None]
         return place if self.pixels is None else self.pixels[place].long()
+
+
+class _PixelPools:
+    """Pixels of three kinds, each of which has a share of its own: far, plain and all others.
+
+    Args:
+        far: Those far from silhouettes.
+        near: All others, the plain ones first.
+        plain: How many of these are plain.
+        shares: Of far and of plain pixels.
+    """
+
+    def __init__(
+        self, far: _PixelPool, near: _PixelPool, plain: int, shares: tuple[float, float]
+    ) -> None:
+        self.order = None
+        """Numbers of all pixels, kind by kind; None where they are of one kind, in order."""
+        if far.pixels is not None and near.pixels is not None:
+            self.order = torch.cat([far.pixels, near.pixels])
+            # No second copy: they are millions.
+            far.pixels, near.pixels = self.order[: len(far)], self.order[len(far) :]
+        elif near.pixels is not None or far.pixels is not None:
+            self.order = near.pixels if len(near) else far.pixels
+        counts = torch.tensor([len(far), plain, len(near) - plain], dtype=torch.float64)
+        self.counts, self.starts = counts, counts.cumsum(dim=0) - counts
+        self.bounds = torch.tensor(shares, dtype=torch.float64).cumsum(dim=0)
+        self.most = len(far) + len(near) - 1
+
+    def to(self, device: torch.device) -> "_PixelPools":
+        """The same on another device."""
+        moved = copy.copy(self)
+        moved.order = None if self.order is None else self.order.to(device)
+        for name in ("counts", "starts", "bounds"):
+            setattr(moved, name, getattr(self, name).to(device))
+        return moved
+
+    def pick(self, kind: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels, and which of them are far, by numbers from 0 to 1. [R] -> bool [R], int64 [R]"""
+        kind = torch.bucketize(kind.contiguous(), self.bounds, right=True)
+        place = torch.addcmul(self.starts[kind], where, self.counts[kind]).long()
+        place.clamp_(max=self.most)
+        return kind == 0, place if self.order is None else self.order[place].long()
 
 
 class _TilePool:

@@ -315,7 +315,7 @@ def test_plugins_of_the_docs_are_composed_and_loaded_again(
     names = {"lightning": lightning, "RadianceModule": RadianceModule, "data": data}
     exec(compile(script, "recipes.md", "exec"), names)
     assert names["again"].method.losses["op"].weight == 0.1
-    words = r"plugins=\[MODULE\]: load_from_checkpoint\(path, plugins=\[MODULE\]\)$"
+    words = r"name a module of your own with load_from_checkpoint\(path, plugins=\[MODULE\]\)$"
     with pytest.raises(ConfigError, match=rf"^losses\.op\._target_=tests\.plugins.*{words}"):
         RadianceModule.load_from_checkpoint("field.ckpt")
 

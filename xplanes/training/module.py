@@ -141,9 +141,10 @@ class RadianceModule(LightningModule):
                 checkpoint_path, *args, weights_only=weights_only, **kwargs
             )
         except ConfigError as error:
-            if (ask := "plugins=[MODULE]") not in str(error):
+            words, ask, _ = str(error).partition("plugins=[MODULE]")
+            if not ask:
                 raise
-            raise ConfigError(f"{error}; here: load_from_checkpoint(path, {ask})") from error
+            raise ConfigError(f"{words}load_from_checkpoint(path, {ask})") from error
 
     # Building
 

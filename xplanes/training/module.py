@@ -442,6 +442,10 @@ class RadianceModule(LightningModule):
         found = model.losses(rendering, rays, state) | sampler.losses(rendering)
         terms = {name: _number(term, f"loss term {name}", device) for name, term in found.items()}
         for name, term in self.method.losses.items():
+            if name in found:
+                raise ConfigError(
+                    f"losses.{name}: the loss has a term of this name already; choose another name"
+                )
             value = term.value(model.field, rendering, rays, state)
             terms[name] = term.weight * _number(value, f"losses.{name}", device)
         return terms

@@ -323,6 +323,8 @@ def test_plugins_of_the_docs_are_composed_and_loaded_again(
 def test_a_list_of_settings_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"^compose\(\['seed=1'\]\): takes settings one by one"):
         RadianceModule.compose(["seed=1"])  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"^compose\(\['seed=1'\]\): takes settings one by one"):
+        SceneDataModule.compose(["seed=1"])  # type: ignore[arg-type]
 
 
 def test_what_a_trainer_of_ours_settles_for_gpus(tmp_path: Path) -> None:

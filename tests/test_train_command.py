@@ -105,7 +105,7 @@ def test_auto_goes_on_with_the_newest_run_of_the_same_settings(tmp_path: Path, m
     monkeypatch.chdir(tmp_path)
     own = ["model.resolution=8", "data.scene=a/b"]
     assert prepare([*own, "resume=auto"]) == [*own, "resume=null"]
-    run = tmp_path / "outputs" / "today_demo-a" / "b_six_planes"
+    run = tmp_path / "outputs" / "today_demo-b_six_planes"
     run.mkdir(parents=True)
     (run / "run.json").write_text('{"status": "interrupted"}')
     for written in ("resume=null", f"resume={run}", ""):

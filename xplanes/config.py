@@ -30,10 +30,16 @@ def compose_plain(name: str | None, overrides: Sequence[str], conf: Path = CONF)
         conf: The configuration folder.
 
     Raises:
-        ConfigError: For a key or option that does not exist.
+        ConfigError: For a key or option that does not exist, or an override that is no text.
     """
     from hydra import compose
 
+    for override in overrides:
+        if not isinstance(override, str):
+            raise ConfigError(
+                f"compose({override!r}): takes settings one by one, as "
+                'compose("model=nine_planes", "lrm=none")'
+            )
     with _hydra(conf, name, overrides):
         return to_plain(compose(name, list(overrides)))
 

@@ -217,9 +217,7 @@ def _require_version(run: Path) -> None:
 def _latest(outputs: Path, overrides: list[str]) -> Path | None:
     """The newest unfinished run with the same overrides."""
     wanted = _without_resume(overrides)
-    # Names of scenes may have slashes, and their runs lie deeper then.
-    records = [path for path in outputs.rglob("run.json") if "sweeps" not in path.parts]
-    for record in sorted(records, key=_mtime, reverse=True):
+    for record in sorted(outputs.glob("*/run.json"), key=_mtime, reverse=True):
         listed = record.parent / "overrides.txt"
         try:
             done = read_json(record).get("status") == "finished"

@@ -111,12 +111,6 @@ class RadianceModule(LightningModule):
         Raises:
             ConfigError: If a setting does not exist or cannot work.
         """
-        for override in overrides:
-            if not isinstance(override, str):
-                raise ConfigError(
-                    f"compose({override!r}): takes settings one by one, as "
-                    'compose("model=nine_planes", "lrm=none")'
-                )
         config = compose_plain("train", overrides)
         return cls(config, plugins=config["plugins"] or ())
 

@@ -20,6 +20,7 @@ from tests.oracles import march as oracle
 from tests.oracles import ray_box
 from xplanes.rendering.marching import march, march_into, march_reference
 from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.visibility import Visibility
 
 STEP = 0.07
 
@@ -46,16 +47,17 @@ def rays_of(count, dtype=torch.float64, seed=1):
     return origins, directions, times, jitter
 
 
-def twin(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0):
+def twin(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0, **options):
     limit = -math.log(occlusion) if occlusion > 0 else math.inf
     occupied = grid.occupied if skip_empty else None
-    return march_reference(*rays, grid, step=step, occupied=occupied, limit=limit)
+    return march_reference(*rays, grid, step=step, occupied=occupied, limit=limit, **options)
 
 
-def into(rays, grid, room, *, step=STEP, skip_empty=True, occlusion=0.0):
+def into(rays, grid, room, *, step=STEP, skip_empty=True, occlusion=0.0, **options):
     limit = -math.log(occlusion) if occlusion > 0 else math.inf
     occupied = grid.occupied if skip_empty else None
-    return march_into(*rays, grid, step=step, occupied=occupied, limit=limit, room=room)
+    given = {"step": step, "occupied": occupied, "limit": limit, **options}
+    return march_into(*rays, grid, room=room, **given)
 
 
 def by_oracle(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0):
@@ -115,16 +117,28 @@ def test_loops_and_twin_agree_on_many_rays():
             assert getattr(ours, name) == getattr(theirs, name), (case, name)
 
 
-def test_samples_in_unseen_cells_are_dropped_where_asked():
-    grid, rays = grid_of(), rays_of(60)
-    grid.lit_before.copy_(torch.rand(216, generator=torch.Generator().manual_seed(2)) < 0.5)
-    dark = (grid.lit_before == 0).repeat(3)
-    every = march(*rays, grid, step=STEP)
-    seen = march(*rays, grid, step=STEP, skip_unseen=True)
-    assert seen.cells.tolist() == [cell for cell in every.cells.tolist() if not dark[cell]]
-    assert 0 < len(seen) < len(every)
-    whole = march(*rays, grid, step=STEP, skip_empty=False, skip_unseen=True)
-    assert whole.empty == 0
+@pytest.mark.parametrize(("skip_empty", "occlusion"), OPTIONS)
+def test_samples_in_unseen_cells_are_dropped_where_asked(skip_empty, occlusion):
+    """Cells that are finer than the grid's, and not a whole number of them to each."""
+    grid, rays, visibility = grid_of(), rays_of(300), Visibility(13)
+    given = {"step": STEP, "skip_empty": skip_empty, "occlusion": occlusion}
+    every = march(*rays, grid, **given)
+    assert len(march(*rays, grid, **given, visibility=visibility)) == len(every)
+    visibility.last.copy_(torch.rand(13**3, generator=torch.Generator().manual_seed(2)) < 0.5)
+    shown = visibility.seen[visibility.cells(every.points)]
+    seen = march(*rays, grid, **given, visibility=visibility)
+    assert visibility.seen[visibility.cells(seen.points)].all()
+    if occlusion == 0:
+        assert torch.equal(seen.points, every.points[shown])
+        assert torch.equal(seen.ray, every.ray[shown])
+    else:  # What is not seen hides nothing.
+        assert len(seen) > shown.sum() > 0
+    given["visibility"] = visibility
+    for other in (twin(rays, grid, **given), into(rays, grid, len(seen), **given)):
+        assert torch.equal(other.cells, seen.cells)
+        torch.testing.assert_close(other.points, seen.points, atol=1e-12, rtol=0)
+        for name in ("candidates", "empty", "occluded"):
+            assert int(getattr(other, name)) == int(getattr(seen, name))
 
 
 def test_in_float32_only_samples_on_borders_differ():

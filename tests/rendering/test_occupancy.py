@@ -450,34 +450,3 @@ def test_looks_by_given_numbers_reach_the_same_cells():
     share = counted[asked] / counted[asked].sum()
     torch.testing.assert_close(share, plain[asked] / plain[asked].sum(), atol=0.004, rtol=0.2)
     assert (plain > 0).sum() > 20
-
-
-def test_a_cell_is_seen_once_a_ray_of_any_time_gave_it_light():
-    grid = grid_of()
-    assert torch.equal(grid.seen, grid.occupied)  # Before the first rays nothing counts as unseen.
-    grid.forget_light()
-    assert not grid.seen.any()
-    # Cell 5 at both times, cell 9 by faint light alone, cell 70 = 6 + 64 by one of several.
-    grid.light(
-        torch.tensor([5, 69, 9, 9, 9, 70, 70]), torch.tensor([0.5, 0.1] + [0.02] * 4 + [0.4])
-    )
-    assert grid.seen.nonzero()[:, 0].tolist() == [5, 6, 69, 70]
-    grid.occupied[69] = False
-    assert grid.seen.nonzero()[:, 0].tolist() == [5, 6, 70]
-
-
-def test_light_is_remembered_for_one_more_sweep():
-    grid = grid_of()
-    grid.forget_light()
-    grid.light(torch.tensor([5]), torch.tensor([0.5]))
-    grid.forget_light()
-    assert grid.seen[5]
-    grid.forget_light()
-    assert not grid.seen.any()
-
-
-def test_light_that_is_no_number_is_none():
-    grid = grid_of()
-    grid.forget_light()
-    grid.light(torch.tensor([5, 6, 6]), torch.tensor([math.nan, math.nan, 0.5]))
-    assert grid.seen.nonzero()[:, 0].tolist() == [6, 70]

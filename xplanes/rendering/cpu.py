@@ -19,11 +19,39 @@ def cell(place, size):
     return min(max(np.int64(place), 0), size - 1)
 
 
+@njit(inline="always", **EXACT)
+def is_seen(origin, direction, distance, seen, finest):
+    half = 0.5 * finest
+    x = cell((origin[0] + distance * direction[0] + 1) * half, finest)
+    y = cell((origin[1] + distance * direction[1] + 1) * half, finest)
+    z = cell((origin[2] + distance * direction[2] + 1) * half, finest)
+    return seen[(z * finest + y) * finest + x] > 0
+
+
 @njit(parallel=True, **EXACT)
 def count_samples(
-    start, slope, near, far, jitter, bins, occupied, least, size, step, limit, skip, counts
+    origins,
+    directions,
+    start,
+    slope,
+    near,
+    far,
+    jitter,
+    bins,
+    occupied,
+    size,
+    seen,
+    finest,
+    step,
+    skip,
+    least,
+    limit,
+    counts,
 ):
-    """Candidates, samples in occupied cells, and those not behind a surface, for each ray."""
+    """Candidates, samples in cells to look into, and those not behind a surface, for each ray.
+
+    No cell is unseen where ``finest`` is 0.
+    """
     for r in prange(len(near)):
         candidates, found, visible = 0, 0, 0
         depth = 0.0
@@ -34,7 +62,9 @@ def count_samples(
             y = cell(start[r, 1] + distance * slope[r, 1], size)
             z = cell(start[r, 2] + distance * slope[r, 2], size)
             index = ((bins[r] * size + z) * size + y) * size + x
-            if not skip or occupied[index]:
+            if (not skip or occupied[index]) and (
+                finest == 0 or is_seen(origins[r], directions[r], distance, seen, finest)
+            ):
                 found += 1
                 if depth < limit:
                     visible += 1
@@ -54,6 +84,8 @@ def fill_samples(
     bins,
     occupied,
     size,
+    seen,
+    finest,
     step,
     skip,
     starts,
@@ -74,11 +106,29 @@ def fill_samples(
             y = cell(start[r, 1] + distance * slope[r, 1], size)
             z = cell(start[r, 2] + distance * slope[r, 2], size)
             index = ((bins[r] * size + z) * size + y) * size + x
-            if not skip or occupied[index]:
+            if (not skip or occupied[index]) and (
+                finest == 0 or is_seen(origins[r], directions[r], distance, seen, finest)
+            ):
                 ray[place], distances[place], cells[place] = r, distance, index
                 for axis in range(3):
                     points[place, axis] = origins[r, axis] + distance * directions[r, axis]
                 place += 1
+
+
+@njit(parallel=True, **EXACT)
+def mark_seen(points, weights, starts, enough, mark, size, last):
+    half = 0.5 * size
+    for r in prange(len(starts)):
+        end = starts[r + 1] if r + 1 < len(starts) else len(points)
+        light = 1.0
+        for i in range(starts[r], end):
+            if light > enough:
+                x = cell((points[i, 0] + 1) * half, size)
+                y = cell((points[i, 1] + 1) * half, size)
+                z = cell((points[i, 2] + 1) * half, size)
+                # Whoever writes here writes the same.
+                last[(z * size + y) * size + x] = mark
+            light -= weights[i]
 
 
 @njit(parallel=True, **COMPILE)

@@ -13,12 +13,13 @@ from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.rendering.behind import behind
 from xplanes.rendering.box import Field, shade
 from xplanes.rendering.carving import carve
-from xplanes.rendering.compositing import composite, depth_before
+from xplanes.rendering.compositing import composite
 from xplanes.rendering.filling import fill
 from xplanes.rendering.marching import march
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
 from xplanes.rendering.thinning import Cut
+from xplanes.rendering.visibility import Visibility, finest_cells
 from xplanes.rendering.warming import render_one_ray
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Range, Share, Steps, Weight
@@ -56,7 +57,7 @@ class GridRenderer(RayRenderer):
         grid: Which cells hold something, and when.
         samples: Steps along the diagonal of the field's cube.
         skip_empty: Skip samples in empty cells.
-        skip_unseen: Skip samples in cells of which training rays have seen nothing.
+        visibility: Skip samples in cells that it has not seen; None skips none.
         occlusion: Skip samples behind surfaces that leave less light than this; 0 skips none.
         thinning: Where gradients are wanted, samples whose own is below this times the mean may be
             left out, see `Cut.pass_on`; 0 leaves none out. On the CPU alone: elsewhere choosing
@@ -67,7 +68,7 @@ class GridRenderer(RayRenderer):
     grid: OccupancyGrid
     samples: int
     skip_empty: bool = True
-    skip_unseen: bool = False
+    visibility: Visibility | None = None
     occlusion: float = 0.001
     thinning: float = 0.0
     room: int | None = None
@@ -112,7 +113,7 @@ class GridRenderer(RayRenderer):
             self.grid,
             step=self.step,
             skip_empty=self.skip_empty,
-            skip_unseen=self.skip_unseen,
+            visibility=self.visibility,
             occlusion=self.occlusion,
             room=self.room,
         )
@@ -211,8 +212,16 @@ class OccupancySettings(SamplerSettings):
             renderer,
             self.scaled(site),
             site.samples_per_batch,
+            visibility=self._visibility(site),
             unseen_from=site.steps(UNSEEN_FROM),
         )
+
+    def _visibility(self, site: Site) -> Visibility | None:
+        if not self.skip_unseen:
+            return None
+        if site.views is None:
+            return Visibility(self.grid_resolution)
+        return Visibility(finest_cells(site.views, site.frame, self.grid_resolution))
 
     def scaled(self, site: Site) -> "OccupancySettings":
         """The same schedule in steps of the batches of a site.
@@ -250,6 +259,7 @@ class OccupancySampler(Sampler):
         renderer: Its grid is changed in place.
         settings: Upkeep of the grid.
         samples: Samples of a batch on average at most; None if not known.
+        visibility: Changed in place; images leave out what it has not seen.
         unseen_from: Step of the first sweep after which a cell may count as unseen.
     """
 
@@ -258,14 +268,16 @@ class OccupancySampler(Sampler):
         renderer: GridRenderer,
         settings: OccupancySettings,
         samples: int | None = None,
+        visibility: Visibility | None = None,
         unseen_from: int = UNSEEN_FROM,
     ) -> None:
         self.settings, self.grid, self.samples = settings, renderer.grid, samples
+        self.visibility = visibility
         self.unseen_from = unseen_from
         room = None if samples is None else self._room(samples)
         self._training = replace(renderer, thinning=settings.thinning, room=room)
         self._coarse = replace(self._training, samples=math.ceil(renderer.samples / 2))
-        images = replace(renderer, skip_unseen=settings.skip_unseen)
+        images = replace(renderer, visibility=visibility)
         self._images = replace(images, samples=settings.render_samples)
         self._is_coarse = settings.coarse_steps > 0
         self._coarse_images = replace(images, samples=self._coarse.samples)
@@ -276,7 +288,8 @@ class OccupancySampler(Sampler):
 
     @property
     def parts(self) -> dict[str, nn.Module]:
-        return {"grid": self.grid}
+        parts = {"grid": self.grid, "visibility": self.visibility}
+        return {name: part for name, part in parts.items() if part is not None}
 
     @property
     def outline(self) -> str:
@@ -308,9 +321,10 @@ class OccupancySampler(Sampler):
     def observe(self, rendering: GridRendering) -> None:
         samples = rendering.samples
         self.grid.observe(samples.cells, rendering.density, samples.live)
-        # What has not been stopped before a sample reaches it.
-        light = 1 - depth_before(rendering.weights, samples.ray, samples.starts)
-        self.grid.light(samples.cells, light if samples.live is None else light * samples.live)
+        if self.visibility is not None:
+            self.visibility.observe(
+                samples.points, rendering.weights, samples.ray, samples.starts, samples.live
+            )
 
     def update(self, field: Any, state: TrainingState) -> None:
         step, settings = state.step, self.settings
@@ -320,8 +334,8 @@ class OccupancySampler(Sampler):
         self._agree()
         generator = step_generator(state.seed, step, Stream.GRID)
         if sweeping:
-            if step >= self.unseen_from:
-                self.grid.forget_light()
+            if self.visibility is not None and step >= self.unseen_from:
+                self.visibility.forget()
             self.grid.sweep(field, generator)
         elif (device := self.grid.density.device).type != "cpu":
             shape = (settings.update_cells, 8)
@@ -335,7 +349,8 @@ class OccupancySampler(Sampler):
         if distributed.is_available() and distributed.is_initialized():
             for part in (self.grid.density, self.grid.least, self.grid.occupied):
                 distributed.broadcast(part, src=0)
-            distributed.all_reduce(self.grid.lit, distributed.ReduceOp.MAX)
+            if self.visibility is not None:
+                distributed.all_reduce(self.visibility.last, distributed.ReduceOp.MAX)
 
     def expect(self, samples: float) -> None:
         if self.samples is None:

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -10,6 +11,7 @@ from xplanes.backend import compiled, cpu_loops
 from xplanes.rendering.box import ray_box
 from xplanes.rendering.compositing import OPAQUE, depth_before
 from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.visibility import Visibility
 
 OUTSIDE = 3.0
 """Coordinate of places without a sample, beyond the planes: nothing is read or added there."""
@@ -66,7 +68,7 @@ def march(
     *,
     step: float,
     skip_empty: bool = True,
-    skip_unseen: bool = False,
+    visibility: Visibility | None = None,
     occlusion: float = 0.0,
     room: int | None = None,
 ) -> Samples:
@@ -80,7 +82,7 @@ def march(
         grid: Tells which cells are empty.
         step: Distance between samples.
         skip_empty: Whether samples in empty cells are dropped.
-        skip_unseen: Whether samples in cells that no training ray has seen are dropped as well.
+        visibility: Samples in cells that it has not seen are dropped as well.
         occlusion: Samples that the grid's least densities leave less light than this are dropped;
             0 keeps all.
         room: Places set apart for samples on a device other than the CPU, so that nothing waits for
@@ -91,18 +93,18 @@ def march(
         The samples that remain.
     """
     limit = -math.log(occlusion) if occlusion > 0 else math.inf
-    occupied = (grid.seen if skip_unseen else grid.occupied) if skip_empty else None
+    rays = origins, directions, times, jitter
+    occupied = grid.occupied if skip_empty else None
     if cpu_loops(origins):
         return _march_cpu(
-            origins, directions, times, jitter, grid, step=step, occupied=occupied, limit=limit
+            *rays, grid, step=step, occupied=occupied, limit=limit, visibility=visibility
         )
     if room is not None and origins.device.type != "cpu":
         return march_into(
-            origins, directions, times, jitter, grid, step=step, occupied=occupied, limit=limit,
-            room=room,
-        )  # fmt: skip
+            *rays, grid, step=step, occupied=occupied, limit=limit, room=room, visibility=visibility
+        )
     return march_reference(
-        origins, directions, times, jitter, grid, step=step, occupied=occupied, limit=limit
+        *rays, grid, step=step, occupied=occupied, limit=limit, visibility=visibility
     )
 
 
@@ -116,6 +118,7 @@ def march_reference(
     step: float,
     occupied: Tensor | None,
     limit: float,
+    visibility: Visibility | None = None,
 ) -> Samples:
     """The same as `march`, in whole-tensor operations."""
     near, far = ray_box(origins, directions)
@@ -124,6 +127,8 @@ def march_reference(
         origins, directions, times, jitter, near, far, grid, step, steps
     )
     live = inside if occupied is None else inside & occupied[cells]
+    if visibility is not None:
+        live = live & _seen(visibility, origins, directions, distances)
     ray, place = live.nonzero(as_tuple=True)
     distances, cells = distances[ray, place], cells[ray, place]
     candidates, found = int(inside.sum()), len(ray)
@@ -166,6 +171,12 @@ def _all_samples(
     return distances, cells, distances < far[:, None]
 
 
+def _seen(visibility: Visibility, origins: Tensor, directions: Tensor, distances: Tensor) -> Tensor:
+    """Whether samples lie in cells that training rays have seen. bool [R, S]"""
+    points = torch.addcmul(origins[:, None], directions[:, None], distances[..., None])
+    return visibility.seen[visibility.cells(points.flatten(0, 1))].view_as(distances)
+
+
 def march_into(
     origins: Tensor,
     directions: Tensor,
@@ -177,6 +188,7 @@ def march_into(
     occupied: Tensor | None,
     limit: float,
     room: int,
+    visibility: Visibility | None = None,
 ) -> Samples:
     """The same as `march_reference` into a fixed number of places, without waiting for the device.
 
@@ -188,6 +200,8 @@ def march_into(
         origins, directions, times, jitter, near, far, grid, step, steps
     )
     met = inside if occupied is None else inside & occupied[cells]
+    if visibility is not None:
+        met = met & _seen(visibility, origins, directions, distances)
     kept = met
     if math.isfinite(limit):
         depth = (grid.least[cells].double() * step).clamp_max(OPAQUE) * met
@@ -234,6 +248,7 @@ def _march_cpu(
     step: float,
     occupied: Tensor | None,
     limit: float,
+    visibility: Visibility | None = None,
 ) -> Samples:
     cpu = compiled("xplanes.rendering.cpu")
     near, far = ray_box(origins, directions)
@@ -244,10 +259,25 @@ def _march_cpu(
     ]
     bins, skip = grid.bins(times).numpy(), occupied is not None
     wanted = (grid.occupied if occupied is None else occupied).numpy()
+    if visibility is None:
+        seen, finest = np.empty(0, np.uint8), 0
+    else:
+        seen, finest = visibility.last.numpy(), visibility.resolution
     counts = torch.empty(3, len(near), dtype=torch.int64)
-    size = grid.resolution
+    size, ways = grid.resolution, (origins.numpy(), directions.numpy())
     cpu.count_samples(
-        *rays, bins, wanted, grid.least.numpy(), size, step, limit, skip, counts.numpy()
+        *ways,
+        *rays,
+        bins,
+        wanted,
+        size,
+        seen,
+        finest,
+        step,
+        skip,
+        grid.least.numpy(),
+        limit,
+        counts.numpy(),
     )
     candidates, found, kept = counts.sum(dim=1).tolist()
     starts = counts[2].cumsum(0) - counts[2]
@@ -255,8 +285,7 @@ def _march_cpu(
     distances, points = origins.new_empty(kept), origins.new_empty(kept, 3)
     start, slope, near, _, jitter_array = rays
     cpu.fill_samples(
-        origins.numpy(),
-        directions.numpy(),
+        *ways,
         start,
         slope,
         near,
@@ -264,6 +293,8 @@ def _march_cpu(
         bins,
         wanted,
         size,
+        seen,
+        finest,
         step,
         skip,
         starts.numpy(),

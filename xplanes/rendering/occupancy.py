@@ -7,9 +7,6 @@ from torch import Tensor, nn
 from xplanes.rendering.box import Field
 from xplanes.rendering.compositing import OPAQUE
 
-LIT = 0.1
-"""Share of the light from which a cell that it reaches counts as seen."""
-
 TRUST = 0.1
 """Share by which the least density of a cell rises towards what a look shows."""
 
@@ -27,11 +24,6 @@ class OccupancyGrid(nn.Module):
     has a high density but lets light through; only by ``least`` can it be told to hide what lies
     behind it.
 
-    ``lit`` is the largest share of the light that has reached each cell of space on a training ray,
-    past all that lay in front, at any time. What lies behind surfaces or below the ground in all
-    training images is never lit: nothing tells the field what is there, and images of other views
-    shall not show it.
-
     Args:
         resolution: Cells along each side.
         time_bins: Bins along time.
@@ -45,8 +37,6 @@ class OccupancyGrid(nn.Module):
     occupied: Tensor
     allowed: Tensor
     likely: Tensor
-    lit: Tensor
-    lit_before: Tensor
 
     def __init__(
         self,
@@ -68,8 +58,6 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("density", torch.full((cells,), 4 * self.empty_density))
         self.register_buffer("least", torch.zeros(cells))
         self.register_buffer("occupied", torch.ones(cells, dtype=torch.bool))
-        self.register_buffer("lit", torch.zeros(resolution**3))
-        self.register_buffer("lit_before", torch.ones(resolution**3))
 
     def bins(self, times: Tensor) -> Tensor:
         """Time bin of each time from 0 to 1. int64 [N]"""
@@ -130,29 +118,6 @@ class OccupancyGrid(nn.Module):
         self.density.scatter_reduce_(0, cells, seen, "amax", include_self=False)
         self.least.scatter_reduce_(0, cells, looked, "amin", include_self=False)
         self.occupied[cells] = self.density[cells] > self.empty_density
-
-    @torch.no_grad()
-    def light(self, cells: Tensor, light: Tensor) -> None:
-        """Take in how much light reaches samples of training rays.
-
-        Args:
-            cells: Cell of each sample. [N]
-            light: Share of the light that nothing in front stops. [N]
-        """
-        light = light.float().nan_to_num(0.0)
-        self.lit.scatter_reduce_(0, cells % len(self.lit), light, "amax")
-
-    @torch.no_grad()
-    def forget_light(self) -> None:
-        """Forget the light of rays before the last time that this was asked."""
-        self.lit_before.copy_(self.lit)
-        self.lit.zero_()
-
-    @property
-    def seen(self) -> Tensor:
-        """Which occupied cells have been lit at any time. bool [time_bins G^3]"""
-        lit = torch.maximum(self.lit, self.lit_before) > LIT
-        return self.occupied & lit.repeat(self.time_bins)
 
     @torch.no_grad()
     def sweep(self, field: Field, generator: torch.Generator, chunk: int | None = None) -> None:

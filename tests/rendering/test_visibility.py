@@ -47,8 +47,8 @@ def test_a_cell_is_seen_if_enough_light_of_any_ray_reaches_it(loops, monkeypatch
     assert visibility.seen.all()  # Before the first rays nothing counts as unseen.
     visibility.forget()
     assert not visibility.seen.any()
-    wall = [((0, 0, 0), 0.0), ((1, 0, 0), 0.85), ((2, 0, 0), 0.1), ((3, 0, 0), 0.05)]
-    other = [((3, 2, 1), 0.95), ((2, 2, 1), 0.05)]
+    wall = [((0, 0, 0), 0.0), ((1, 0, 0), 0.98), ((2, 0, 0), 0.015), ((3, 0, 0), 0.005)]
+    other = [((3, 2, 1), 0.995), ((2, 2, 1), 0.005)]
     observe(visibility, [wall, [], other])
     assert seen(visibility) == [(0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 2, 1)]
     observe(visibility, [[((3, 0, 0), 1.0)]])

@@ -47,7 +47,7 @@ def test_a_cell_is_seen_if_enough_light_of_any_ray_reaches_it(loops, monkeypatch
     assert visibility.seen.all()  # Before the first rays nothing counts as unseen.
     visibility.forget()
     assert not visibility.seen.any()
-    wall = [((0, 0, 0), 0.0), ((1, 0, 0), 0.98), ((2, 0, 0), 0.015), ((3, 0, 0), 0.005)]
+    wall = [((0, 0, 0), 0.0), ((1, 0, 0), 0.95), ((2, 0, 0), 0.04), ((3, 0, 0), 0.01)]
     other = [((3, 2, 1), 0.995), ((2, 2, 1), 0.005)]
     observe(visibility, [wall, [], other])
     assert seen(visibility) == [(0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 2, 1)]

@@ -8,7 +8,7 @@ from xplanes.rendering.compositing import depth_before
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
 
-LIT = 0.01
+LIT = 0.03
 """Share of the light from which a cell that it reaches counts as seen."""
 
 FINEST = 256

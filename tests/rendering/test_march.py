@@ -125,9 +125,9 @@ def test_samples_in_unseen_cells_are_dropped_where_asked(skip_empty, occlusion):
     every = march(*rays, grid, **given)
     assert len(march(*rays, grid, **given, visibility=visibility)) == len(every)
     visibility.last.copy_(torch.rand(13**3, generator=torch.Generator().manual_seed(2)) < 0.5)
-    shown = visibility.seen[visibility.cells(every.points)]
+    shown = visibility.sees(every.points)
     seen = march(*rays, grid, **given, visibility=visibility)
-    assert visibility.seen[visibility.cells(seen.points)].all()
+    assert visibility.sees(seen.points).all()
     if occlusion == 0:
         assert torch.equal(seen.points, every.points[shown])
         assert torch.equal(seen.ray, every.ray[shown])

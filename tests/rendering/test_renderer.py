@@ -241,7 +241,7 @@ def test_what_lets_light_through_is_seen_to_its_end():
     seen = renderer.render(fog(0.3), *rays, WHITE)
     assert seen.weights.max() < 0.02
     sampler.observe(seen)
-    assert sampler.visibility.seen[sampler.visibility.cells(seen.samples.points)].all()
+    assert sampler.visibility.sees(seen.samples.points).all()
     images = replace(renderer, visibility=sampler.visibility)
     again = images.render(fog(0.3), *rays, WHITE)
     assert torch.equal(again.opacity, seen.opacity)

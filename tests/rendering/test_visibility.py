@@ -37,16 +37,16 @@ def observe(visibility, rays):
 def seen(visibility):
     """Cells (x, y, z) that are seen."""
     size = visibility.resolution
-    return [(x, y, z) for z, y, x in visibility.seen.view(size, size, size).nonzero().tolist()]
+    return [(x, y, z) for z, y, x in visibility.last.view(size, size, size).nonzero().tolist()]
 
 
 @TWINS
 def test_a_cell_is_seen_if_enough_light_of_any_ray_reaches_it(loops, monkeypatch):
     monkeypatch.setenv("XPLANES_CPU_LOOPS", loops)
     visibility = Visibility(4)
-    assert visibility.seen.all()  # Before the first rays nothing counts as unseen.
+    assert visibility.last.all()  # Before the first rays nothing counts as unseen.
     visibility.forget()
-    assert not visibility.seen.any()
+    assert not visibility.last.any()
     wall = [((0, 0, 0), 0.0), ((1, 0, 0), 0.95), ((2, 0, 0), 0.04), ((3, 0, 0), 0.01)]
     other = [((3, 2, 1), 0.995), ((2, 2, 1), 0.005)]
     observe(visibility, [wall, [], other])
@@ -65,7 +65,7 @@ def test_what_was_seen_is_remembered_for_one_more_sweep():
         visibility.forget()
         assert seen(visibility) == [(1, 2, 3)]
         visibility.forget()
-        assert not visibility.seen.any()
+        assert not visibility.last.any()
 
 
 @TWINS
@@ -89,7 +89,7 @@ def test_loops_and_twin_see_the_same(monkeypatch):
         monkeypatch.setenv("XPLANES_CPU_LOOPS", loops)
         visibility = emptied(31)
         visibility.observe(samples.points, weights, samples.ray, samples.starts)
-        found.append(visibility.seen)
+        found.append(visibility.last)
     assert torch.equal(*found)
     assert 0 < found[0].sum() < len(samples)
 
@@ -112,6 +112,11 @@ def test_cells_are_as_wide_as_pixels(scale):
         frame = cube_frame(scale, torch.zeros(3))
         assert finest_cells(views, frame, 64) == pytest.approx(cells, abs=1)
         assert finest_cells(views, frame, 300) == 300
+
+
+def test_cells_are_the_finest_for_cameras_at_the_centre():
+    views = ball_views(1, 1.0, poses=torch.eye(4)[None])
+    assert finest_cells(views, cube_frame(1.0, torch.zeros(3)), 64) == 256
 
 
 def test_a_state_brings_its_own_resolution():

@@ -20,12 +20,24 @@ def cell(place, size):
 
 
 @njit(inline="always", **EXACT)
-def is_seen(origin, direction, distance, seen, finest):
-    half = 0.5 * finest
-    x = cell((origin[0] + distance * direction[0] + 1) * half, finest)
-    y = cell((origin[1] + distance * direction[1] + 1) * half, finest)
-    z = cell((origin[2] + distance * direction[2] + 1) * half, finest)
-    return seen[(z * finest + y) * finest + x] > 0
+def cell_to_sample(
+    r, distance, origins, directions, start, slope, bins, occupied, size, seen, finest, skip
+):
+    """Index of the cell in which ray r is at a distance; -1 where no sample is wanted there."""
+    x = cell(start[r, 0] + distance * slope[r, 0], size)
+    y = cell(start[r, 1] + distance * slope[r, 1], size)
+    z = cell(start[r, 2] + distance * slope[r, 2], size)
+    index = ((bins[r] * size + z) * size + y) * size + x
+    if skip and not occupied[index]:
+        index = -1
+    elif finest > 0:
+        half = 0.5 * finest
+        x = cell((origins[r, 0] + distance * directions[r, 0] + 1) * half, finest)
+        y = cell((origins[r, 1] + distance * directions[r, 1] + 1) * half, finest)
+        z = cell((origins[r, 2] + distance * directions[r, 2] + 1) * half, finest)
+        if seen[(z * finest + y) * finest + x] == 0:
+            index = -1
+    return index
 
 
 @njit(parallel=True, **EXACT)
@@ -34,16 +46,16 @@ def count_samples(
     directions,
     start,
     slope,
-    near,
-    far,
-    jitter,
     bins,
+    near,
+    jitter,
+    step,
     occupied,
     size,
     seen,
     finest,
-    step,
     skip,
+    far,
     least,
     limit,
     counts,
@@ -58,13 +70,21 @@ def count_samples(
         distance = near[r] + jitter[r] * step
         while distance < far[r]:
             candidates += 1
-            x = cell(start[r, 0] + distance * slope[r, 0], size)
-            y = cell(start[r, 1] + distance * slope[r, 1], size)
-            z = cell(start[r, 2] + distance * slope[r, 2], size)
-            index = ((bins[r] * size + z) * size + y) * size + x
-            if (not skip or occupied[index]) and (
-                finest == 0 or is_seen(origins[r], directions[r], distance, seen, finest)
-            ):
+            index = cell_to_sample(
+                r,
+                distance,
+                origins,
+                directions,
+                start,
+                slope,
+                bins,
+                occupied,
+                size,
+                seen,
+                finest,
+                skip,
+            )
+            if index >= 0:
                 found += 1
                 if depth < limit:
                     visible += 1
@@ -79,14 +99,14 @@ def fill_samples(
     directions,
     start,
     slope,
+    bins,
     near,
     jitter,
-    bins,
+    step,
     occupied,
     size,
     seen,
     finest,
-    step,
     skip,
     starts,
     counts,
@@ -102,13 +122,21 @@ def fill_samples(
         while place < end:
             distance = near[r] + (candidate + jitter[r]) * step
             candidate += 1
-            x = cell(start[r, 0] + distance * slope[r, 0], size)
-            y = cell(start[r, 1] + distance * slope[r, 1], size)
-            z = cell(start[r, 2] + distance * slope[r, 2], size)
-            index = ((bins[r] * size + z) * size + y) * size + x
-            if (not skip or occupied[index]) and (
-                finest == 0 or is_seen(origins[r], directions[r], distance, seen, finest)
-            ):
+            index = cell_to_sample(
+                r,
+                distance,
+                origins,
+                directions,
+                start,
+                slope,
+                bins,
+                occupied,
+                size,
+                seen,
+                finest,
+                skip,
+            )
+            if index >= 0:
                 ray[place], distances[place], cells[place] = r, distance, index
                 for axis in range(3):
                     points[place, axis] = origins[r, axis] + distance * directions[r, axis]

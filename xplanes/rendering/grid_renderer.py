@@ -334,8 +334,8 @@ class OccupancySampler(Sampler):
         self._agree()
         generator = step_generator(state.seed, step, Stream.GRID)
         if sweeping:
-            if self.visibility is not None and step >= self.unseen_from:
-                self.visibility.forget()
+            if step >= self.unseen_from:
+                self._forget_unseen()
             self.grid.sweep(field, generator)
         elif (device := self.grid.density.device).type != "cpu":
             shape = (settings.update_cells, 8)
@@ -349,8 +349,14 @@ class OccupancySampler(Sampler):
         if distributed.is_available() and distributed.is_initialized():
             for part in (self.grid.density, self.grid.least, self.grid.occupied):
                 distributed.broadcast(part, src=0)
-            if self.visibility is not None:
-                distributed.all_reduce(self.visibility.last, distributed.ReduceOp.MAX)
+
+    def _forget_unseen(self) -> None:
+        """Forget what no process has seen of late."""
+        if self.visibility is None:
+            return
+        if distributed.is_available() and distributed.is_initialized():
+            distributed.all_reduce(self.visibility.last, distributed.ReduceOp.MAX)
+        self.visibility.forget()
 
     def expect(self, samples: float) -> None:
         if self.samples is None:

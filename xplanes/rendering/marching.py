@@ -174,7 +174,7 @@ def _all_samples(
 def _seen(visibility: Visibility, origins: Tensor, directions: Tensor, distances: Tensor) -> Tensor:
     """Whether samples lie in cells that training rays have seen. bool [R, S]"""
     points = torch.addcmul(origins[:, None], directions[:, None], distances[..., None])
-    return visibility.seen[visibility.cells(points.flatten(0, 1))].view_as(distances)
+    return visibility.sees(points.flatten(0, 1)).view_as(distances)
 
 
 def march_into(
@@ -254,53 +254,23 @@ def _march_cpu(
     near, far = ray_box(origins, directions)
     half = 0.5 * grid.resolution
     origins, directions = origins.contiguous(), directions.contiguous()
-    rays = [
-        t.numpy() for t in ((origins + 1) * half, directions * half, near, far, jitter.contiguous())
-    ]
-    bins, skip = grid.bins(times).numpy(), occupied is not None
+    rays = (origins, directions, (origins + 1) * half, directions * half, grid.bins(times), near)
     wanted = (grid.occupied if occupied is None else occupied).numpy()
     if visibility is None:
         seen, finest = np.empty(0, np.uint8), 0
     else:
         seen, finest = visibility.last.numpy(), visibility.resolution
+    ways = [t.numpy() for t in (*rays, jitter.contiguous())]
+    cells_to_sample = (wanted, grid.resolution, seen, finest, occupied is not None)
     counts = torch.empty(3, len(near), dtype=torch.int64)
-    size, ways = grid.resolution, (origins.numpy(), directions.numpy())
-    cpu.count_samples(
-        *ways,
-        *rays,
-        bins,
-        wanted,
-        size,
-        seen,
-        finest,
-        step,
-        skip,
-        grid.least.numpy(),
-        limit,
-        counts.numpy(),
-    )
+    surfaces = (far.numpy(), grid.least.numpy(), limit)
+    cpu.count_samples(*ways, step, *cells_to_sample, *surfaces, counts.numpy())
     candidates, found, kept = counts.sum(dim=1).tolist()
     starts = counts[2].cumsum(0) - counts[2]
     ray, cells = torch.empty(2, kept, dtype=torch.int64)
     distances, points = origins.new_empty(kept), origins.new_empty(kept, 3)
-    start, slope, near, _, jitter_array = rays
-    cpu.fill_samples(
-        *ways,
-        start,
-        slope,
-        near,
-        jitter_array,
-        bins,
-        wanted,
-        size,
-        seen,
-        finest,
-        step,
-        skip,
-        starts.numpy(),
-        counts[2].numpy(),
-        *(t.numpy() for t in (ray, distances, cells, points)),
-    )
+    places = (starts, counts[2], ray, distances, cells, points)
+    cpu.fill_samples(*ways, step, *cells_to_sample, *(t.numpy() for t in places))
     return Samples(
         ray, starts, points, distances, cells, candidates, candidates - found, found - kept
     )

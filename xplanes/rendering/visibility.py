@@ -76,10 +76,9 @@ class Visibility(nn.Module):
         """Forget the rays before the last time that this was asked."""
         self.last.clamp_(min=1).sub_(1)
 
-    @property
-    def seen(self) -> Tensor:
-        """Which cells are seen. bool [resolution^3], axes z, y, x"""
-        return self.last > 0
+    def sees(self, points: Tensor) -> Tensor:
+        """Whether points of the cube lie in cells that are seen. [N, 3] -> bool [N]"""
+        return self.last[self.cells(points)] > 0
 
 
 def _resize(module: Visibility, state: dict[str, Tensor], prefix: str, *rest: object) -> None:
@@ -105,4 +104,4 @@ def finest_cells(views: Views, frame: Frame, least: int) -> int:
     """
     away = (views.camera_to_world[:, :3, 3].double() - frame.centre.double()).norm(dim=-1)
     pixel = frame.scale * away / views.intrinsics.focal.mean(dim=-1)
-    return max(least, min(FINEST, int(2 / float(pixel.median()))))
+    return max(least, int(2 / max(float(pixel.median()), 2 / FINEST)))

@@ -34,6 +34,9 @@ from xplanes.fields.lookup import plane_features_gpu
 from xplanes.fields.products import DYNAMIC, plane_product_gpu
 from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 from xplanes.rendering.compositing import composite_gpu
+from xplanes.rendering.marching import march_gpu
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.visibility import Visibility
 
 ARCHITECTURES = (80, 86, 90, 120)
 """Compute capabilities: A100, RTX 3090, H100, RTX 5090."""
@@ -134,6 +137,14 @@ def compositing() -> None:
     composite_gpu(depth, colour, torch.zeros(5), starts)[0].sum().backward()
 
 
+def marching() -> None:
+    """Placing samples along rays."""
+    grid, rays = OccupancyGrid(4, 2, step=0.1), [torch.zeros(5, 3), torch.ones(5, 3)]
+    rays += [torch.zeros(5), torch.zeros(5)]
+    given = {"step": 0.1, "occupied": grid.occupied, "limit": 7.0}
+    march_gpu(*rays, grid, room=9, visibility=Visibility(8), **given)
+
+
 CASES: dict[str, Callable[[], None]] = {
     "six planes, 16 channels": lambda: lookup("six", 16),
     "six planes, 40 channels": lambda: lookup("six", 40),
@@ -141,6 +152,7 @@ CASES: dict[str, Callable[[], None]] = {
     "nine planes, 40 channels": lambda: lookup("nine", 40),
     "products, 32 channels": lambda: products(32),
     "compositing": compositing,
+    "marching": marching,
 }
 
 

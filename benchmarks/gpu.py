@@ -35,6 +35,7 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.strategies import SingleDeviceStrategy
 from runner import RESULTS, Measured, command, lego, machine, markdown, measure
 from torch import Tensor
+from torch.nn import functional
 from torch.profiler import ProfilerActivity
 
 from xplanes import RadianceModule, SceneDataModule
@@ -47,6 +48,9 @@ from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 from xplanes.files import read_json, require_writable, write_json, write_rows, write_text
 from xplanes.lrm.bundled import load_bundled
 from xplanes.rendering.compositing import composite_gpu, composite_reference
+from xplanes.rendering.marching import Samples, march_gpu, march_into
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.visibility import Visibility
 from xplanes.scenes.batches import DeviceBatches
 
 BEGAN = time.monotonic()
@@ -73,6 +77,10 @@ MANY, FEW = 2**16, 2**7
 """Points at which kernels are compared with float64, on a GPU and in the interpreter."""
 RAY = 32
 """Points of a ray."""
+RAYS = 2**10, 2**15
+"""Rays of a step (small batches, default) for which samples are placed."""
+STEP, PLACES = 2 * math.sqrt(3) / 128, 16
+"""Distance between samples, as in training, and places for samples to a ray."""
 CPU_MINUTES = 3.0
 RESERVE = 15.0
 """Seconds of the budget reserved for start-up and for writing the page."""
@@ -370,6 +378,44 @@ def measure_compositing(record: Record, part: "Part", args: argparse.Namespace) 
     measure_kernels(record, part, kinds, [(0, 0, 0)])
 
 
+def marching_case(rays: int, device: torch.device) -> tuple[Callable[[], Samples], ...]:
+    """Kernel and twin, for rays through a cube in which a tenth of the cells holds something."""
+    grid, visibility = OccupancyGrid(64, 8, step=STEP).to(device), Visibility(128).to(device)
+    grid.occupied.copy_(torch.rand(len(grid.occupied), device=device) < 0.1)
+    grid.least.copy_(grid.occupied * torch.rand(len(grid.least), device=device) / STEP)
+    visibility.last.copy_(torch.rand(len(visibility.last), device=device) < 0.7)
+    origins = 3 * functional.normalize(torch.randn(rays, 3, device=device), dim=1)
+    directions = functional.normalize(torch.rand(rays, 3, device=device) - 0.5 - origins, dim=1)
+    times, jitter = torch.rand(2, rays, device=device)
+    options = {"step": STEP, "occupied": grid.occupied, "limit": 7.0, "visibility": visibility}
+    given = (origins, directions, times, jitter, grid)
+
+    def call(function: Callable[..., Samples]) -> Callable[[], Samples]:
+        return lambda: function(*given, room=PLACES * rays, **options)
+
+    return call(march_gpu), call(march_into)
+
+
+def measure_marching(record: Record, part: "Part", args: argparse.Namespace) -> None:
+    torch.manual_seed(0)
+    device = found_device()
+    on_gpu = device.type == "cuda"
+    for rays in RAYS if on_gpu else (FEW // 8,):
+        kernel, twin = marching_case(rays, device)
+        ours, theirs = kernel(), twin()
+        pairs = [(ours.ray, theirs.ray), (ours.cells, theirs.cells)]
+        other = torch.stack([a != b for a, b in pairs]).any(dim=0)[theirs.live]
+        share = float((other.sum() + abs(ours.count - theirs.count)) / theirs.count)
+        row = f"{part.row}, {rays} rays"
+        if share > TOLERANCE:
+            record.error = f"{row}: {100 * share:.3g}% of the samples lie elsewhere"
+        record.add("accuracy", row, {"kernels: values": (share, "relative")})
+        if on_gpu:
+            ours, theirs = microseconds(kernel), microseconds(twin)
+            cells = {"kernels": (ours, "us"), "twin": (theirs, "us")}
+            record.add("kernel time", row, cells | {"times faster": (theirs / ours, "times")})
+
+
 # Preparation
 
 
@@ -623,6 +669,7 @@ PARTS = (
     Part("kernels", "plane lookup", measure_lookup, needs_gpu=False, need=60, limit=150),
     Part("kernels", "products of planes", measure_products, needs_gpu=False),
     Part("kernels", "compositing", measure_compositing, needs_gpu=False),
+    Part("kernels", "marching", measure_marching, needs_gpu=False),
     training("random, GPU", NONE, "gpu", rays_of_the_cpu=True),
     training("random, CPU", NONE, "cpu", needs_gpu=False, need=60, limit=120),
     throughput("six planes", NONE),
@@ -764,7 +811,8 @@ TABLES = {
         "Kernels against float64",
         "The largest difference from the readable twin in float64, over its largest value; "
         '"twin" is the same twin in float32. Gradients are those of the planes; in compositing, '
-        f"those of optical depths and colours. Kernels count as wrong above {TOLERANCE:g}.",
+        "those of optical depths and colours. In marching, the share of samples that lie in other "
+        f"cells than the twin's in float32. Kernels count as wrong above {TOLERANCE:g}.",
     ),
     "kernel time": (
         "Time of the kernels",

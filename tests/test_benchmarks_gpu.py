@@ -123,7 +123,7 @@ def test_parts_that_do_not_fit_into_the_minutes_are_left_out(gpu, faked, found_g
     page = (tmp_path / "gpu.md").read_text(encoding="utf-8")
     # Of 225 seconds three parts leave 45: enough for one that needs 40, not for one that needs 60.
     assert len(faked.begun) == 4, faked.begun
-    assert "Too little was left of the minutes: training (random, CPU); " in page
+    assert "Too little was left of the minutes: training (random, GPU); " in page
 
 
 def test_without_a_gpu_the_page_says_what_is_missing(gpu, faked, tmp_path):

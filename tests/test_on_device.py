@@ -145,7 +145,8 @@ def test_training_there_comes_to_the_numbers_of_plain_torch(fake_gpu, monkeypatc
     assert there.counts == here.counts
     assert there.counts["no_room"] == 0
     for ours, theirs in zip(there.parameters(), here.parameters(), strict=True):
-        torch.testing.assert_close(ours.cpu(), theirs, atol=1e-4, rtol=1e-4)
+        # Adam makes as much of a tiny gradient, in which rounding shows, as of a large one.
+        torch.testing.assert_close(ours.cpu(), theirs, atol=3e-4, rtol=1e-4)
 
 
 def test_what_a_step_shows_is_read_now_and_then(fake_gpu):

@@ -23,12 +23,15 @@ def compiled(cache, *options):
 
 
 def test_kernels_with_most_numbers_fit_the_registers_of_a_common_gpu(tmp_path):
-    rows = compiled(tmp_path, "--arch", "86", "--only", "nine planes, 40", "compositing")
+    cases = ("nine planes, 40", "compositing", "marching")
+    rows = compiled(tmp_path, "--arch", "86", "--only", *cases)
     assert [(row[0], row[1]) for row in rows] == [
         ("nine planes, 40 channels", "gpu.forward"),
         ("nine planes, 40 channels", "gpu.backward_by_row"),
         ("compositing", "gpu.forward"),
         ("compositing", "gpu.backward"),
+        ("marching", "gpu_march.march"),
+        ("marching", "gpu_march.march"),
     ]
     assert all(int(row[4]) == 0 for row in rows)
 

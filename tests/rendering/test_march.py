@@ -7,6 +7,8 @@ border of their cell, and samples may come or go within 1e-5 of where the ray le
 nothing else may differ.
 """
 
+import copy
+import dataclasses
 import itertools
 import math
 
@@ -18,11 +20,19 @@ from hypothesis import strategies as st
 
 from tests.oracles import march as oracle
 from tests.oracles import ray_box
-from xplanes.rendering.marching import march, march_into, march_reference
+from xplanes.rendering import marching
+from xplanes.rendering.marching import march, march_gpu, march_into, march_reference
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.visibility import Visibility
 
+try:
+    import triton
+except ImportError:
+    triton = None
+
 STEP = 0.07
+
+needs_triton = pytest.mark.skipif(triton is None, reason="triton is not installed")
 
 
 def grid_of(resolution=6, bins=3, *, seed=0, filled=0.4, dense=20.0):
@@ -58,6 +68,19 @@ def into(rays, grid, room, *, step=STEP, skip_empty=True, occlusion=0.0, **optio
     occupied = grid.occupied if skip_empty else None
     given = {"step": step, "occupied": occupied, "limit": limit, **options}
     return march_into(*rays, grid, room=room, **given)
+
+
+def by_kernel(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0, room=None, **options):
+    """The Triton kernel: on a GPU if there is one, else in triton's interpreter."""
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    limit = -math.log(occlusion) if occlusion > 0 else math.inf
+    grid, rays = copy.deepcopy(grid).to(device), [ray.to(device) for ray in rays]
+    occupied = grid.occupied if skip_empty else None
+    options = {name: part.to(device) for name, part in options.items()}
+    given = {"step": step, "occupied": occupied, "limit": limit, "room": room}
+    found = march_gpu(*rays, grid, **given, **options)
+    on_cpu = {n: t.cpu() for n, t in vars(found).items() if isinstance(t, torch.Tensor)}
+    return dataclasses.replace(found, **on_cpu)
 
 
 def by_oracle(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0):
@@ -367,3 +390,126 @@ def test_no_samples_take_no_place():
     assert not found.live.any()
     assert found.shown.all()
     assert (found.starts == 0).all()
+
+
+@needs_triton
+@pytest.mark.parametrize(("skip_empty", "occlusion"), OPTIONS)
+def test_the_kernel_places_the_samples_of_the_oracle(skip_empty, occlusion):
+    grid, rays = grid_of(), rays_of(12)
+    given = {"skip_empty": skip_empty, "occlusion": occlusion}
+    kept, counts = by_oracle(rays, grid, **given)
+    found = by_kernel(rays, grid, **given)
+    assert found.ray.tolist() == [row[0] for row in kept]
+    assert found.cells.tolist() == [row[2] for row in kept]
+    np.testing.assert_allclose(found.distances, [row[1] for row in kept], atol=1e-12)
+    np.testing.assert_allclose(found.points, [row[3:] for row in kept], atol=1e-12)
+    assert (found.candidates, found.empty, found.occluded) == counts
+    assert torch.equal(found.starts, twin(rays, grid, **given).starts)
+    assert found.live is found.number is found.shown is None
+
+
+def same_places(found, expected):
+    for name in ("starts", "live", "shown", "ray"):
+        assert torch.equal(getattr(found, name), getattr(expected, name)), name
+    for name in ("cells", "distances"):
+        ours, theirs = (getattr(samples, name)[expected.live] for samples in (found, expected))
+        torch.testing.assert_close(ours, theirs, msg=name)
+    torch.testing.assert_close(found.points, expected.points)
+    for name in ("candidates", "empty", "occluded", "count"):
+        assert int(getattr(found, name)) == int(getattr(expected, name)), name
+
+
+@needs_triton
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_kernel_fills_a_fixed_number_of_places_as_the_twin_does(dtype):
+    grid, rays, visibility = grid_of(7, 3), rays_of(16, dtype), Visibility(13)
+    visibility.last.copy_(torch.rand(13**3, generator=torch.Generator().manual_seed(2)) < 0.7)
+    given = {"occlusion": 0.001, "visibility": visibility}
+    number = len(twin(rays, grid, **given))
+    assert number > 20
+    for room in (number + 9, number, number - 1, number // 2, 0):
+        same_places(by_kernel(rays, grid, room=room, **given), into(rays, grid, room, **given))
+
+
+@needs_triton
+def test_the_kernel_looks_as_far_as_a_ray_goes():
+    """Through several blocks of places, and with cells that are denser than float32 holds."""
+    for huge in (1e30, math.inf):
+        grid, rays = grid_of(8, 1, filled=1.1, dense=0.5), rays_of(6)
+        grid.least[::97] = huge
+        given = {"step": 0.011, "occlusion": 0.2}
+        found, expected = by_kernel(rays, grid, **given), twin(rays, grid, **given)
+        assert torch.equal(found.cells, expected.cells)
+        assert torch.equal(found.ray, expected.ray)
+        assert found.occluded == expected.occluded > 0
+        assert found.candidates > 3 * 64
+
+
+@needs_triton
+@pytest.mark.filterwarnings("ignore:divide by zero:RuntimeWarning")
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+def test_the_kernel_finds_no_samples_on_impossible_rays():
+    for bad in [math.nan, math.inf, -math.inf]:
+        grid, rays = grid_of(filled=1.1), list(rays_of(4))
+        rays[0][1, 2], rays[1][2, 0] = bad, bad
+        found = by_kernel(rays, grid)
+        assert set(found.ray.tolist()) == set(twin(rays, grid).ray.tolist()), bad
+        assert found.points.isfinite().all(), bad
+    along = torch.tensor([[1.0, 0, 3], [1, 1, 3], [0, 0, 3]]), torch.tensor([[0.0, 0, -1]] * 3)
+    rays = [t.double() for t in (*along, torch.zeros(3), torch.full((3,), 0.5))]
+    found, expected = by_kernel(rays, grid), twin(rays, grid)
+    assert torch.equal(found.ray, expected.ray)
+    assert torch.equal(found.cells, expected.cells)
+
+
+@needs_triton
+def test_no_rays_and_no_samples_in_the_kernel():
+    for rays, room in ((rays_of(0), None), (rays_of(0), 5), (rays_of(3), None), (rays_of(3), 5)):
+        found = by_kernel(rays, grid_of(filled=-1), room=room)
+        assert found.count == 0
+        assert len(found.points) == (room or 0)
+        assert found.starts.tolist() == [0] * len(rays[0])
+
+
+@pytest.fixture
+def as_on_a_gpu(monkeypatch):
+    """Tensors of this machine are taken for ones on a GPU."""
+    monkeypatch.setattr(marching, "cpu_loops", lambda tensor: False)
+    monkeypatch.setattr(marching, "gpu_kernels", lambda tensor: True)
+    marching._kernels_hold.cache_clear()
+    yield
+    marching._kernels_hold.cache_clear()
+
+
+@needs_triton
+def test_the_kernel_is_used_once_it_has_proved_itself(as_on_a_gpu, monkeypatch, caplog):
+    rooms = []
+    real = marching.march_gpu
+    monkeypatch.setattr(
+        marching,
+        "march_gpu",
+        lambda *rays, room, **o: rooms.append(room) or real(*rays, room=room, **o),
+    )
+    grid, rays = grid_of(), rays_of(5, torch.float32)
+    for room in (None, 90):
+        found = march(*rays, grid, step=STEP, occlusion=0.001, room=room)
+        expected = twin(rays, grid, occlusion=0.001)
+        assert torch.equal(found.cells[: len(expected)], expected.cells)
+    assert rooms[1:] == [None, 90]
+    assert rooms[0] not in (None, 90)  # The trial.
+    assert not caplog.records
+
+
+@needs_triton
+def test_a_kernel_that_places_samples_elsewhere_is_not_used(as_on_a_gpu, monkeypatch, caplog):
+    def broken(*given, **options):
+        found = march_gpu(*given, **options)
+        return dataclasses.replace(found, points=found.points + 0.01)
+
+    monkeypatch.setattr(marching, "march_gpu", broken)
+    grid, rays = grid_of(), rays_of(5, torch.float32)
+    for _ in range(2):
+        found, expected = march(*rays, grid, step=STEP), twin(rays, grid)
+        assert torch.equal(found.points, expected.points)
+    assert [record.message for record in caplog.records] == [caplog.records[0].message]
+    assert "marching" in caplog.text

@@ -1,13 +1,15 @@
 """Placing samples along rays where the scene holds something."""
 
+import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from xplanes.backend import compiled, cpu_loops
+from xplanes.backend import compiled, cpu_loops, gpu_kernels, gpu_module, proven, waves
 from xplanes.rendering.box import ray_box
 from xplanes.rendering.compositing import OPAQUE, depth_before
 from xplanes.rendering.occupancy import OccupancyGrid
@@ -15,6 +17,10 @@ from xplanes.rendering.visibility import Visibility
 
 OUTSIDE = 3.0
 """Coordinate of places without a sample, beyond the planes: nothing is read or added there."""
+
+
+STEP_OF_TRIAL = 0.07
+"""Distance between samples where the kernel is tried."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +104,10 @@ def march(
     if cpu_loops(origins):
         return _march_cpu(
             *rays, grid, step=step, occupied=occupied, limit=limit, visibility=visibility
+        )
+    if gpu_kernels(origins) and _kernels_hold(origins.device, origins.dtype):
+        return march_gpu(
+            *rays, grid, step=step, occupied=occupied, limit=limit, room=room, visibility=visibility
         )
     if room is not None and origins.device.type != "cpu":
         return march_into(
@@ -230,6 +240,102 @@ def march_into(
         number=total,
         shown=shown,
     )
+
+
+def march_gpu(
+    origins: Tensor,
+    directions: Tensor,
+    times: Tensor,
+    jitter: Tensor,
+    grid: OccupancyGrid,
+    *,
+    step: float,
+    occupied: Tensor | None,
+    limit: float,
+    room: int | None,
+    visibility: Visibility | None = None,
+) -> Samples:
+    """The same as `march_into`, or as `march_reference` without ``room``, in a Triton kernel.
+
+    It runs twice, to count the samples of each ray and to write them down.
+    """
+    gpu = gpu_module("xplanes.rendering.gpu_march")
+    rays, device = len(origins), origins.device
+    given = [t.contiguous() for t in (origins, directions, times, jitter)]
+    seen = None if visibility is None else (visibility.last, visibility.resolution)
+    limited = math.isfinite(limit)
+    cells_of = (occupied, grid.least, grid.resolution, grid.time_bins, OPAQUE, limited)
+    spacing = [torch.full((), n, dtype=torch.float64, device=device) for n in (step, limit)]
+    counts = torch.zeros(3, rays, dtype=torch.int64, device=device)
+    gpu.launch(given, cells_of, seen, spacing, counts, 0)
+    ends = counts[2].cumsum(0)
+    tally = counts.sum(dim=1)
+    if room is None:
+        candidates, found, places = tally.tolist()
+        starts, live, total, shown = ends - counts[2], None, None, None
+    else:
+        places, shown = room, ends <= room
+        total = (ends * shown).amax() if rays else ends.sum()
+        starts, live = torch.minimum(ends - counts[2], total), torch.arange(room, device=device)
+        live = live < total
+        candidates, found, _ = tally
+    ray = torch.full((places,), max(rays - 1, 0), dtype=torch.int64, device=device)
+    distances, points = origins.new_zeros(places), origins.new_full((places, 3), OUTSIDE)
+    cells = torch.zeros(places, dtype=torch.int64, device=device)
+    kept = counts if shown is None else counts * shown
+    gpu.launch(
+        given, cells_of, seen, spacing, kept, places, (starts, ray, distances, cells, points)
+    )
+    return Samples(
+        ray=ray,
+        starts=starts,
+        points=points,
+        distances=distances,
+        cells=cells,
+        candidates=candidates,
+        empty=candidates - found,
+        occluded=found - tally[2] if room is not None else found - places,
+        live=live,
+        number=total,
+        shown=shown,
+    )
+
+
+@functools.cache
+def _kernels_hold(device: torch.device, dtype: torch.dtype) -> bool:
+    """Whether the kernel proves itself on rays that enter, start inside and miss the cube."""
+
+    def attempt(function: Callable[..., Samples], precision: torch.dtype) -> list[Tensor]:
+        grid = OccupancyGrid(6, 3, step=STEP_OF_TRIAL).to(device)
+        grid.least.copy_(20 * waves(device, len(grid.least)).abs())
+        visibility = Visibility(13).to(device)
+        visibility.last.copy_(waves(device, len(visibility.last)) > -0.5)
+        origins = 2 * waves(device, 50, 3)
+        ahead = 0.9 * waves(device, 57, 3)[7:] - origins
+        directions = torch.nn.functional.normalize(ahead, dim=-1)
+        times, jitter = waves(device, 2, 50).abs()
+        rays = [t.to(precision) for t in (origins, directions, times, jitter)]
+        occupied = waves(device, len(grid.least)) > 0
+        found = function(
+            *rays,
+            grid,
+            step=STEP_OF_TRIAL,
+            occupied=occupied,
+            limit=3.0,
+            room=400,
+            visibility=visibility,
+        )
+        assert found.live is not None
+        here = found.live
+        numbers = [found.candidates, found.empty, found.occluded, found.count]
+        return [
+            *(torch.as_tensor(n, dtype=precision, device=device) for n in numbers),
+            found.starts.to(precision),
+            *(t[here].to(precision) for t in (found.ray, found.distances, found.cells)),
+            found.points[here],
+        ]
+
+    return proven(f"marching ({dtype})", device, attempt, march_gpu, march_into, dtype)
 
 
 def _starts(ray: Tensor, rays: int) -> Tensor:

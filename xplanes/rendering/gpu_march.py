@@ -1,0 +1,226 @@
+"""Triton kernels that place samples along rays on CUDA; `marching` holds the readable twin.
+
+A program takes a ray and walks along it, a block of places at a time: once to count its samples,
+and once more, when all rays know where theirs begin, to write them down. Both come to the same
+numbers, since no product is fused with a sum. Imported only when needed, since triton takes a while
+to load.
+"""
+
+# ruff: noqa: D103 (the callers in marching.py document these kernels)
+
+import torch
+import triton
+import triton.language as tl
+
+BLOCK = 64
+"""Places that a program looks at once: two a thread."""
+
+
+@triton.jit
+def within(value, size):
+    """The cell in which a place lies, or the nearest; the first for a NaN. int32"""
+    value = tl.where(value > 0, value, 0.0)
+    return tl.where(value < size - 1, value, size - 1.0).to(tl.int32)
+
+
+@triton.jit
+def slab(origin, direction):
+    """Distances at which a ray enters and leaves -1 <= x <= 1."""
+    inverse = 1.0 / direction
+    first, second = (-1.0 - origin) * inverse, (1.0 - origin) * inverse
+    low, high = tl.minimum(first, second), tl.maximum(first, second)
+    # A ray that runs along a face is inside this slab.
+    unknown = (first != first) | (second != second)
+    return tl.where(unknown, float("-inf"), low), tl.where(unknown, float("inf"), high)
+
+
+@triton.jit
+def load_ray(origins, directions, ray):
+    origin = (
+        tl.load(origins + 3 * ray),
+        tl.load(origins + 3 * ray + 1),
+        tl.load(origins + 3 * ray + 2),
+    )
+    direction = (
+        tl.load(directions + 3 * ray),
+        tl.load(directions + 3 * ray + 1),
+        tl.load(directions + 3 * ray + 2),
+    )
+    return origin, direction
+
+
+@triton.jit
+def ray_box(origin, direction):
+    """Distances at which a ray enters and leaves the cube; 0 and 0 if it does not."""
+    x0, x1 = slab(origin[0], direction[0])
+    y0, y1 = slab(origin[1], direction[1])
+    z0, z1 = slab(origin[2], direction[2])
+    near = tl.maximum(tl.maximum(tl.maximum(x0, y0), z0), 0.0)
+    far = tl.minimum(tl.minimum(x1, y1), z1)
+    whole = origin[0] + origin[1] + origin[2] + direction[0] + direction[1] + direction[2]
+    hit = (far > near) & (tl.abs(far + whole) < float("inf"))
+    return tl.where(hit, near, 0.0), tl.where(hit, far, 0.0)
+
+
+@triton.jit
+def look(
+    origin,
+    direction,
+    distance,
+    time_bin,
+    inside,
+    occupied,
+    seen,
+    size,
+    finest,
+    SKIP: tl.constexpr,
+    SEEN: tl.constexpr,
+):
+    """Cells of a block of places on a ray, and whether samples are wanted there."""
+    x, y, z = (
+        origin[0] + distance * direction[0] + 1,
+        origin[1] + distance * direction[1] + 1,
+        origin[2] + distance * direction[2] + 1,
+    )
+    column, row = within(x * (0.5 * size), size), within(y * (0.5 * size), size)
+    cell = ((time_bin * size + within(z * (0.5 * size), size)) * size + row) * size + column
+    wanted = inside
+    if SKIP:
+        wanted = wanted & (tl.load(occupied + cell, mask=wanted, other=0) != 0)
+    if SEEN:
+        column, row = within(x * (0.5 * finest), finest), within(y * (0.5 * finest), finest)
+        fine = (within(z * (0.5 * finest), finest) * finest + row) * finest + column
+        wanted = wanted & (tl.load(seen + fine, mask=wanted, other=0) != 0)
+    return cell, wanted
+
+
+@triton.jit
+def not_hidden(least, cell, wanted, step, limit, depth, opaque, LIMITED: tl.constexpr):
+    """Which of a block's samples lie in front of all opaque cells, and the depth behind them."""
+    if LIMITED:
+        depths = tl.load(least + cell, mask=wanted, other=0.0).to(tl.float64) * step
+        depths = tl.where(depths < opaque, depths, opaque)
+        depths = tl.where(wanted, depths, 0.0)
+        before = depth + tl.cumsum(depths, 0) - depths
+        kept = wanted & (before < limit)
+        depth += tl.sum(depths, 0)
+    else:
+        kept = wanted
+    return kept, depth
+
+
+@triton.jit(do_not_specialize=["rays", "size", "bins", "finest"])
+def march(
+    origins,
+    directions,
+    times,
+    jitter,
+    occupied,
+    least,
+    seen,
+    step,
+    limit,
+    counts,
+    starts,
+    ray_of,
+    distances,
+    cells,
+    points,
+    rays,
+    size,
+    bins,
+    finest,
+    opaque,
+    room,
+    SKIP: tl.constexpr,
+    SEEN: tl.constexpr,
+    LIMITED: tl.constexpr,
+    FILL: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Counts samples, or writes them down if FILL; ``counts`` is [3, rays]."""
+    ray = tl.program_id(0)
+    origin, direction = load_ray(origins, directions, ray)
+    near, far = ray_box(origin, direction)
+    exact_step, limit = tl.load(step), tl.load(limit)
+    spacing = exact_step.to(near.dtype)
+    shift = tl.load(jitter + ray)
+    time_bin = within(tl.load(times + ray) * bins, bins)
+    candidates, found, kept = 0, 0, 0
+    depth = tl.zeros([], tl.float64)
+    place = tl.zeros([], tl.int64)
+    last = tl.zeros([], tl.int64)
+    if FILL:
+        place = tl.load(starts + ray)
+        last = tl.minimum(place + tl.load(counts + 2 * rays + ray), room)
+    first = 0
+    ahead = near + shift * spacing < far
+    while ahead:
+        n = first + tl.arange(0, BLOCK)
+        distance = near + (n.to(near.dtype) + shift) * spacing
+        inside = distance < far
+        cell, wanted = look(
+            origin, direction, distance, time_bin, inside, occupied, seen, size, finest, SKIP, SEEN
+        )
+        shown, depth = not_hidden(least, cell, wanted, exact_step, limit, depth, opaque, LIMITED)
+        number = shown.to(tl.int32)
+        if FILL:
+            slot = place + tl.cumsum(number, 0) - 1
+            here = shown & (slot < last)
+            tl.store(ray_of + slot, tl.zeros_like(slot) + ray, mask=here)
+            tl.store(distances + slot, distance, mask=here)
+            tl.store(cells + slot, cell, mask=here)
+            for axis in tl.static_range(3):
+                point = origin[axis] + distance * direction[axis]
+                tl.store(points + 3 * slot + axis, point, mask=here)
+            place += tl.sum(number, 0)
+            ahead = place < last
+        else:
+            candidates += tl.sum(inside.to(tl.int32), 0)
+            found += tl.sum(wanted.to(tl.int32), 0)
+            kept += tl.sum(number, 0)
+            ahead = True
+        first += BLOCK
+        ahead = ahead & (near + (first + shift) * spacing < far)
+    if not FILL:
+        tl.store(counts + ray, candidates)
+        tl.store(counts + rays + ray, found)
+        tl.store(counts + 2 * rays + ray, kept)
+
+
+def launch(rays, grid, seen, spacing, counts, room, found=None):
+    """Launches `march`: to count, or with ``found`` to write down.
+
+    Args:
+        rays: Origins, directions, times and jitter.
+        grid: Flags of cells to look into (None: all), least densities, resolution and time bins.
+        seen: Flags of fine cells and how many lie along each side; None: all are seen.
+        spacing: Distance of the places and largest optical depth in front, float64 [] each.
+        counts: Places in the cube, samples wanted, and those not hidden. int64 [3, R]
+        room: Places to write to.
+        found: Starts [R], then what is written: ray, distances, cells, points [N, ...].
+    """
+    number = len(rays[0])
+    occupied, least, size, bins, opaque, limited = grid
+    unused = counts
+    fine, finest = (unused, 1) if seen is None else seen
+    given = (*rays, unused if occupied is None else occupied, least, fine, *spacing, counts)
+    written = [unused] * 5 if found is None else found
+    flags = {"SKIP": occupied is not None, "SEEN": seen is not None, "LIMITED": limited}
+    if number:
+        with torch.cuda.device_of(counts):
+            march[(number,)](
+                *given,
+                *written,
+                number,
+                size,
+                bins,
+                finest,
+                opaque,
+                room,
+                **flags,
+                FILL=found is not None,
+                BLOCK=BLOCK,
+                num_warps=1,
+                enable_fp_fusion=False,
+            )

@@ -33,6 +33,9 @@ from xplanes.training.step_threads import StepThreads
 LITTLE = 0.5
 """PSNR in dB above that of empty images below which a run shows nothing."""
 
+CLUTTERED = 0.2
+"""Share of floaters above which a run says so; scenes that succeed have less than a tenth."""
+
 VIDEO_PIXELS = 48 * 200 * 200
 """Pixels of the video at the end."""
 
@@ -218,11 +221,17 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
         more_scores += f"  of the thing {metrics['test']['psnr_thing']:.2f}"
     if "floaters" in metrics["test"]:
         more_scores += f"  floaters {100 * metrics['test']['floaters']:.2f}%"
-    blank = []
+    warnings = []
     if metrics["test"]["psnr"] < metrics["blank_psnr"] + LITTLE:
-        blank.append(
+        warnings.append(
             f"warning  hardly better than images of background alone ({metrics['blank_psnr']:.2f} "
             "dB): this run shows nothing yet"
+        )
+    if (share := metrics["test"].get("floaters", 0)) > CLUTTERED:
+        warnings.append(
+            f"warning  {100 * share:.0f}% of the background is not empty (floaters): train longer, "
+            "or check the cameras and times; what is too\n         thin or too fast for the views "
+            "comes out so as well"
         )
     place = shlex.quote(str(run))
     named = "".join(f" --plugin {name}" for name in experiment.config.get("plugins") or [])
@@ -241,7 +250,7 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             f"{metrics['split']:<9}psnr {metrics['test']['psnr']:.2f}  ssim "
             f"{metrics['test']['ssim']:.4f}{more_scores}  over {len(metrics['views'])} views, step "
             f"{metrics['step']}",
-            *blank,
+            *warnings,
             f"time     prepare {prepare:.1f} s + train {seconds['train']:.1f} s · {warm_up}scoring "
             f"{seconds['evaluate']:.1f} s · {seconds['total']:.1f} s in all · "
             f"{metrics['rays_per_second'] / 1000:.1f}k rays/s",

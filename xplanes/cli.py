@@ -97,7 +97,7 @@ def _download(options: argparse.Namespace) -> None:
 
 def _add_inspect(commands: "argparse._SubParsersAction") -> None:
     parser = commands.add_parser(
-        "inspect", help="say and draw what is read of a capture, and warn of what may be wrong"
+        "inspect", help="print and draw what was read of a capture, and warn of what may be wrong"
     )
     parser.add_argument(
         "arguments",

@@ -242,7 +242,7 @@ class _Module:
         return 0
 
     @staticmethod
-    def synchronize() -> None:
+    def synchronize(device: object = None) -> None:
         count("waits", "synchronize")
 
     @staticmethod

@@ -148,7 +148,15 @@ def test_a_stopped_sweep_says_how_the_whole_of_it_goes_on(tmp_path, monkeypatch,
 
 @pytest.mark.parametrize(
     ("scene", "name"),
-    [("lego", "lego"), ("my scene (1)", "my-scene-1"), ("/data/people/anna", "anna"), ("..", "..")],
+    [
+        ("lego", "lego"),
+        ("my scene (1)", "my-scene-1"),
+        ("/data/people/anna", "anna"),
+        ("..", ".."),
+        ("café", "café"),
+        ("null", "null"),
+        (".5", ".5"),
+    ],
 )
 def test_run_directories_have_names_that_need_no_quotes(scene: str, name: str) -> None:
     assert file_name(scene) == name
@@ -235,7 +243,8 @@ def test_two_processes_share_the_rays_and_end_with_one_model(scenes: str, tmp_pa
     assert len(first) > 6
     assert "grid.occupied" in first
     for name in first:
-        assert torch.equal(first[name], second[name]), name
+        if name != "visibility.last":  # Told the others at sweeps after step 400 alone.
+            assert torch.equal(first[name], second[name]), name
         assert torch.equal(first[name], state["state_dict"][name]), name
 
 

@@ -205,7 +205,7 @@ def gpu_module(module: str) -> Any:
 def synchronize(device: torch.device) -> None:
     """Wait until a device has done all that it was asked to do; the CPU always has."""
     if device.type != "cpu":
-        torch.get_device_module(device).synchronize()
+        torch.get_device_module(device).synchronize(device)
 
 
 @functools.cache

@@ -55,13 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _known_errors() -> tuple[type[Exception], ...]:
     """Errors that are reported without a traceback."""
-    from xplanes.errors import ConfigError
-    from xplanes.files import StorageError
-    from xplanes.lrm.errors import LRMError
-    from xplanes.optional import MissingExtraError
-    from xplanes.scenes.errors import SceneError
+    from xplanes.pipeline import KNOWN_ERRORS
 
-    return ConfigError, SceneError, LRMError, MissingExtraError, StorageError, PermissionError
+    return *KNOWN_ERRORS, PermissionError
 
 
 def build_parser() -> argparse.ArgumentParser:

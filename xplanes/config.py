@@ -17,6 +17,17 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / 
 CHOICES = ("experiment", "entry", "recipe", "scale")
 """Groups whose files set keys of other groups."""
 
+NAMES = ("data.root", "data.scene")
+"""Settings whose values are names, even where they look like numbers."""
+
+_NUMBER = re.compile(r"[+-]?[\d._]+(?:[eE][+-]?\d+)?")
+
+_PLAIN = re.compile(r"(?!\.\d)[A-Za-z_./][A-Za-z0-9_./-]*")
+"""Text that Hydra reads as it is; other letters it takes in quotes alone."""
+
+_WORDS = ("null", "none", "true", "false", "inf", "nan")
+"""Text that means something else without quotes."""
+
 _UNKNOWN_OPTION = re.compile(r"Could not find '(\S+)/(\S+)'\s+Available options.*:\n((?:\t.*\n)+)")
 """Hydra's message: group, what was asked for, and what there is."""
 
@@ -41,7 +52,7 @@ def compose_plain(name: str | None, overrides: Sequence[str], conf: Path = CONF)
                 'compose("model=nine_planes", "lrm=none")'
             )
     with _hydra(conf, name, overrides):
-        return to_plain(compose(name, list(overrides)))
+        return to_plain(compose(name, [with_names(override) for override in overrides]))
 
 
 def group_options(
@@ -110,10 +121,20 @@ def to_plain(config: Any) -> dict[str, Any]:
 
 def quoted(text: str) -> str:
     """Text as Hydra reads it in an override."""
-    if re.fullmatch(r"[A-Za-z_./][\w./-]*", text):
+    if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
         return text
     escaped = re.sub(r"(\\*)'", r"\1\1\'", text)
     return f"'{escaped}'"
+
+
+def with_names(override: str) -> str:
+    """An override, in quotes where Hydra would make a number of a name: 2024_05_01 is 20240501."""
+    key, equals, value = override.partition("=")
+    names = value.split(",")
+    if not equals or key.lstrip("+~") not in NAMES or not any(map(_NUMBER.fullmatch, names)):
+        return override
+    found = [f"'{name}'" if _NUMBER.fullmatch(name) else name for name in names]
+    return f"{key}={','.join(found)}"
 
 
 def near_names(

@@ -5,6 +5,7 @@ import errno
 import json
 import math
 import os
+import re
 import shutil
 import tempfile
 import time
@@ -61,6 +62,11 @@ _WAYS_OUT = {
 
 _ONLY_WRITING = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 """Problems that reading cannot have."""
+
+
+def natural(name: str) -> list[str | int]:
+    """A name as text and numbers in turns, so that frame_10 is sorted after frame_9."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 def existing(path: Path) -> Path:

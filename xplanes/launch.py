@@ -20,12 +20,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from xplanes import __version__
-from xplanes.config import CONF, near_names, quoted, to_plain
+from xplanes.config import CONF, near_names, quoted, to_plain, with_names
 from xplanes.errors import ConfigError
 from xplanes.files import StorageError, read_json, require_writable
-
-NAMES = ("data.root", "data.scene")
-"""Settings whose values are names, even where they look like numbers."""
 
 
 def file_name(scene: Any) -> str:
@@ -34,8 +31,6 @@ def file_name(scene: Any) -> str:
 
 
 OmegaConf.register_new_resolver("file_name", file_name, replace=True)
-
-_NUMBER = re.compile(r"[+-]?[\d._]+(?:[eE][+-]?\d+)?")
 
 
 def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
@@ -151,7 +146,7 @@ def prepare(arguments: list[str]) -> list[str]:
         ConfigError: If the run cannot be resumed.
         StorageError: If the folder of the run cannot be written.
     """
-    arguments = [_with_names(text) for text in arguments]
+    arguments = [with_names(text) for text in arguments]
     values = {key: value for key, value in map(_split, arguments) if key}
     resume = values.get("resume", "null").strip("\"'")
     if resume in ("null", "", "None", "auto"):
@@ -237,16 +232,6 @@ def _without_resume(overrides: Iterable[str]) -> list[str]:
 
 def _mtime(path: Path) -> float:
     return path.stat().st_mtime
-
-
-def _with_names(argument: str) -> str:
-    """An override, in quotes where Hydra would make a number of a name: 2024_05_01 is 20240501."""
-    key, value = _split(argument)
-    names = value.split(",")
-    if key not in NAMES or not any(map(_NUMBER.fullmatch, names)):
-        return argument
-    found = [f"'{name}'" if _NUMBER.fullmatch(name) else name for name in names]
-    return f"{argument.partition('=')[0]}={','.join(found)}"
 
 
 def _split(argument: str) -> tuple[str, str]:

@@ -483,6 +483,9 @@ def test_bad_options_are_refused(tmp_path: Path):
         ExportOptions(threshold=-1.0): "--threshold -1",
         ExportOptions(threshold=float("nan")): "--threshold nan",
         ExportOptions(times="2.5"): "--times 2.5",
+        ExportOptions(what="gaussians", form="glb"): "--format glb: --what gaussians does not use",
+        ExportOptions(what="path", times="3"): "--times 3: --what path does not use",
+        ExportOptions(what="mesh", count=9): "--points 9: --what mesh does not use",
     }.items():
         with pytest.raises(ConfigError, match=words):
             options.check()
@@ -494,6 +497,8 @@ def test_exports_that_cannot_be_are_refused(tmp_path: Path):
         export(trained, ExportOptions(resolution=16), out, say=quiet)
     with pytest.raises(ConfigError, match=r"nowhere above the threshold 5; the largest is 0\.1"):
         export(trained, ExportOptions(resolution=16, threshold=5.0), out, say=quiet)
+    if out.is_dir():  # The way out, another threshold, finds room there.
+        assert not list(out.iterdir())
     with pytest.raises(ConfigError, match="--what planes: some model has no planes"):
         export(trained, ExportOptions(what="planes"), out, say=quiet)
     out.write_text("in the way")

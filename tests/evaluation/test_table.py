@@ -177,6 +177,20 @@ def test_seeds_are_averaged(tmp_path):
     assert "seed" not in rows[0]
 
 
+def test_a_mean_is_that_of_all_seeds_or_there_is_none(tmp_path):
+    """Of three seeds one comes to 20 dB, after 10 s: that is not the setting's time."""
+    for seed, last in ((0, 24), (1, 15), (2, 16)):
+        make(tmp_path / f"{seed}", seed=seed, psnr=20.0 + seed)
+        rows = f"0,0,test,8,0.1\n10,50,test,16,0.2\n20,90,test,{last},0.3\n"
+        (tmp_path / f"{seed}" / "curve.csv").write_text(CURVE + rows)
+    write_tables(tmp_path)
+    with (tmp_path / "table_seeds.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert row["seconds_to_20"] == ""
+    assert float(row["start_psnr"]) == 8
+    assert float(row["psnr"]) == 21
+
+
 def test_a_repetition_with_the_same_seed_is_no_second_seed(tmp_path):
     for name, seed in (("0", 0), ("1", 0), ("2", 1)):
         make(tmp_path / name, seed=seed, psnr=20.0 + seed)

@@ -60,6 +60,12 @@ def test_images_become_triplanes_and_a_video(tmp_path: Path, pictures, few, caps
         assert video.size == (24, 24)
 
 
+def test_images_of_a_folder_come_in_the_order_of_their_numbers(tmp_path: Path):
+    for name in ("f_10.png", "f_2.png", "f_1.png", ".f_3.png", "notes.txt"):
+        (tmp_path / name).touch()
+    assert [p.name for p in module.find_pictures([tmp_path])] == ["f_1.png", "f_2.png", "f_10.png"]
+
+
 def test_the_video_begins_at_the_models_camera_and_completes_one_orbit(few):
     model = model_of()
     with torch.no_grad():

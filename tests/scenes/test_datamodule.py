@@ -117,6 +117,31 @@ def test_the_video_does_not_show_what_is_held_out():
     assert set(video.files) == set(data.scene.splits["train"].files)
 
 
+def test_nothing_shows_what_is_held_out_if_all_of_it_is():
+    scene = ball_scene(count=16)
+    train = scene.splits["train"]
+    data = SceneDataModule.of(scene)
+    data.setup("fit")
+    held_out = set(data.scene.splits["val"].files)
+    places = torch.tensor([i for i, file in enumerate(train.files) if file in held_out])
+    data = SceneDataModule.of(replace(scene, video=train.subset(places), cut=train))
+    data.setup("fit")
+    assert data.scene.video is None
+    assert data.scene.cut is not None
+    assert list(data.scene.cut.files) == list(data.scene.splits["train"].files)
+
+
+def test_as_many_views_are_held_out_as_are_scored_at_most():
+    data = SceneDataModule.of(ball_scene(count=40))
+    data.setup("fit")
+    assert (len(data.scene.splits["train"]), len(data.scene.splits["val"])) == (35, 5)
+    few = SceneDataModule.of(ball_scene(count=40))
+    few.settings = replace(few.settings, eval_views=2)
+    few.setup("fit")
+    assert (len(few.scene.splits["train"]), len(few.scene.splits["val"])) == (38, 2)
+    assert set(few.scene.splits["val"].files) < set(data.scene.splits["val"].files)
+
+
 def test_a_module_that_says_nothing_gets_rays_over_all_pixels_in_the_scenes_cube():
     data = SceneDataModule.of(ball_scene(), seed=3)
     views = data.scene.splits["train"]

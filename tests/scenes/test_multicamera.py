@@ -340,6 +340,20 @@ def test_cameras_of_different_lengths_and_rates(videos: Path, tmp_path: Path, ca
         read(folder)
 
 
+def test_a_frame_that_one_camera_lacks_is_noticed(tmp_path: Path) -> None:
+    folder = neural_3d_video(tmp_path / "scene", write_images, "")
+    whole = len(read(folder).splits["train"])
+    (folder / "cam02" / f"{5 + FRAMES - 1}.png").unlink()  # The last one: it stopped early.
+    assert len(read(folder).splits["train"]) < whole
+    for camera in range(CAMERAS):  # Another number for the same moment.
+        for path in sorted((folder / f"cam{camera:02d}").iterdir(), key=lambda p: int(p.stem)):
+            path.rename(path.with_name(f"x{int(path.stem) + 100 * camera}.png"))
+    assert len(read(folder).splits["train"]) < whole
+    (folder / "cam02" / "x206.png").unlink()
+    with pytest.raises(SceneError, match=r"cam02: image number 2 is x207\.png, but cam00/x6\.png"):
+        read(folder)
+
+
 def test_damaged_files_are_named(videos: Path, tmp_path: Path) -> None:
     folder = tmp_path / "scene"
     folder.mkdir()

@@ -150,6 +150,10 @@ def test_lists_of_file_names_are_the_splits(capture):
     capture.refused("no val split", error=MissingSplitError, splits=("val",))
     assert len(capture.read(views=3, splits=("train",)).splits["train"]) == 3
     whole = dict(capture.content)
+    # Some tools list the same views for validation as for testing.
+    capture.content |= {"val_filenames": [names[1], names[2]]}
+    parts = capture.read(("val", "test")).splits
+    assert [numbers(parts[split]) for split in ("val", "test")] == [[1, 2], [1]]
     for change, words in (
         ({"val_filenames": "a"}, "val_filenames is 'a', not a list"),
         ({"val_filenames": ["images/none.png"]}, "no image"),

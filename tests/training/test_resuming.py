@@ -5,6 +5,7 @@ import shutil
 import signal
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import pytest
 from lightning import Trainer
@@ -70,9 +71,20 @@ def test_what_planes_and_frame_depend_on_is_kept(tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=rf"{key}=that: .* {key}=this"):
             require_same_settings(tmp_path, before, now)
         require_same_settings(tmp_path, before, before)
+        for values in ((before, None), (None, now)):  # null is a value like others.
+            pair = [_nested(groups, name, None) if v is None else v for v in values]
+            with pytest.raises(ConfigError, match=rf"{key}="):
+                require_same_settings(tmp_path, *pair)
         # A setting that an older version did not have.
         require_same_settings(tmp_path, without, now)
         require_same_settings(tmp_path, {}, now)
+
+
+def _nested(groups: list[str], name: str, value: object) -> dict[str, Any]:
+    found: dict[str, Any] = {name: value}
+    for group in reversed(groups):
+        found = {group: found}
+    return found
 
 
 def test_a_run_is_not_resumed_with_other_images(scenes: Path, folder: Path) -> None:

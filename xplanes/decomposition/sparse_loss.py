@@ -31,7 +31,8 @@ def sparse_product_loss(
     Returns:
         The loss, differentiable with respect to the time planes. []
     """
-    target = sparse[frames.to(sparse.device)].to(time_planes.dtype)
+    frames = frames.to(sparse.device, non_blocking=True)
+    target = sparse[frames].to(time_planes.dtype)
     count, (height, width) = len(sparse), sparse.shape[-2:]
     wide = frame_profiles(time_planes, frames, count, width)
     tall = wide if height == width else frame_profiles(time_planes, frames, count, height)

@@ -88,9 +88,25 @@ class ExportOptions:
             raise ConfigError(f"--threshold {self.threshold:g}: must be a finite number above 0")
         if self.times is not None:
             export_times(self.times)
+        self._refuse_what_is_not_used()
         if self.what in ("mesh", "points"):
             require("skimage.measure", extra="export")
             require("trimesh", extra="export")
+
+    def _refuse_what_is_not_used(self) -> None:
+        surfaces = ("mesh", "points")
+        default = ExportOptions()
+        for name, value, ordinary, kinds in (
+            ("times", self.times, default.times, (*surfaces, "gaussians")),
+            ("resolution", self.resolution, default.resolution, surfaces),
+            ("threshold", self.threshold, default.threshold, surfaces),
+            ("points", self.count, default.count, ("points",)),
+            ("format", self.form, default.form, surfaces),
+        ):
+            if value != ordinary and self.what not in kinds:
+                raise ConfigError(
+                    f"--{name} {value}: --what {self.what} does not use it; leave it out"
+                )
 
 
 def export_times(text: str) -> list[float]:
@@ -178,8 +194,14 @@ def export(
         say(f"threshold   density {threshold:.4g}")
     names = [f"{options.what}_{number:04d}.{options.form}" for number in range(len(times))]
     files = [folder / name for name in names]
-    for _ in progress(_write_each(trained, options, threshold, times, files), len(times), "times"):
-        pass
+    written = _write_each(trained, options, threshold, times, files)
+    try:
+        for _ in progress(written, len(times), "times"):
+            pass
+    except ConfigError:
+        for path in files:  # So that the way out, another threshold, may write here.
+            path.unlink(missing_ok=True)
+        raise
     write_json(
         folder / "export.json",
         {

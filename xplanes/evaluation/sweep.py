@@ -4,7 +4,6 @@ Must stay quick, and a damaged file must not hide the other runs: every problem 
 status.
 """
 
-import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -13,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from xplanes.files import read_json
+from xplanes.files import natural, read_json
 from xplanes.files import read_rows as read_csv
 
 SCORES = {
@@ -112,19 +111,14 @@ def _groups(folder: Path) -> Iterator[tuple[Path, list[Path]]]:
         yield folder, [folder]
         return
     inside = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()]
-    inside = sorted((p for p in inside if not p.name.startswith(".")), key=_natural)
+    inside = [path for path in inside if not path.name.startswith(".")]
+    inside.sort(key=lambda path: natural(path.name))
     runs = [path for path in inside if _is_job(path)]
     if runs or (folder / "multirun.yaml").is_file():
         yield folder, runs
     for path in inside:
         if path not in runs:
             yield from _groups(path)
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sorts 2_... before 10_..."""
-    parts = re.split(r"(\d+)", path.name)
-    return [(int(part), "") if part.isdigit() else (0, part) for part in parts]
 
 
 def _is_job(folder: Path) -> bool:

@@ -146,7 +146,8 @@ def seed_table(
         line = [_text(settings[n]) if n in settings else "" for n in names] + [str(len(group))]
         for name in measures:
             values = [row.scores[name] for row in group if name in row.scores]
-            mean = math.fsum(values) / len(values) if values else None
+            # The mean of those that got there would be best where most did not.
+            mean = math.fsum(values) / len(values) if len(values) == len(group) else None
             shown = _number(mean, name, exact)
             if name not in SPREAD:
                 line.append(shown)

@@ -12,6 +12,7 @@ from xplanes.evaluation.render import render_path, write_video
 from xplanes.experiment import Experiment
 from xplanes.fields import XPlanes
 from xplanes.fields.xplanes import SPACE_PLANES
+from xplanes.files import natural
 from xplanes.lrm.model import LRM
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.encode import encode
@@ -89,7 +90,7 @@ def write_triplanes(
 
 
 def find_pictures(paths: Sequence[Path]) -> list[Path]:
-    """Image files; a folder stands for all images in it, sorted by name.
+    """Image files; a folder stands for all images in it, by the numbers in their names.
 
     Raises:
         SceneError: If one is missing, or there are none.
@@ -97,8 +98,9 @@ def find_pictures(paths: Sequence[Path]) -> list[Path]:
     found: list[Path] = []
     for path in paths:
         if path.is_dir():
-            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in KINDS)
+            inside = [p for p in path.iterdir() if p.suffix.lower() in KINDS]
             inside = [p for p in inside if not p.name.startswith(".")]
+            inside.sort(key=lambda p: natural(p.name))
             if not inside:
                 raise SceneError(f"{path} holds no pictures ({', '.join(KINDS)})")
             found += inside

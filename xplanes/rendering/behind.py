@@ -50,7 +50,7 @@ def behind(
     clear = opacity.detach() < 1 - DARK
     if clear.device.type != "cpu":
         # Looking for those few would be waited for.
-        return torch.where(clear[:, None], look(background, origins, directions, jitter), 0)
+        return torch.where(clear[:, None], look(background, origins, directions, jitter, ends), 0)
     seen = clear.nonzero()[:, 0]
     place = None if jitter is None else jitter[seen]
     colour = look(background, origins[seen], directions[seen], place, ends)

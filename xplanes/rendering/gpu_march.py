@@ -109,7 +109,7 @@ def not_hidden(least, cell, wanted, step, limit, depth, opaque, LIMITED: tl.cons
     return kept, depth
 
 
-@triton.jit(do_not_specialize=["rays", "size", "bins", "finest"])
+@triton.jit(do_not_specialize=["rays", "size", "bins", "finest", "room"])
 def march(
     origins,
     directions,

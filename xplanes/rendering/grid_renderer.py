@@ -137,6 +137,9 @@ class GridRenderer(RayRenderer):
         )
         opacity = total[:, 3]
         background = behind(field, origins, directions, opacity, background, jitter)
+        if samples.shown is not None:
+            # A ray without room sees nothing but the background, which must not learn from it.
+            background = torch.where(samples.shown[:, None], background, background.detach())
         return GridRendering(
             colour=total[:, :3] + (1 - opacity)[:, None] * background,
             opacity=opacity,

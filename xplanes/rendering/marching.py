@@ -313,7 +313,7 @@ def _kernels_hold(device: torch.device, dtype: torch.dtype) -> bool:
         origins = 2 * waves(device, 50, 3)
         ahead = 0.9 * waves(device, 57, 3)[7:] - origins
         directions = torch.nn.functional.normalize(ahead, dim=-1)
-        times, jitter = waves(device, 2, 50).abs()
+        times, jitter = (numbers.clone() for numbers in waves(device, 2, 50).abs())
         rays = [t.to(precision) for t in (origins, directions, times, jitter)]
         occupied = waves(device, len(grid.least)) > 0
         found = function(

@@ -101,12 +101,13 @@ class OccupancyGrid(nn.Module):
         Args:
             cells: Cell of each sample. [N]
             density: Density there. [N]
-            live: Which of them count; all when None. [N]
+            live: Which of them count, the first ones; all when None. [N]
         """
         density = self._usable(density)
         if live is not None:
-            # All others repeat one that counts, which changes nothing.
-            one = live.long().argmax(dim=0, keepdim=True)
+            # The others repeat those that count, which changes nothing. If all repeated the same
+            # one, they would queue to write it.
+            one = torch.arange(len(live), device=live.device) % live.sum().clamp_min(1)
             cells = torch.where(live, cells, cells[one])
             density = torch.where(live, density, density[one])
         before, least = self.density[cells], self.least[cells]

@@ -68,8 +68,12 @@ class Visibility(nn.Module):
             loops.mark_seen(*arrays, LIT, NOW, self.resolution, self.last.numpy())
             return
         lit = 1 - depth_before(weights, ray, starts) > LIT
-        marks = (lit if live is None else lit & live) * NOW
-        self.last.scatter_reduce_(0, self.cells(points), marks.to(torch.uint8), "amax")
+        cells = self.cells(points)
+        if live is not None:
+            # No mark changes nothing anywhere; at one place the others would queue to write it.
+            spread = torch.arange(len(live), device=live.device) % len(self.last)
+            lit, cells = lit & live, torch.where(live, cells, spread)
+        self.last.scatter_reduce_(0, cells, (lit * NOW).to(torch.uint8), "amax")
 
     @torch.no_grad()
     def forget(self) -> None:

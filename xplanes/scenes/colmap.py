@@ -11,8 +11,9 @@ from pathlib import Path, PurePosixPath
 import torch
 
 from xplanes.errors import ConfigError
+from xplanes.files import natural
 from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, read_model
-from xplanes.scenes.errors import SceneError
+from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.listing import (
     Listing,
     MaskUse,
@@ -90,7 +91,14 @@ class ColmapSettings(SceneSettings):
             )
 
     def load(self, splits: Sequence[str]) -> Scene:
-        model = read_model(_model_folder(self.folder, self.model))
+        source = _model_folder(self.folder, self.model)
+        if "test" in splits and not self.test_cameras:
+            # Known before the model and all images are looked at.
+            raise MissingSplitError(
+                f"{source} has no test split. Name the folders of some cameras in "
+                "data.test_cameras, or choose another data.eval_split."
+            )
+        model = read_model(source)
         listing, points = self._listing(model)
         chosen = picked(
             self._parts(listing),
@@ -295,7 +303,7 @@ def _ranks(names: Sequence[str], present: set[str]) -> list[float]:
     places: dict[str, float] = {}
     for inside in folders.values():
         # frame_10 comes after frame_9.
-        inside.sort(key=_natural)
+        inside.sort(key=natural)
         places |= {name: place for place, name in enumerate(inside)}
     counts = {len(folders[_camera(name)]) for name in names}
     if len(counts) > 1:
@@ -305,11 +313,6 @@ def _ranks(names: Sequence[str], present: set[str]) -> list[float]:
             *(min(counts), max(counts)),
         )
     return [places[name] for name in names]
-
-
-def _natural(name: str) -> list[str | int]:
-    """A name as text and numbers in turns."""
-    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 def _listed_times(path: Path, names: Sequence[str]) -> list[float]:

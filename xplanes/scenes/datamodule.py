@@ -19,7 +19,7 @@ from xplanes.files import read_json
 from xplanes.scenes.batches import Batch, Batches, DeviceBatches, RayBatches, RaySettings
 from xplanes.scenes.errors import MissingSplitError
 from xplanes.scenes.frame import scene_frame
-from xplanes.scenes.listing import held_out_places
+from xplanes.scenes.listing import even_ranks, held_out_places
 from xplanes.scenes.source import HELD_OUT, SceneSettings, may_hold_out
 from xplanes.scenes.views import Scene, Views
 
@@ -190,16 +190,17 @@ class SceneDataModule(LightningDataModule):
             return
         chosen = torch.zeros(len(train), dtype=torch.bool)
         times, order = train.times.sort(stable=True)
-        chosen[order[held_out_places(times.tolist(), HELD_OUT)]] = True
+        places = held_out_places(times.tolist(), HELD_OUT)
+        if (most := self.settings.eval_views) is not None:
+            places = [places[rank] for rank in even_ranks(min(most, len(places)), len(places))]
+        chosen[order[places]] = True
         parts = {
             "train": train.subset((~chosen).nonzero()[:, 0]),
             "val": train.subset(chosen.nonzero()[:, 0]),
         }
-        video = self.scene.video
-        if video is not None and (shared := set(video.files) & set(parts["val"].files)):
-            kept = [index for index, file in enumerate(video.files) if file not in shared]
-            video = video.subset(torch.tensor(kept))
-        self._scene = replace(self.scene, splits=self.scene.splits | parts, video=video)
+        shared = set(parts["val"].files)
+        video, cut = (_without(views, shared) for views in (self.scene.video, self.scene.cut))
+        self._scene = replace(self.scene, splits=self.scene.splits | parts, video=video, cut=cut)
         self._batches = {}  # Those before held all of them.
         self.held_out = len(parts["val"])
 
@@ -313,6 +314,14 @@ class _GivenScene(SceneSettings):
         raise MissingSplitError(
             f"{self.scene}: there are no splits {', '.join(splits)} in this scene"
         )
+
+
+def _without(views: Views | None, files: set[str]) -> Views | None:
+    """Views but for those of some files; None if none are left."""
+    if views is None or files.isdisjoint(views.files):
+        return views
+    kept = [index for index, file in enumerate(views.files) if file not in files]
+    return views.subset(torch.tensor(kept)) if kept else None
 
 
 def found_root(run: Path, root: str) -> str:

@@ -27,6 +27,9 @@ FARTHEST = 1e15
 ROUNDING = 1e-4
 """Largest rounding error of camera positions in single precision, as a share of their extent."""
 
+STILL = 1e-4
+"""World units by which the positions of a fixed camera differ at most."""
+
 SHORTEST, LONGEST = 1e-3, 1e5
 """Smallest and largest focal length, in sizes of the image."""
 
@@ -166,8 +169,12 @@ class Listing:
                 f"{total}, or null for all."
             )
         by_time = self.times.argsort(stable=True).tolist()
-        ranks = [round(i * (total - 1) / max(count - 1, 1)) for i in range(count)]
-        return self.subset(sorted(by_time[rank] for rank in ranks))
+        return self.subset(sorted(by_time[rank] for rank in even_ranks(count, total)))
+
+
+def even_ranks(count: int, total: int) -> list[int]:
+    """``count`` of ``total`` ranks, evenly spread, the first and the last among them."""
+    return [round(i * (total - 1) / max(count - 1, 1)) for i in range(count)]
 
 
 def held_out_places(times: Sequence[float], every: int) -> list[int]:
@@ -635,7 +642,8 @@ def require_precision(source: Path, positions: np.ndarray) -> None:
     """
     extent = float(np.ptp(positions, axis=0).max())
     largest = float(np.abs(positions).max())
-    room = ROUNDING * extent / float(np.finfo(np.float32).eps) if extent > 0 else FARTHEST
+    still = extent <= STILL
+    room = FARTHEST if still else ROUNDING * extent / float(np.finfo(np.float32).eps)
     if not largest <= min(room, FARTHEST):
         raise SceneError(
             f"{source}: the cameras lie up to {largest:.3g} world units from the origin and "

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from xplanes.errors import ConfigError
+from xplanes.files import natural
 from xplanes.scenes import store, videos
 from xplanes.scenes.colmap_model import MODELS, find_model, read_model
 from xplanes.scenes.errors import MissingSplitError, SceneError
@@ -195,6 +196,7 @@ def read_multicamera(
     watched = _video_camera(cameras, parts, video_camera)
     recordings = [_recording(camera) for camera in cameras]
     _require_one_rate(recordings)
+    _require_same_frames(recordings)
     numbers = _frame_numbers(folder, recordings, frames)
     whole = _read_views(recordings, numbers, resolution, cache)
     count = len(numbers)
@@ -441,7 +443,7 @@ def _recording(camera: Camera) -> Recording:
             for path in camera.source.iterdir()
             if path.suffix.lower() in SUFFIXES[1:] and not path.name.startswith(".")
         ),
-        key=lambda path: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", path.name)],
+        key=lambda path: natural(path.name),
     )
     if not images:
         raise SceneError(
@@ -468,6 +470,30 @@ def _require_one_rate(recordings: Sequence[Recording]) -> None:
                 f"{timed[0][1]:g}: frames of one number are not of one time. Encode all videos at "
                 f"one rate: ffmpeg -i {camera.source.name} -r {timed[0][1]:g} NEW.mp4"
             )
+
+
+def _require_same_frames(recordings: Sequence[Recording]) -> None:
+    """Refuse folders of numbered images of which a camera lacks some in the middle.
+
+    Frames that follow the missing one would be those of earlier times in other cameras. Where
+    cameras begin to count is up to them, and some may have stopped early.
+    """
+    first: tuple[Recording, list[int]] | None = None
+    for recording in recordings:
+        found = [re.findall(r"\d+", path.stem) for path in recording.images or ()]
+        if not found or not all(found):
+            continue
+        numbers = [int(digits[-1]) - int(found[0][-1]) for digits in found]
+        first = first or (recording, numbers)
+        for place, (number, other) in enumerate(zip(numbers, first[1], strict=False)):
+            if number != other:
+                paths = [r.images[place] for r in (recording, first[0]) if r.images]
+                raise SceneError(
+                    f"{recording.camera.source}: image number {place + 1} is {paths[0].name}, but "
+                    f"{paths[1].parent.name}/{paths[1].name} in {first[0].camera.name}. One of the "
+                    "cameras lacks a frame before it, and frames must be of one time: add it, or "
+                    "take the frame out of all cameras."
+                )
 
 
 def _frame_numbers(

@@ -131,7 +131,9 @@ def _listed_splits(
                     f"{path}: {key} names {name}, which no frame shows. Add the frame, or take the "
                     "name out."
                 )
-            if (other := owner.setdefault(places[image], key)) != key:
+            # Validation and test views may be the same ones.
+            other = owner.setdefault(places[image], key)
+            if other != key and "train_filenames" in (other, key):
                 raise SceneError(
                     f"{path}: {name} is in {other} and in {key}. Views that are scored must not be "
                     "trained on: take it out of one of them."

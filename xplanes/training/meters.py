@@ -22,7 +22,10 @@ class Meters:
         self._known: dict[str, float] = {}
 
     def add(self, values: Mapping[str, Tensor | float]) -> None:
-        """Add what a batch shows: the same names each time, numbers or tensors without axes."""
+        """Add what a batch shows: numbers or tensors without axes.
+
+        Each time the same names, and tensors of the same types.
+        """
         by_type: dict[torch.dtype, dict[str, Tensor]] = {}
         for name, value in values.items():
             if isinstance(value, Tensor):

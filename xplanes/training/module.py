@@ -357,7 +357,7 @@ class RadianceModule(LightningModule):
         if self.between_updates:
             values["skipped"] = self._update_by_flag(optimizer, state)
         else:
-            values["skipped"] = 0
+            values["skipped"] = torch.zeros_like(bad)
         self._meters.add(values)
         if due(self.batches) or self._logs_now:
             self._read_meters()

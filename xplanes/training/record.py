@@ -21,7 +21,8 @@ logger = logging.getLogger(__name__)
 
 KEPT = """model.name lrm.name model.sampler.name data.name data.scene data.seed data.resolution
 data.views data.train_views data.train_on_video data.static data.half_side data.eval_split
-data.eval_every data.test_cameras data.frames data.protocol data.mask_use""".split()
+data.eval_every data.test_cameras data.frames data.protocol data.masks data.mask_use data.model
+data.images data.orient data.times data.time_pattern""".split()
 """Settings on which the planes, their frame and what they show depend. Files may have moved."""
 
 
@@ -38,7 +39,8 @@ def require_same_settings(run: Path, before: Mapping[str, Any], now: Mapping[str
     """
     for key in KEPT:
         was, wanted = (_value(content, key) for content in (before, now))
-        if was is not None and wanted is not None and was != wanted:
+        if _ABSENT not in (was, wanted) and was != wanted:
+            was, wanted = ("null" if value is None else value for value in (was, wanted))
             raise ConfigError(
                 f"resume={run} with {key}={wanted}: its checkpoint was trained with {key}={was}. "
                 "Leave it out, or train anew in another folder"
@@ -65,9 +67,13 @@ def require_same_views(run: Path, record: Mapping[str, Any], views: Views) -> No
         )
 
 
+_ABSENT = object()
+"""Stands for a setting that a configuration lacks; one that is null is there."""
+
+
 def _value(content: Any, key: str) -> Any:
     for name in key.split("."):
-        content = content.get(name) if isinstance(content, Mapping) else None
+        content = content.get(name, _ABSENT) if isinstance(content, Mapping) else _ABSENT
     return content
 
 

@@ -32,6 +32,7 @@ from xplanes.models.base import LossTerm
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.encode import encode
 from xplanes.rendering.behind import behind
+from xplanes.rendering.box import ray_box
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes import batches
 from xplanes.scenes.batches import DeviceBatches
@@ -210,14 +211,25 @@ def test_a_background_is_the_same_without_a_list_of_rays(fake_gpu):
     opacity = torch.rand(12, generator=generator)
     opacity[:4] = 1
     field = SimpleNamespace(background=background)
-    here = behind(field, origins, directions, opacity, None)
+    box = functools.partial(ray_box, half=0.6)
+    found = [behind(field, origins, directions, opacity, None, ends=e) for e in (ray_box, box)]
+    assert not torch.allclose(*found)  # It begins where rays leave the field's box.
     field.background = background.to(fake_gpu)
     rays = [part.to(fake_gpu) for part in (origins, directions, opacity)]
-    with fake_device.counted() as counts:
-        there = behind(field, *rays, None)
-    assert counts.totals[1:] == (0, 0)
-    torch.testing.assert_close(there.cpu(), here)
-    assert (here[:4] == 0).all()
+    for ends, here in zip((ray_box, box), found, strict=True):
+        with fake_device.counted() as counts:
+            there = behind(field, *rays, None, ends=ends)
+        assert counts.totals[1:] == (0, 0)
+        torch.testing.assert_close(there.cpu(), here)
+        assert (here[:4] == 0).all()
+
+
+def test_loss_and_psnr_are_means_of_all_batches_whose_gradients_add_up(fake_gpu):
+    module, _, _ = trained("six", 8, "model.rays.accumulate=2")
+    assert module.batches == 16
+    alone, _, _ = trained("six", 8)
+    assert module.last["loss"] == pytest.approx(alone.last["loss"], rel=0.3)
+    assert module.last["psnr"] == pytest.approx(alone.last["psnr"], abs=1.5)
 
 
 def test_warming_up_does_all_of_a_step_and_changes_nothing(fake_gpu):

@@ -384,9 +384,7 @@ def test_views_are_held_out_by_time_and_by_camera(tmp_path):
     capture.refused(
         r"data\.test_cameras=cam3: .*no such folder.*cam1, cam11, cam2", test_cameras=["cam3"]
     )
-    with pytest.raises(
-        MissingSplitError, match=r"has no test split.*data\.test_cameras"
-    ):
+    with pytest.raises(MissingSplitError, match=r"has no test split.*data\.test_cameras"):
         capture.read("test")
     with pytest.raises(MissingSplitError, match="has no train split"):
         capture.read("train", test_cameras=["cam1", "cam2", "cam11"])

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
@@ -18,7 +19,7 @@ from xplanes.evaluation.progress import progress
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.files import replacing, require_writable
 from xplanes.optional import require
-from xplanes.rendering.base import Renderer
+from xplanes.rendering.base import Renderer, leave_empty
 from xplanes.rendering.pictures import colour_map, to_bytes
 from xplanes.scenes.cameras import orbit
 from xplanes.scenes.frame import Frame
@@ -54,6 +55,7 @@ def render_path(
     lens: Lenses | None = None,
     background: Tensor,
     what: str = "colour",
+    shown: Tensor | None = None,
 ) -> Iterator[Tensor]:
     """Render frames along a path of cameras and times, one at a time.
 
@@ -70,6 +72,8 @@ def render_path(
         lens: Lens of these frames; a pinhole when None.
         background: Colour behind the scene. [3]
         what: ``colour``, or ``depth`` as colours whose scale is the same in all frames.
+        shown: Pixels that the lens has rays for, the others stay empty; all when None. bool
+            [rows, columns]
 
     Yields:
         Pictures. uint8 [rows, columns, 3]
@@ -79,6 +83,8 @@ def render_path(
     for pose, each, time in zip(poses, focals, times.tolist(), strict=True):
         camera = PosedCamera(pose, each, rows, columns, centre, lens)
         image = renderer.view(field, frame, camera, time, background)
+        if shown is not None:
+            leave_empty(image, ~shown, background)
         picture = image["colour"]
         if what == "depth":
             picture = _depth(image, float(frame.points(pose[:3, 3]).norm()))
@@ -365,9 +371,10 @@ def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = N
         lens=distortion,
         background=trained.scene.background,
         what=options.what,
+        shown=pixels_with_rays(trained.scene.splits, options.path, size),
     )
-    shown = progress(frames, options.count, "frames")
-    return write_video(target, shown, fps=options.rate, folder=folder)
+    counted = progress(frames, options.count, "frames")
+    return write_video(target, counted, fps=options.rate, folder=folder)
 
 
 def check_out(out: str | None, options: VideoOptions) -> None:
@@ -433,6 +440,23 @@ def lens(
     if own is not None:
         own = replace(own, skew=own.skew * scale[0])
     return intrinsics.focal[index] * scale, intrinsics.centre[index] * scale, own
+
+
+def pixels_with_rays(splits: dict[str, Views], path: str, size: tuple[int, int]) -> Tensor | None:
+    """Pixels of a picture that its lens has rays for; None for all. bool [rows, columns]
+
+    Args:
+        splits: The views of the scene.
+        path: As in `VideoOptions`.
+        size: Rows and columns of the pictures.
+    """
+    if not path.startswith("view:"):
+        return None
+    views, index = find_view(splits, path.removeprefix("view:"))
+    known = views.intrinsics.has_ray(index)
+    if known is None:
+        return None
+    return F.interpolate(known[None, None].float(), size, mode="nearest-exact")[0, 0] > 0
 
 
 def view_pose(splits: dict[str, Views], name: str) -> Tensor:

@@ -666,7 +666,7 @@ def throughput(row: str, *overrides: str, **options: Any) -> Part:
 
 
 NONE, TINY, NINE = "lrm=none", "lrm=tiny", "model=nine_planes"
-SMALL = ("model.rays.per_batch=1024", "model.rays.samples_per_batch=8192")
+SMALL = ("model.rays.per_batch=1365", "model.rays.samples_per_batch=8192")
 """The CPU's batch; on a GPU X-Planes has a larger one of its own."""
 LOOKS = [round(second / LEGO_SECONDS, 4) for second in (1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 45)]
 LEGO = (

@@ -300,9 +300,9 @@ def test_a_static_scene_has_no_other_times():
 def test_batches_of_open_size_follow_the_device():
     cpu, gpu = torch.device("cpu"), torch.device("cuda")
     left_open = replace(SETTINGS, per_batch="auto", samples_per_batch="auto")
-    assert (left_open.most, left_open.most_samples) == (1024, 8192)
+    assert (left_open.most, left_open.most_samples) == (1365, 8192)
     assert left_open.on(cpu) is left_open
-    assert len(batches_of(per_batch="auto").draw(0)["times"]) == 1024
+    assert len(batches_of(per_batch="auto").draw(0)["times"]) == 1365
     large = left_open.on(gpu)
     assert (large.per_batch, large.samples_per_batch) == (32768, 524288)
     assert (large.fitting(256, 4096), left_open.fitting(256, 4096)) == (32768, 512)

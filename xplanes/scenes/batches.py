@@ -50,7 +50,7 @@ LARGEST_SHARE = 0.25
 AHEAD = 8
 """Batches whose tiles the system is told to read in advance."""
 
-CPU_RAYS, CPU_SAMPLES = 1024, 8192
+CPU_RAYS, CPU_SAMPLES = 1365, 8192
 """Largest batch on the CPU where the settings leave it open; schedules in steps are made for it."""
 
 GPU_RAYS, GPU_SAMPLES = 2**15, 2**19
@@ -119,8 +119,8 @@ class BatchSettings(Settings, ABC):
 class RaySettings(BatchSettings):
     """Which rays a training step gets."""
 
-    # Maximum number of rays per batch. auto: 1024 on the CPU, 32768 on a GPU, where schedules of
-    # X-Planes and of the occupancy grid take 1/32 of their steps.
+    # Maximum number of rays per batch. auto: 1365 on the CPU, 32768 on a GPU, where schedules of
+    # X-Planes and of the occupancy grid take 1/24 of their steps.
     per_batch: Count | Literal["auto"]
     # Maximum number of samples per batch, on average. auto: 8192 on the CPU, 524288 on a GPU.
     samples_per_batch: Count | Literal["auto"]

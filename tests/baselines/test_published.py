@@ -61,6 +61,8 @@ OURS = (
     "model.rays.samples_per_batch=auto",
     "model.rays.skip_background=true",
     "model.rays.background=white",
+    "model.rays.background_share=0.4",
+    "model.rays.background_jitter=0.1",
 )
 """The rays of X-Planes, for models that bring others."""
 

@@ -9,6 +9,7 @@ import pytest
 
 from tests import warm
 from xplanes.cli import main
+from xplanes.errors import DeviceError, GaussianError
 
 
 def python(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -27,6 +28,16 @@ def test_help_loads_nothing_heavy(tmp_path):
     assert done.returncode == 0, done.stderr
     for verb in ("download", "triplanes", "evaluate", "render", "view", "table"):
         assert verb in done.stdout
+
+
+def test_the_error_of_a_quick_command_waits_for_nothing_heavy(tmp_path):
+    code = (
+        "import sys; from xplanes.cli import _known_errors; _known_errors();"
+        "heavy = {'lightning', 'xplanes.pipeline'} & set(sys.modules);"
+        "sys.exit(f'loaded {heavy}' if heavy else 0)"
+    )
+    done = python("-c", code, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
 
 
 def test_evaluate_as_a_program(trained_run: Path, tmp_path: Path):
@@ -117,6 +128,18 @@ def test_other_errors_keep_their_traceback(trained_run: Path, monkeypatch):
     monkeypatch.setattr(runs, "load_run", broken)
     with pytest.raises(ZeroDivisionError):
         main(["evaluate", str(trained_run)])
+
+
+@pytest.mark.parametrize("kind", [DeviceError, GaussianError])
+def test_what_happens_while_rendering_is_one_line_too(kind, trained_run: Path, monkeypatch, capsys):
+    from xplanes.evaluation import runs
+
+    def broken(*_: object, **__: object) -> None:
+        raise kind("what, and the way out")
+
+    monkeypatch.setattr(runs, "load_run", broken)
+    assert main(["evaluate", str(trained_run)]) == 1
+    assert capsys.readouterr().err == "error: what, and the way out\n"
 
 
 def test_the_view_ends_with_ctrl_c(trained_run: Path, monkeypatch, capsys):

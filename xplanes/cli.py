@@ -55,9 +55,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _known_errors() -> tuple[type[Exception], ...]:
     """Errors that are reported without a traceback."""
-    from xplanes.pipeline import KNOWN_ERRORS
+    # Not those of the pipeline: its imports would hold back the message of a quick command.
+    from xplanes.errors import ConfigError, DeviceError, GaussianError
+    from xplanes.files import StorageError
+    from xplanes.lrm.errors import LRMError
+    from xplanes.optional import MissingExtraError
+    from xplanes.scenes.errors import SceneError
 
-    return *KNOWN_ERRORS, PermissionError
+    settings = ConfigError, SceneError, LRMError, MissingExtraError
+    return *settings, StorageError, PermissionError, DeviceError, GaussianError
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -7,3 +7,7 @@ class ConfigError(ValueError):
 
 class DeviceError(RuntimeError):
     """A device that does not work any more; the message names what it was doing and the way out."""
+
+
+class GaussianError(ValueError):
+    """Gaussians that cannot be drawn; the message names the tensor and the Gaussian."""

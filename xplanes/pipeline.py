@@ -15,7 +15,7 @@ from lightning import seed_everything
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from xplanes.backend import warm_up
-from xplanes.errors import ConfigError, DeviceError
+from xplanes.errors import ConfigError, DeviceError, GaussianError
 from xplanes.evaluation.findings import camera_findings, opaque_findings
 from xplanes.evaluation.published import check_published
 from xplanes.evaluation.render import orbit_poses, render_path, video_times, write_video
@@ -36,7 +36,6 @@ from xplanes.lrm import LRMError
 from xplanes.models.initialisation import Initialisation, Place
 from xplanes.optional import MissingExtraError
 from xplanes.process import resume_command
-from xplanes.rendering.gaussians.rasteriser import GaussianError
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame

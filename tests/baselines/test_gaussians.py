@@ -12,7 +12,7 @@ import torch
 from tests.baselines.runs import baseline_config
 from tests.synthetic import ball_scene, ball_views
 from xplanes.config import compose_plain
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, GaussianError
 from xplanes.evaluation.export import ExportOptions, export, write_gaussians
 from xplanes.fields.gaussians import Gaussians, HexPlaneGaussians, PointCloud, neighbour_distance
 from xplanes.fields.products import PlaneProducts
@@ -23,7 +23,7 @@ from xplanes.models.initialisation import Method
 from xplanes.preparation.fixed_view import rendering_method
 from xplanes.rendering.gaussians.camera import Camera
 from xplanes.rendering.gaussians.harmonics import spherical_harmonics
-from xplanes.rendering.gaussians.rasteriser import GaussianError, rasterise
+from xplanes.rendering.gaussians.rasteriser import rasterise
 from xplanes.rendering.gaussians.renderer import GaussianRenderer, camera_in
 from xplanes.rendering.sampler import Site
 from xplanes.scenes.batches import ViewBatches, ViewSettings

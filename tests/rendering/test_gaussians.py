@@ -9,12 +9,13 @@ import torch
 
 from tests import gaussian_oracle as oracle
 from xplanes.backend import threads
+from xplanes.errors import GaussianError
 from xplanes.optional import MissingExtraError
 from xplanes.rendering.gaussians import cuda
 from xplanes.rendering.gaussians.camera import Camera
 from xplanes.rendering.gaussians.cpu import _power
 from xplanes.rendering.gaussians.harmonics import spherical_harmonics
-from xplanes.rendering.gaussians.rasteriser import GaussianError, rasterise
+from xplanes.rendering.gaussians.rasteriser import rasterise
 from xplanes.scenes.cameras import camera_around, project
 
 NAMES = ("means", "quaternions", "scales", "opacities", "colours")

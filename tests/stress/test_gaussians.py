@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from tests import gaussian_oracle as oracle
 from tests.stress.references import worst
+from xplanes.errors import GaussianError
 from xplanes.rendering.gaussians.camera import Camera
-from xplanes.rendering.gaussians.rasteriser import GaussianError, rasterise
+from xplanes.rendering.gaussians.rasteriser import rasterise
 
 pytestmark = pytest.mark.stress
 

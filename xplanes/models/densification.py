@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from xplanes.errors import GaussianError
 from xplanes.fields.gaussians import Gaussians
-from xplanes.rendering.gaussians.rasteriser import GaussianError
 from xplanes.rendering.gaussians.reference import rotations
 from xplanes.settings import Count, Positive, Settings, Share, Steps
 

@@ -10,16 +10,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from xplanes.backend import compiled, cpu_loops
+from xplanes.errors import GaussianError
 from xplanes.rendering.gaussians import cuda
 from xplanes.rendering.gaussians.camera import Camera
 from xplanes.rendering.gaussians.reference import blend, project
 
 MOST = 2**24
 """Places in a list that float32 tells apart."""
-
-
-class GaussianError(ValueError):
-    """Gaussians that cannot be drawn; the message names the tensor and the Gaussian."""
 
 
 @dataclass(frozen=True)

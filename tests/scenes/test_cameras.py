@@ -7,9 +7,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.oracles import project
-from xplanes.scenes.cameras import focal_length, look_at, orbit, pixel_rays
+from xplanes.scenes.cameras import cast_rays, focal_length, look_at, orbit, pixel_rays
+from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import camera_rays
 
 EYE = torch.eye(4)
@@ -118,3 +120,34 @@ def test_orbit_is_a_circle_that_starts_at_minus_y():
     assert offset[2].tolist() == pytest.approx([math.sqrt(3), 0, 1], abs=1e-6)
     assert orbit(0, radius=1.0, elevation=0.0).shape == (0, 4, 4)
     assert orbit(1, radius=1.0, elevation=90.0).isfinite().all()
+
+
+class _Operations(TorchDispatchMode):
+    """Takes down the names of all operations."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: set[str] = set()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.names.add(func.overloadpacket.__name__)
+        return func(*args, **(kwargs or {}))
+
+
+def test_rays_are_turned_without_matrix_products_which_a_gpu_may_round() -> None:
+    generator = torch.Generator().manual_seed(0)
+    poses = torch.eye(4).repeat(50, 1, 1)
+    poses[:, :3, :3] = torch.linalg.qr(torch.randn(50, 3, 3, generator=generator)).Q
+    frame = Frame(0.3, poses[0, :3, :3], torch.tensor([1.0, -2.0, 0.5]))
+    rows, columns = (torch.rand(50, generator=generator) * 40 for _ in range(2))
+    pinhole = {"focal": (40.0, 30.0), "centre": (20.0, 20.0)}
+    with _Operations() as seen:
+        origins, directions = frame.rays(*cast_rays(poses, rows, columns, **pinhole))
+        back = frame.to_world(origins)
+    assert not seen.names & {"mm", "bmm", "addmm", "baddbmm", "matmul", "einsum"}, seen.names
+    assert "addcmul_" in seen.names
+    local = cast_rays(torch.eye(4), rows, columns, **pinhole)[1].double()
+    turns = frame.rotation.double() @ poses[:, :3, :3].double()
+    exact = (turns @ local[..., None])[..., 0]
+    torch.testing.assert_close(directions.double(), exact, atol=5e-7, rtol=0)
+    torch.testing.assert_close(back, poses[:, :3, 3], atol=2e-6, rtol=0)

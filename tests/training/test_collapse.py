@@ -18,7 +18,8 @@ from xplanes.training import collapse
 from xplanes.training.checkpoints import Checkpoints
 from xplanes.training.collapse import CollapseWatch, verdict
 from xplanes.training.evaluation import blank_psnr, floaters, psnr_thing
-from xplanes.training.module import RadianceModule, mean_opacities
+from xplanes.training.meters import mean_opacities
+from xplanes.training.module import RadianceModule
 
 QUICK = ("trainer.max_steps=24", "callbacks.evaluation.at=[]", "callbacks.checkpoints.every=14")
 

@@ -19,15 +19,14 @@ from xplanes.models.x_planes import XPlanesModel
 from xplanes.pipeline import run
 from xplanes.training.checkpoints import find_resumable
 from xplanes.training.clock import TrainingClock
-from xplanes.training.module import (
-    RadianceModule,
-    TrainingError,
+from xplanes.training.finite import (
     all_usable,
     not_finite,
     unusable_gradients,
     usable,
     usable_together,
 )
+from xplanes.training.module import RadianceModule, TrainingError
 
 FEW = ("trainer.max_steps=12", "callbacks.checkpoints.every=5", "callbacks.evaluation.at=[]")
 SCORED = (*FEW, "callbacks.evaluation.at=[0.4]")

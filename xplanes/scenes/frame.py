@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from xplanes.scenes.cameras import cast_rays, project
+from xplanes.scenes.cameras import cast_rays, project, turned
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.views import Views
 
@@ -52,15 +52,15 @@ class Frame:
 
     def points(self, world: Tensor) -> Tensor:
         """World points in the field's frame. [..., 3]"""
-        return self.scale * (world - self.centre) @ self.rotation.T
+        return turned(self.scale * (world - self.centre), self.rotation)
 
     def rays(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Rays in the field's frame; directions keep their length. [R, 3], [R, 3]"""
-        return self.points(origins), directions @ self.rotation.T
+        return self.points(origins), turned(directions, self.rotation)
 
     def to_world(self, points: Tensor) -> Tensor:
         """Points of the field's frame in the world. [..., 3]"""
-        return points @ self.rotation / self.scale + self.centre
+        return turned(points, self.rotation.T) / self.scale + self.centre
 
 
 def frame_content(frame: Frame) -> dict[str, Any]:

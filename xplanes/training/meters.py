@@ -1,9 +1,12 @@
-"""What training steps on a GPU show, added up there and read now and then."""
+"""What training steps show: opacities, and sums on a GPU that are read now and then."""
 
 from collections.abc import Mapping
 
 import torch
 from torch import Tensor
+
+from xplanes.rendering.base import Rendering
+from xplanes.scenes.batches import Batch
 
 EVERY = 32
 """Batches from one look at the sums to the next; at first the gaps are shorter."""
@@ -46,3 +49,24 @@ class Meters:
             found = found | dict(zip(names, total.tolist(), strict=True))
         self._sums, self._known = {}, {}
         return found
+
+
+def mean_opacities(rendering: Rendering, rays: Batch) -> dict[str, Tensor]:
+    """Mean opacity of rays that must show something, and of those that must not; NaN for none.
+
+    The former are opaque and of another colour than the background; the latter are transparent.
+    Rays that were left out do not count.
+    """
+    opacity = rendering.opacity.detach()
+    far = (rays["target"] - rays["background"]).abs().amax(dim=-1) > 0.2
+    which = {"foreground": far & (rays["alpha"] > 0.5), "background": rays["alpha"] == 0}
+    if opacity.device.type == "cpu":
+        return {name: opacity[chosen].mean() for name, chosen in which.items()}
+    shown: Tensor | None = getattr(rendering.samples, "shown", None)
+    both = which if shown is None else {name: some & shown for name, some in which.items()}
+    return {name: masked_mean(opacity, some) for name, some in both.items()}
+
+
+def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Mean of some values, without a list of which; NaN for none. [N], bool [N] -> []"""
+    return values.mean() if mask is None else (values * mask).sum() / mask.sum()

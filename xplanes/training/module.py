@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -26,7 +26,8 @@ from xplanes.scenes.frame import Frame, frame_content, read_frame
 from xplanes.scenes.views import Scene
 from xplanes.streams import TrainingState
 from xplanes.training.clock import training_seconds
-from xplanes.training.meters import Meters, due
+from xplanes.training.finite import all_usable, not_finite, unusable_gradients
+from xplanes.training.meters import Meters, due, masked_mean, mean_opacities
 
 ANOTHER_SEED = 1_000_003
 """Added to the seed of a field that begins anew."""
@@ -40,7 +41,6 @@ those whose gradients reached the field, and rays left out for want of room on a
 
 DROPPED = ("candidates", "empty", "occluded")
 """Numbers of samples before some are dropped."""
-
 
 OPACITIES = 5
 """Batches from one look at the rays' opacity to the next."""
@@ -757,27 +757,6 @@ def _precision(settings: ModelSettings, device: torch.device) -> str:
     return settings.precision
 
 
-def mean_opacities(rendering: Rendering, rays: Batch) -> dict[str, Tensor]:
-    """Mean opacity of rays that must show something, and of those that must not; NaN for none.
-
-    The former are opaque and of another colour than the background; the latter are transparent.
-    Rays that were left out do not count.
-    """
-    opacity = rendering.opacity.detach()
-    far = (rays["target"] - rays["background"]).abs().amax(dim=-1) > 0.2
-    which = {"foreground": far & (rays["alpha"] > 0.5), "background": rays["alpha"] == 0}
-    if opacity.device.type == "cpu":
-        return {name: opacity[chosen].mean() for name, chosen in which.items()}
-    shown: Tensor | None = getattr(rendering.samples, "shown", None)
-    both = which if shown is None else {name: some & shown for name, some in which.items()}
-    return {name: masked_mean(opacity, some) for name, some in both.items()}
-
-
-def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
-    """Mean of some values, without a list of which; NaN for none. [N], bool [N] -> []"""
-    return values.mean() if mask is None else (values * mask).sum() / mask.sum()
-
-
 def require_field(model: Model) -> Representation:
     """The field of a model, if it is one.
 
@@ -823,43 +802,3 @@ def require_groups(model: Model, sampler: Sampler) -> None:
 def _takes_flags(optimizer: torch.optim.Optimizer) -> bool:
     """Whether an optimiser leaves a step out where a tensor says so, as fused Adam does."""
     return bool(getattr(optimizer, "_step_supports_amp_scaling", False))
-
-
-NamedTensors = Iterable[tuple[str, Tensor]]
-
-
-def usable(gradient: Tensor) -> bool:
-    """Whether an optimiser can take in a gradient: the sum of its squares is finite.
-
-    Adam keeps the squares. One that overflows its type would stay infinite for ever and hold its
-    parameter where it is, without a NaN anywhere.
-    """
-    if gradient.is_contiguous():
-        flat = gradient.view(-1)
-        return bool(torch.dot(flat, flat).isfinite())
-    return bool(torch.linalg.vector_norm(gradient).isfinite())
-
-
-def all_usable(parameters: Iterable[nn.Parameter]) -> bool:
-    """Whether all gradients are `usable`; one pass over each, and one wait for the device."""
-    gradients = [p.grad for p in parameters if p.grad is not None]
-    if not gradients or gradients[0].device.type == "cpu":
-        return all(usable(gradient) for gradient in gradients)
-    return usable_together(gradients)
-
-
-def usable_together(gradients: Iterable[Tensor]) -> bool:
-    """Whether all of some gradients, at least one, are `usable`, with one wait for the device."""
-    norms = [torch.linalg.vector_norm(gradient, dtype=torch.float32) for gradient in gradients]
-    return bool(torch.stack(norms).square().isfinite().all())
-
-
-def unusable_gradients(named: Iterable[tuple[str, nn.Parameter]]) -> list[str]:
-    """Names of the parameters whose gradient is not `usable`."""
-    return [name for name, p in named if p.grad is not None and not usable(p.grad)]
-
-
-def not_finite(named: NamedTensors) -> list[str]:
-    """Names of the tensors that hold a NaN or an infinity."""
-    # NaN and infinity survive a product with 0 as NaN; the sum of finite numbers may overflow.
-    return [name for name, tensor in named if not bool((tensor.detach() * 0).sum() == 0)]

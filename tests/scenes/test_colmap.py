@@ -25,9 +25,9 @@ from xplanes.errors import ConfigError
 from xplanes.scenes.cameras import cast_rays
 from xplanes.scenes.colmap import ColmapSettings
 from xplanes.scenes.colmap_model import LENSES, read_model
+from xplanes.scenes.entries import require_precision
 from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses
-from xplanes.scenes.listing import require_precision
 from xplanes.scenes.source import SceneSettings
 
 PYCOLMAP = Path(__file__).parents[1] / "data" / "colmap"

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from xplanes.scenes.entries import checked_pose, is_number, is_positive, read_object, short
 from xplanes.scenes.errors import SceneError
-from xplanes.scenes.listing import checked_pose, is_number, is_positive, read_object, short
 from xplanes.scenes.views import Views
 
 

@@ -13,24 +13,26 @@ import torch
 from xplanes.errors import ConfigError
 from xplanes.files import natural
 from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, read_model
+from xplanes.scenes.entries import (
+    image_path,
+    is_number,
+    mask_files,
+    oriented,
+    refuse_repeats,
+    require_precision,
+    short,
+    some,
+    unit_times,
+)
 from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.listing import (
     Listing,
     MaskUse,
     held_out,
-    image_path,
-    is_number,
-    mask_files,
-    oriented,
     picked,
     read_splits,
-    refuse_repeats,
-    require_precision,
     require_shapes,
-    short,
-    some,
     thinned,
-    unit_times,
 )
 from xplanes.scenes.multicamera import recordings_of_cameras
 from xplanes.scenes.source import SceneSettings

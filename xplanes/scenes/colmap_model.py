@@ -16,9 +16,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from xplanes.scenes.entries import short
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
-from xplanes.scenes.listing import Calibration, short
+from xplanes.scenes.listing import Calibration
 
 LENSES: dict[str, tuple[int, LensModel, str]] = {
     "SIMPLE_PINHOLE": (0, LensModel.PERSPECTIVE, "f cx cy"),

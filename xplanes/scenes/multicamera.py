@@ -22,6 +22,14 @@ from xplanes.errors import ConfigError
 from xplanes.files import natural
 from xplanes.scenes import store, videos
 from xplanes.scenes.colmap_model import MODELS, find_model, read_model
+from xplanes.scenes.entries import (
+    SUFFIXES,
+    checked_pose,
+    is_positive,
+    paths_inside,
+    require_precision,
+    some,
+)
 from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.images import (
     Size,
@@ -34,17 +42,11 @@ from xplanes.scenes.images import (
     shrink,
 )
 from xplanes.scenes.listing import (
-    SUFFIXES,
     Calibration,
     Listing,
-    checked_pose,
     final_intrinsics,
-    is_positive,
-    paths_inside,
-    require_precision,
     require_rays,
     require_shape,
-    some,
     thinned,
 )
 from xplanes.scenes.source import SceneSettings

@@ -10,29 +10,31 @@ from typing import Any
 import numpy as np
 import torch
 
+from xplanes.scenes.entries import (
+    checked_pose,
+    image_path,
+    is_number,
+    is_positive,
+    mask_files,
+    oriented,
+    read_object,
+    refuse_repeats,
+    require_precision,
+    short,
+    some,
+    unit_times,
+)
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.images import native_sizes
 from xplanes.scenes.listing import (
     Calibration,
     Listing,
     MaskUse,
-    checked_pose,
     held_out,
-    image_path,
-    is_number,
-    is_positive,
-    mask_files,
-    oriented,
     picked,
-    read_object,
     read_splits,
-    refuse_repeats,
-    require_precision,
     require_shapes,
-    short,
-    some,
     thinned,
-    unit_times,
 )
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene

@@ -5,16 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from xplanes.scenes.entries import image_path, short
 from xplanes.scenes.errors import MissingSplitError, SceneError
-from xplanes.scenes.listing import (
-    Listing,
-    MaskUse,
-    held_out,
-    image_path,
-    read_splits,
-    short,
-    thinned,
-)
+from xplanes.scenes.listing import Listing, MaskUse, held_out, read_splits, thinned
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.transforms import listing_of, read_frames
 from xplanes.scenes.views import Scene

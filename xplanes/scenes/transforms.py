@@ -11,11 +11,7 @@ import numpy as np
 import torch
 
 from xplanes.scenes.cameras import focal_length
-from xplanes.scenes.errors import SceneError
-from xplanes.scenes.lenses import COEFFICIENTS, LensModel
-from xplanes.scenes.listing import (
-    Calibration,
-    Listing,
+from xplanes.scenes.entries import (
     checked_pose,
     image_path,
     is_number,
@@ -23,10 +19,12 @@ from xplanes.scenes.listing import (
     read_object,
     refuse_repeats,
     require_precision,
-    require_shapes,
     short,
     unit_times,
 )
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.lenses import COEFFICIENTS, LensModel
+from xplanes.scenes.listing import Calibration, Listing, require_shapes
 
 logger = logging.getLogger(__name__)
 

@@ -1,0 +1,281 @@
+"""Names, poses, numbers and times in files of cameras, read and checked."""
+
+import json
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path, PureWindowsPath
+from typing import Any, TypeGuard
+
+import numpy as np
+import torch
+
+from xplanes.scenes.cameras import upright
+from xplanes.scenes.errors import SceneError
+
+SUFFIXES = ("", ".png", ".jpg", ".jpeg")
+RIGID_TOLERANCE = 1e-3
+
+FARTHEST = 1e15
+"""Largest coordinate of a camera; squares of it still fit single precision."""
+
+STILL = 1e-4
+"""World units by which the positions of a fixed camera differ at most."""
+
+ROUNDING = 1e-4
+"""Largest rounding error of camera positions in single precision, as a share of their extent."""
+
+
+def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> Path:
+    """The file that ``name`` stands for, with or without its suffix, inside ``folder``.
+
+    Args:
+        label: The file and frame that name it, for messages.
+        folder: The scene's folder, with its links resolved.
+        name: Name relative to ``folder``.
+        key: The key that holds the name.
+
+    Raises:
+        SceneError: If it is no name, leaves the folder, or there is no such file.
+    """
+    for image in paths_inside(label, folder, name, key, "./train/r_000"):
+        if image.is_file():
+            return image
+    raise SceneError(
+        f"{label}: no image {folder / name}, nor with {', '.join(SUFFIXES[1:])} added. "
+        f"Add the file or take the frame out of the list."
+    )
+
+
+def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) -> Iterator[Path]:
+    """What a name may stand for, as it is and with the suffix of an image, inside ``folder``.
+
+    Args:
+        label: The file and frame that name it, for messages.
+        folder: The scene's folder, with its links resolved.
+        name: Name relative to ``folder``.
+        key: The key that holds the name.
+        example: Such a name, for messages.
+
+    Raises:
+        SceneError: If it is no name, or leaves the folder.
+    """
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise SceneError(f"{label}: {key} is {short(name)}; it must be text such as {example}.")
+    # Blender on Windows writes backslashes.
+    relative = Path(name.replace("\\", "/"))
+    if relative.is_absolute() or PureWindowsPath(name).anchor:
+        raise SceneError(
+            f"{label}: {key} is absolute. Write it relative to {folder}, as in {example}."
+        )
+    for suffix in (*SUFFIXES, *(suffix.upper() for suffix in SUFFIXES[1:])):
+        path = (folder / f"{relative}{suffix}").resolve()
+        if not path.is_relative_to(folder):
+            raise SceneError(
+                f"{label}: {key} leaves the scene's folder {folder} (it leads to {path}). Put its "
+                f"files inside the folder and correct {key}."
+            )
+        yield path
+
+
+def mask_files(
+    folder: Path, names: Sequence[Sequence[str]], key: str = "data.masks"
+) -> tuple[Path | None, ...]:
+    """The mask of each image; None for images without, of which a warning tells.
+
+    Args:
+        folder: Folder of masks.
+        names: Names that the mask of each image may have in it, in the order of preference. [V]
+        key: The setting that names the folder.
+
+    Raises:
+        SceneError: If no image has a mask.
+    """
+    masks = tuple(
+        next((path for name in each if (path := folder / name).is_file()), None) for each in names
+    )
+    bare = [each[0] for each, mask in zip(names, masks, strict=True) if mask is None]
+    if len(bare) == len(masks):
+        raise SceneError(
+            f"{key}: {folder} {'holds' if folder.is_dir() else 'does not exist, so there is'} no "
+            f"mask of any image, such as {bare[0]}. Put the masks there, or set {key}=null."
+        )
+    if bare:
+        warnings.warn(
+            f"{folder} has no mask of {len(bare)} of {len(masks)} images, which are shown whole: "
+            f"{some(bare)}.",
+            stacklevel=4,
+        )
+    return masks
+
+
+def unit_times(times: Sequence[float]) -> list[float]:
+    """Times in any unit, mapped to [0, 1]; all 0 where they are equal."""
+    # Integers stay as they are until the first was subtracted: clocks count nanoseconds.
+    first, last = min(times), max(times)
+    return [(time - first) / (last - first) if last > first else 0.0 for time in times]
+
+
+def read_object(path: Path, content: str) -> dict[str, Any]:
+    """A JSON object from a file.
+
+    Args:
+        path: The file.
+        content: What the object must have, for messages.
+
+    Raises:
+        SceneError: If it cannot be read, or is none.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as problem:
+        raise SceneError(
+            f"{path} cannot be read as JSON ({problem}). Export or download it again."
+        ) from problem
+    if not isinstance(found, dict):
+        raise SceneError(f"{path} must hold a JSON object with {content}, not {short(found)}.")
+    return found
+
+
+def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.ndarray:
+    """A camera-to-world matrix: finite, rigid, right-handed.
+
+    Args:
+        label: The file and frame that hold it, for messages.
+        matrix: 4 rows of 4 numbers.
+        key: What it is called there.
+
+    Returns:
+        The matrix. float64 [4, 4]
+
+    Raises:
+        SceneError: If it is no such matrix.
+    """
+    try:
+        pose = np.asarray(matrix, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pose = np.empty(0)
+    if pose.shape != (4, 4):
+        raise SceneError(f"{label}: {key} must be 4 rows of 4 numbers, not {short(matrix)}.")
+    if not np.isfinite(pose).all():
+        raise SceneError(f"{label}: {key} holds NaN or infinity. Export it again.")
+    if np.abs(pose[3] - [0, 0, 0, 1]).max() > RIGID_TOLERANCE:
+        raise SceneError(
+            f"{label}: the last row of {key} is {pose[3].tolist()}, not [0, 0, 0, 1]. "
+            f"Poses are camera-to-world, written row by row (perhaps this one is transposed)."
+        )
+    rotation = pose[:3, :3]
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if error > RIGID_TOLERANCE:
+        raise SceneError(
+            f"{label}: the rotation in {key} is not orthonormal (off by {error:.2g}, "
+            f"allowed {RIGID_TOLERANCE:g}). Set the camera's scale to 1 and export again."
+        )
+    if np.linalg.det(rotation) < 0:
+        raise SceneError(
+            f"{label}: the rotation in {key} mirrors (determinant -1, must be +1). "
+            f"Axes are OpenGL's: x right, y up, z backward; negate one column."
+        )
+    return pose
+
+
+def oriented(poses: np.ndarray, points: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """A capture whose world is turned so that the cameras' mean up vector is its z axis.
+
+    It stays as it is, and a warning says so, where the cameras agree on no up vector.
+
+    Args:
+        poses: Cameras. float64 [V, 4, 4]
+        points: Points in the same world. float64 [N, 3]
+    """
+    rotation = upright(torch.from_numpy(poses))
+    if rotation is None:
+        warnings.warn(
+            "The up vectors of the cameras cancel out, so the world keeps the axes that the files "
+            "give it. data.orient=false says that it should.",
+            stacklevel=4,
+        )
+        return poses, points
+    turned, turn = poses.copy(), rotation.numpy()
+    turned[:, :3] = turn @ poses[:, :3]
+    return turned, None if points is None else points @ turn.T
+
+
+def require_precision(source: Path, positions: np.ndarray) -> None:
+    """Refuse cameras so far from the world's origin that single precision moves them.
+
+    Args:
+        source: Where they were read, for messages.
+        positions: Of all cameras of a capture. float64 [V, 3]
+
+    Raises:
+        SceneError: If they lie too far away.
+    """
+    extent = float(np.ptp(positions, axis=0).max())
+    largest = float(np.abs(positions).max())
+    still = extent <= STILL
+    room = FARTHEST if still else ROUNDING * extent / float(np.finfo(np.float32).eps)
+    if not largest <= min(room, FARTHEST):
+        raise SceneError(
+            f"{source}: the cameras lie up to {largest:.3g} world units from the origin and "
+            f"{extent:.3g} apart, which single precision cannot hold. Move the capture to the "
+            "origin first, as with colmap model_transformer, or correct the cameras."
+        )
+
+
+def refuse_repeats(
+    labels: Sequence[str], paths: Sequence[Path], poses: np.ndarray, times: Sequence[float]
+) -> None:
+    """Refuse images that are listed twice.
+
+    Args:
+        labels: The file and frame of each image, for messages. [V]
+        paths: Image files. [V]
+        poses: Their cameras. [V, 4, 4]
+        times: Their times; empty for a static scene, whose cameras may repeat. [V]
+
+    Raises:
+        SceneError: If a file, or a camera and time, comes twice.
+    """
+    files: dict[Path, str] = {}
+    seen: dict[tuple[bytes, float], str] = {}
+    for index, label in enumerate(labels):
+        other = files.setdefault(paths[index], label)
+        if other is not label:
+            raise SceneError(f"{label} shows the same file as {other}. Remove one of the two.")
+        # Paths around a static object may pass the same place twice, so only times convict.
+        if not times:
+            continue
+        other = seen.setdefault((poses[index].tobytes(), times[index]), label)
+        if other is not label:
+            raise SceneError(
+                f"{label} has the same camera and time as {other}. Remove one of the two, or "
+                f"correct its time."
+            )
+
+
+def is_number(value: Any) -> TypeGuard[float]:
+    """Whether a value read from a file is a finite number."""
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        # JSON holds integers that no float can.
+        return False
+
+
+def is_positive(value: Any) -> TypeGuard[float]:
+    """Whether a value read from a file is a finite number above 0."""
+    return is_number(value) and value > 0
+
+
+def short(value: Any) -> str:
+    """A value read from a file, for messages."""
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def some(names: Sequence[str]) -> str:
+    """The first of many names, for messages."""
+    return f"{', '.join(names[:5])}{', ...' if len(names) > 5 else ''}"

@@ -63,11 +63,18 @@ def scripts(folder: Path) -> dict[str, list[list[str]]]:
     for name in ("initialisation", "gaussians", "pareto"):
         given[name] = [[*scene, "--together", "2"]]
     models = ["--variants", "world,kplanes,tineuvox_s", "--seconds", "30", "--together", "2"]
+    beside = [*models, "--title"]
     given["captures"] = [
         ["--together", "2"],
-        [*models, "--name", "captures_models"],
-        [*models, "--name", "captures_test", "--scenes", "phone_test,rig_test", "--seeds", "3"],
-        [*models, "--name", "suite_models", "--scenes", "dark_test,topology_test,occlusion_test"],
+        [*beside, "Captures in three models", "--name", "captures_models"],
+        [
+            *(*beside, "Test captures in three models", "--name", "captures_test"),
+            *("--scenes", "phone_test,rig_test", "--seeds", "3"),
+        ],
+        [
+            *(*beside, "Scenes of the suite in three models", "--name", "suite_models"),
+            *("--scenes", "dark_test,topology_test,occlusion_test"),
+        ],
     ]
     given["lrm_quality"] = [["--together", "2"]]
     apart = "preparation.cache=null"

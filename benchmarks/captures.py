@@ -2,7 +2,7 @@
 
     python benchmarks/captures.py [--scenes phone,rig,phone_test,rig_test] [--resolution 100]
         [--steps 1000 | --seconds 120] [--variants NAMES] [--seeds 1] [--together 1]
-        [--name captures] [--work FOLDER] [KEY=VALUE ...]
+        [--name captures] [--title TITLE] [--work FOLDER] [KEY=VALUE ...]
 
 Writes docs/results/NAME.md and NAME.csv. The scenes are procedural captures of the
 suite, whose masks of the thing are known: scores are those of whole pictures, and of the pixels
@@ -123,6 +123,7 @@ def main() -> None:
     parser.add_argument("--root", type=Path, default=Path("data/suite"), help="of the scenes")
     parser.add_argument("--work", type=Path, help="keeps finished runs")
     parser.add_argument("--name", default="captures", help="of the results")
+    parser.add_argument("--title", default="Captures with a world behind", help="of the page")
     parser.add_argument("overrides", nargs="*", help="settings of train.py")
     args = parser.parse_intermixed_args()
     os.environ["OMP_NUM_THREADS"] = "1"
@@ -145,13 +146,10 @@ def main() -> None:
             if len(runs) == args.seeds:
                 print("  ".join(row(scene, variant, runs)), flush=True)
     rows = [row(*key, runs) for key, runs in found.items()]
-    title = "Captures without silhouettes"
-    if not set(args.scenes.split(",")) <= set(captures):
-        title = "Scenes of the suite"
     budget = f"{args.steps} steps" if args.seconds is None else f"{args.seconds:g} s"
     write_rows(RESULTS / f"{args.name}.csv", COLUMNS, rows)
     text = [
-        f"# {title}",
+        f"# {args.title}",
         "",
         f"After {budget} at {args.resolution} pixels, mean over {args.seeds} "
         f"seed{'s' if args.seeds > 1 else ''}. {machine()}.",

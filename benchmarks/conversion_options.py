@@ -12,9 +12,9 @@ import math
 import time
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 
 import torch
+from runner import RESULTS, command, machine
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -26,8 +26,8 @@ from xplanes.decomposition import (
     unexplained_energy,
 )
 from xplanes.fields.xplanes import PLANE_SETS
+from xplanes.files import write_text
 
-RESULTS = Path(__file__).parent.parent / "docs" / "results"
 FRAMES, CHANNELS, SIZE = 50, 32, 64
 AXES = ((0, 1), (0, 2), (1, 2))
 Path3D = Callable[[float], tuple[float, float, float]]
@@ -143,8 +143,8 @@ def main() -> None:
     lines = [
         "# Conversion: which choice is nearest the truth",
         "",
-        f"{FRAMES} frames, {CHANNELS} features, {SIZE} x {SIZE}, seeded; two cores, AMD EPYC.",
-        "Script: `benchmarks/conversion_options.py`.",
+        f"{FRAMES} frames, {CHANNELS} features, {SIZE} x {SIZE}, seeded; {machine()}.",
+        f"`{command()}`",
         "",
         "## Static: relative error of the space planes against the true background",
         "",
@@ -162,7 +162,7 @@ def main() -> None:
         "|---|---|---|---|---|---|---|",
         *dynamic_rows,
     ]
-    (RESULTS / "conversion_options.md").write_text("\n".join(lines) + "\n")
+    write_text(RESULTS / "conversion_options.md", "\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

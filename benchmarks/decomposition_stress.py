@@ -15,15 +15,14 @@ import itertools
 import time
 import warnings
 from collections.abc import Iterator
-from pathlib import Path
 
 import torch
+from runner import RESULTS, command, machine
 from torch import Tensor
 
 from xplanes.decomposition import robust_pca
 from xplanes.files import replacing, write_text
 
-RESULTS = Path(__file__).parent.parent / "docs" / "results"
 ROWS = 1000
 
 
@@ -71,11 +70,10 @@ def objective(low: Tensor, matrix: Tensor, weight: float) -> float:
 
 HEAD = f"""# Robust PCA: stress table
 
-{ROWS} rows, tolerance 1e-6, at most 2,000 iterations, weight auto, two cores of an AMD EPYC. The
-low-rank part has the given condition number, 5% of the entries are hit. Errors against float64 ADMM
-with a full SVD on the SAME (rounded) input, relative to |Y|; gap: of the objective (negative: below
-the oracle, which was stopped by the clock). Step: where the oracle stopped. Script:
-`benchmarks/decomposition_stress.py`.
+{ROWS} rows, tolerance 1e-6, at most 2,000 iterations, weight auto; {machine()}. The low-rank part
+has the given condition number, 5% of the entries are hit. Errors against float64 ADMM with a full
+SVD on the SAME (rounded) input, relative to |Y|; gap: of the objective (negative: below the oracle,
+which was stopped by the clock). Step: where the oracle stopped. `{command()}`
 
 | frames | condition | type | scale | L error | S error | gap | iterations | s | converged | step |
 |---|---|---|---|---|---|---|---|---|---|---|

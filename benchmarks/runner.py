@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -59,7 +60,7 @@ def command() -> str:
     named = (name for name in ("OMP_NUM_THREADS", "XPLANES_CPU_LOOPS") if name in os.environ)
     given = [f"{name}={os.environ[name]}" for name in named]
     script = f"benchmarks/{Path(sys.argv[0]).name}"
-    return " ".join([*given, "python", script, *without_folders(sys.argv[1:])])
+    return shlex.join([*given, "python", script, *without_folders(sys.argv[1:])])
 
 
 def without_folders(words: Iterable[str]) -> list[str]:

@@ -97,7 +97,7 @@ def main() -> None:
     parser.add_argument("overrides", nargs="*")
     args = parser.parse_args()
 
-    from runner import RESULTS, machine, markdown, measure, without_folders
+    from runner import RESULTS, command, machine, markdown, measure
 
     from xplanes.files import write_text
 
@@ -114,12 +114,12 @@ def main() -> None:
         (name, f"{spent:.2f}", f"{100 * spent / whole:.1f}%", watch.calls.get(name, ""))
         for name, spent in sorted(found.items(), key=lambda item: -item[1])
     ]
-    command = " ".join(["python train.py", *without_folders(args.overrides)])
     page = f"""# Where the time goes: {args.name}
 
-`{command}`: {whole:.1f} s in all, {metrics["step"]} steps, PSNR
-{metrics["test"]["psnr"]:.2f}; {machine()}. Script: `benchmarks/where_time_goes.py`. Each stage
-without the stages that it calls.
+    {command()}
+
+{whole:.1f} s in all, {metrics["step"]} steps, PSNR {metrics["test"]["psnr"]:.2f}; {machine()}.
+Each stage without the stages that it calls.
 
 {markdown(COLUMNS, rows)}
 """

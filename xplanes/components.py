@@ -75,6 +75,18 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
     else:
         cls = class_of(target, kind, f"{key}._target_")
     arguments = {name: value for name, value in node.items() if name != "_target_"}
+    for name in arguments.keys() & more.keys():
+        raise ConfigError(
+            f"{key}.{name}={arguments[name]}: it is set by the groups callbacks and logger and by "
+            "the run directory (hydra.run.dir); leave it out"
+        )
+    if not issubclass(cls, Settings):
+        for name, value in arguments.items():
+            if isinstance(value, Mapping) and "_target_" in value:
+                raise ConfigError(
+                    f"{key}.{name}._target_={value['_target_']}: {cls.__name__} takes plain values "
+                    "here; derive a class that makes this one, and name it instead (plugins)"
+                )
     try:
         if issubclass(cls, Settings):
             cls.require_names([*arguments, *more])

@@ -146,7 +146,8 @@ def _logger(name: str, node: Mapping[str, Any], run: Path) -> Logger:
     cls = class_of(node.get("_target_"), Logger, f"{key}._target_")
     taken = inspect.signature(cls).parameters.values()
     known = any(each.name == "save_dir" or each.kind is each.VAR_KEYWORD for each in taken)
-    logger = build(node, Logger, key, **({"save_dir": str(run)} if known else {}))
+    place = {"save_dir": str(run)} if known and "save_dir" not in node else {}
+    logger = build(node, Logger, key, **place)
     if isinstance(logger, TensorBoardLogger):
         from torch.utils.tensorboard import SummaryWriter
 

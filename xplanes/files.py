@@ -49,6 +49,7 @@ def storage_error(problem: OSError, path: Path | None = None) -> StorageError | 
 
 _FREE = "Free some space, or choose a folder on another disk; what was there before is still whole"
 _OPEN = "Choose a folder that can be written"
+_IN_THE_WAY = "A file stands where a folder should be: choose another folder"
 _WAYS_OUT = {
     errno.ENOSPC: _FREE,
     errno.EDQUOT: _FREE,
@@ -56,7 +57,8 @@ _WAYS_OUT = {
     errno.EROFS: _OPEN,
     errno.EACCES: _OPEN,
     errno.EPERM: _OPEN,
-    errno.ENOTDIR: "A file stands where a folder should be: choose another folder",
+    errno.ENOTDIR: _IN_THE_WAY,
+    errno.EEXIST: _IN_THE_WAY,
     errno.EIO: "The disk or its connection fails; choose a folder on another disk",
 }
 

@@ -9,8 +9,11 @@ import torch
 from safetensors.torch import save_file
 
 from tests.lrm.reduced import reduced
+from xplanes.components import build
+from xplanes.config import compose_plain
 from xplanes.lrm import LRMError
 from xplanes.lrm.bundled import CHECKSUM, bundled_models, load_bundled
+from xplanes.preparation.sources import BundledLRMSettings
 
 
 def ship(folder: Path, name: str, seed: int = 0) -> Path:
@@ -64,3 +67,20 @@ def test_a_model_that_is_not_there_is_named_with_those_that_are(tmp_path: Path):
     (tmp_path / "tiny.json").unlink()
     with pytest.raises(LRMError, match=r"tiny\.json: no such model.*contains none"):
         load_bundled("tiny", tmp_path)
+
+
+def test_the_file_that_is_named_is_the_one_that_is_read(tmp_path: Path):
+    path = ship(tmp_path, "own")
+
+    def settings(weights: Path) -> BundledLRMSettings:
+        lrm = compose_plain("train", ["lrm=tiny", f"lrm.weights={weights}"])["lrm"]
+        return build(lrm, BundledLRMSettings, "lrm")
+
+    assert settings(path).load_model(print).key
+    beside = tmp_path / "own.ckpt"
+    for name in (beside, tmp_path / "absent.safetensors"):
+        with pytest.raises(LRMError, match=rf"{name.name} is no file.*safetensors"):
+            settings(name).load_model(print)
+    beside.write_bytes(path.read_bytes())
+    with pytest.raises(LRMError, match=r"own\.ckpt is no file.*safetensors"):
+        settings(beside).load_model(print)

@@ -221,6 +221,10 @@ def test_damaged_files_are_named(tmp_path):
             path.write_bytes(content)
             with pytest.raises(LRMError, match=file):
                 load(settings, path)
+        for content in (b"error", b"\x80\x02" + bytes(range(256)), bytes(64)):
+            path.write_bytes(content)
+            with pytest.raises(LRMError, match=file):
+                load(settings, path)
         path.unlink()
         with pytest.raises(LRMError, match="is not a file"):
             load(settings, path)
@@ -239,3 +243,24 @@ def test_a_model_that_fits_nothing_published_says_so(tmp_path):
     path = save(tmp_path / "model.safetensors", random_state(parse_config(settings)))
     with pytest.raises(LRMError, match="fits no published model"):
         load({"architecture": "openlrm-small-1.1"}, path)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+def test_weights_that_are_not_finite_are_named(tmp_path, value):
+    settings, state = reduced("triposr")
+    name = next(key for key, tensor in state.items() if tensor.ndim == 2)
+    state = {key: tensor.clone() for key, tensor in state.items()}
+    state[name][0, 0] = value
+    path = save(tmp_path / "model.safetensors", state)
+    with pytest.raises(LRMError, match=rf"model\.safetensors holds NaN or infinity.*{name}"):
+        load(settings, path)
+
+
+def test_sizes_that_make_no_model_are_refused(tmp_path):
+    settings, state = reduced("triposr")
+    width = {"tokenizer": settings["tokenizer"] | {"num_channels": 33}}
+    inner = {"backbone": settings["backbone"] | {"in_channels": 33}}
+    last = {"post_processor": settings["post_processor"] | {"in_channels": 33}}
+    path = save(tmp_path / "model.safetensors", state)
+    with pytest.raises(LRMError, match="configuration cannot be used"):
+        load(settings | width | inner | last, path)

@@ -80,6 +80,17 @@ def test_unusable_configurations_are_refused():
         assert_refused(LRMError, message, lambda settings=settings: parse_config(settings), change)
 
 
+def test_values_of_another_kind_are_refused():
+    for name, change in (
+        ("openlrm-1.1", {"encoder_sizes": [1]}),
+        ("openlrm-1.1", {"encoder_sizes": "small"}),
+        ("openlrm-1.0", {"image_mean": ["a", 1, 2]}),
+    ):
+        settings = {k: v for k, v in CONFIGS[name].items() if k != "_reduced_encoder"} | change
+        with pytest.raises(LRMError, match="configuration cannot be used"):
+            parse_config(settings)
+
+
 def test_configurations_and_names_of_no_known_model_are_refused():
     with pytest.raises(LRMError, match=r"config\.json"):
         parse_config({"downloads": 12})

@@ -7,6 +7,7 @@ from tests.lrm.reduced import SIDES, reduced
 from tests.lrm.reference import compare
 from xplanes.lrm.checkpoint import build, fill
 from xplanes.lrm.config import parse_config
+from xplanes.lrm.errors import LRMError
 from xplanes.lrm.images import square_crop
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.encode import encode, straight_alpha
@@ -108,3 +109,13 @@ def test_bfloat16_is_kept_apart_and_close(tmp_path):
     assert rough.triplanes.dtype == torch.float32
     gap = (rough.triplanes - exact.triplanes).norm() / exact.triplanes.norm()
     assert 0 < gap < 0.03
+
+
+def test_a_triplane_that_is_not_finite_is_refused_and_not_kept(tmp_path, monkeypatch):
+    model, frames, cache = model_of(), frames_of(2), StageCache(tmp_path)
+    original = model.encode
+    with monkeypatch.context() as patch:
+        patch.setattr(model, "encode", lambda images, *rest: original(images, *rest) * float("inf"))
+        with pytest.raises(LRMError, match=r"NaN or infinity of frame 0"):
+            run(model, frames, cache)
+    assert run(model, frames, cache).cached == 0

@@ -1,6 +1,8 @@
+import errno
 import hashlib
 import io
 import json
+import os
 import shutil
 import threading
 import zipfile
@@ -12,6 +14,7 @@ from itertools import product
 import pytest
 
 from tests.refusals import assert_refused
+from xplanes.files import StorageError
 from xplanes.scenes import download as download_module
 from xplanes.scenes import download as fetch_module
 from xplanes.scenes.download import DNERF_URL, TRAIN_VIEWS, download_dnerf
@@ -374,3 +377,31 @@ def test_full_disk(tmp_path, server, monkeypatch):
     (tmp_path / "dnerf.zip").write_bytes(server.content)
     assert "free space" in error(tmp_path, server)
     assert scenes_in(tmp_path) == []
+
+
+def test_a_web_page_in_between_keeps_what_was_fetched(tmp_path, server, monkeypatch):
+    monkeypatch.setattr(fetch_module, "ATTEMPTS", 1)
+    server.limits = [50_000]
+    error(tmp_path, server)
+    content, server.content = server.content, b"<html>Busy</html>"
+    kind, server.content_type, server.ranges = server.content_type, "text/html", False
+    assert "web page" in error(tmp_path, server)
+    assert (tmp_path / "dnerf.zip.part").stat().st_size == 50_000
+    server.content, server.content_type, server.ranges = content, kind, True
+    download(tmp_path, server)
+    assert server.requests[-1]["Range"] == "bytes=50000-"
+    assert_complete(tmp_path)
+
+
+def test_a_disk_that_refuses_is_said_in_words(tmp_path, server):
+    (tmp_path / "file").write_text("")
+    for root in (tmp_path / "file", tmp_path / "file" / "deeper"):
+        with pytest.raises(StorageError, match="A file stands where a folder should be"):
+            download(root, server)
+
+    def full(line: str) -> None:
+        if line.startswith("Downloading"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(StorageError, match=r"cannot be written: No space left.*Free some space"):
+        download_dnerf(tmp_path / "root", url=server.url, announce=full)

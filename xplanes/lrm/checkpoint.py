@@ -59,12 +59,17 @@ def load(config: Mapping[str, Any] | LRMConfig, weights: Path) -> LRM:
             if carried and _same_size(config, carried):
                 config = carried
         config = parse_config(config)
-    model = build(config)
+    try:
+        model = build(config)
+    except ValueError as problem:
+        raise LRMError(f"the model's configuration cannot be used: {problem}") from problem
     try:
         fill(model, state)
     except MismatchError as problem:
         message = f"{path} does not fit {name or config.architecture}: {problem}"
         raise MismatchError(message, problem.fits) from None
+    if broken := [tensor for tensor, values in state.items() if not _finite(values)]:
+        raise LRMError(f"{path} holds NaN or infinity in {_some(broken)}: the weights are damaged")
     return model
 
 
@@ -93,6 +98,11 @@ def fill(model: LRM, state: Mapping[str, Tensor]) -> None:
         raise MismatchError("; ".join(problems) + advice, fits)
     model.load_state_dict(_translated(model, state), assign=True)
     model.requires_grad_(False)
+
+
+def _finite(values: Tensor) -> bool:
+    """Whether all numbers are finite; without a copy of them."""
+    return not values.is_floating_point() or bool(values.sum(dtype=torch.float64).isfinite())
 
 
 def mismatches(model: LRM, state: Mapping[str, Tensor]) -> list[str]:
@@ -180,7 +190,7 @@ def _read_pickle(path: Path) -> Any:
             f"{path} is not a file of weights, or contains code, which is never run: use the "
             f".safetensors file if there is one"
         ) from problem
-    except (RuntimeError, OSError, EOFError, ValueError, KeyError) as problem:
+    except Exception as problem:  # Files that are no weights fail in many ways.
         raise LRMError(f"{path} is damaged or incomplete: {problem}") from problem
 
 

@@ -208,9 +208,12 @@ def parse_config(config: Mapping[str, Any]) -> LRMConfig:
         LRMError: If a key is missing, out of range or not supported.
     """
     architecture = guess_architecture(config)
-    if architecture == "triposr":
-        return _triposr(Reader(config))
-    return _openlrm(config, architecture)
+    try:
+        if architecture == "triposr":
+            return _triposr(Reader(config))
+        return _openlrm(config, architecture)
+    except (AttributeError, TypeError, ValueError) as problem:
+        raise LRMError(f"the model's configuration cannot be used: {problem}") from problem
 
 
 def guess_architecture(config: Mapping[str, Any]) -> Architecture:

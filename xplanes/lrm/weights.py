@@ -173,7 +173,7 @@ def read_config(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
         content = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
-    except (OSError, ValueError, yaml.YAMLError) as problem:
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as problem:
         raise LRMError(f"{path} cannot be read: {problem}") from problem
     if not isinstance(content, dict):
         raise LRMError(f"{path} is not a configuration: it has no keys")

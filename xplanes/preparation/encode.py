@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from xplanes.lrm.errors import LRMError
 from xplanes.lrm.images import Crop
 from xplanes.lrm.model import LRM
 from xplanes.preparation.cache import StageCache, fingerprint
@@ -55,6 +56,9 @@ def encode(
         device: Device of the model.
         batch: Frames per batch.
         bf16: Use bfloat16 products.
+
+    Raises:
+        LRMError: If a triplane is not finite.
     """
     places: dict[str, list[int]] = {}
     for number, frame in enumerate(frames):
@@ -78,6 +82,11 @@ def encode(
         pictures = model.prepare(crop.apply(straight_alpha(frames[first])))
         with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
             planes = model.encode(pictures.to(device)).float().cpu()
+        if not bool(planes.isfinite().all()):
+            raise LRMError(
+                f"the LRM makes NaN or infinity of frame {int(first[0])} or one of the next: its "
+                f"weights do not work{' in bfloat16; set lrm.precision=32' if bf16 else ''}"
+            )
         share = (time.perf_counter() - began) / len(chunk)
         for frame_key, triplane in zip(chunk, planes, strict=True):
             inputs = _inputs(key, frame_key, shown, device, bf16)

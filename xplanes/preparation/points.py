@@ -59,7 +59,8 @@ class FieldSettings(InitialiserSettings):
 
     def check(self) -> None:
         sources = sorted(path.stem for path in (CONF / "lrm").glob("*.yaml"))
-        sources.remove("field")
+        for other in ("field", "file"):  # They have no triplanes of their own.
+            sources.remove(other)
         if self.source not in sources:
             raise ConfigError(f"source={self.source}: must be one of {', '.join(sources)}")
 
@@ -82,7 +83,8 @@ class FieldInitialiser(Initialiser):
         self.settings, self.field = settings, field
 
     def initialise(self, method: Method, place: Place) -> Initialisation:
-        settings, views = self.settings, place.scene.splits["train"]
+        settings, scene = self.settings, place.scene
+        views = scene.splits["train"]
         count = cast(GaussiansSettings, method.model).count
         field = replace(
             self.field,
@@ -98,6 +100,7 @@ class FieldInitialiser(Initialiser):
             intrinsics_key(views.intrinsics),
             frame_content(place.frame),
             field.plain(),
+            [None if more is None else more.identity for more in (scene.cut, scene.video)],
             [settings.steps, settings.seconds, count],
         ]
 

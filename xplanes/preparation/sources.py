@@ -9,6 +9,7 @@ from typing import cast
 
 from xplanes.errors import ConfigError
 from xplanes.lrm.bundled import load_bundled
+from xplanes.lrm.errors import LRMError
 from xplanes.lrm.weights import WeightSource, find_weights, load_weights
 from xplanes.models.base import InitialValues
 from xplanes.models.initialisation import (
@@ -39,10 +40,16 @@ class BundledLRMSettings(ImageLRMSettings):
 
     def load_model(self, say: Callable[[str], None]) -> LoadedLRM:
         began = time.perf_counter()
-        own = None if self.weights is None else Path(self.weights)
-        model, path = (
-            load_bundled(self.bundled) if own is None else load_bundled(own.stem, own.parent)
-        )
+        if self.weights is None:
+            model, path = load_bundled(self.bundled)
+        else:
+            own = Path(self.weights)
+            if own.suffix != ".safetensors" or not own.is_file():
+                raise LRMError(
+                    f"{own} is no file that ends in .safetensors: name one that xplanes "
+                    "pretrain-lrm wrote, whose .json lies beside it"
+                )
+            model, path = load_bundled(own.stem, own.parent)
         return loaded(model, path, began)
 
     def load(self, say: Callable[[str], None] = print) -> "LRMInitialiser":

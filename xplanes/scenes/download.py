@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 
+from xplanes.files import storage_error
 from xplanes.scenes.errors import SceneError
 
 CHUNK_BYTES = 1 << 20
@@ -91,6 +92,8 @@ def _advance(url: str, part: Path, announce: Callable[[str], None], space_factor
                 raise _BrokenTransferError(f"{url} has changed since the download began")
             announce(f"Continuing {url} after {_size(part)} MB")
         else:
+            if response.headers.get_content_type() == "text/html":  # What is there is kept.
+                raise FetchError(f"{url} answered with a web page instead of a file.")
             start = 0
             _save_validator(url, part, response)
         _receive(url, response, part, start, announce, space_factor)
@@ -104,9 +107,6 @@ def _receive(
     announce: Callable[[str], None],
     space_factor: float,
 ) -> None:
-    if response.headers.get_content_type() == "text/html":
-        _discard(part)
-        raise FetchError(f"{url} answered with a web page instead of a file.")
     total = None if response.length is None else start + response.length
     if total is not None:
         check_space(part.parent, int(space_factor * total) - start)
@@ -237,8 +237,18 @@ def download_dnerf(
 
     Raises:
         SceneError: The archive cannot be fetched, is damaged, or is not the expected one.
+        StorageError: The disk is full, or cannot be written.
     """
     root = Path(root).absolute()
+    try:
+        return _downloaded(root, url, sha256, announce)
+    except OSError as problem:
+        if (words := storage_error(problem, root)) is None:
+            raise
+        raise words from problem
+
+
+def _downloaded(root: Path, url: str, sha256: str | None, announce: Callable[[str], None]) -> Path:
     missing = [name for name in TRAIN_VIEWS if not (root / name / "transforms_train.json").exists()]
     if not missing:
         announce(f"All D-NeRF scenes are already in {root}")

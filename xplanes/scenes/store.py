@@ -343,7 +343,7 @@ def decoded(
         try:
             if path.stat().st_size != length:
                 return None
-            with suppress(PermissionError):  # The cache may be another user's.
+            with suppress(OSError):  # The cache may be another user's, or on a read-only disk.
                 os.utime(path)
             return StoredImages.all_of(TileFile(path, key, sizes, channels))
         except FileNotFoundError:

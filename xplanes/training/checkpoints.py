@@ -1,8 +1,12 @@
 """Checkpoints that are never half-written, and loading them as data."""
 
+import io
 import logging
+import pickle
+import re
 import shutil
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +26,9 @@ logger = logging.getLogger(__name__)
 
 LAST, BEST = "last.ckpt", "best.ckpt"
 
+TENSORS = ("state_dict", "optimizer_states")
+"""Parts of a checkpoint that are large, and tensors alone."""
+
 
 class AtomicCheckpointIO(TorchCheckpointIO):
     """Writes checkpoints whole or not at all, and loads them as data, checksums included."""
@@ -29,11 +36,35 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
     ) -> None:
+        _require_data(checkpoint)
         with replacing(Path(path)) as temporary:
             super().save_checkpoint(checkpoint, temporary, storage_options)
 
     def load_checkpoint(self, path: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
         return load_checkpoint(Path(path))
+
+
+def _require_data(checkpoint: Mapping[str, Any]) -> None:
+    """Refuse what could be written but not read again, such as a callback's numbers of numpy.
+
+    Raises:
+        ConfigError: Naming what holds it.
+    """
+    parts = {name: part for name, part in checkpoint.items() if name not in TENSORS}
+    parts |= {f"callback {name}": state for name, state in parts.pop("callbacks", {}).items()}
+    for name, part in parts.items():
+        with io.BytesIO() as file:
+            torch.save(part, file)
+            file.seek(0)
+            try:
+                torch.load(file, weights_only=True)
+            except pickle.UnpicklingError as error:
+                kind = re.search(r"GLOBAL (\S+)", str(error))
+                raise ConfigError(
+                    f"{name}: its state holds more than data{f' ({kind[1]})' if kind else ''}, so "
+                    "that a checkpoint could not be read again; let state_dict return tensors, "
+                    "numbers, text, lists and dictionaries"
+                ) from error
 
 
 class Checkpoints(Checkpoint):

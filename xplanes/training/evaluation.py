@@ -4,14 +4,21 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from lightning import LightningModule, Trainer
-from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.callbacks import (
+    Callback,
+    EarlyStopping,
+    ModelCheckpoint,
+    WeightAveraging,
+)
 from torch import Tensor
 
 from xplanes.errors import ConfigError
@@ -278,13 +285,18 @@ class Evaluation(Callback):
         """Score the views now; only the first process does."""
         self.step = trainer.global_step
         with off_clock(trainer):
-            scores = self._score(trainer, module, renderer) if trainer.is_global_zero else {}
+            with averaged(trainer, module):
+                scores = self._score(trainer, module, renderer) if trainer.is_global_zero else {}
             if trainer.world_size > 1:
                 scores = trainer.strategy.broadcast(scores)  # The others wait off the clock.
             trainer.callback_metrics.update({n: torch.tensor(v) for n, v in scores.items()})
             for callback in trainer.callbacks:  # type: ignore[attr-defined]
                 if isinstance(callback, EarlyStopping | ModelCheckpoint):
-                    callback.on_validation_end(trainer, module)
+                    try:
+                        callback.on_validation_end(trainer, module)
+                    except (MisconfigurationException, RuntimeError) as error:
+                        name = type(callback).__name__
+                        raise ConfigError(f"callbacks: {name}: {error}") from error
 
     def _score(
         self, trainer: Trainer, module: RadianceModule, renderer: Renderer
@@ -398,6 +410,20 @@ def log_image(trainer: Trainer, tag: str, picture: Tensor, step: int) -> None:
             writer.add_image(tag, picture, step, dataformats="HWC")
         elif hasattr(log, "log_image"):
             log.log_image(tag, [picture.cpu().numpy()], step=step)  # type: ignore[attr-defined]
+
+
+@contextmanager
+def averaged(trainer: Trainer, module: RadianceModule) -> Iterator[None]:
+    """With the averaged weights, where a callback averages them: those that checkpoints hold."""
+    callbacks: list[Any] = trainer.callbacks  # type: ignore[attr-defined]
+    averages = [callback for callback in callbacks if isinstance(callback, WeightAveraging)]
+    for callback in averages:
+        callback.on_validation_epoch_start(trainer, module)
+    try:
+        yield
+    finally:
+        for callback in averages:
+            callback.on_validation_epoch_end(trainer, module)
 
 
 def _folder(trainer: Trainer) -> Path:

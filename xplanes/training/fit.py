@@ -11,7 +11,12 @@ from typing import Any, Literal
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback, ProgressBar
+from lightning.pytorch.callbacks import (
+    Callback,
+    GradientAccumulationScheduler,
+    ProgressBar,
+    StochasticWeightAveraging,
+)
 from lightning.pytorch.plugins.io import CheckpointIO
 from lightning.pytorch.strategies import DDPStrategy
 
@@ -28,7 +33,7 @@ from xplanes.training.clock import TrainingClock, find_callback
 from xplanes.training.collapse import CollapseWatch
 from xplanes.training.evaluation import Evaluation
 from xplanes.training.interrupt import Interrupt
-from xplanes.training.module import RadianceModule
+from xplanes.training.module import RadianceModule, require_whole_floats
 
 
 class Trainer(lightning.Trainer):
@@ -73,6 +78,13 @@ class Trainer(lightning.Trainer):
                 f"gradient_clip_val={clip} with accumulate_grad_batches={accumulate}: optimisation "
                 "is manual, so that neither applies; leave both out, or set model.rays.accumulate"
             )
+        if others.get("overfit_batches", 0) != 0:
+            raise ConfigError(
+                f"overfit_batches={others['overfit_batches']}: rays are drawn anew at each step; "
+                "leave it out, and set data.views for a field of few images"
+            )
+        require_whole_floats(str(others.get("precision") or "32-true"))
+        _refuse_callbacks(callbacks)
         device = find_device(accelerator)
         if device.type == "cuda":
             if deterministic:
@@ -137,6 +149,21 @@ class Trainer(lightning.Trainer):
             for callback in self.checkpoint_callbacks:
                 if isinstance(callback, Checkpoints):
                     callback.on_train_end(self, module)
+
+
+def _refuse_callbacks(callbacks: Sequence[Callback]) -> None:
+    for callback in callbacks:
+        name = type(callback).__name__
+        if isinstance(callback, GradientAccumulationScheduler):
+            raise ConfigError(
+                f"callbacks: {name}: optimisation is manual, so that it does not apply; set "
+                "model.rays.accumulate"
+            )
+        if isinstance(callback, StochasticWeightAveraging):
+            raise ConfigError(
+                f"callbacks: {name}: the model's schedules would overrule its learning rates; use "
+                "lightning.pytorch.callbacks.EMAWeightAveraging"
+            )
 
 
 def find_device(accelerator: str) -> torch.device:

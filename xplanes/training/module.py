@@ -143,6 +143,7 @@ class RadianceModule(LightningModule):
     # Building
 
     def setup(self, stage: str) -> None:
+        require_whole_floats(str(self.trainer.precision))
         if self.model is not None:
             return
         data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
@@ -274,11 +275,20 @@ class RadianceModule(LightningModule):
     def on_fit_start(self) -> None:
         # Callbacks ask for `progress` in their on_train_start, which is before this module's.
         trainer = self.trainer
-        steps = trainer.max_steps if trainer.max_steps > 0 else trainer.estimated_stepping_batches
-        self._steps = max(1, steps)
+        self._steps = max(1, self._most_steps())
         callbacks: list[Any] = trainer.callbacks  # type: ignore[attr-defined]
         self._schedules = [c for c in callbacks if isinstance(getattr(c, "progress", None), float)]
         self.method.require_devices(trainer.world_size)
+
+    def _most_steps(self) -> float:
+        """Steps that the Trainer does at most, by its steps and its epochs."""
+        trainer = self.trainer
+        most = trainer.max_steps if trainer.max_steps > 0 else math.inf
+        batches = trainer.estimated_stepping_batches  # Makes the data loader, whose length counts.
+        if trainer.max_epochs is not None and trainer.max_epochs > 0:
+            batches = trainer.max_epochs * trainer.num_training_batches
+            most = min(most, batches / self.ray_settings.accumulate)
+        return most
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         model, step, progress = self._parts[0], self.global_step, self.progress
@@ -470,7 +480,9 @@ class RadianceModule(LightningModule):
     def _logs_now(self) -> bool:
         """Whether the Trainer wants logs of the last batch."""
         every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
-        return bool(every and not self.batches % every and self.trainer.loggers)
+        # As the Trainer counts, for which a module that was loaded begins anew.
+        batch = self.trainer.fit_loop.epoch_loop.total_batch_idx + 1
+        return bool(every and not batch % every and self.trainer.loggers)
 
     def _log_terms(self, terms: Mapping[str, Tensor], state: TrainingState) -> None:
         """Log every term of the loss, weighted, where the Trainer wants logs of this step."""
@@ -755,6 +767,19 @@ def _precision(settings: ModelSettings, device: torch.device) -> str:
     if settings.precision == "auto":
         return "bf16" if fast_bf16(device) else "32"
     return settings.precision
+
+
+def require_whole_floats(precision: str) -> None:
+    """Refuse a Trainer that changes the precision: the model sets its own.
+
+    Raises:
+        ConfigError: With what to set instead.
+    """
+    if precision not in ("32", "32-true"):
+        raise ConfigError(
+            f"precision={precision}: a field computes in model.precision (auto, 32 or bf16), and "
+            "its planes are float32; leave it out"
+        )
 
 
 def require_field(model: Model) -> Representation:

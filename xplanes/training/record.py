@@ -202,16 +202,23 @@ def _version(name: str) -> str | None:
 
 def _commit() -> str | None:
     """Commit of the source tree, with a mark if it was changed; None outside a checkout."""
-    folder = Path(__file__).resolve().parent
+    root = Path(__file__).resolve().parent.parent.parent
     try:
-        run = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            timeout=5,
-            check=True,
-        )
+        # Installed into an environment, the package may lie in a repository of the user's own.
+        if Path(_git(root, "rev-parse", "--show-toplevel")).resolve() != root:
+            return None
+        return _git(root, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
     except (OSError, subprocess.SubprocessError):
         return None
+
+
+def _git(folder: Path, *words: str) -> str:
+    """What git says, in a folder.
+
+    Raises:
+        OSError, subprocess.SubprocessError: If it fails.
+    """
+    run = subprocess.run(
+        ["git", *words], cwd=folder, capture_output=True, text=True, timeout=5, check=True
+    )
     return run.stdout.strip()

@@ -1,0 +1,218 @@
+"""Callbacks, loggers and arguments of Lightning's that do not go with training as it is here."""
+
+import csv
+import json
+import warnings
+from pathlib import Path
+from typing import Any
+
+import lightning
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch import callbacks
+from lightning.pytorch.loggers import CSVLogger
+
+from tests.training.runs import small_config
+from xplanes import RadianceModule, SceneDataModule
+from xplanes.errors import ConfigError
+from xplanes.evaluation.evaluate import evaluate
+from xplanes.evaluation.runs import load_run
+from xplanes.pipeline import run
+from xplanes.training.fit import Trainer
+
+PLAIN = {"accelerator": "cpu", "enable_progress_bar": False, "enable_model_summary": False}
+
+
+class Numbers(callbacks.Callback):
+    """A callback whose state is what numpy makes of a mean."""
+
+    def __init__(self, kind: str = "numpy") -> None:
+        self.kind = kind
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"mean": np.mean([1.0, 2.0]) if self.kind == "numpy" else 1.5}
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("scenes")
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader((folder / "csv" / "metrics.csv").open()))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"precision": "64-true"}, r"precision=64-true.*model\.precision"),
+        ({"precision": "bf16-true"}, r"precision=bf16-true.*model\.precision"),
+        ({"precision": "16-mixed"}, r"precision=16-mixed.*model\.precision"),
+        ({"overfit_batches": 1}, r"overfit_batches=1.*data\.views"),
+        (
+            {"callbacks": [callbacks.GradientAccumulationScheduler({0: 2})]},
+            r"GradientAccumulationScheduler.*model\.rays\.accumulate",
+        ),
+        (
+            {"callbacks": [callbacks.StochasticWeightAveraging(0.1)]},
+            r"StochasticWeightAveraging.*EMAWeightAveraging",
+        ),
+    ],
+)
+def test_what_would_train_wrongly_is_refused(options: dict, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        Trainer(max_steps=2, **PLAIN, **options)
+
+
+def test_a_plain_trainer_that_scales_or_widens_numbers_is_refused(scenes: Path) -> None:
+    config = small_config(scenes)
+    module, data = RadianceModule(config), SceneDataModule(config["data"])
+    trainer = lightning.Trainer(max_steps=2, precision="64-true", logger=False, **PLAIN)
+    with pytest.raises(ConfigError, match=r"precision=64-true.*model\.precision"):
+        trainer.fit(module, data)
+
+
+@pytest.mark.parametrize("precision", [None, 32, "32", "32-true"])
+def test_whole_floats_are_accepted(precision: Any) -> None:
+    assert Trainer(max_steps=2, precision=precision, **PLAIN).precision == "32-true"
+
+
+def test_a_state_that_could_not_be_read_again_is_refused_at_once(
+    scenes: Path, tmp_path: Path
+) -> None:
+    config = small_config(scenes, "trainer.max_steps=4")
+    config["plugins"] = ["tests.test_foreign_parts"]
+    config["callbacks"]["mine"] = {"_target_": "tests.test_foreign_parts.Numbers"}
+    with pytest.raises(ConfigError, match=r"callback Numbers.*numpy.*state_dict"):
+        run(config, tmp_path / "numpy", [], resume=False)
+    assert not list((tmp_path / "numpy").rglob("*.ckpt"))
+    config["callbacks"]["mine"]["kind"] = "float"
+    run(config, tmp_path / "float", [], resume=False)
+    kept = torch.load(tmp_path / "float" / "checkpoints" / "last.ckpt", weights_only=True)
+    assert {"mean": 1.5} in kept["callbacks"].values()
+
+
+def test_a_resumed_run_goes_on_with_its_csv(scenes: Path, tmp_path: Path) -> None:
+    options = ("logger=csv", "trainer.log_every_n_steps=2", "callbacks.checkpoints.every=4")
+
+    def train(folder: str, steps: int, *, resume: bool) -> None:
+        config = small_config(scenes, *options, f"trainer.max_steps={steps}")
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", ".*will be deleted.*")
+            run(config, tmp_path / folder, [], resume=resume)
+
+    def steps(folder: str) -> list[int]:
+        return [int(row["step"]) for row in rows(tmp_path / folder) if row["train/loss"]]
+
+    train("parts", 8, resume=False)
+    before = rows(tmp_path / "parts")
+    # As if it had been killed later than its last checkpoint: these steps are done again.
+    with (tmp_path / "parts" / "csv" / "metrics.csv").open("a") as file:
+        file.write(",".join("9" for _ in before[0]) + "\n")
+    train("parts", 14, resume=True)
+    train("whole", 14, resume=False)
+    assert steps("parts") == steps("whole") == [1, 3, 5, 7, 9, 11, 13]
+    kept = rows(tmp_path / "parts")[: len(before)]
+    assert [{k: row[k] for k in before[0]} for row in kept][:4] == before[:4]
+    train("parts", 14, resume=True)  # Nothing is left to do.
+    assert steps("parts") == [1, 3, 5, 7, 9, 11, 13]
+
+
+def test_scores_are_of_the_averaged_weights_that_checkpoints_hold(
+    scenes: Path, tmp_path: Path
+) -> None:
+    config = small_config(
+        scenes, "trainer.max_steps=60", "data.eval_split=val", "callbacks.evaluation.views=null"
+    )
+    name = "lightning.pytorch.callbacks.EMAWeightAveraging"
+    config["callbacks"]["average"] = {"_target_": name, "decay": 0.98}
+    run(config, tmp_path / "run", [], resume=False)
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    again = evaluate(load_run(tmp_path / "run"), "none")
+    assert found["test"]["psnr"] == pytest.approx(again["test"]["psnr"], abs=1e-6)
+    plain = small_config(
+        scenes, "trainer.max_steps=60", "data.eval_split=val", "callbacks.evaluation.views=null"
+    )
+    run(plain, tmp_path / "plain", [], resume=False)
+    raw = json.loads((tmp_path / "plain" / "metrics.json").read_text())
+    assert abs(raw["test"]["psnr"] - found["test"]["psnr"]) > 0.1
+
+
+def test_epochs_end_the_schedules_too(scenes: Path) -> None:
+    config = small_config(scenes)
+
+    def rates(**options: Any) -> tuple[int, list[float]]:
+        module, data = RadianceModule(config), SceneDataModule(config["data"])
+        trainer = lightning.Trainer(logger=False, enable_checkpointing=False, **PLAIN, **options)
+        trainer.fit(module, data)
+        return trainer.global_step, [group["lr"] for group in trainer.optimizers[0].param_groups]
+
+    steps, both = rates(max_epochs=1, max_steps=30_000)
+    assert steps < 30_000
+    assert rates(max_steps=steps) == (steps, both)
+
+
+def test_a_module_that_was_loaded_logs_as_a_fresh_one(scenes: Path, tmp_path: Path) -> None:
+    config = small_config(scenes)
+
+    def fit(module: RadianceModule, folder: str, steps: int) -> lightning.Trainer:
+        trainer = lightning.Trainer(
+            max_steps=steps,
+            log_every_n_steps=4,
+            logger=CSVLogger(tmp_path / folder, name="", version="csv"),
+            limit_val_batches=0,
+            **PLAIN,
+        )
+        trainer.fit(module, SceneDataModule(config["data"]))
+        return trainer
+
+    fit(RadianceModule(config), "first", 6).save_checkpoint(tmp_path / "field.ckpt")
+    again = RadianceModule.load_from_checkpoint(tmp_path / "field.ckpt")
+    fit(again, "second", 9)
+    assert [row["step"] for row in rows(tmp_path / "first") if row["train/loss"]] == ["3"]
+    assert [row["step"] for row in rows(tmp_path / "second") if row["train/loss"]] == ["3", "7"]
+
+
+@pytest.mark.parametrize(
+    ("key", "node", "words"),
+    [
+        ("trainer", {"logger": False}, r"trainer\.logger=False: .*leave it out"),
+        ("trainer", {"default_root_dir": "x"}, r"trainer\.default_root_dir=x: .*hydra\.run\.dir"),
+        (
+            "callbacks",
+            {
+                "bar": {
+                    "_target_": "lightning.pytorch.callbacks.RichProgressBar",
+                    "theme": {"_target_": "lightning.pytorch.callbacks.progress.rich_progress.X"},
+                }
+            },
+            r"callbacks\.bar\.theme\._target_=.*plain values.*derive",
+        ),
+        (
+            "callbacks",
+            {
+                "stop": {
+                    "_target_": "lightning.pytorch.callbacks.EarlyStopping",
+                    "monitor": "val/pnsr",
+                }
+            },
+            r"callbacks: EarlyStopping.*val/pnsr",
+        ),
+    ],
+)
+def test_settings_that_were_ignored_are_refused(
+    scenes: Path, tmp_path: Path, key: str, node: dict, words: str
+) -> None:
+    config = small_config(scenes, "trainer.max_steps=4")
+    config[key] |= node
+    with pytest.raises(ConfigError, match=words):
+        run(config, tmp_path / "run", [], resume=False)
+
+
+def test_a_logger_may_have_a_folder_of_its_own(scenes: Path, tmp_path: Path) -> None:
+    config = small_config(scenes, "logger=csv", "trainer.max_steps=4")
+    config["logger"]["csv"]["save_dir"] = str(tmp_path / "elsewhere")
+    run(config, tmp_path / "run", [], resume=False)
+    assert rows(tmp_path / "elsewhere")
+    assert not (tmp_path / "run" / "csv").exists()

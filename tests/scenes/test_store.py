@@ -1,6 +1,7 @@
 """Images in a file of tiles: the same pixels as in memory, drawn evenly, whatever happens."""
 
 import copy
+import errno
 import os
 import shutil
 import threading
@@ -507,3 +508,17 @@ def test_an_interrupted_decoder_stops_soon(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="camera 7"):
         store.decoded([source], "", [(4, 4)] * 101, 3, [slow, broken], tmp_path / "cache")
     assert time.monotonic() - began < 1.5
+
+
+def test_tiles_on_a_read_only_disk_are_read(tmp_path: Path, small, monkeypatch) -> None:
+    paths = pictures(tmp_path / "scene", [(65, 65)] * 2, alpha=False)
+    first = read_images(paths, None, cache=tmp_path / "cache")[0]
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(os, "utime", refuse)
+    again = read_images(paths, None, cache=tmp_path / "cache")[0]
+    assert isinstance(again, StoredImages)
+    assert isinstance(first, StoredImages)
+    assert torch.equal(again.image(1), first.image(1))

@@ -193,6 +193,17 @@ def test_the_last_lines_name_tensorboard_only_where_it_has_something_to_show(
         assert f"xplanes render {tmp_path / logger}" in "\n".join(lines)
 
 
+def test_without_checkpoints_the_last_lines_offer_none(tmp_path: Path, capsys) -> None:
+    config = small_config(tmp_path / "scenes", "trainer.max_steps=2")
+    config["callbacks"]["checkpoints"] = None
+    run(config, tmp_path / "run", [], resume=False)
+    shown = capsys.readouterr().out
+    assert "last.ckpt" not in shown
+    assert "resume=" not in shown
+    assert "xplanes render" not in shown
+    assert "next     tensorboard" in shown or "next" not in shown
+
+
 def test_a_run_of_an_earlier_version_is_refused_with_its_version(tmp_path: Path) -> None:
     (tmp_path / "overrides.txt").write_text("loss.every=4\n")
     (tmp_path / "run.json").write_text(json.dumps({"xplanes": "0.1.0", "status": "interrupted"}))

@@ -128,6 +128,90 @@ def test_runs_in_folders_of_any_name_are_resumed(tmp_path: Path) -> None:
     assert shlex.split(resume_command(run))[-1] == f"resume={run}"
 
 
+def test_one_job_of_an_experiment_that_is_a_sweep_goes_on_alone(tmp_path: Path) -> None:
+    (tmp_path / "overrides.txt").write_text("experiment=planes\ndata.scene=balls\n")
+    prepared = prepare([f"resume={tmp_path}"])
+    assert "hydra.mode=RUN" in prepared
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("train", prepared, return_hydra_config=True)
+    assert config.hydra.mode.name == "RUN"
+    assert (config.hydra.run.dir, config.data.scene) == (str(tmp_path), "balls")
+
+
+def test_auto_finds_runs_whatever_was_said_to_hydra(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "outputs" / "run"
+    run.mkdir(parents=True)
+    (run / "run.json").write_text('{"status": "interrupted"}')
+    (run / "overrides.txt").write_text("hydra.searchpath=[file://groups]\nseed=1\n")
+    own = ["seed=1", "hydra.searchpath=[file://groups]", "hydra.output_subdir=null"]
+    assert prepare([*own, "resume=auto"])[-1].startswith("resume=outputs")
+    assert prepare([own[0], own[2], "resume=auto"])[-1] == "resume=null"
+
+
+def test_sweeps_in_groups_of_the_users_own_are_known(tmp_path: Path) -> None:
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text("hydra: {mode: MULTIRUN}\n")
+    for place in (
+        [f"hydra.searchpath=[file://{tmp_path}]"],
+        [f"hydra.searchpath=['file:///none','file://{tmp_path}']"],
+        ["--config-dir", str(tmp_path)],
+        [f"--config-dir={tmp_path}"],
+    ):
+        given = [*place, "experiment=mine", f"hydra.sweep.dir={tmp_path}", "resume=auto"]
+        assert prepare(given) == given
+    assert prepare(["experiment=mine", "resume=auto"])[-1] == "resume=null"
+
+
+def test_a_sweep_does_not_take_other_jobs_for_its_own(tmp_path: Path) -> None:
+    (tmp_path / "overrides.txt").write_text("model.plane_lr=0.002\ntrainer.max_steps=9\n")
+    for same in (
+        ["model.plane_lr=0.002", "resume=auto"],
+        ["trainer.max_steps=99", "model.plane_lr=0.002", "+callbacks.x.y=1"],
+    ):
+        launch._require_same_job(tmp_path, same)
+    for other in (["model.plane_lr=0.4"], ["model.plane_lr=0.002", "seed=1"], []):
+        with pytest.raises(ConfigError, match=r"plane_lr=0\.002.*another hydra\.sweep\.dir"):
+            launch._require_same_job(tmp_path, other)
+
+
+def test_what_hydra_knows_may_stand_in_settings(scenes: str, tmp_path: Path) -> None:
+    root = scenes.partition("=")[2]
+    (tmp_path / "link").symlink_to(root)
+    result = train(
+        *(option for option in SMALL if not option.startswith("trainer.max_steps")),
+        *("trainer.max_steps=2", "callbacks.evaluation.at=[]"),
+        "data.root=${hydra:runtime.cwd}/link",
+        "+callbacks.keep._target_=lightning.pytorch.callbacks.ModelCheckpoint",
+        "+callbacks.keep.dirpath=${hydra:runtime.output_dir}/mine",
+        f"hydra.run.dir={tmp_path / 'run'}",
+        cwd=tmp_path,
+    )
+    assert result.returncode == 0, result.stderr
+    assert "psnr" in result.stdout
+
+
+def test_a_group_set_to_null_is_answered_with_its_choices() -> None:
+    for group, choice in (("logger", "none"), ("lrm", "tiny"), ("callbacks", "default")):
+        with pytest.raises(ConfigError, match=rf"{group}=null: must be one of .*{choice}"):
+            prepare([f"{group}=null"])
+
+
+def test_a_run_goes_on_from_another_directory(scenes: str, tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    (tmp_path / "a" / "scenes").symlink_to(scenes.partition("=")[2])
+    own = [option for option in SMALL if not option.startswith("trainer.max_steps")]
+    own += ["callbacks.evaluation.at=[]", "data.root=scenes"]
+    run = tmp_path / "a" / "run"
+    first = train(*own, "trainer.max_steps=2", f"hydra.run.dir={run}", cwd=tmp_path / "a")
+    assert first.returncode == 0, first.stderr
+    again = train(f"resume={run}", "trainer.max_steps=4", cwd=tmp_path / "b")
+    assert again.returncode == 0, again.stderr
+    assert json.loads((run / "metrics.json").read_text())["step"] == 4
+    assert not list((tmp_path / "b").iterdir())
+
+
 def test_a_stopped_sweep_says_how_the_whole_of_it_goes_on(tmp_path, monkeypatch, capsys) -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         chosen = ["hydra.mode=MULTIRUN", f"hydra.sweep.dir={tmp_path}", "hydra.job.num=0"]

@@ -24,6 +24,8 @@ from xplanes.config import CONF, near_names, quoted, to_plain, with_names
 from xplanes.errors import ConfigError
 from xplanes.files import StorageError, read_json, require_writable
 
+SEARCHPATH = "hydra.searchpath"
+
 
 def file_name(scene: Any) -> str:
     """The name of a scene as a part of a run directory's: no folders, and nothing to quote."""
@@ -75,11 +77,22 @@ class SettingsCheck(Callback):
         from xplanes.pipeline import KNOWN_ERRORS, check
 
         names = [str(name) for name in config if name != "hydra"]
+        HydraConfig.instance().set_config(config)  # As Hydra does for the job, for ${hydra:...}.
         try:
-            plain = to_plain(OmegaConf.masked_copy(config, names))
-            check(plain, Path.cwd())  # Settings may lack what the run's own name consists of.
+            if (plain := _resolved(OmegaConf.masked_copy(config, names))) is not None:
+                check(plain, Path.cwd())  # Settings may lack what the run's own name consists of.
         except KNOWN_ERRORS as error:
             sys.exit(f"error: {error}")  # Hydra makes warnings of other exceptions.
+
+
+def _resolved(config: DictConfig) -> dict[str, Any] | None:
+    """Settings without references; None where one is to what Hydra knows in the job alone."""
+    try:
+        return to_plain(config)
+    except ConfigError:
+        if "${hydra:" in OmegaConf.to_yaml(config):
+            return None
+        raise
 
 
 class _Copied(io.TextIOBase):
@@ -118,8 +131,10 @@ def _job(config: DictConfig) -> float:
             )
         auto = plain["resume"] == "auto" and (folder / "run.json").is_file()
         resume = auto or plain["resume"] not in (None, "auto")
+        if auto:
+            _require_same_job(folder, settings.overrides.task)
         # A run that goes on must find the user's own groups again.
-        own = [text for text in settings.overrides.hydra if _split(text)[0] == "hydra.searchpath"]
+        own = [text for text in settings.overrides.hydra if _split(text)[0] == SEARCHPATH]
         task = [text for text in settings.overrides.task if _split(text)[0] != "resume"]
         return run(plain, folder, [*own, *task], resume=resume)
     except KNOWN_ERRORS as error:
@@ -131,6 +146,32 @@ def _job(config: DictConfig) -> float:
             place = shlex.quote(f"hydra.sweep.dir={settings.sweep.dir}")
             print(f"the whole sweep: the same command with {place} resume=auto")
         sys.exit(130)
+
+
+def _require_same_job(folder: Path, overrides: Iterable[str]) -> None:
+    """Refuse to take another job's run for the one that a sweep would go on with.
+
+    Raises:
+        ConfigError: With the settings of that run.
+    """
+    try:
+        kept = (folder / "overrides.txt").read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return  # Damaged: it is written anew.
+    before, now = ({t for t in each if not _may_differ(t)} for each in (kept, overrides))
+    if before != now:
+        raise ConfigError(
+            f"{folder} holds the run with {' '.join(sorted(before)) or 'no settings'}, not that "
+            f"with {' '.join(sorted(now)) or 'none'}: give the sweep that it belongs to, or take "
+            "another hydra.sweep.dir"
+        )
+
+
+def _may_differ(override: str) -> bool:
+    """Whether a run may go on with this changed: how long it trains, what it writes, and where."""
+    return not override or _split(override)[0].split(".")[0] in (
+        *("resume", "hydra", "trainer", "callbacks", "logger", "media", "viewer", "sheet"),
+    )
 
 
 def prepare(arguments: list[str]) -> list[str]:
@@ -148,6 +189,10 @@ def prepare(arguments: list[str]) -> list[str]:
     """
     arguments = [with_names(text) for text in arguments]
     values = {key: value for key, value in map(_split, arguments) if key}
+    for key, value in values.items():
+        if value in ("null", "None") and (CONF / key).is_dir():
+            names = ", ".join(sorted(path.stem for path in (CONF / key).glob("*.yaml")))
+            raise ConfigError(f"{key}={value}: must be one of {names}")
     resume = values.get("resume", "null").strip("\"'")
     if resume in ("null", "", "None", "auto"):
         # Before Hydra makes the folder, whose errors are tracebacks.
@@ -193,7 +238,10 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
     new = [a for a in arguments if not a.startswith(("resume=", "hydra.run.dir="))]
     changed = {key for key, _ in map(_split, new) if key}
     old = [line for line in text.splitlines() if line and _split(line)[0] not in changed]
-    return [*old, *new, f"hydra.run.dir={quoted(str(run))}", f"resume={quoted(str(run))}"]
+    # One job of an experiment that is a sweep goes on alone.
+    alone = [] if "hydra.mode" in changed else ["hydra.mode=RUN"]
+    place = quoted(str(run))
+    return [*old, *new, *alone, f"hydra.run.dir={place}", f"resume={place}"]
 
 
 def _require_version(run: Path) -> None:
@@ -226,8 +274,9 @@ def _latest(outputs: Path, overrides: list[str]) -> Path | None:
 
 def _without_resume(overrides: Iterable[str]) -> list[str]:
     """Overrides in order, but for what the command line alone says of the run that it continues."""
-    mine = ("resume=", "hydra.run.dir=")
-    return sorted(text for text in overrides if text and not text.startswith(mine))
+    keys = {text: _split(text)[0] for text in overrides if text}
+    mine = {t for t, key in keys.items() if key.startswith("hydra.") and key != SEARCHPATH}
+    return sorted(text for text, key in keys.items() if key != "resume" and text not in mine)
 
 
 def _mtime(path: Path) -> float:
@@ -249,13 +298,22 @@ def _is_multirun(arguments: list[str]) -> bool:
         return True
     if "hydra.mode" in values:
         return values["hydra.mode"] == "MULTIRUN"
-    return _is_sweep(values.get("experiment", ""))
+    folders = re.findall(r"file://([^\]\[,'\"]+)", values.get(SEARCHPATH, ""))
+    for number, text in enumerate(arguments):
+        option, equals, folder = text.partition("=")
+        if option in ("--config-dir", "-cd"):
+            folders += [folder] if equals else arguments[number + 1 : number + 2]
+    return _is_sweep(values.get("experiment", ""), [CONF, *map(Path, folders)])
 
 
-def _is_sweep(experiment: str) -> bool:
+def _is_sweep(experiment: str, folders: Iterable[Path]) -> bool:
     """Whether the experiment's file says that it is a multirun."""
-    path = CONF / "experiment" / f"{experiment}.yaml"
-    if not path.is_file():
+    paths = [folder / "experiment" / f"{experiment}.yaml" for folder in folders]
+    path = next((path for path in paths if path.is_file()), None)
+    if path is None:
         return False
-    content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    return (content.get("hydra") or {}).get("mode") == "MULTIRUN"
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+        return (content.get("hydra") or {}).get("mode") == "MULTIRUN"
+    except (OSError, ValueError, AttributeError, yaml.YAMLError):
+        return False  # Hydra says what is wrong with it.

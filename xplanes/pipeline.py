@@ -36,7 +36,7 @@ from xplanes.lrm import LRMError
 from xplanes.models.initialisation import Initialisation, Place
 from xplanes.optional import MissingExtraError
 from xplanes.process import resume_command
-from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.datamodule import SceneDataModule, found_root
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene
@@ -83,6 +83,9 @@ def run(config: dict[str, Any], folder: Path, overrides: list[str], *, resume: b
             what to do.
         KeyboardInterrupt: If the user stopped it; the state is saved.
     """
+    if resume and isinstance(root := config.get("data", {}).get("root"), str):
+        # It may be relative to where the run was started.
+        config = config | {"data": config["data"] | {"root": found_root(folder, root)}}
     experiment = check(config, folder)
     if int(os.environ.get("LOCAL_RANK", "0")):
         train(experiment, folder, resume=resume)

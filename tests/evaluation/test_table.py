@@ -267,6 +267,33 @@ def test_jobs_without_a_run_are_rows(tmp_path):
     assert "model.plane_set" not in written[0]
 
 
+def test_jobs_in_nested_folders_and_begun_by_resume_are_not_missing(tmp_path):
+    sweep = {
+        "hydra": {
+            "sweeper": {
+                "_target_": "hydra._internal.core_plugins.basic_sweeper.BasicSweeper",
+                "params": None,
+            },
+            "overrides": {"task": ["seed=0,1", "resume=auto"]},
+        }
+    }
+    (tmp_path / "multirun.yaml").write_text(yaml.safe_dump(sweep))
+    for seed in (0, 1):
+        lines = (f"seed={seed}", "hydra.searchpath=[file://mine]")
+        make(tmp_path / "six" / f"{seed}", seed=seed, overrides=lines)
+    assert [row.status for row in read_rows(tmp_path)] == ["finished", "finished"]
+
+
+def test_where_a_run_logs_keeps_no_seeds_apart(tmp_path):
+    for seed in (0, 1):
+        run = make(tmp_path / f"{seed}", seed=seed)
+        config = yaml.safe_load((run / "config.yaml").read_text())
+        config["logger"] = {"csv": {"prefix": f"s{seed}"}}
+        config["callbacks"] = {"keep": {"dirpath": f"{run}/mine"}}
+        (run / "config.yaml").write_text(yaml.safe_dump(config))
+    assert "Mean and standard deviation over seeds" in write_tables(tmp_path)
+
+
 def test_an_unknown_sweeper_lists_no_jobs(tmp_path):
     make(tmp_path / "0")
     for content in (

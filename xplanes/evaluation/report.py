@@ -16,6 +16,7 @@ from xplanes.experiment import Experiment
 from xplanes.process import resume_command
 from xplanes.rendering.pictures import write_png
 from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.training.checkpoints import LAST
 from xplanes.training.clock import TrainingClock, find_callback, training_seconds
 from xplanes.training.evaluation import (
     ViewScore,
@@ -69,6 +70,8 @@ def header(
         moving = f" · trains as a static one, without time planes: {reason}"
     steps, seconds = trainer.get("max_steps", -1), trainer.get("max_seconds")
     limits = [f"{steps} steps"] if steps >= 0 else []
+    if (epochs := trainer.get("max_epochs")) is not None and epochs >= 0:
+        limits.append(f"{epochs} epoch{'s' * (epochs != 1)}")
     limits += [] if seconds is None else [f"{seconds:g} s"]
     budget = " or ".join(limits) + ", whichever comes first" * (len(limits) > 1)
     lines = {
@@ -243,6 +246,10 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
         f"{metrics['samples_per_ray']:.1f} samples a ray remained, gradients of "
         f"{100 * (1 - skipped['gradients']):.0f}% of them{plateau}"
     )
+    # Without callbacks.checkpoints there is nothing to render or to go on with.
+    kept = "checkpoints/last.ckpt  " if (run / "checkpoints" / LAST).is_file() else ""
+    steps = [*curves, f"xplanes render {place}{named}", resume_command(run) + more]
+    steps = steps if kept else curves
     warm_up = f"compiling {seconds['warm_up']:.1f} s · " if seconds["warm_up"] >= 1 else ""
     return "\n".join(
         [
@@ -257,9 +264,7 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             *([skips] if metrics["samples_per_ray"] else []),
             f"memory   {metrics['peak_memory_bytes'] / 2**30:.1f} GB at its peak",
             f"wrote    {run}",
-            f"         metrics.json  curve.csv  checkpoints/last.ckpt  {metrics.get('media', '')}",
-            *(f"next     {line}" for line in curves),
-            f"{'' if curves else 'next':<9}xplanes render {place}{named}",
-            f"         {resume_command(run)}{more}",
+            f"         metrics.json  curve.csv  {kept}{metrics.get('media', '')}",
+            *(f"{'next' if line is steps[0] else '':<9}{line}" for line in steps),
         ]
     )

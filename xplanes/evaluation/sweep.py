@@ -5,7 +5,7 @@ status.
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -93,10 +93,11 @@ class RunRow:
 
 def read_rows(folder: Path) -> list[RunRow]:
     """All runs in a folder, however deep, and the jobs of sweeps that left no run."""
-    rows = []
-    for place, runs in _groups(folder):
+    rows, groups = [], list(_groups(folder))
+    for place, runs in groups:
         rows += [read_run(run, _name(run, folder)) for run in runs]
-        rows += _missing_jobs(place, folder, [run_overrides(run) for run in runs])
+        below = [run for other, its in groups if other.is_relative_to(place) for run in its]
+        rows += _missing_jobs(place, folder, [run_overrides(run) for run in below])
     return rows
 
 
@@ -267,10 +268,10 @@ def _missing_jobs(sweep: Path, folder: Path, done: list[list[str]]) -> list[RunR
     content = _read_yaml(sweep, ("multirun.yaml",), [])
     if not isinstance(content, dict):
         return []
-    left = Counter(tuple(sorted(lines)) for lines in done)
+    left = Counter(_settings_of(lines) for lines in done)
     rows = []
     for number, job in enumerate(_jobs(content)):
-        key = tuple(sorted(job))
+        key = _settings_of(job)
         if left[key]:
             left[key] -= 1
             continue
@@ -278,6 +279,12 @@ def _missing_jobs(sweep: Path, folder: Path, done: list[list[str]]) -> list[RunR
         name = str(Path(_name(sweep, folder) if sweep != folder else "") / f"job {number}")
         rows.append(RunRow(name, settings, frozenset(settings), status="missing: no run"))
     return rows
+
+
+def _settings_of(overrides: Iterable[str]) -> tuple[str, ...]:
+    """Overrides in order, but for those that say how Hydra runs the job."""
+    mine = ("resume", "hydra")
+    return tuple(sorted(text for text in overrides if _key(text).split(".")[0] not in mine))
 
 
 def _jobs(multirun: dict[str, Any]) -> list[list[str]]:

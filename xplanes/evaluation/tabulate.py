@@ -115,6 +115,11 @@ def _measures(rows: Iterable[RunRow]) -> list[str]:
     return [name for name in MEASURES if known or name != "psnr_thing"]
 
 
+def _unlisted(key: str) -> bool:
+    """Whether a setting says nothing about a result: where and what a run writes."""
+    return key in UNLISTED or key.startswith("logger.") or key.endswith(".dirpath")
+
+
 def seed_groups(rows: Sequence[RunRow]) -> list[list[RunRow]]:
     """Finished runs that differ in nothing but their seed, if there are two such runs at all.
 
@@ -123,7 +128,7 @@ def seed_groups(rows: Sequence[RunRow]) -> list[list[RunRow]]:
     groups: dict[str, dict[str, RunRow]] = {}
     for row in rows:
         if row.status == "finished" and row.settings and {"psnr", "ssim"} <= row.scores.keys():
-            rest = {k: v for k, v in row.settings.items() if k not in (SEED, *UNLISTED)}
+            rest = {k: v for k, v in row.settings.items() if k != SEED and not _unlisted(k)}
             group = groups.setdefault(json.dumps(rest, sort_keys=True, default=str), {})
             group.setdefault(_text(row.settings.get(SEED)), row)
     several = any(len(group) > 1 for group in groups.values())

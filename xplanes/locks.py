@@ -82,8 +82,7 @@ def alone_in(run: Path) -> Iterator[None]:
         with suppress(OSError, ValueError, KeyError):
             process = f"process {read_json(run / 'run.json')['process']}"
         raise ConfigError(
-            f"{run} is in use by {process}: wait for it to end, stop it, or choose another "
-            "hydra.run.dir"
+            f"{run} is in use by {process}: wait for it to end, stop it, or choose another folder"
         ) from None
     except (OSError, NotImplementedError) as problem:
         logger.warning("%s cannot be locked (%s): start no second process in it", run, problem)

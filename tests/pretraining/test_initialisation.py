@@ -117,7 +117,11 @@ def test_settings_that_cannot_work_are_refused_by_name():
     for section, key, value, message in (
         ("model", "patch", 7, r"model\.image_size=24.*model\.patch=7"),
         ("model", "heads", 5, r"model\.width=48"),
+        ("model", "heads", 24, r"model\.width=48: must be at least 288"),
+        ("pool", "views", 1, r"pool\.views=1"),
         ("batch", "objects", 0, r"batch\.objects=0"),
+        ("batch", "objects", 10**6, r"batch\.objects=1000000.*pool\.objects"),
+        ("batch", "colour", 0, r"batch\.colour=0"),
         ("batch", "samples", 2, r"batch\.samples=2"),
         ("schedule", "max_steps", 0, r"schedule\.max_steps=0"),
         ("schedule", "clip", -1.0, r"schedule\.clip=-1"),
@@ -126,6 +130,9 @@ def test_settings_that_cannot_work_are_refused_by_name():
         plain = small_plain()
         plain[section][key] = value
         assert_refused(ConfigError, message, partial(parse_pretraining, plain), key)
+    plain = small_plain()
+    plain["batch"] |= dict.fromkeys(("near", "volume", "free"), 0)
+    assert_refused(ConfigError, r"batch\.near=0", partial(parse_pretraining, plain), "points")
     for override, message in (
         ("schedule.clip=-1", r"schedule\.clip=-1"),
         ("batch.object=3", "batch.object"),

@@ -3,6 +3,7 @@
 import copy
 import json
 import os
+import shutil
 import signal
 
 import pytest
@@ -10,6 +11,7 @@ import torch
 
 from tests.pretraining.small import OVERRIDES, same, small_config, small_pool, small_sizes
 from xplanes.cli import main
+from xplanes.locks import alone_in
 from xplanes.lrm import load
 from xplanes.pretraining import pool as pool_module
 from xplanes.pretraining.initialisation import init_model
@@ -85,6 +87,45 @@ def test_finer_planes_are_initialised_from_a_finished_run(finished, tmp_path, po
     assert command(tmp_path / "fine", pool_folder, *finer) == 0
     assert command(tmp_path / "wrong", pool_folder, *finer, "model.width=24") == 1
     assert "init_from=" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("changed", ["model.heads=1", "model.distance=5", "model.density_scale=3"])
+def test_weights_of_a_model_that_differs_in_more_are_refused(
+    finished, tmp_path, pool_folder, capsys, changed
+):
+    coarse = f"init_from={finished}/tiny.safetensors"
+    assert command(tmp_path, pool_folder, coarse, "schedule.max_steps=1", changed) == 1
+    assert "init_from=" in capsys.readouterr().err
+
+
+def test_a_damaged_or_used_run_is_said_in_words(finished, tmp_path, pool_folder, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    steps = "schedule.max_steps=2"
+    with alone_in(run):
+        assert command(run, pool_folder, steps) == 1
+    assert "in use" in capsys.readouterr().err
+    whole = (run / CHECKPOINT).read_bytes()
+    (run / CHECKPOINT).write_bytes(whole[: len(whole) // 2])
+    assert command(run, pool_folder, steps) == 1
+    assert "last.ckpt is damaged: delete it" in capsys.readouterr().err
+    (run / CHECKPOINT).write_bytes(whole)
+    settings = (run / "config.json").read_text()
+    (run / "config.json").write_text(settings[:50])
+    assert command(run, pool_folder, steps) == 1
+    assert "config.json is damaged" in capsys.readouterr().err
+    (run / "config.json").write_text(settings)
+    assert command(run, pool_folder, steps) == 0
+
+
+def test_a_score_that_fails_loses_no_step(tmp_path, pool_folder, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("no score")
+
+    monkeypatch.setattr("xplanes.pretraining.quick.QuickLook.scores", fail)
+    with pytest.raises(RuntimeError, match="no score"):
+        command(tmp_path, pool_folder, "schedule.max_steps=3")
+    assert state(tmp_path)["progress"]["steps"] == 3
 
 
 def module(*overrides):

@@ -1,5 +1,7 @@
 """Initialisation of a model: position embeddings of image and planes that match each other."""
 
+from dataclasses import fields
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -117,7 +119,14 @@ def grow_model(earlier: OpenLRM, config: LRMConfig) -> OpenLRM:
     Args:
         earlier: The trained model; it may differ in ``low_resolution`` only.
         config: Sizes of the new model.
+
+    Raises:
+        ValueError: If they differ in more.
     """
+    for each in fields(config):
+        before, now = getattr(earlier.config, each.name), getattr(config, each.name)
+        if each.name != "low_resolution" and before != now:
+            raise ValueError(f"its {each.name} is {before}, and {now} here")
     model, places = OpenLRM(config), _places(config)
     old = earlier.config.low_resolution
     learned = earlier.position[0] - 0.5 * _plane_places(earlier.config, places)

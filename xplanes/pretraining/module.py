@@ -234,10 +234,12 @@ class Upkeep(Callback):
         done = pl_module.progress >= 1
         if pl_module.steps % self.schedule.log_every == 0 or done:
             self._log(trainer, pl_module, pl_module.last)
-        if done or self._due("score", pl_module.clock, self.schedule.score_seconds):
+        scores = done or self._due("score", pl_module.clock, self.schedule.score_seconds)
+        kept = self._due("checkpoint", pl_module.clock, self.schedule.checkpoint_seconds)
+        if done or scores or kept:
+            self.save(trainer)  # First: a score that fails must not lose the training.
+        if scores:
             self._log(trainer, pl_module, self.look.scores(pl_module.average))
-        if done or self._due("checkpoint", pl_module.clock, self.schedule.checkpoint_seconds):
-            self.save(trainer)
         trainer.should_stop = done
         self.started = time.perf_counter()
 

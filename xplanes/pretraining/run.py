@@ -18,6 +18,7 @@ from xplanes.backend import fast_bf16
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.files import read_json, replacing, write_json
+from xplanes.locks import alone_in
 from xplanes.lrm import load
 from xplanes.lrm.bundled import CHECKSUM
 from xplanes.lrm.config import LRMConfig, parse_config
@@ -29,6 +30,7 @@ from xplanes.pretraining.objects import HELD_OUT_SEEDS, TRAINING_SEEDS
 from xplanes.pretraining.pool import FOCAL, SHARD, PretrainingBatch, PretrainingBatches, ensure_pool
 from xplanes.pretraining.quick import QuickLook
 from xplanes.pretraining.settings import PretrainingSettings, parse_pretraining, published_sizes
+from xplanes.training.checkpoints import load_checkpoint
 from xplanes.training.fit import quiet_lightning
 from xplanes.training.interrupt import Interrupt
 
@@ -113,9 +115,21 @@ def pretrain(plain: dict, config: PretrainingSettings, announce: Callable[[str],
         ConfigError: If the run folder holds a run with another model, pool or seed.
     """
     quiet_lightning()
+    with alone_in(Path(config.run)):
+        return _pretrain(plain, config, announce)
+
+
+def _pretrain(plain: dict, config: PretrainingSettings, announce: Callable[[str], None]) -> Path:
     run = Path(config.run)
     last = run / CHECKPOINT
     _settle(run, plain)
+    if last.is_file():
+        try:
+            load_checkpoint(last)
+        except ConfigError as problem:
+            raise ConfigError(
+                f"{last} is damaged: delete it to begin anew, or name another run"
+            ) from problem
     module, data, look = assemble(config, announce)
     if last.is_file():
         announce(f"resuming from {last}")
@@ -186,7 +200,8 @@ def _grown(init_from: str, sizes: LRMConfig) -> OpenLRM:
     weights = Path(init_from)
     try:
         earlier = load(read_json(weights.with_suffix(".json")), weights)
-        assert isinstance(earlier, OpenLRM)
+        if not isinstance(earlier, OpenLRM):
+            raise ValueError(f"they are of {earlier.config.architecture}")
         return grow_model(earlier, sizes).requires_grad_(True)
     except (OSError, ValueError, RuntimeError) as problem:
         raise ConfigError(
@@ -198,7 +213,13 @@ def _settle(run: Path, plain: dict) -> None:
     """Write the configuration to the run folder; refuse one that contradicts the earlier one."""
     path = run / "config.json"
     if path.is_file():
-        before = read_json(path)
+        try:
+            before = read_json(path)
+        except ValueError as problem:
+            raise ConfigError(
+                f"{path} is damaged: delete it if the settings are those that the run began with, "
+                "or name another run"
+            ) from problem
         for key in ("seed", "model", "pool"):
             if before.get(key) != plain[key]:
                 raise ConfigError(

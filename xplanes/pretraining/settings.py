@@ -7,6 +7,9 @@ from typing import Any
 from xplanes.errors import ConfigError
 from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
 
+NARROWEST = 12
+"""Channels of a head at least: a sine and a cosine of two coordinates along three axes."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SizeSettings(Settings):
@@ -33,6 +36,11 @@ class SizeSettings(Settings):
             )
         if self.width % self.heads:
             raise ConfigError(f"width={self.width}: must be a multiple of model.heads={self.heads}")
+        if self.width // self.heads < NARROWEST:
+            raise ConfigError(
+                f"width={self.width}: must be at least {NARROWEST * self.heads}, {NARROWEST} for "
+                f"each of model.heads={self.heads}, which hold sines and cosines of a place"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +49,11 @@ class PoolSettings(Settings):
 
     root: str  # Folder of the pool.
     objects: Count  # Training objects, a multiple of 256.
-    views: Count  # Images per object.
+    views: Count  # Images per object, at least 2: scores are of views that the model did not see.
+
+    def check(self) -> None:
+        if self.views < 2:
+            raise ConfigError(f"views={self.views}: must be at least 2, one of them to score")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,13 +64,15 @@ class BatchSettings(Settings):
     near: Steps  # Points near the surface, per object.
     volume: Steps  # Points in the volume around the object, per object.
     free: Steps  # Points in the free space in front of the surface, per object.
-    colour: Steps  # Surface points with colour supervision, per object.
+    colour: Count  # Surface points with colour supervision, per object.
     rays: Steps  # Rays rendered per object, from schedule.render_from on.
     samples: Count  # Samples per ray.
 
     def check(self) -> None:
         if self.rays and self.samples < 4:
             raise ConfigError(f"samples={self.samples}: a ray needs at least 4")
+        if not (self.near or self.volume or self.free):
+            raise ConfigError("near=0: near, volume and free are all 0; one must be above")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +108,13 @@ class PretrainingSettings(Settings):
     pool: PoolSettings
     batch: BatchSettings
     schedule: ScheduleSettings
+
+    def check(self) -> None:
+        if self.batch.objects > self.pool.objects:
+            raise ConfigError(
+                f"batch.objects={self.batch.objects}: must not be above pool.objects="
+                f"{self.pool.objects}"
+            )
 
 
 def parse_pretraining(plain: Mapping[str, Any]) -> PretrainingSettings:

@@ -77,6 +77,7 @@ def scripts(folder: Path) -> dict[str, list[list[str]]]:
         ],
     ]
     given["lrm_quality"] = [["--together", "2"]]
+    given["ray_drawing"] = [["--gigabytes", "22"]]  # More than the system keeps in memory.
     apart = "preparation.cache=null"
     given["where_time_goes"] = [[apart], ["--name", "lego", apart, *lego(folder.resolve())]]
     return {name: given.get(name, [[]]) for name in PARTS}

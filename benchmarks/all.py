@@ -153,7 +153,8 @@ def main() -> int:
         return 0
     wanted = args.only or [name for name, reason in stale.items() if reason]
     chosen = {name: runs for name, runs in scripts(args.lego).items() if name in wanted}
-    if any(any(runs) for runs in chosen.values()) and not args.lego.is_dir():
+    needs_lego = any("lego" in " ".join(line) for runs in chosen.values() for line in runs)
+    if needs_lego and not args.lego.is_dir():
         parser.error(f"--lego {args.lego}: there is no such folder; xplanes download dnerf")
     failed = []
     for name, runs in chosen.items():

@@ -3,7 +3,8 @@
     python benchmarks/where_time_goes.py [--name default] [key=value ...]
 
 Writes results/time_NAME.md beside this file. The functions of each stage are timed as they are
-called, without what they call in other stages; what no stage claims is shown too.
+called, without what they call in other stages; what no stage claims is shown too. The first run
+after an installation compiles loops and renders the scene, which counts: run it twice.
 """
 
 import os

@@ -12,6 +12,7 @@ import argparse
 import ast
 import hashlib
 import json
+import re
 import subprocess
 import sys
 import time
@@ -125,7 +126,12 @@ def digest_of(part: str) -> str:
 def state_of(name: str) -> dict[str, Any]:
     """Version, machine and measured code as they are now."""
     parts = {part: digest_of(part) for part in (*PARTS[name], f"benchmarks/{name}.py")}
-    return {"version": __version__, "machine": machine(), "parts": parts}
+    return {"version": __version__, "machine": kind_of(machine()), "parts": parts}
+
+
+def kind_of(machine: str) -> str:
+    """A machine without how many of its cores were used, which a script says itself."""
+    return re.sub(r"^\d+ of ", "", machine)
 
 
 def why_stale(now: dict[str, Any], then: dict[str, Any] | None) -> str:
@@ -133,7 +139,7 @@ def why_stale(now: dict[str, Any], then: dict[str, Any] | None) -> str:
     if then is None:
         return "not recorded"
     changes = [f"made with {then['version']}"] * (then["version"] != now["version"])
-    changes += [f"made on {then['machine']}"] * (then["machine"] != now["machine"])
+    changes += [f"made on {then['machine']}"] * (kind_of(then["machine"]) != now["machine"])
     parts = [name for name, code in now["parts"].items() if then["parts"].get(name) != code]
     changes += [f"changed since: {', '.join(parts)}"] * bool(parts)
     return "; ".join(changes)

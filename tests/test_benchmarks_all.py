@@ -45,6 +45,10 @@ def test_what_has_changed_is_said(every) -> None:
     then = {"version": "1", "machine": "small", "parts": {"xplanes/lrm": "a", "conf": "c"}}
     assert every.why_stale(now, then) == "made with 1; made on small; changed since: conf"
     assert "conf" in every.why_stale(now, {**now, "parts": {"xplanes/lrm": "a"}})
+    assert every.kind_of("1 of 2 cores, small") == every.kind_of("2 cores, small")
+    cores = {**now, "machine": "2 cores, small"}
+    assert every.why_stale(cores, {**cores, "machine": "1 of 2 cores, small"}) == ""
+    assert every.why_stale(cores, {**cores, "machine": "1 of 4 cores, small"}) != ""
 
 
 def test_printed_commands_name_no_folder(every) -> None:

@@ -177,8 +177,8 @@ def test_a_module_that_was_loaded_logs_as_a_fresh_one(scenes: Path, tmp_path: Pa
 @pytest.mark.parametrize(
     ("key", "node", "words"),
     [
-        ("trainer", {"logger": False}, r"trainer\.logger=False: .*leave it out"),
-        ("trainer", {"default_root_dir": "x"}, r"trainer\.default_root_dir=x: .*hydra\.run\.dir"),
+        ("trainer", {"logger": False}, r"trainer\.logger=False: set logger=none"),
+        ("trainer", {"default_root_dir": "x"}, r"trainer\.default_root_dir=x: set hydra\.run\.dir"),
         (
             "callbacks",
             {

@@ -75,11 +75,6 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
     else:
         cls = class_of(target, kind, f"{key}._target_")
     arguments = {name: value for name, value in node.items() if name != "_target_"}
-    for name in arguments.keys() & more.keys():
-        raise ConfigError(
-            f"{key}.{name}={arguments[name]}: it is set by the groups callbacks and logger and by "
-            "the run directory (hydra.run.dir); leave it out"
-        )
     if not issubclass(cls, Settings):
         for name, value in arguments.items():
             if isinstance(value, Mapping) and "_target_" in value:

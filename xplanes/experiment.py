@@ -17,6 +17,13 @@ from xplanes.models.initialisation import Method
 from xplanes.scenes.source import SceneSettings
 from xplanes.training.fit import Trainer, find_device
 
+OWNERS = {
+    "callbacks": "the group callbacks",
+    "logger": "logger=none, or another of its group,",
+    "default_root_dir": "hydra.run.dir",
+}
+"""Arguments of the Trainer that are not set as such, and what is set instead."""
+
 
 @dataclass(frozen=True)
 class Experiment:
@@ -113,6 +120,9 @@ class Experiment:
                 f"trainer.devices={self.devices} with trainer.strategy=auto: several devices need "
                 "trainer=ddp"
             )
+        for name, owner in OWNERS.items():
+            if name in self.trainer:
+                raise ConfigError(f"trainer.{name}={self.trainer[name]}: set {owner} instead")
         with plugins(self.config.get("plugins") or []):
             callbacks = [
                 build(node, Callback, f"callbacks.{name}") for name, node in self.callbacks.items()

@@ -69,7 +69,7 @@ def differing(rows: Sequence[RunRow]) -> list[str]:
         # Jobs without a run know only what was overridden.
         among = known if name in overridden or name.endswith(".name") else whole
         values = {_text(row.settings.get(name)) for row in among if _has(row, name)}
-        if len(values) < 2 or name in UNLISTED:
+        if len(values) < 2 or _unlisted(name):
             continue
         parts = name.split(".")
         groups = [f"{'.'.join(parts[:end])}.name" for end in range(1, len(parts))]

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from xplanes.lrm.config import LRMConfig
 from xplanes.lrm.openlrm import OpenLRM
+from xplanes.pretraining.settings import NARROWEST
 
 SHARPNESS = 1.2
 """Scale of the identity that initialises queries and keys of attention to the image."""
@@ -73,7 +74,7 @@ def _compare(attention: nn.Module, sharpness: float) -> None:
 def _places(config: LRMConfig) -> tuple[range, int]:
     """First channel of each axis within a head, and the number of frequencies per axis."""
     width = config.head_width
-    waves = width // 12
+    waves = width // NARROWEST
     return range(0, 6 * waves, 2 * waves), waves
 
 

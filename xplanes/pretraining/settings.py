@@ -8,7 +8,7 @@ from xplanes.errors import ConfigError
 from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
 
 NARROWEST = 12
-"""Channels of a head at least: a sine and a cosine of two coordinates along three axes."""
+"""Channels of a head at least: half of them hold a sine and a cosine along each of three axes."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,12 +12,7 @@ from xplanes.scenes.changes import changing
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.pools import PixelPool, PixelPools, in_cells, tile_pools
 from xplanes.scenes.silhouettes import foreground, plain
-from xplanes.scenes.store import (
-    CELL,
-    TILE,
-    StoredImages,
-    unpacked,
-)
+from xplanes.scenes.store import CELL, TILE, StoredImages, unpacked
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Settings, Share
 from xplanes.streams import Stream, counted_uniform, step_generator

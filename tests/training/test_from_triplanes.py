@@ -212,6 +212,7 @@ def test_regularisers_towards_the_initialisation_fade(place: Path) -> None:
     """Without other terms, a gradient is what it would be without fading times what is left."""
     quiet = [
         "model.loss.total_variation=0",
+        "model.loss.time_variation=0",
         "model.loss.time_smoothness=0",
         "model.loss.time_magnitude=0",
     ]
@@ -234,6 +235,40 @@ def test_regularisers_towards_the_initialisation_fade(place: Path) -> None:
     for gradient, all_of_it in zip(left, whole, strict=True):
         torch.testing.assert_close(gradient, 0.75 * all_of_it)
     assert not any(gradient.any() for gradient in gradients(96, "288") + gradients(104, "288"))
+
+
+def test_total_variation_has_a_weight_for_the_planes_of_space_and_one_for_those_of_time(
+    place: Path,
+) -> None:
+    """Values and gradients, against the formula in float64."""
+    weights = {"total_variation": 0.3, "time_variation": 0.7}
+    off = [f"model.loss.time_{name}=0" for name in ("smoothness", "magnitude", "identity")]
+    off += ["model.loss.initial_weight=0", "model.loss.sparse_weight=0", "model.loss.every=1"]
+    weigh = [f"model.loss.{name}={weight}" for name, weight in weights.items()]
+    model = built(settings(place, *off, *weigh))
+    field, state = model.field, TrainingState(seed=0, step=1, batch=1, rank=0)
+    assert field.time is not None
+    with torch.no_grad():
+        for plane in (field.space, field.time):
+            plane.add_(torch.randn(plane.shape, generator=torch.Generator().manual_seed(5)))
+    space, time = (p.detach().double().requires_grad_() for p in (field.space, field.time))
+    columns, rows = space[:, :, 1:] - space[:, :, :-1], space[:, 1:] - space[:, :-1]
+    along = time[:, :, 1:] - time[:, :, :-1]
+    expected = {
+        "total_variation": 0.3 * (columns.square().mean() + rows.square().mean()),
+        "time_variation": 0.7 * along.square().mean(),
+    }
+    values = {name: value.item() for name, value in expected.items()}
+    assert model.regularisers(state) == pytest.approx(values, rel=1e-5)
+
+    torch.stack(list(expected.values())).sum().backward()
+    for plane in (field.space, field.time):
+        plane.grad = torch.zeros_like(plane)
+    model.regularise(state)
+    for plane, exact in ((field.space, space), (field.time, time)):
+        assert plane.grad is not None
+        assert exact.grad is not None
+        torch.testing.assert_close(plane.grad.double(), exact.grad, rtol=1e-4, atol=1e-9)
 
 
 def test_the_regulariser_scales_with_the_inverse_square_of_the_views(place: Path) -> None:

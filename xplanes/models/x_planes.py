@@ -8,6 +8,7 @@ products of the space-time planes to the sparse part of the LRM's triplanes (Eq.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -65,9 +66,10 @@ class XPlanesLoss(Settings):
     # mean: differences along space, mean over planes. coded: as in K-Planes' released code, summed
     # over planes, along time too.
     variation: Literal["mean", "coded"]
-    total_variation: Weight  # Weight of total variation.
+    total_variation: Weight  # Weight of the space planes' total variation.
     # Replaces `model.loss.total_variation` where a background is learnt.
     world_variation: Weight
+    time_variation: Weight  # Weight of the time planes' total variation.
     time_smoothness: Weight  # Weight of time smoothness (squared second differences).
     time_magnitude: Weight  # Weight of the squared values of time planes.
     time_identity: Weight  # Weight of the time planes' mean distance from 1, as in K-Planes.
@@ -266,9 +268,9 @@ class XPlanesModel(Model):
             for plane, initial in zip(self._planes, self._initial, strict=True):
                 if plane.grad is not None:
                     add_distance_gradient(plane.grad, plane, initial, weight)
-        for plane, dims, factor in self._variation():
-            if (weight := factor * self.total_variation * every) and plane.grad is not None:
-                add_total_variation_gradient(plane.grad, plane, dims, weight)
+        for plane, dims, weight in self._variation().values():
+            if weight and plane.grad is not None:
+                add_total_variation_gradient(plane.grad, plane, dims, weight * every)
         if field.time is None or field.time.grad is None:
             return
         if weight := weights.time_smoothness * every:
@@ -289,13 +291,8 @@ class XPlanesModel(Model):
     def regularisers(self, state: TrainingState) -> dict[str, float]:
         weights, field, fading = self.weights, self._field, self._fading(state.step)
         terms: dict[str, tuple[float, Callable[[], Any]]] = {
-            "total_variation": (
-                self.total_variation,
-                lambda: sum(
-                    factor * total_variation(plane, dims)
-                    for plane, dims, factor in self._variation()
-                ),
-            )
+            name: (weight, partial(total_variation, plane, dims))
+            for name, (plane, dims, weight) in self._variation().items()
         }
         if (world := field.background) is not None and (options := self.settings.background):
             variation = options.total_variation
@@ -310,16 +307,18 @@ class XPlanesModel(Model):
                 terms["l_r"] = (fading * weights.sparse_weight, lambda: product.value(time))
         return {name: weight * float(value()) for name, (weight, value) in terms.items() if weight}
 
-    def _variation(self) -> list[tuple[Tensor, tuple[int, ...], float]]:
-        """Stacks of planes, the axes along which they shall be smooth, and factors."""
+    def _variation(self) -> dict[str, tuple[Tensor, tuple[int, ...], float]]:
+        """Stacks of planes by term: the axes along which they shall be smooth, and the weight."""
         space, time = self._field.space, self._field.time
         coded = self.weights.variation == "coded"
         # Coded: twice the sum over planes, in which space planes count twice (as `PlaneTerms`).
-        found: list[tuple[Tensor, tuple[int, ...], float]] = [
-            (space, (1, 2), 4.0 * len(space) if coded else 1.0)
-        ]
+        weight = self.total_variation * (4 * len(space) if coded else 1)
+        found: dict[str, tuple[Tensor, tuple[int, ...], float]] = {
+            "total_variation": (space, (1, 2), weight)
+        }
         if time is not None:
-            found.append((time, (1, 2), 2.0 * len(time)) if coded else (time, (2,), 1.0))
+            weight = self.weights.time_variation * (2 * len(time) if coded else 1)
+            found["time_variation"] = (time, (1, 2) if coded else (2,), weight)
         return found
 
     def _distance(self) -> float:

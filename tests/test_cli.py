@@ -32,12 +32,13 @@ def test_help_loads_nothing_heavy(tmp_path):
 
 def test_the_error_of_a_quick_command_waits_for_nothing_heavy(tmp_path):
     code = (
-        "import sys; from xplanes.cli import _known_errors; _known_errors();"
+        "import sys; from xplanes.cli import main; code = main(['inspect', 'nowhere']);"
         "heavy = {'lightning', 'xplanes.pipeline'} & set(sys.modules);"
-        "sys.exit(f'loaded {heavy}' if heavy else 0)"
+        "sys.exit(f'loaded {heavy}' if heavy else code)"
     )
     done = python("-c", code, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: nowhere")
 
 
 def test_evaluate_as_a_program(trained_run: Path, tmp_path: Path):

@@ -794,6 +794,21 @@ def test_what_must_load_at_once_loads_nothing_heavy(module, banned):
     assert not loaded & banned
 
 
+def test_errors_that_users_see_have_one_base():
+    caught = {"UnavailableError", "FetchError"}  # By the callers of those who raise them.
+    errors = {
+        node.name: {base.id for base in node.bases if isinstance(base, ast.Name)}
+        for path in sources().values()
+        for node in tree_of(path).body
+        if isinstance(node, ast.ClassDef) and node.name.endswith("Error")
+    }
+    seen = {name for name in errors if not name.startswith("_")} - {"XPlanesError"} - caught
+    assert {"ConfigError", "SceneError", "StorageError", "TrainingError"} <= seen
+    for name in seen:
+        bases = errors[name]
+        assert "XPlanesError" in bases or bases & seen, name
+
+
 def test_no_module_calls_anything_for_its_effect_when_imported():
     for module, path in sources().items():
         for node in tree_of(path).body:

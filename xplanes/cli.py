@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xplanes import __version__
+from xplanes.errors import XPlanesError
 from xplanes.process import defaults, train_command
 
 if TYPE_CHECKING:
@@ -45,25 +46,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The reader of the pipe (such as head) has exited; closing suppresses Python's warning.
         sys.stderr.close()
         return 0
-    except Exception as error:
-        if not isinstance(error, _known_errors()):
-            raise
+    except (XPlanesError, PermissionError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
-
-
-def _known_errors() -> tuple[type[Exception], ...]:
-    """Errors that are reported without a traceback."""
-    # Not those of the pipeline: its imports would hold back the message of a quick command.
-    from xplanes.errors import ConfigError, DeviceError, GaussianError
-    from xplanes.files import StorageError
-    from xplanes.lrm.errors import LRMError
-    from xplanes.optional import MissingExtraError
-    from xplanes.scenes.errors import SceneError
-
-    settings = ConfigError, SceneError, LRMError, MissingExtraError
-    return *settings, StorageError, PermissionError, DeviceError, GaussianError
 
 
 def build_parser() -> argparse.ArgumentParser:

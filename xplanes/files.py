@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from xplanes.errors import XPlanesError
+
 MARK = ".tmp-"
 """Part of the name of every file that is not whole yet."""
 
@@ -21,7 +23,7 @@ DAY = 86_400.0
 """Seconds of a day, the age from which an unfinished file in a cache counts as abandoned."""
 
 
-class StorageError(OSError):
+class StorageError(XPlanesError, OSError):
     """What cannot be written; the message names it, the reason and the way out."""
 
 

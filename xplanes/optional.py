@@ -3,8 +3,10 @@
 import importlib
 from types import ModuleType
 
+from xplanes.errors import XPlanesError
 
-class MissingExtraError(ImportError):
+
+class MissingExtraError(XPlanesError, ImportError):
     """A package of an extra is not installed; the message names the extra."""
 
 

@@ -15,7 +15,7 @@ from lightning import seed_everything
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from xplanes.backend import warm_up
-from xplanes.errors import ConfigError, DeviceError, GaussianError
+from xplanes.errors import ConfigError, XPlanesError
 from xplanes.evaluation.findings import camera_findings, opaque_findings
 from xplanes.evaluation.published import check_published
 from xplanes.evaluation.render import orbit_poses, render_path, video_times, write_video
@@ -45,22 +45,12 @@ from xplanes.training.clock import find_callback, training_seconds
 from xplanes.training.evaluation import Evaluation, final_scores
 from xplanes.training.fit import estimate
 from xplanes.training.fit import warm_up as warm_up_loops
-from xplanes.training.module import RadianceModule, TrainingError
+from xplanes.training.module import RadianceModule
 from xplanes.training.record import RunRecord, claim, require_same_settings, require_same_views
 
 logger = logging.getLogger(__name__)
 
-KNOWN_ERRORS = (
-    ConfigError,
-    DeviceError,
-    SceneError,
-    LRMError,
-    TrainingError,
-    GaussianError,
-    MissingExtraError,
-    StorageError,
-    MisconfigurationException,
-)
+KNOWN_ERRORS = (XPlanesError, MisconfigurationException)
 """Errors that are reported by their message; the traceback is written to train.log only."""
 
 VIDEO_FRAMES, VIDEO_FPS, VIDEO_SIZE = 48, 16, 200

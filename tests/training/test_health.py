@@ -5,8 +5,9 @@ import math
 import re
 import shutil
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -17,7 +18,7 @@ from xplanes.errors import ConfigError
 from xplanes.models.base import LossTerm
 from xplanes.models.x_planes import XPlanesModel
 from xplanes.pipeline import run
-from xplanes.training.checkpoints import find_resumable
+from xplanes.training.checkpoints import find_resumable, load_checkpoint
 from xplanes.training.clock import TrainingClock
 from xplanes.training.finite import (
     all_usable,
@@ -270,6 +271,18 @@ def test_damaged_checkpoints_alone_are_refused_with_a_message(tmp_path: Path) ->
         (tmp_path / name).write_bytes(b"half")
         with pytest.raises(ConfigError, match=r"last\.ckpt cannot be read.*delete .*begin anew"):
             find_resumable(tmp_path)
+
+
+def test_a_sound_checkpoint_that_cannot_be_read_is_not_called_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "last.ckpt"
+    torch.save({"place": PurePosixPath("anywhere")}, path)
+    with pytest.raises(ConfigError, match=r"last\.ckpt holds more than data \(pathlib\.PurePos"):
+        load_checkpoint(path)
+    with (
+        patch("zipfile.ZipFile", side_effect=PermissionError(13, "Permission denied")),
+        pytest.raises(ConfigError, match=r"last\.ckpt cannot be read: Permission denied$"),
+    ):
+        load_checkpoint(path)
 
 
 def test_a_damaged_record_does_not_end_a_run(scenes, folder, caplog) -> None:

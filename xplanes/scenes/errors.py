@@ -1,7 +1,9 @@
 """Errors that problems with scene data are reported as."""
 
+from xplanes.errors import XPlanesError
 
-class SceneError(ValueError):
+
+class SceneError(XPlanesError, ValueError):
     """Scene data cannot be used; the message says which file, why, and what to do."""
 
 

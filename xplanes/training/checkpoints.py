@@ -59,12 +59,17 @@ def _require_data(checkpoint: Mapping[str, Any]) -> None:
             try:
                 torch.load(file, weights_only=True)
             except pickle.UnpicklingError as error:
-                kind = re.search(r"GLOBAL (\S+)", str(error))
                 raise ConfigError(
-                    f"{name}: its state holds more than data{f' ({kind[1]})' if kind else ''}, so "
-                    "that a checkpoint could not be read again; let state_dict return tensors, "
-                    "numbers, text, lists and dictionaries"
+                    f"{name}: its state holds more than data{_kind_in(error)}, so that a "
+                    "checkpoint could not be read again; let state_dict return tensors, numbers, "
+                    "text, lists and dictionaries"
                 ) from error
+
+
+def _kind_in(error: pickle.UnpicklingError) -> str:
+    """The class that was refused, in brackets; empty where it is not named."""
+    kind = re.search(r"GLOBAL (\S+)", str(error))
+    return f" ({kind[1]})" if kind else ""
 
 
 class Checkpoints(Checkpoint):
@@ -115,9 +120,7 @@ class Checkpoints(Checkpoint):
         """Keep the model if its score is the best so far."""
         evaluation = find_callback(trainer, Evaluation)
         step = -1 if evaluation is None else evaluation.best_step
-        # All ranks take part in saving, but only the first knows the scores.
-        better = step > self._best and step == trainer.global_step
-        if trainer.strategy.reduce_boolean_decision(better, all=False):
+        if step > self._best and step == trainer.global_step:
             self._save(trainer, BEST)
             self._best = step
 
@@ -164,7 +167,7 @@ def load_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
     """Read a checkpoint, tensors and builtins only.
 
     Raises:
-        ConfigError: If the file is missing or damaged.
+        ConfigError: If the file is missing, cannot be read, is damaged, or holds more than data.
     """
     if not path.is_file():
         raise ConfigError(
@@ -177,6 +180,15 @@ def load_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
             if (name := archive.testzip()) is not None:
                 raise zipfile.BadZipFile(f"wrong checksum of {name}")
         return torch.load(path, map_location=device, weights_only=True)
+    except MemoryError:
+        raise
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror or error}") from error
+    except pickle.UnpicklingError as error:
+        raise ConfigError(
+            f"{path} holds more than data{_kind_in(error)}, which is not read from a file; save "
+            "tensors, numbers, text, lists and dictionaries"
+        ) from error
     except Exception as error:
         raise ConfigError(
             f"{path} cannot be read ({type(error).__name__}: {str(error).split('. ')[0]}): it is "

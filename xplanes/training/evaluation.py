@@ -289,6 +289,9 @@ class Evaluation(Callback):
                 scores = self._score(trainer, module, renderer) if trainer.is_global_zero else {}
             if trainer.world_size > 1:
                 scores = trainer.strategy.broadcast(scores)  # The others wait off the clock.
+            split = trainer.datamodule.validation_split  # type: ignore[attr-defined]
+            if split is not None and scores[f"{split}/psnr"] > self.best:
+                self.best, self.best_step = scores[f"{split}/psnr"], self.step
             trainer.callback_metrics.update({n: torch.tensor(v) for n, v in scores.items()})
             for callback in trainer.callbacks:  # type: ignore[attr-defined]
                 if isinstance(callback, EarlyStopping | ModelCheckpoint):
@@ -328,8 +331,6 @@ class Evaluation(Callback):
         psnr_now = mean([s.psnr for s in self.latest])
         scores = {f"{split}/psnr": psnr_now, f"{split}/ssim": mean([s.ssim for s in self.latest])}
         module.last.update(scores)
-        if psnr_now > self.best and data.validation_split is not None:
-            self.best, self.best_step = psnr_now, step
         self._write(trainer, module, run, split, scores, pictures)
         self.seconds += time.perf_counter() - began
         return scores

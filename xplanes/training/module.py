@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from xplanes.backend import fast_bf16
 from xplanes.components import build, plugins
 from xplanes.config import compose_plain
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, XPlanesError
 from xplanes.fields.base import Representation
 from xplanes.metrics import psnr, ssim
 from xplanes.models.base import Model, ModelSettings, colour_error
@@ -46,7 +46,7 @@ OPACITIES = 5
 """Batches from one look at the rays' opacity to the next."""
 
 
-class TrainingError(RuntimeError):
+class TrainingError(XPlanesError, RuntimeError):
     """Training cannot go on; the message says what was seen and what to change."""
 
 

@@ -426,6 +426,22 @@ reloads.
 ::: xplanes.rendering.gaussians.camera.Camera
 
 ::: xplanes.rendering.gaussians.harmonics.spherical_harmonics
+
+## Errors
+
+::: xplanes.errors.XPlanesError
+
+::: xplanes.errors.ConfigError
+
+::: xplanes.scenes.errors.SceneError
+
+::: xplanes.lrm.errors.LRMError
+
+::: xplanes.training.module.TrainingError
+
+::: xplanes.files.StorageError
+
+::: xplanes.optional.MissingExtraError
 """
 """The page of the Python API before `api` adds headings, sentences and signatures."""
 
@@ -485,7 +501,7 @@ def stub(thing: Any, members: Iterable[str] | None) -> list[str]:
                 first -= 1
             told = isinstance(after, ast.Expr)
             parts += lines[first : after.end_lineno if told else below.end_lineno]
-    return parts
+    return parts if len(parts) > 1 else [f"{parts[0]} ..."]
 
 
 def signature(lines: list[str], node: Any) -> list[str]:

@@ -2,7 +2,7 @@
 
 
 class XPlanesError(Exception):
-    """Any of them; commands print its message without a traceback."""
+    """The base of all errors whose message says enough; commands print it without a traceback."""
 
 
 class ConfigError(XPlanesError, ValueError):

@@ -63,18 +63,14 @@ def scripts(folder: Path) -> dict[str, list[list[str]]]:
     # CPU seconds: runs side by side do not disturb one another.
     for name in ("initialisation", "gaussians", "pareto"):
         given[name] = [[*scene, "--together", "2"]]
-    models = ["--variants", "world,kplanes,tineuvox_s", "--seconds", "30", "--together", "2"]
-    beside = [*models, "--title"]
+    own = "plain,world,world_tiny,masks,masks_tiny,rough_world,rough_field,thin_fog,even_rays"
+    several = ["--together", "2", "--seeds", "3"]
     given["captures"] = [
-        ["--together", "2"],
-        [*beside, "Captures in three models", "--name", "captures_models"],
+        [*several, "--scenes", "phone,rig", "--variants", own],
         [
-            *(*beside, "Test captures in three models", "--name", "captures_test"),
-            *("--scenes", "phone_test,rig_test", "--seeds", "3"),
-        ],
-        [
-            *(*beside, "Scenes of the suite in three models", "--name", "suite_models"),
-            *("--scenes", "dark_test,topology_test,occlusion_test"),
+            *(*several, "--seconds", "30", "--variants", "world,kplanes,tineuvox_s"),
+            *("--scenes", "phone_test,rig_test,dark_test,topology_test,occlusion_test"),
+            *("--name", "captures_models", "--title", "Test scenes in three models"),
         ],
     ]
     given["lrm_quality"] = [["--together", "2"]]

@@ -4,7 +4,7 @@
         [--steps 1000 | --seconds 120] [--variants NAMES] [--seeds 1] [--together 1]
         [--name captures] [--title TITLE] [--work FOLDER] [KEY=VALUE ...]
 
-Writes docs/results/NAME.md and NAME.csv. The scenes are procedural captures of the
+Writes docs/results/NAME.md, NAME.csv and NAME.png. The scenes are procedural captures of the
 suite, whose masks of the thing are known: scores are those of whole pictures, and of the pixels
 that show the thing. Of scenes with silhouettes there is the former alone. Variants of X-Planes
 with six planes:
@@ -26,12 +26,14 @@ CPU time (cpu_clock.py); ``--together`` so many run side by side.
 """
 
 import argparse
+import math
 import os
 import statistics
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from figures import bars, panels, save
 from runner import CPU_CLOCK, RESULTS, Measured, command, machine, markdown, run_apart
 
 from xplanes.files import write_rows, write_text
@@ -110,6 +112,26 @@ def row(scene: str, variant: str, runs: list[Measured]) -> list[str]:
     return [scene, variant, *scores, *times, f"{mean('peak_memory_bytes') / 2**30:.1f}"]
 
 
+def plot(found: dict[tuple[str, str], list[Measured]], name: str) -> None:
+    """PSNR of the whole picture of each variant, and of the thing where its mask is known."""
+    scenes, variants = (list(dict.fromkeys(key[place] for key in found)) for place in (0, 1))
+
+    def score(scene: str, variant: str, key: str) -> float:
+        if key == "psnr" and variant.startswith("masks"):
+            return math.nan
+        runs = found[scene, variant]
+        return statistics.mean(run.metrics["test"].get(key, math.nan) for run in runs)
+
+    figure, axes = panels(2, 9, 0.45 * len(variants) + 1.6, sharey=True)
+    keys = {"psnr": "PSNR, dB", "psnr_thing": "PSNR of the thing, dB"}
+    for axis, (key, label) in zip(axes, keys.items(), strict=True):
+        groups = {s: [score(s, variant, key) for variant in variants] for s in scenes}
+        bars(axis, variants, groups)
+        axis.set_xlabel(label)
+    axes[0].legend(fontsize=8)
+    save(figure, name)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     captures = [name for name, scene in SUITE_SCENES.items() if scene.world is not None]
@@ -147,6 +169,7 @@ def main() -> None:
                 print("  ".join(row(scene, variant, runs)), flush=True)
     rows = [row(*key, runs) for key, runs in found.items()]
     budget = f"{args.steps} steps" if args.seconds is None else f"{args.seconds:g} s"
+    plot(found, args.name)
     write_rows(RESULTS / f"{args.name}.csv", COLUMNS, rows)
     text = [
         f"# {args.title}",
@@ -155,6 +178,8 @@ def main() -> None:
         f"seed{'s' if args.seeds > 1 else ''}. {machine()}.",
         "",
         f"    {command()}",
+        "",
+        f"![PSNR of each variant]({args.name}.png)",
         "",
         markdown(COLUMNS, rows),
         "",

@@ -2,8 +2,8 @@
 
     python benchmarks/decomposition_stress.py [--frames 1 2 50 300] [--condition 1e1 1e3 1e6]
 
-Writes results/decomposition_stress.md and .csv beside this file; what is not measured this time
-keeps its rows.
+Writes docs/results/decomposition_stress.csv, a row for each of these; its page and its plot show
+the worst of each type. What is not measured this time keeps its rows.
 
 The oracle is plain ADMM in float64 with a full singular value decomposition; for condition 1e6 its
 penalty grows by 1% per iteration, up to tenfold, else it is fixed.
@@ -17,7 +17,8 @@ import warnings
 from collections.abc import Iterator
 
 import torch
-from runner import RESULTS, command, machine
+from figures import panels, save
+from runner import RESULTS, command, machine, markdown
 from torch import Tensor
 
 from xplanes.decomposition import robust_pca
@@ -71,13 +72,18 @@ def objective(low: Tensor, matrix: Tensor, weight: float) -> float:
 HEAD = f"""# Robust PCA: stress table
 
 {ROWS} rows, tolerance 1e-6, at most 2,000 iterations, weight auto; {machine()}. The low-rank part
-has the given condition number, 5% of the entries are hit. Errors against float64 ADMM with a full
-SVD on the SAME (rounded) input, relative to |Y|; gap: of the objective (negative: below the oracle,
-which was stopped by the clock). Step: where the oracle stopped. `{command()}`
+has the given condition number, 5% of the entries are hit. Errors of L and S against float64 ADMM
+with a full SVD on the SAME (rounded) input, relative to |Y|: the worst of both parts and of inputs
+scaled by 1e-6, 1 and 1e6 (half precision: 1). Gap: of the objective, the worst of all. Iterations
+and seconds: the most. [Each case](decomposition_stress.csv). `{command()}`
 
-| frames | condition | type | scale | L error | S error | gap | iterations | s | converged | step |
-|---|---|---|---|---|---|---|---|---|---|---|
+![Worst error of each type](decomposition_stress.png)
+
 """
+TYPES = ("float16", "bfloat16", "float32", "float64")
+COLUMNS = ("frames", "condition", *TYPES, "gap", "iterations", "s", "converged")
+FULL = ("frames", "condition", "type", "scale", "L error", "S error", "gap", "iterations", "s")
+FULL += ("converged", "oracle's last step")
 SCALES = {
     "float16": (1.0,),
     "bfloat16": (1.0,),
@@ -134,14 +140,56 @@ def main() -> None:
         done = {tuple(row[:2]) for row in rows}
         if table.exists():
             with table.open(newline="") as file:
-                rows += [row for row in csv.reader(file) if tuple(row[:2]) not in done]
+                kept = [row for row in csv.reader(file) if row != list(FULL)]
+            rows += [row for row in kept if tuple(row[:2]) not in done]
         rows.sort(key=lambda row: (int(row[0]), float(row[1])))
         with replacing(table) as temporary, temporary.open("w", newline="") as file:
-            csv.writer(file).writerows(rows)
-    worst = max(max(float(row[4]), float(row[5])) for row in rows if row[2] == "float32")
-    lines = [f"| {' | '.join(row)} |" for row in rows]
+            csv.writer(file).writerows([FULL, *rows])
+    cases: dict[tuple[str, str], list[list[str]]] = {}
+    for row in rows:
+        cases.setdefault((row[0], row[1]), []).append(row)
+    plot(cases)
+    page = [summary(*case, found) for case, found in cases.items()]
+    worst = max(error(row) for row in rows if row[2] == "float32")
     tail = f"\n\nWorst float32 error: {worst:.1e}. No NaN or infinity anywhere.\n"
-    write_text(RESULTS / "decomposition_stress.md", HEAD + "\n".join(lines) + tail)
+    write_text(RESULTS / "decomposition_stress.md", HEAD + markdown(COLUMNS, page) + tail)
+
+
+def error(row: list[str]) -> float:
+    """The larger of the errors of L and S."""
+    return max(float(row[4]), float(row[5]))
+
+
+def summary(frames: str, condition: str, found: list[list[str]]) -> tuple[str, ...]:
+    """The worst of a number of frames and a condition number."""
+    errors = {kind: [error(row) for row in found if row[2] == kind] for kind in TYPES}
+    gaps = [float(row[6]) for row in found]
+    return (
+        frames,
+        condition,
+        *(f"{max(errors[kind]):.1e}" if errors[kind] else "" for kind in TYPES),
+        f"{max(gaps, key=abs):.0e}",
+        max((row[7] for row in found), key=int),
+        max((row[8] for row in found), key=float),
+        f"{sum(row[9] == 'yes' for row in found)} of {len(found)}",
+    )
+
+
+def plot(cases: dict[tuple[str, str], list[list[str]]]) -> None:
+    """The worst error of each type, a line each, over the cases."""
+    figure, (axes,) = panels(1, 8, 4)
+    labels = [f"{frames}\n{condition}" for frames, condition in cases]
+    for kind in TYPES:
+        line = [
+            (place, max(errors))
+            for place, found in enumerate(cases.values())
+            if (errors := [error(row) for row in found if row[2] == kind])
+        ]
+        axes.semilogy(*zip(*line, strict=True), "o", label=kind, alpha=0.7)
+    axes.set_xticks(range(len(labels)), labels, fontsize=8)
+    axes.set(xlabel="frames, condition number", ylabel="worst error, relative to |Y|")
+    axes.legend(fontsize=8)
+    save(figure, "decomposition_stress")
 
 
 if __name__ == "__main__":

@@ -3,11 +3,11 @@
     python benchmarks/gaussians.py [--lego FOLDER] [--seconds 24] [--large 60] [--seeds 3]
         [--together 1] [--work FOLDER]
 
-Writes docs/results/gaussians.md and gaussians.csv. Seconds are those that a process has computed on
-one thread, so that others do not count, and the initialisation's are among them; scenes of 400
-pixels get --large. Models are compared on all scenes with one seed, initialisations on two demo
-scenes with --seeds. ``--together`` so many run side by side; what the work folder holds is not
-repeated.
+Writes docs/results/gaussians.md, gaussians.csv and gaussians.png. Seconds are those that a process
+has computed on one thread, so that others do not count, and the initialisation's are among them;
+scenes of 400 pixels get --large. Models are compared on all scenes with one seed, initialisations
+on two demo scenes with --seeds. ``--together`` so many run side by side; what the work folder holds
+is not repeated.
 """
 
 import os
@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from figures import bars, panels, save
 from lightning.pytorch.callbacks import Callback
 from runner import RESULTS, command, lego, machine, markdown
 
@@ -239,6 +240,25 @@ def begins(found: dict[Case, dict[str, Any]]) -> str:
     return markdown(("scene", "model", *INITIALISATIONS), lines)
 
 
+def plot(models: list[Case], found: dict[Case, dict[str, Any]]) -> None:
+    """PSNR and SSIM of each model of Gaussians less those of six planes, on each scene."""
+    scenes = list(dict.fromkeys(case.scene for case in models))
+    figure, axes = panels(2, 10, 5.4, sharey=True)
+    for key, unit, axis in zip(("psnr", "ssim"), ("PSNR, dB", "SSIM"), axes, strict=True):
+        scores = {(case.scene, case.model): found[case][key] for case in models}
+        bars(
+            axis,
+            scenes,
+            {
+                model: [scores[scene, model] - scores[scene, "six_planes"] for scene in scenes]
+                for model in GAUSSIANS
+            },
+        )
+        axis.set_xlabel(f"{unit}: Gaussians less six planes")
+    axes[1].legend(fontsize=8)
+    save(figure, "gaussians")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--lego", type=Path)
@@ -262,6 +282,7 @@ def main() -> None:
         ) as pool:
             found |= zip(some, pool.map(result, some, [args.work] * len(some)), strict=True)
     rows = [shown(case, found[case]) for case in models]
+    plot(models, found)
     write_rows(RESULTS / "gaussians.csv", COLUMNS, rows)
     text = f"""# Gaussians against six planes
 
@@ -272,6 +293,8 @@ the test split of demo scenes and of the suite, and on the val split of lego. Si
 random planes, Gaussians on the silhouettes' hull; `first psnr` is that of the initial model, and
 `peak GB` is shown for runs that had a process of their own.
 {machine()}.
+
+![PSNR and SSIM of Gaussians less those of six planes](gaussians.png)
 
 {markdown(COLUMNS, rows)}
 

@@ -20,9 +20,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
+from figures import panels, save
 from runner import CPU_CLOCK, RESULTS, Measured, command, machine, markdown, run_apart
 
-from xplanes.files import read_json, replacing, write_rows, write_text
+from xplanes.files import read_json, write_rows, write_text
 
 COLUMNS = (
     *("LRM", "steps of pretraining", "IoU", "novel views of the LRM, dB"),
@@ -95,12 +96,7 @@ def across(runs: list[list[Measured]], first: bool) -> tuple[float, float]:
 
 def plot(starts: list[Start], trained: list[tuple[float, float]]) -> None:
     """PSNR after training against the LRM's own; random initialisation as a line."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(6, 3.8))
+    figure, (axes,) = panels(1, 6, 3.8)
     axes.margins(x=0.1)
     for number, (start, (mean, spread)) in enumerate(zip(starts, trained, strict=True)):
         if start.scores is None:
@@ -115,10 +111,7 @@ def plot(starts: list[Start], trained: list[tuple[float, float]]) -> None:
         where = (5, 6 if number % 2 else -14)
         axes.annotate(label, (novel, mean), xytext=where, textcoords="offset points")
     axes.set(xlabel="novel views of the LRM alone, dB", ylabel="field after training, dB")
-    axes.grid(alpha=0.3)
-    figure.tight_layout()
-    with replacing(RESULTS / "lrm_quality.png") as temporary:
-        figure.savefig(temporary, dpi=120, format="png")
+    save(figure, "lrm_quality")
 
 
 def main() -> None:

@@ -18,9 +18,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+from figures import panels, save
 from runner import CPU_CLOCK, RESULTS, Measured, command, lego, machine, markdown, run_apart
 
-from xplanes.files import replacing, write_rows, write_text
+from xplanes.files import write_rows, write_text
 
 SMALLER = (
     "model/sampler=occupancy",
@@ -110,18 +111,11 @@ def on_front(name: str, curves: dict[str, list[tuple[float, float]]]) -> bool:
 
 def plot(scenes: dict[str, dict[str, list[tuple[float, float]]]]) -> None:
     """One panel per scene: runs on the front in colour, the others in grey."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, panels = pyplot.subplots(
-        1, len(scenes), figsize=(5.2 * len(scenes), 4.6), squeeze=False
-    )
+    figure, all_axes = panels(len(scenes), 5.2 * len(scenes), 4.6)
     best = {scene: [n for n in curves if on_front(n, curves)] for scene, curves in scenes.items()}
     names = dict.fromkeys(name for found in best.values() for name in found)
     colours = {name: f"C{place}" for place, name in enumerate(names)}
-    for axes, (scene, curves) in zip(panels[0], scenes.items(), strict=True):
+    for axes, (scene, curves) in zip(all_axes, scenes.items(), strict=True):
         for name, curve in curves.items():
             seen = [point for point in curve if point[0] > 0]
             front = name in best[scene]
@@ -135,12 +129,9 @@ def plot(scenes: dict[str, dict[str, list[tuple[float, float]]]]) -> None:
             )
         axes.set_xscale("log")
         axes.set(title=scene, xlabel="seconds, preparation included", ylabel="PSNR in dB")
-        axes.grid(alpha=0.3)
         axes.legend(fontsize=7, loc="lower right")
     figure.suptitle(f"grey: never as good as the best; {machine()}", fontsize=8)
-    figure.tight_layout()
-    with replacing(RESULTS / "pareto.png") as temporary:
-        figure.savefig(temporary, dpi=120, format="png")
+    save(figure, "pareto")
 
 
 def line(scene: str, name: str, result: Measured, front: bool) -> tuple:

@@ -2,7 +2,7 @@
 
     python benchmarks/rendering.py [--lego FOLDER] [--seconds 60] [--work FOLDER]
 
-Writes results/rendering.md and rendering.csv beside this file.
+Writes docs/results/rendering.md, rendering.csv and rendering.png.
 """
 
 import os
@@ -18,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from figures import panels, save
 from runner import RESULTS, command, lego, machine, markdown, run_apart
 
 from xplanes.evaluation.runs import TrainedRun, load_run
@@ -73,6 +74,22 @@ def measure(run: TrainedRun, size: int, samples: int) -> tuple:
     )
 
 
+def plot(rows: list[tuple]) -> None:
+    """PSNR against seconds a frame: a line for each size, a mark for each number of samples."""
+    figure, (axes,) = panels(1, 7, 4)
+    for size in SIZES:
+        line = [(float(row[2]), float(row[5])) for row in rows if row[0] == size and row[5]]
+        if line:
+            axes.plot(*zip(*line, strict=True), marker="o", label=f"{size} px")
+            for place, samples in zip(line, SAMPLES, strict=True):
+                axes.annotate(str(samples), place, (4, -10), textcoords="offset points", size=7)
+    axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.set(xlabel="seconds a frame; marks: samples along the cube", ylabel="PSNR, dB")
+    axes.legend(fontsize=8)
+    save(figure, "rendering")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--lego", type=Path, default=Path("data/dnerf/lego"))
@@ -89,6 +106,7 @@ def main() -> None:
     run_apart([*scene, *overrides, "media=false"], folder)
     run = load_run(folder)
     rows = [measure(run, size, samples) for size in SIZES for samples in SAMPLES]
+    plot(rows)
     write_rows(RESULTS / "rendering.csv", COLUMNS, rows)
     page = f"""# Rendering: seconds per frame against PSNR
 
@@ -96,6 +114,8 @@ def main() -> None:
 {run.scene.splits["train"].width} px with 128 samples along the cube's diagonal; median of {FRAMES}
 views, PSNR their mean, blank where the scene has no images of that size; {machine()}.
 `{command()}`
+
+![PSNR against seconds a frame](rendering.png)
 
 {markdown(COLUMNS, rows)}
 """

@@ -1,9 +1,9 @@
 """What each saving saves, and what it costs: same steps and rays, one saving off at a time.
 
-    python benchmarks/skips.py [--lego FOLDER] [--steps 1000] [--resolution 100] [--seeds 2]
+    python benchmarks/skips.py [--lego FOLDER] [--steps 1000] [--resolution 100] [--seeds 3]
         [--only SAVING ...] [--name skips]
 
-Writes results/NAME.md and results/NAME.csv beside this file. Seconds are the training clock of
+Writes docs/results/NAME.md, NAME.csv and NAME.png. Seconds are the training clock of
 one process with nothing else running; compare them within one scene only.
 """
 
@@ -17,14 +17,14 @@ import argparse
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, stdev
 
+from figures import bars, panels, save
 from runner import RESULTS, Measured, command, lego, machine, markdown, measure
 
 from xplanes.files import write_rows, write_text
 
-SWITCHES = {
-    "all savings": (),
+ONE_OFF = {
     "empty space off": ("model.sampler.skip_empty=false",),
     "occlusion off": ("model.sampler.skip_occluded=false",),
     "unseen cells off": ("model.sampler.skip_unseen=false",),
@@ -32,15 +32,9 @@ SWITCHES = {
     "background off": ("model.rays.skip_background=false",),
     "coarse steps off": ("model.sampler.coarse_steps=0",),
     "thinning off": ("model.sampler.thinning=0",),
-    "all off": (
-        "model.sampler.skip_empty=false",
-        "model.sampler.skip_occluded=false",
-        "model.sampler.silhouettes=false",
-        "model.rays.skip_background=false",
-        "model.sampler.coarse_steps=0",
-        "model.sampler.thinning=0",
-    ),
 }
+EVERYTHING = tuple(line for lines in ONE_OFF.values() for line in lines)
+SWITCHES: dict[str, tuple[str, ...]] = {"all savings": (), **ONE_OFF, "all off": EVERYTHING}
 
 KINDS = ("empty", "occluded", "background", "gradients")
 
@@ -61,7 +55,7 @@ PAIRS = {
 """Savings beside those of single samples: a scene, what switches it off there, and for how many
 times the steps."""
 
-PAIR_COLUMNS = ("saving", "scene", "seconds", "without it", "psnr", "without it", "steps")
+PAIR_COLUMNS = ("saving", "scene", "seconds", "without it", "psnr", "without it ", "steps")
 
 FIGURES: dict[str, Callable[[dict], float]] = {
     "seconds": lambda run: run["seconds"]["train"],
@@ -107,28 +101,43 @@ def train(scene: list[str], switches: tuple[str, ...], seed: int, work: Path, ar
     return measure(overrides, work)
 
 
+def spread(values: list[float]) -> str:
+    """The standard deviation over seeds, as it is written behind a mean."""
+    return f" ± {stdev(values):.2f}" if len(values) > 1 else ""
+
+
+def plot(found: dict[str, dict[str, dict[str, float]]], name: str) -> None:
+    """Seconds and PSNR of each run beside those of all savings; a colour for each scene."""
+    figure, (slower, better) = panels(2, 9, 4.2, sharey=True)
+    labels = [label for label in next(iter(found.values())) if label != "all savings"]
+    ratios, changes = {}, {}
+    for scene, runs in found.items():
+        base = runs["all savings"]
+        ratios[scene] = [runs[label]["seconds"] / base["seconds"] for label in labels]
+        changes[scene] = [runs[label]["psnr"] - base["psnr"] for label in labels]
+    bars(slower, labels, ratios, start=1)
+    bars(better, labels, changes)
+    slower.set_xscale("log", base=2)
+    slower.xaxis.set_major_formatter("{x:g}")
+    slower.set_xlabel("times the seconds of all savings")
+    better.set_xlabel("change of PSNR, dB")
+    better.legend(fontsize=8)
+    save(figure, name)
+
+
 def pair(name: str, work: Path, args) -> tuple:
     """A row of the second table."""
     scene, off, longer = PAIRS[name]
     scene = list(scene)
     several = argparse.Namespace(**(vars(args) | {"steps": longer * args.steps}))
-    cells = []
+    seconds, scores, steps = [], [], []
     for switches in ((), off):
         runs = [train(scene, switches, seed, work, several).metrics for seed in range(args.seeds)]
-        cells.append(
-            (
-                fmean(run["seconds"]["train"] for run in runs),
-                fmean(run["test"]["psnr"] for run in runs),
-                fmean(run["step"] for run in runs),
-            )
-        )
-    (seconds, psnr, steps), (slower, other, more) = cells
-    return (
-        name,
-        scene[0].split("=")[1],
-        *(f"{seconds:.1f}", f"{slower:.1f}", f"{psnr:.2f}", f"{other:.2f}"),
-        f"{steps:.0f} / {more:.0f}",
-    )
+        psnr = [FIGURES["psnr"](run) for run in runs]
+        seconds.append(f"{fmean(FIGURES['seconds'](run) for run in runs):.1f}")
+        scores.append(f"{fmean(psnr):.2f}{spread(psnr)}")
+        steps.append(f"{fmean(run['step'] for run in runs):.0f}")
+    return (name, scene[0].split("=")[1], *seconds, *scores, " / ".join(steps))
 
 
 def preparation(work: Path) -> list[tuple]:
@@ -154,7 +163,7 @@ def main() -> None:
     parser.add_argument("--lego", type=Path, default=Path("data/dnerf/lego"))
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--resolution", type=int, default=100)
-    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--only", nargs="+", choices=SWITCHES, default=list(SWITCHES))
     parser.add_argument("--pairs", nargs="*", choices=PAIRS, default=list(PAIRS))
     parser.add_argument("--name", default="skips")
@@ -165,24 +174,26 @@ def main() -> None:
     }
     if args.lego.is_dir():
         scenes["lego (val)"] = lego(args.lego)
-    rows = []
+    rows, found = [], {}
     with tempfile.TemporaryDirectory() as work:
         for name, scene in scenes.items():
-            base: dict[str, float] = {}
+            found[name] = {}
             for label in args.only:
                 runs = [
                     train(scene, SWITCHES[label], seed, Path(work), args).metrics
                     for seed in range(args.seeds)
                 ]
                 means = {key: fmean(find(run) for run in runs) for key, find in FIGURES.items()}
-                base = base or means
+                found[name][label] = means
+                base = next(iter(found[name].values()))
+                psnr = [FIGURES["psnr"](run) for run in runs]
                 rows.append(
                     (
                         name,
                         label,
                         f"{means['seconds']:.1f}",
                         f"{means['seconds'] / base['seconds']:.2f}",
-                        f"{means['psnr']:.2f}",
+                        f"{means['psnr']:.2f}{spread(psnr)}",
                         f"{means['psnr'] - base['psnr']:+.2f}",
                         f"{means['ssim']:.3f}",
                         f"{means['samples']:.1f}",
@@ -193,7 +204,11 @@ def main() -> None:
         pairs = [pair(name, Path(work), args) for name in args.pairs]
         prepared = preparation(Path(work)) if args.pairs else []
     write_rows(RESULTS / f"{args.name}.csv", COLUMNS, rows)
+    if "all savings" in args.only:
+        plot(found, args.name)
     page = f"""# Savings, one switched off at a time
+
+![Seconds and PSNR with one saving off]({args.name}.png)
 
 {args.steps} steps of 512 rays, {args.resolution} px, six planes with random initialisation,
 {"one seed" if args.seeds == 1 else f"means of {args.seeds} seeds"}; {machine()}. `{command()}`

@@ -2,7 +2,7 @@
 
     python benchmarks/stages.py
 
-Writes results/stages.md and stages.csv beside this file: encoding, decomposition and conversion of
+Writes docs/results/stages.md, stages.csv and stages.png: encoding, decomposition and conversion of
 triplane sequences, lookup in planes forward and backward, marching. Each size is timed in turn with
 the others, five rounds over, and the least time counts. Growth is the slope of seconds over size,
 both as logarithms.
@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 import torch
 from decomposition_data import feature_matrix
+from figures import panels, save
 from runner import RESULTS, command, machine, markdown
 from torch import Tensor
 
@@ -142,9 +143,22 @@ def growth(sizes: tuple[int, ...], spent: list[float]) -> float:
     return float(((x - x.mean()) * (y - y.mean())).sum() / (x - x.mean()).square().sum())
 
 
+def plot(curves: dict[str, tuple[tuple[int, ...], list[float]]]) -> None:
+    """Seconds against size, both relative to the smallest; equal growth is the dotted line."""
+    figure, (axes,) = panels(1, 7, 4.2)
+    for place, (name, (sizes, spent)) in enumerate(curves.items()):
+        relative = [size / sizes[0] for size in sizes]
+        dash = "--" if place >= 5 else "-"
+        axes.loglog(relative, [s / spent[0] for s in spent], dash, marker="o", ms=3, label=name)
+    axes.plot([1, 64], [1, 64], ":", color="0.4", label="in proportion")
+    axes.set(xlabel="times the smallest size", ylabel="times the seconds of the smallest")
+    axes.legend(fontsize=7)
+    save(figure, "stages")
+
+
 def main() -> None:
     argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0]).parse_args()
-    rows = []
+    rows, curves = [], {}
     for stage in STAGES:
         print(f"{stage.name}: {stage.unit}", flush=True)
         spent = seconds(stage)
@@ -153,12 +167,16 @@ def main() -> None:
             ratio = value / size / (spent[0] / stage.sizes[0])
             last = f"size^{slope:.2f}" if index == len(spent) - 1 else ""
             rows.append((stage.name, f"{size} {stage.unit}", f"{value:.4g}", f"{ratio:.2f}", last))
+        curves[f"{stage.name}, {stage.unit}"] = (stage.sizes, spent)
+    plot(curves)
     write_rows(RESULTS / "stages.csv", COLUMNS, rows)
     page = f"""# Stages against the size of their problem
 
 Least of {ROUNDS} calls; {machine()}. `{command()}`. Sequences have 30 frames, 32
 channels and 32 texels a side, planes 64 texels and 32 channels, lookups 8,000 points, where nothing
 else is said. "growth": the exponent fitted over all sizes of a stage.
+
+![Seconds against size](stages.png)
 
 {markdown(COLUMNS, rows)}
 """

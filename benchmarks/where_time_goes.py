@@ -115,12 +115,20 @@ def main() -> None:
         (name, f"{spent:.2f}", f"{100 * spent / whole:.1f}%", watch.calls.get(name, ""))
         for name, spent in sorted(found.items(), key=lambda item: -item[1])
     ]
+    from figures import bars, panels, save
+
+    figure, (axes,) = panels(1, 7, 0.22 * len(rows) + 0.6)
+    bars(axes, [row[0] for row in rows], {"": [float(row[1]) for row in rows]})
+    axes.set_xlabel("seconds")
+    save(figure, f"time_{args.name}")
     page = f"""# Where the time goes: {args.name}
 
     {command()}
 
 {whole:.1f} s in all, {metrics["step"]} steps, PSNR {metrics["test"]["psnr"]:.2f}; {machine()}.
 Each stage without the stages that it calls.
+
+![Seconds of each stage](time_{args.name}.png)
 
 {markdown(COLUMNS, rows)}
 """

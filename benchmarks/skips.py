@@ -238,7 +238,7 @@ through the model, as it equals another.
 {markdown(("video", "seconds", "frames"), prepared)}
 
 Singular directions: [robust PCA](decomposition_speed.md). Static cells of a moving scene are not
-skipped: [concepts](../concepts.md) say why.
+skipped: [why](../decisions.md#what-is-skipped).
 """
     write_text(RESULTS / f"{args.name}.md", page)
 

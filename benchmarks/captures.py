@@ -4,25 +4,13 @@
         [--steps 1000 | --seconds 120] [--variants NAMES] [--seeds 1] [--together 1]
         [--name captures] [--title TITLE] [--work FOLDER] [KEY=VALUE ...]
 
-Writes docs/results/NAME.md, NAME.csv and NAME.png. The scenes are procedural captures of the
-suite, whose masks of the thing are known: scores are those of whole pictures, and of the pixels
-that show the thing. Of scenes with silhouettes there is the former alone. Variants of X-Planes
-with six planes:
-
-* `plain`: without a background;
-* `sky`: a background whose colour depends on direction alone;
-* `world`: the default;
-* `masks`: told by silhouettes what is the thing, before white;
-* `world_tiny`, `masks_tiny`: the same, initialised from the LRM that is bundled;
-* `cut_tiny`: as `world_tiny`, but the LRM is shown the thing alone, cut out by masks;
-* `rough_world`, `rough_field`: `world` without smoothness of the background, or of the field;
-* `thin_fog`: `world` with all cells sampled that elsewhere are;
-* `even_rays`: `world` with all pixels drawn alike.
-
-`kplanes` and `tineuvox_s` are the baselines, with a world of their own and as many rays a step as
+Writes docs/results/NAME.md, NAME.csv and NAME.png. The scenes are procedural captures of the suite,
+whose masks are known: scores are those of whole images, and of the pixels that show the foreground
+object. Scenes with silhouettes have the former alone. `MEANINGS` describes the variants. The
+baselines `kplanes` and `tineuvox_s` have a background field too, and as many rays per step as
 X-Planes; K-Planes has one scale, few samples and a short warm-up, as it learns nothing in a minute
-of a CPU otherwise. Each run is a process of its own with one thread, and seconds are those of its
-CPU time (cpu_clock.py); ``--together`` so many run side by side.
+of a CPU otherwise. Each run is a process of its own with one thread, and seconds are its CPU time
+(cpu_clock.py); ``--together`` so many run side by side.
 """
 
 import argparse
@@ -58,10 +46,25 @@ VARIANTS = {
     ],
     "tineuvox_s": ["model=tineuvox_s", "model.rays.per_batch=1024"],
 }
+MEANINGS = {
+    "plain": "no background field",
+    "sky": "a background whose colour depends on direction alone",
+    "world": "six planes, the default",
+    "world_tiny": "the default, initialised from `tiny`",
+    "cut_tiny": "the same, with the object cut out by masks for the LRM",
+    "masks": "masks used as alpha, in front of white",
+    "masks_tiny": "the same, initialised from `tiny`",
+    "rough_world": "the default without smoothness of the background",
+    "rough_field": "the default without smoothness of the field",
+    "thin_fog": "the default with the occupancy threshold of scenes with alpha",
+    "even_rays": "the default with all pixels drawn uniformly",
+    "kplanes": "K-Planes with one scale, fewer samples and a short warm-up",
+    "tineuvox_s": "TiNeuVox-S",
+}
 VIEWS = {"phone": 60, "rig": 96}
 COLUMNS = (
-    *("scene", "variant", "PSNR, dB", "PSNR of the thing, dB", "SSIM", "floaters, %"),
-    *("steps", "seconds", "ms a step", "memory, GB"),
+    *("scene", "variant", "PSNR, dB", "PSNR of the object, dB", "SSIM", "floaters, %"),
+    *("steps", "seconds", "ms per step", "memory, GB"),
 )
 
 
@@ -112,6 +115,11 @@ def row(scene: str, variant: str, runs: list[Measured]) -> list[str]:
     return [scene, variant, *scores, *times, f"{mean('peak_memory_bytes') / 2**30:.1f}"]
 
 
+def legend(variants: list[str]) -> list[str]:
+    """What the variants are, a line each."""
+    return [f"* `{variant}`: {MEANINGS[variant]}" for variant in variants]
+
+
 def plot(found: dict[tuple[str, str], list[Measured]], name: str) -> None:
     """PSNR of the whole picture of each variant, and of the thing where its mask is known."""
     scenes, variants = (list(dict.fromkeys(key[place] for key in found)) for place in (0, 1))
@@ -123,7 +131,7 @@ def plot(found: dict[tuple[str, str], list[Measured]], name: str) -> None:
         return statistics.mean(run.metrics["test"].get(key, math.nan) for run in runs)
 
     figure, axes = panels(2, 9, 0.45 * len(variants) + 1.6, sharey=True)
-    keys = {"psnr": "PSNR, dB", "psnr_thing": "PSNR of the thing, dB"}
+    keys = {"psnr": "PSNR, dB", "psnr_thing": "PSNR of the foreground object, dB"}
     for axis, (key, label) in zip(axes, keys.items(), strict=True):
         groups = {s: [score(s, variant, key) for variant in variants] for s in scenes}
         bars(axis, variants, groups)
@@ -174,8 +182,9 @@ def main() -> None:
     text = [
         f"# {args.title}",
         "",
-        f"After {budget} at {args.resolution} pixels, mean over {args.seeds} "
-        f"seed{'s' if args.seeds > 1 else ''}. {machine()}.",
+        f"After {budget} at {args.resolution} pixels, "
+        f"{f'means of {args.seeds} seeds' if args.seeds > 1 else 'one seed'}. {machine()}. "
+        "`PSNR of the object` is that of the pixels that show the foreground object.",
         "",
         f"    {command()}",
         "",
@@ -183,8 +192,10 @@ def main() -> None:
         "",
         markdown(COLUMNS, rows),
         "",
-        "Seconds are the CPU time of training with one thread, without the preparation of `_tiny`. "
-        "Memory is the peak of a whole run.",
+        "Seconds are CPU time of training with one thread, without the preparation of `_tiny`. "
+        "Memory is the peak over the whole run.",
+        "",
+        *legend(args.variants.split(",")),
     ]
     write_text(RESULTS / f"{args.name}.md", "\n".join(text) + "\n")
 

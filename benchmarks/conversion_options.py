@@ -107,7 +107,7 @@ def main() -> None:
                 planes = space_planes(parts.low_rank, static=static).permute(0, 3, 1, 2)
                 errors[static] = ((planes - truth).norm() / norm).item()
             raw = space_planes(triplanes, static="median").permute(0, 3, 1, 2)
-            errors["median of the frames themselves"] = ((raw - truth).norm() / norm).item()
+            errors["median of the input frames"] = ((raw - truth).norm() / norm).item()
             for key, value in errors.items():
                 totals.setdefault((weight, key), []).append(value)
             cells = " | ".join(f"{value:.4f}" for value in errors.values())
@@ -141,22 +141,23 @@ def main() -> None:
         for weight in (0.009, "auto")
     ]
     lines = [
-        "# Conversion: which choice is nearest the truth",
+        "# Conversion: error of each option against the ground truth",
         "",
-        f"{FRAMES} frames, {CHANNELS} features, {SIZE} x {SIZE}, seeded; {machine()}.",
+        f"Synthetic sequences: {FRAMES} frames, {CHANNELS} channels, {SIZE} x {SIZE} texels.",
+        f"{machine()}.",
         f"`{command()}`",
         "",
         "## Static: relative error of the space planes against the true background",
         "",
-        "| sequence | weight | middle | median | mean | median of the frames themselves | rank xy "
-        "| sparsity xy | drift xy |",
+        "| sequence | sparsity weight | middle frame of L | median of L | mean of L "
+        "| median of the input frames | rank xy | sparsity xy | drift xy |",
         "|---|---|---|---|---|---|---|---|---|",
         *static_rows,
         *means,
         "",
-        "## Dynamic: share of the energy of S (weight auto) that the products leave",
+        "## Dynamic: share of the energy of S (weight auto) that the products do not explain",
         "",
-        "The loss is then trained with Adam (0.01), four random frames per step.",
+        "The products are then optimised with Adam (rate 0.01, four random frames per step).",
         "",
         "| sequence | planes | initialisation | seconds | step 0 | after 100 steps | after 400 |",
         "|---|---|---|---|---|---|---|",

@@ -72,10 +72,11 @@ def objective(low: Tensor, matrix: Tensor, weight: float) -> float:
 HEAD = f"""# Robust PCA: stress table
 
 {ROWS} rows, tolerance 1e-6, at most 2,000 iterations, weight auto; {machine()}. The low-rank part
-has the given condition number, 5% of the entries are hit. Errors of L and S against float64 ADMM
-with a full SVD on the SAME (rounded) input, relative to |Y|: the worst of both parts and of inputs
-scaled by 1e-6, 1 and 1e6 (half precision: 1). Gap: of the objective, the worst of all. Iterations
-and seconds: the most. [Each case](decomposition_stress.csv). `{command()}`
+has the given condition number, and 5% of the entries are outliers. The columns of types have the
+larger error of L and S against float64 ADMM with a full SVD on the same rounded input, relative to
+|Y|: the worst over inputs scaled by 1e-6, 1 and 1e6 (half precision: 1). Gap: the worst relative
+gap of the objective. Iterations and seconds: maxima. [Each case](decomposition_stress.csv).
+`{command()}`
 
 ![Worst error of each type](decomposition_stress.png)
 

@@ -32,14 +32,14 @@ def page(found: Gatherer) -> str:
     notes = "".join(f"\n{reason}\n" for reason in reasons)
     if found.other_failures:
         notes += f"\nFailed without a count: {', '.join(found.other_failures)}.\n"
-    return f"""# Faults
+    return f"""# Recovery from faults
 
 Runs of 40 steps on a scene of 32 pixels, a checkpoint every 3 steps, random initialisation or
-`tiny`, forked from one process that has loaded everything. "Same end": once the fault is gone, the
-run (resumed where one had begun) comes to the parameters, scores and curve of an uninterrupted one,
-bit-identically, and leaves no unfinished file; a curve.csv that was cut short itself loses rows.
-"Messages": the words that a user saw, checked for the file, the reason and the way out. Cases with
-no end of their own are files and folders that must be refused.
+`tiny`, each forked from one fully loaded process. "Same end": after the fault is removed, the run
+(resumed if it had started) reaches bit-identical parameters, scores and curve to an uninterrupted
+run and leaves no unfinished file; a truncated curve.csv loses rows. "Messages in words": what a
+user saw, checked for the file, the reason and the remedy. Cases without "same end" are files and
+folders that must be refused.
 
 {machine()}; {found.seconds:.0f} s on one thread. Script: `benchmarks/faults.py`; tests:
 `python -m pytest -m stress tests/faults`.

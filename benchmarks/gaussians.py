@@ -254,7 +254,7 @@ def plot(models: list[Case], found: dict[Case, dict[str, Any]]) -> None:
                 for model in GAUSSIANS
             },
         )
-        axis.set_xlabel(f"{unit}: Gaussians less six planes")
+        axis.set_xlabel(f"{unit}: Gaussians minus six planes")
     axes[1].legend(fontsize=8)
     save(figure, "gaussians")
 
@@ -288,21 +288,21 @@ def main() -> None:
 
     {command()}
 
-Seconds are CPU time of one core, and each run's initialisation is among them; one seed; scored on
-the test split of demo scenes and of the suite, and on the val split of lego. Six planes begin with
-random planes, Gaussians on the silhouettes' hull; `first psnr` is that of the initial model, and
-`peak GB` is shown for runs that had a process of their own.
+Seconds are CPU time of one core and include the initialisation. One seed. Scores are on the test
+split of demo scenes and of the suite, and on the val split of lego. Six planes are initialised at
+random, Gaussians on the visual hull of the silhouettes; `first psnr` is the initial model's, and
+`peak GB` is given for runs in a process of their own.
 {machine()}.
 
-![PSNR and SSIM of Gaussians less those of six planes](gaussians.png)
+![PSNR and SSIM of Gaussians minus those of six planes](gaussians.png)
 
 {markdown(COLUMNS, rows)}
 
 ## Initialisations of Gaussians
 
-PSNR in dB after {args.seconds:g} s, means of {args.seeds} seeds. Gaussians begin on the hull
-(`model.points=silhouettes`, the default), anywhere (`model.points=random`), or on the surfaces
-of a six-plane field that is trained first (`lrm=field`).
+PSNR in dB after {args.seconds:g} s, means of {args.seeds} seeds. The first points lie on the visual
+hull (`model.points=silhouettes`, the default), at random positions (`model.points=random`), or on
+the surfaces of a six-plane field that is trained beforehand (`lrm=field`).
 
 {begins({case: found[case] for case in starts})}
 """

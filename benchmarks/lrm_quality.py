@@ -26,8 +26,8 @@ from runner import CPU_CLOCK, RESULTS, Measured, command, machine, markdown, run
 from xplanes.files import read_json, write_rows, write_text
 
 COLUMNS = (
-    *("LRM", "steps of pretraining", "IoU", "novel views of the LRM, dB"),
-    *("before the first step, dB", "after training, dB"),
+    *("LRM", "pretraining steps", "IoU", "LRM's PSNR on novel views, dB"),
+    *("PSNR before the first step, dB", "PSNR after training, dB"),
 )
 
 
@@ -150,10 +150,11 @@ def main() -> None:
 
 Six planes on {", ".join(args.scenes)} at 100 pixels, {args.seconds:g} s of one core's CPU time
 without the preparation; means over the scenes, ± the standard deviation of {args.seeds} seeds. The
-LRM alone is scored on {args.held_out} held-out objects, each seen from one side. The first models
-are one, kept while it is pretrained on {args.objects} objects; `tiny` and `mini` were pretrained on
-16,384 objects at 32 x 32, for hours and with another schedule. All of them see 16 frames of a fixed
-camera's video, which `none` does not: [what that is worth](initialisation.md). {machine()}.
+LRM alone is scored on {args.held_out} held-out objects, each from one input view. The planes of
+16 x 16 are those of one model at several steps of its pretraining on {args.objects} objects; `tiny`
+and `mini` were pretrained on 16,384 objects at 32 x 32, for hours with a different schedule. All of
+them see 16 frames of a fixed camera's video, which `none` does not ([effect of these
+frames](initialisation.md)). {machine()}.
 
 ![PSNR after training against the LRM's own](lrm_quality.png)
 

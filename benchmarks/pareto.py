@@ -70,7 +70,7 @@ CASES: dict[str, tuple[str, ...]] = {
 COLUMNS = (
     "scene",
     "run",
-    "front",
+    "on front",
     "psnr",
     "ssim",
     "prepare s",
@@ -202,10 +202,10 @@ def main() -> None:
 
 {args.seconds:g} s of training for each run, in CPU time of one core, {args.resolution} px, five
 views of the test split (lego: val), one seed; {machine()}.
-"front": at some moment, preparation included, as good as the best (to {MARGIN:g} dB), between
-scores on the line between them. On the way four views are scored; of the baselines two, and seldom.
-The LRM's starts see the frames of a video that others do not (not on lego, which has none):
-[what that is worth](initialisation.md).
+"on front": at some time, preparation included, the run is within {MARGIN:g} dB of the best; PSNR is
+interpolated linearly between evaluations. During training four views are scored; for baselines two,
+and less often. Runs initialised from the LRM see frames of a video that the others do not, except
+on lego, which has none ([effect of these frames](initialisation.md)).
 
     {command()}
 

@@ -36,7 +36,7 @@ from xplanes.scenes.views import Views
 
 SIZE = (1014, 1352)
 STEPS = 150
-COLUMNS = ("images", "median ms", "95% ms", "share of a step", "private MB")
+COLUMNS = ("images", "median ms", "95th percentile ms", "share of a step", "private MB")
 
 
 def frames(first: int, count: int) -> Iterator[tuple[int, np.ndarray]]:
@@ -89,7 +89,7 @@ def main() -> None:
     args = parser.parse_args()
     pause, frame = args.step_ms / 1000, cube_frame(4.0, torch.zeros(3))
     count = max(8, round(args.gigabytes * 2**30 / (3 * SIZE[0] * SIZE[1])))
-    rows = [["none: the process alone", "", "", "", f"{private_bytes() / 2**20:.0f}"]]
+    rows = [["none (process only)", "", "", "", f"{private_bytes() / 2**20:.0f}"]]
     with tempfile.TemporaryDirectory(dir=args.cache) as place:
         source = Path(place) / "source"
         source.write_bytes(b"")
@@ -122,7 +122,7 @@ def main() -> None:
         rows.append(measure("on disk, in the system's cache", batches, pause, warm))
         silent = RayBatches(views, frame, settings, seed=0)
         silent._prefetch = lambda step: None  # type: ignore[method-assign]
-        rows.append(measure("on disk, cold, not announced", silent, pause, drop))
+        rows.append(measure("on disk, cold, without prefetching", silent, pause, drop))
         size = file.stat().st_size
         del batches, silent, prefetched, views, images
     held = store.in_memory([SIZE] * 32, [lambda: frames(0, 32)])
@@ -131,15 +131,15 @@ def main() -> None:
     write_rows(RESULTS / "ray_drawing.csv", COLUMNS, rows)
     page = f"""# Drawing rays from images on disk
 
-{count} images of {SIZE[1]} x {SIZE[0]} pixels without alpha, {size / 2**30:.1f} GB as a file of
-tiles, written in {writing:.0f} s; {settings.per_batch} rays a batch; a step is {args.step_ms:g} ms;
-{STEPS} steps, the first ones included; {machine()}, of which {os.getloadavg()[0]:.1f} processes
-wanted time on average. `{command()}`
+{count} images of {SIZE[1]} x {SIZE[0]} pixels without alpha, {size / 2**30:.1f} GB in one tiled
+file, written in {writing:.0f} s; {settings.per_batch} rays per batch; a training step is assumed to
+take {args.step_ms:g} ms; {STEPS} steps, warm-up included; {machine()}, load average
+{os.getloadavg()[0]:.1f}. `{command()}`
 
 {markdown(COLUMNS, rows)}
 
 "private MB": memory of the process alone (USS) after the draws. Images in memory, for
-scenes of up to {store.IN_MEMORY / 2**30:g} GB: a draw of scattered pixels.
+scenes of up to {store.IN_MEMORY / 2**30:g} GB, are sampled at scattered pixels.
 """
     write_text(RESULTS / "ray_drawing.md", page)
     print(page)

@@ -55,7 +55,10 @@ PAIRS = {
 """Savings beside those of single samples: a scene, what switches it off there, and for how many
 times the steps."""
 
-PAIR_COLUMNS = ("saving", "scene", "seconds", "without it", "psnr", "without it ", "steps")
+PAIR_COLUMNS = (
+    *("saving", "scene", "seconds with", "seconds without", "psnr with", "psnr without"),
+    "steps with / without",
+)
 
 FIGURES: dict[str, Callable[[dict], float]] = {
     "seconds": lambda run: run["seconds"]["train"],
@@ -73,7 +76,7 @@ COLUMNS = (
     "psnr",
     "psnr change",
     "ssim",
-    "samples a ray",
+    "samples per ray",
     "empty",
     "occluded",
     "background",
@@ -145,7 +148,7 @@ def preparation(work: Path) -> list[tuple]:
     cases = {
         "16 different frames": ("data.scene=excavator", "preparation.cache=null"),
         "16 equal frames": ("data.scene=still_life", "data.static=false", "preparation.cache=null"),
-        "stages kept": ("data.scene=excavator", f"preparation.cache={work / 'cache'}"),
+        "stages cached": ("data.scene=excavator", f"preparation.cache={work / 'cache'}"),
     }
     rows = []
     for name, overrides in cases.items():
@@ -206,38 +209,36 @@ def main() -> None:
     write_rows(RESULTS / f"{args.name}.csv", COLUMNS, rows)
     if "all savings" in args.only:
         plot(found, args.name)
-    page = f"""# Savings, one switched off at a time
+    page = f"""# Skipped computation: one saving off at a time
 
 ![Seconds and PSNR with one saving off]({args.name}.png)
 
 {args.steps} steps of 512 rays, {args.resolution} px, six planes with random initialisation,
 {"one seed" if args.seeds == 1 else f"means of {args.seeds} seeds"}; {machine()}. `{command()}`
 
-empty and occluded: shares of the samples in the box; background: share of the pixels; gradients:
-share of the samples left that needed none.
+Columns `empty` and `occluded`: skipped shares of the samples in the cube; `background`: of the
+pixels; `gradients`: share of the remaining samples without a gradient.
 
-All runs see equally many rays. Without the saving of the background they are spread over the whole
-picture, where most meet nothing and cost little: it shows in PSNR, not in seconds.
+All runs use the same number of rays. With background skipping off, the rays cover the whole image.
+Most of them hit nothing and are cheap, so this saving improves PSNR rather than seconds.
 
 {markdown(COLUMNS, rows)}
 """
     if pairs:
         page += f"""
-## Savings beside those of single samples
+## Other savings
 
-Seconds of training and PSNR with a saving and without it, steps with / without. Where the steps
-after convergence are as many in both, the rule found that the run still gained.
+Equal step counts for "steps after convergence" mean that the stopping rule did not trigger.
 
 {markdown(PAIR_COLUMNS, pairs)}
 
 ## Preparation
 
-Seconds of a run of one step with `lrm=tiny`, without scoring; frames: share that did not pass
-through the model, as it equals another.
+Seconds of a run of one step with `lrm=tiny`, without evaluation.
 
-{markdown(("video", "seconds", "frames"), prepared)}
+{markdown(("video", "seconds", "duplicate frames, not encoded"), prepared)}
 
-Singular directions: [robust PCA](decomposition_speed.md). Static cells of a moving scene are not
+Truncated SVD: see [robust PCA](decomposition_speed.md). Static cells of a moving scene are not
 skipped: [why](../decisions.md#what-is-skipped).
 """
     write_text(RESULTS / f"{args.name}.md", page)

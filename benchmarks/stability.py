@@ -34,17 +34,16 @@ def page(found: Gatherer) -> str:
     return f"""# Numerical stability
 
 Each case runs forward and backward, or trains 50 steps (Tensor4D 15): all values, gradients and
-parameters must be finite to the end, or training must stop with words that name what is not finite
-and the way out. Errors are the largest difference from float64 (or from the other number of
-threads) as a share of the largest expected value; each test states what it allows.
+parameters must be finite to the end, or training must stop with a message that names the non-finite
+quantity and the remedy. Errors are the largest difference from float64 (or from the other number of
+threads) as a share of the largest expected value; each test states its tolerance.
 
 {machine()}; {found.seconds:.0f} s on one thread. Script: `benchmarks/stability.py`; tests:
 `python -m pytest -m stress tests/stress`.
 
 {markdown(COLUMNS, rows)}
 {others}
-Robust PCA at its extremes:
-[a table of its own](decomposition_stress.md).
+Robust PCA has [its own table](decomposition_stress.md).
 """
 
 

@@ -197,10 +197,10 @@ def main() -> None:
     shares = [(part, f"{1000 * split[part]:.1f}", f"{split[part] / whole:.0%}") for part in split]
     write_rows(RESULTS / "gaussian_rasteriser.csv", COLUMNS, rows)
     plot(rows)
-    page = f"""# Rasteriser of Gaussians on the CPU
+    page = f"""# Gaussian rasteriser on the CPU
 
-A ball of Gaussians of random shapes and opacities; one iteration draws an image and differentiates
-its colours by all parameters. Medians and best of {repeats} iterations by the clock, which other
+A ball of Gaussians of random shapes and opacities; one iteration renders an image and differentiates
+it with respect to all parameters. Medians and best of {repeats} iterations by the clock, which other
 processes slow down; "CPU" counts the time of this process alone on all cores, at best. {machine()};
 on average {os.getloadavg()[0]:.1f} processes wanted time on them. `{command()}`
 
@@ -218,11 +218,11 @@ takes {statistics.median(ratios):.0f} times as long (median of the pairs; {min(r
 
 ![Milliseconds against Gaussians and pixels](gaussian_rasteriser.png)
 
-The Gaussians shrink as their number grows, so that their areas add up to the same.
+The Gaussians shrink as their number grows, so that their total area stays constant.
 
 ## Where the time goes
 
-{COUNT} Gaussians, {SIZE} x {SIZE} pixels, milliseconds of all cores.
+{COUNT} Gaussians, {SIZE} x {SIZE} pixels, CPU milliseconds summed over all cores.
 
 {markdown(("part", "CPU ms", "share"), shares)}
 """

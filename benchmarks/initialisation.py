@@ -174,10 +174,10 @@ def main() -> None:
 
 Six planes at {args.resolution} pixels; {seeds}; {machine()}. The budget is {args.seconds:g} s of
 one core's CPU time with all views and {args.few_seconds:g} s with {FEW}; **it includes the
-preparation**, which is what `tiny` takes before its first step. Demo scenes (the first two) have a
-video of a fixed camera, whose frames the LRM sees and `none` does not; "on the video" has them
-among the training views. The other scenes have no such video: the preparation trains a field that
-films them, and both starts see the same images.
+preparation**, the time that `tiny` takes before its first step. Demo scenes (the first two) have a
+video of a fixed camera, whose frames the LRM sees and `none` does not; "on the video" adds them
+to the training views. The other scenes have no such video: the preparation trains a field that
+renders one, and both initialisations see the same images.
 
 ![Lead of tiny over random initialisation](initialisation.png)
 

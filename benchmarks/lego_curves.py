@@ -29,8 +29,8 @@ MOMENTS = (0.05, 0.1, 0.25, 0.5, 0.75, 1.0)
 """Shares of the budget after which the field is scored."""
 
 COLUMNS = (
-    *("pixels", "planes", "budget s", "steps", "psnr at a quarter", "psnr", "ssim"),
-    *("rays/s", "samples a ray"),
+    *("pixels", "planes", "budget, s", "steps", "psnr at a quarter of it", "psnr", "ssim"),
+    *("rays/s", "samples per ray"),
 )
 
 FOUR_DGS = "https://github.com/riccardolanza05/dynamic-gaussian-splatting-benchmark"
@@ -144,7 +144,7 @@ def main() -> None:
     page = f"""# Lego: PSNR against seconds
 
 Default settings with random initialisation, val split; means of {args.seeds} seeds with their
-standard deviation; seconds are those of training. {machine()}. `{command()}`
+standard deviation; seconds are training time. {machine()}. `{command()}`
 
 ![PSNR against seconds](lego.png)
 
@@ -152,8 +152,8 @@ standard deviation; seconds are those of training. {machine()}. `{command()}`
 
 ## Published runs
 
-Of the **test** split, whose shovel is in another state than in the training images: every method
-stops at about 25 dB there, and the two splits must not be compared with each other.
+These are of the **test** split, whose shovel is in a different state from the training images: every
+method stops at about 25 dB. Scores on the two splits are not comparable.
 
 {markdown(published, list(PUBLISHED))}
 """

@@ -100,10 +100,10 @@ def main() -> None:
         print(*rows[-1], flush=True)
     page = f"""# Published LRMs at full size
 
-Random weights in float32, saved as safetensors without tensors that the model never uses
-(OpenLRM 1.0 and TripoSR are published as pickles), one picture of 512 pixels;
-{machine()}. The file is mapped into memory, so that it is
-read while the picture is encoded. `{command()}`
+Random weights in float32, saved as safetensors without unused tensors
+(OpenLRM 1.0 and TripoSR are published as pickles), one image of 512 pixels;
+{machine()}. The file is memory-mapped, so part of it
+is read while the image is encoded. `{command()}`
 
 {markdown(COLUMNS, rows)}
 """

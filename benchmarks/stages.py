@@ -170,11 +170,11 @@ def main() -> None:
         curves[f"{stage.name}, {stage.unit}"] = (stage.sizes, spent)
     plot(curves)
     write_rows(RESULTS / "stages.csv", COLUMNS, rows)
-    page = f"""# Stages against the size of their problem
+    page = f"""# Run time of stages against problem size
 
 Least of {ROUNDS} calls; {machine()}. `{command()}`. Sequences have 30 frames, 32
-channels and 32 texels a side, planes 64 texels and 32 channels, lookups 8,000 points, where nothing
-else is said. "growth": the exponent fitted over all sizes of a stage.
+channels and 32 texels a side, planes 64 texels and 32 channels, lookups 8,000 points, unless
+stated otherwise. "growth": the exponent fitted over all sizes of a stage.
 
 ![Seconds against size](stages.png)
 

@@ -126,7 +126,7 @@ def main() -> None:
     {command()}
 
 {whole:.1f} s in all, {metrics["step"]} steps, PSNR {metrics["test"]["psnr"]:.2f}; {machine()}.
-Each stage without the stages that it calls.
+Times exclude nested stages.
 
 ![Seconds of each stage](time_{args.name}.png)
 

@@ -5,7 +5,8 @@
 A result is stale if it was made with another version, on another kind of machine, or before the
 code or the settings that it measures changed; comments and docstrings do not count. --list says
 which are and why; --only makes those named, stale or not. Needs the extra `dev` and D-NeRF's lego
-(`xplanes download dnerf`). One script that fails does not stop the others. Nothing else should run.
+(`xplanes download dnerf`). One script that fails does not stop the others, and one that was
+interrupted goes on where it stopped if nothing has changed. Nothing else should run.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import ast
 import hashlib
 import json
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -28,6 +30,8 @@ from xplanes.files import write_text
 
 HERE = Path(__file__).resolve().parent
 MADE = RESULTS / "made.json"
+WORK = Path("outputs/benchmarks")
+"""Scripts keep finished runs below it, each in a folder of its name."""
 
 TRAINING = ("conf", *(f"xplanes/{part}" for part in ("fields", "models", "rendering", "training")))
 START = ("conf", *(f"xplanes/{part}" for part in ("decomposition", "lrm", "preparation")))
@@ -49,6 +53,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "decomposition_speed": ("xplanes/decomposition",),
     "decomposition_stress": ("xplanes/decomposition",),
     "conversion_options": (*TRAINING, *START[1:]),
+    "paper": (*TRAINING, *START[1:]),
     "rank_curve": START,
     "stability": (*TRAINING, "xplanes/decomposition", "tests/stress"),
     "faults": ("xplanes", "tests/faults"),
@@ -59,9 +64,9 @@ PARTS: dict[str, tuple[str, ...]] = {
 def scripts(folder: Path) -> dict[str, list[list[str]]]:
     """The arguments of each script's runs, by its name; ``folder`` is that of lego."""
     scene = ["--lego", str(folder)]
-    given = {name: [scene] for name in ("lego_curves", "skips", "rendering")}
+    given = {name: [scene] for name in ("lego_curves", "rendering")}
     # CPU seconds: runs side by side do not disturb one another.
-    for name in ("initialisation", "gaussians", "pareto"):
+    for name in ("skips", "initialisation", "gaussians", "pareto"):
         given[name] = [[*scene, "--together", "2"]]
     own = "plain,world,world_tiny,masks,masks_tiny,rough_world,rough_field,thin_fog,even_rays"
     several = ["--together", "2", "--seeds", "3"]
@@ -73,7 +78,8 @@ def scripts(folder: Path) -> dict[str, list[list[str]]]:
             *("--name", "captures_models", "--title", "Test scenes in three models"),
         ],
     ]
-    given["lrm_quality"] = [["--together", "2"]]
+    for name in ("lrm_quality", "paper"):
+        given[name] = [["--together", "2"]]
     given["ray_drawing"] = [["--gigabytes", "22"]]  # More than the system keeps in memory.
     apart = "preparation.cache=null"
     given["where_time_goes"] = [[apart], ["--name", "lego", apart, *lego(folder.resolve())]]
@@ -141,6 +147,15 @@ def why_stale(now: dict[str, Any], then: dict[str, Any] | None) -> str:
     return "; ".join(changes)
 
 
+def keep_runs_of(state: dict[str, Any], folder: Path) -> None:
+    """Forget the runs in a script's folder, unless they were made in this very state."""
+    file = folder / "state.json"
+    if not file.is_file() or json.loads(file.read_text(encoding="utf-8")) != state:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        write_text(file, json.dumps(state))
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--lego", type=Path, default=Path("data/dnerf/lego"))
@@ -161,12 +176,14 @@ def main() -> int:
     failed = []
     for name, runs in chosen.items():
         state, began = state_of(name), time.perf_counter()
+        keep_runs_of(state, WORK / name)
         script = [sys.executable, str(HERE / f"{name}.py")]
         codes = [subprocess.run([*script, *line], check=False).returncode for line in runs]
         print(f"{name}: {time.perf_counter() - began:.0f} s, exit codes {codes}", flush=True)
         if any(codes):
             failed.append(name)
             continue
+        shutil.rmtree(WORK / name)
         made[name] = state
         write_text(MADE, json.dumps(dict(sorted(made.items())), indent=1) + "\n")
     if failed:

@@ -17,7 +17,6 @@ import argparse
 import math
 import os
 import statistics
-import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -151,7 +150,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--together", type=int, default=1, help="runs side by side")
     parser.add_argument("--root", type=Path, default=Path("data/suite"), help="of the scenes")
-    parser.add_argument("--work", type=Path, help="keeps finished runs")
+    parser.add_argument("--work", type=Path, default=Path("outputs/benchmarks/captures"))
     parser.add_argument("--name", default="captures", help="of the results")
     parser.add_argument("--title", default="Captures with a world behind", help="of the page")
     parser.add_argument("overrides", nargs="*", help="settings of train.py")
@@ -159,11 +158,8 @@ def main() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     names = [(s, v) for s in args.scenes.split(",") for v in args.variants.split(",")]
     jobs = [(scene, variant, seed) for scene, variant in names for seed in range(args.seeds)]
-    with (
-        tempfile.TemporaryDirectory() as scratch,
-        ThreadPoolExecutor(args.together) as pool,
-    ):
-        work = args.work or Path(scratch)
+    work = args.work.absolute() / args.name
+    with ThreadPoolExecutor(args.together) as pool:
 
         def measure(job: tuple[str, str, int]) -> Measured:
             folder = work / "_".join(map(str, job))

@@ -204,7 +204,7 @@ def main() -> None:
     parser.add_argument("--weight", nargs="+", default=["0.009", "auto"], help="a number or auto")
     parser.add_argument("--part", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--budget", type=float, default=100, help="seconds for each part")
-    parser.add_argument("--work", type=Path, default=Path("build/decomposition_speed"))
+    parser.add_argument("--work", type=Path, default=Path("outputs/benchmarks/decomposition_speed"))
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     options.work.mkdir(parents=True, exist_ok=True)

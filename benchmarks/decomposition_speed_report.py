@@ -26,11 +26,13 @@ TARGETS = (
 HEAD = """# Robust PCA: run time against error
 
 163,840 rows (64 x 64 cells of 40 features), float32; {machine}. Each
-column has the seconds until an error falls below the bound and stays there. Residual: |L + S - Y| / |Y|. Errors against a
-long float64 run: objective of the feasible pair (L, Y - L), relative difference of L and of S.
-`-`: not reached within the iterations of the last column; ours end at tolerance 1e-5. Seconds are
-iterations times the least time per iteration over interleaved rounds, plus set-up and final steps. Script: `benchmarks/decomposition_speed.py`; points: `decomposition_speed.csv` (its
-own column of seconds is raw), times: `decomposition_speed_clock.csv`.
+column has the seconds until an error falls below the bound and stays there. Residual:
+|L + S - Y| / |Y|. Errors against a long float64 run: objective of the feasible pair (L, Y - L),
+relative difference of L and of S. `-`: not reached within the iterations of the last column; ours
+end at tolerance 1e-5. Seconds are iterations times the least time per iteration over interleaved
+rounds, plus set-up and final steps. Script: `benchmarks/decomposition_speed.py`; points:
+`decomposition_speed.csv` (its own column of seconds is raw), times:
+`decomposition_speed_clock.csv`.
 """
 
 

@@ -75,7 +75,7 @@ HEAD = f"""# Robust PCA: stress table
 has the given condition number, and 5% of the entries are outliers. The columns of types have the
 larger error of L and S against float64 ADMM with a full SVD on the same rounded input, relative to
 |Y|: the worst over inputs scaled by 1e-6, 1 and 1e6 (half precision: 1). Gap: the worst relative
-gap of the objective. Iterations and seconds: maxima. [Each case](decomposition_stress.csv).
+gap of the objective. Iterations and seconds: maxima. Each case is in `decomposition_stress.csv`.
 `{command()}`
 
 ![Worst error of each type](decomposition_stress.png)

@@ -199,9 +199,10 @@ def main() -> None:
     plot(rows)
     page = f"""# Gaussian rasteriser on the CPU
 
-A ball of Gaussians of random shapes and opacities; one iteration renders an image and differentiates
-it with respect to all parameters. Medians and best of {repeats} iterations by the clock, which other
-processes slow down; "CPU" counts the time of this process alone on all cores, at best. {machine()};
+A ball of Gaussians of random shapes and opacities; one iteration renders an image and
+differentiates it with respect to all parameters. Medians and best of {repeats} iterations by the
+clock, which other processes slow down; "CPU" counts the time of this process alone on all cores, at
+best. {machine()};
 on average {os.getloadavg()[0]:.1f} processes wanted time on them. `{command()}`
 
 ## Against plain torch

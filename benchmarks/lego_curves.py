@@ -152,8 +152,8 @@ standard deviation; seconds are training time. {machine()}. `{command()}`
 
 ## Published runs
 
-These are of the **test** split, whose shovel is in a different state from the training images: every
-method stops at about 25 dB. Scores on the two splits are not comparable.
+These are of the **test** split, whose shovel is in a different state from the training images:
+every method stops at about 25 dB. Scores on the two splits are not comparable.
 
 {markdown(published, list(PUBLISHED))}
 """

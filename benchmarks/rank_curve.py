@@ -188,8 +188,8 @@ def main() -> None:
 {" and ".join(f"`{lrm}`" for lrm in args.lrms)} for the videos of {", ".join(args.scenes)};
 16 timesteps, so the rank is 16 at most. Means over scenes and planes.
 
-The paper reports a mean rank of {PUBLISHED} with lambda {LAMBDA} and mu {MU}. It does not state the scale
-of its features. With these constants and a residual of {TOLERANCE:g}
+The paper reports a mean rank of {PUBLISHED} with lambda {LAMBDA} and mu {MU}. It does not state the
+scale of its features. With these constants and a residual of {TOLERANCE:g}
 (`decomposition=paper`), the mean rank here is **{statistics.fmean(ranks):.2f}** of 16. The
 features' rms is {min(units):.2f} to {max(units):.2f}.
 
@@ -198,8 +198,8 @@ features' rms is {min(units):.2f} to {max(units):.2f}.
 ## Against lambda
 
 Solved to a relative residual of 1e-4 (`method=adaptive`). The solution does not depend on mu or on
-the scale of the features: L and S scale with them. The usual choice, one over the square root of the
-number of rows, is {size:.4f} for `{args.lrms[0]}`. The rank is nearest to the published one at
+the scale of the features: L and S scale with them. The usual choice, one over the square root of
+the number of rows, is {size:.4f} for `{args.lrms[0]}`. The rank is nearest to the published one at
 lambda = {nearest(rows, "lambda")[1]}.
 
 {found["lambda"]}

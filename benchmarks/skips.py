@@ -1,26 +1,23 @@
 """What each saving saves, and what it costs: same steps and rays, one saving off at a time.
 
     python benchmarks/skips.py [--lego FOLDER] [--steps 1000] [--resolution 100] [--seeds 3]
-        [--only SAVING ...] [--name skips]
+        [--together 1] [--only SAVING ...] [--name skips] [--work FOLDER]
 
-Writes docs/results/NAME.md, NAME.csv and NAME.png. Seconds are the training clock of
-one process with nothing else running; compare them within one scene only.
+Writes docs/results/NAME.md, NAME.csv and NAME.png. Each run is a process of its own with one
+thread, and seconds are its CPU time (cpu_clock.py); ``--together`` so many run side by side.
 """
 
-import os
-
-from xplanes.process import defaults
-
-os.environ.update(defaults(os.environ))
-
 import argparse
-import tempfile
+import os
+import re
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from statistics import fmean, stdev
+from typing import Any
 
 from figures import bars, panels, save
-from runner import RESULTS, Measured, command, lego, machine, markdown, measure
+from runner import CPU_CLOCK, RESULTS, command, lego, machine, markdown, run_apart
 
 from xplanes.files import write_rows, write_text
 
@@ -84,12 +81,11 @@ COLUMNS = (
 )
 
 
-def train(scene: list[str], switches: tuple[str, ...], seed: int, work: Path, args) -> Measured:
-    """One run with equal rays at equal steps."""
+def train(name: str, scene: tuple[str, ...], switches: tuple[str, ...], args: Any) -> list[dict]:
+    """What runs with equal rays at equal steps measured, one for each seed."""
     overrides = [
         *([] if any(line.startswith("lrm=") for line in scene) else ["lrm=none"]),
         *scene,
-        f"seed={seed}",
         f"data.resolution={args.resolution}",
         f"trainer.max_steps={args.steps}",
         "trainer.max_seconds=null",
@@ -97,11 +93,18 @@ def train(scene: list[str], switches: tuple[str, ...], seed: int, work: Path, ar
         # No limit on samples, so that every run sees the same rays at the same step.
         "model.rays.samples_per_batch=1000000",
         "callbacks.evaluation.at=[]",
-        "media=false",
         "trainer.accelerator=cpu",
         *switches,
     ]
-    return measure(overrides, work)
+    return [
+        apart(f"{name} {seed}", [*overrides, f"seed={seed}"], args) for seed in range(args.seeds)
+    ]
+
+
+def apart(name: str, overrides: list[str], args: Any) -> dict:
+    """The metrics of a run in a process of its own."""
+    folder = args.work.absolute() / args.name / re.sub(r"[^a-z0-9]+", "_", name)
+    return run_apart([*overrides, "logger=none", "media=false"], folder, CPU_CLOCK).metrics
 
 
 def spread(values: list[float]) -> str:
@@ -128,14 +131,13 @@ def plot(found: dict[str, dict[str, dict[str, float]]], name: str) -> None:
     save(figure, name)
 
 
-def pair(name: str, work: Path, args) -> tuple:
+def pair(name: str, args: Any) -> tuple:
     """A row of the second table."""
     scene, off, longer = PAIRS[name]
-    scene = list(scene)
     several = argparse.Namespace(**(vars(args) | {"steps": longer * args.steps}))
     seconds, scores, steps = [], [], []
-    for switches in ((), off):
-        runs = [train(scene, switches, seed, work, several).metrics for seed in range(args.seeds)]
+    for word, switches in (("with", ()), ("without", off)):
+        runs = train(f"{name} {word}", scene, switches, several)
         psnr = [FIGURES["psnr"](run) for run in runs]
         seconds.append(f"{fmean(FIGURES['seconds'](run) for run in runs):.1f}")
         scores.append(f"{fmean(psnr):.2f}{spread(psnr)}")
@@ -143,18 +145,19 @@ def pair(name: str, work: Path, args) -> tuple:
     return (name, scene[0].split("=")[1], *seconds, *scores, " / ".join(steps))
 
 
-def preparation(work: Path) -> list[tuple]:
-    """Seconds of the preparation with 16 frames: different ones, equal ones, and kept stages."""
+def preparation(args: Any) -> list[tuple]:
+    """Seconds of the preparation with 16 frames: different ones, equal ones, and cached stages."""
+    cache = args.work.absolute() / args.name / "cache"
     cases = {
         "16 different frames": ("data.scene=excavator", "preparation.cache=null"),
         "16 equal frames": ("data.scene=still_life", "data.static=false", "preparation.cache=null"),
-        "stages cached": ("data.scene=excavator", f"preparation.cache={work / 'cache'}"),
+        "stages cached": ("data.scene=excavator", f"preparation.cache={cache}"),
     }
     rows = []
     for name, overrides in cases.items():
-        lines = [*overrides, "trainer.max_steps=1", "callbacks.evaluation.at=[]", "media=false"]
-        for _ in range(2):  # Whatever is made once, the second finds.
-            metrics = measure([*lines, "trainer.accelerator=cpu"], work).metrics
+        lines = [*overrides, "trainer.max_steps=1", "callbacks.evaluation.at=[]"]
+        for turn in range(2):  # Whatever is made once, the second finds.
+            metrics = apart(f"{name} {turn}", [*lines, "trainer.accelerator=cpu"], args)
         # Not the stages' own seconds: of what was kept these are the ones that it once took.
         waited = metrics["seconds"]["total"] - metrics["seconds"]["evaluate"]
         rows.append((name, f"{waited:.1f}", f"{100 * metrics['skipped']['frames']:.0f}%"))
@@ -169,43 +172,43 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--only", nargs="+", choices=SWITCHES, default=list(SWITCHES))
     parser.add_argument("--pairs", nargs="*", choices=PAIRS, default=list(PAIRS))
+    parser.add_argument("--together", type=int, default=1, help="runs side by side")
     parser.add_argument("--name", default="skips")
+    parser.add_argument("--work", type=Path, default=Path("outputs/benchmarks/skips"))
     args = parser.parse_args()
+    os.environ["OMP_NUM_THREADS"] = "1"
     scenes = {
-        "demo excavator": ["data.scene=excavator"],
-        "demo balls": ["data.scene=balls"],
+        "demo excavator": ("data.scene=excavator",),
+        "demo balls": ("data.scene=balls",),
     }
     if args.lego.is_dir():
-        scenes["lego (val)"] = lego(args.lego)
+        scenes["lego (val)"] = tuple(lego(args.lego.resolve()))
+    cases = [(name, label) for name in scenes for label in args.only]
+    with ThreadPoolExecutor(args.together) as pool:
+        trained = pool.map(
+            lambda case: train(" ".join(case), scenes[case[0]], SWITCHES[case[1]], args), cases
+        )
+        pairs = list(pool.map(lambda name: pair(name, args), args.pairs))
+        runs = dict(zip(cases, trained, strict=True))
+    prepared = preparation(args) if args.pairs else []
     rows, found = [], {}
-    with tempfile.TemporaryDirectory() as work:
-        for name, scene in scenes.items():
-            found[name] = {}
-            for label in args.only:
-                runs = [
-                    train(scene, SWITCHES[label], seed, Path(work), args).metrics
-                    for seed in range(args.seeds)
-                ]
-                means = {key: fmean(find(run) for run in runs) for key, find in FIGURES.items()}
-                found[name][label] = means
-                base = next(iter(found[name].values()))
-                psnr = [FIGURES["psnr"](run) for run in runs]
-                rows.append(
-                    (
-                        name,
-                        label,
-                        f"{means['seconds']:.1f}",
-                        f"{means['seconds'] / base['seconds']:.2f}",
-                        f"{means['psnr']:.2f}{spread(psnr)}",
-                        f"{means['psnr'] - base['psnr']:+.2f}",
-                        f"{means['ssim']:.3f}",
-                        f"{means['samples']:.1f}",
-                        *(f"{100 * means[kind]:.0f}%" for kind in KINDS),
-                    )
-                )
-                print(*rows[-1], flush=True)
-        pairs = [pair(name, Path(work), args) for name in args.pairs]
-        prepared = preparation(Path(work)) if args.pairs else []
+    for (name, label), metrics in runs.items():
+        means = {key: fmean(find(run) for run in metrics) for key, find in FIGURES.items()}
+        found.setdefault(name, {})[label] = means
+        base = next(iter(found[name].values()))
+        rows.append(
+            (
+                name,
+                label,
+                f"{means['seconds']:.1f}",
+                f"{means['seconds'] / base['seconds']:.2f}",
+                f"{means['psnr']:.2f}{spread([FIGURES['psnr'](run) for run in metrics])}",
+                f"{means['psnr'] - base['psnr']:+.2f}",
+                f"{means['ssim']:.3f}",
+                f"{means['samples']:.1f}",
+                *(f"{100 * means[kind]:.0f}%" for kind in KINDS),
+            )
+        )
     write_rows(RESULTS / f"{args.name}.csv", COLUMNS, rows)
     if "all savings" in args.only:
         plot(found, args.name)
@@ -214,7 +217,8 @@ def main() -> None:
 ![Seconds and PSNR with one saving off]({args.name}.png)
 
 {args.steps} steps of 512 rays, {args.resolution} px, six planes with random initialisation,
-{"one seed" if args.seeds == 1 else f"means of {args.seeds} seeds"}; {machine()}. `{command()}`
+{"one seed" if args.seeds == 1 else f"means of {args.seeds} seeds"}; seconds of training are CPU
+time of one core; {machine()}. `{command()}`
 
 Columns `empty` and `occluded`: skipped shares of the samples in the cube; `background`: of the
 pixels; `gradients`: share of the remaining samples without a gradient.

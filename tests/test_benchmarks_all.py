@@ -69,9 +69,11 @@ def test_what_is_made_is_recorded_and_what_fails_is_not(
     every, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     ran = []
+    monkeypatch.chdir(tmp_path)
 
     def execute(line: list[str], check: bool) -> subprocess.CompletedProcess:
         ran.append(Path(line[1]).stem)
+        (every.WORK / ran[-1] / "run").touch()
         return subprocess.CompletedProcess(line, int(ran[-1] == "stages"))
 
     monkeypatch.setattr(every, "MADE", tmp_path / "made.json")
@@ -81,6 +83,13 @@ def test_what_is_made_is_recorded_and_what_fails_is_not(
     assert every.main() == 1
     assert ran == ["ray_drawing", "stages"]
     assert list(json.loads((tmp_path / "made.json").read_text())) == ["ray_drawing"]
+    # What a finished script kept is gone; one that failed goes on with it, unless code changed.
+    assert not (every.WORK / "ray_drawing").exists()
+    kept = every.WORK / "stages" / "run"
+    every.keep_runs_of(every.state_of("stages"), kept.parent)
+    assert kept.is_file()
+    every.keep_runs_of({**every.state_of("stages"), "version": "0"}, kept.parent)
+    assert not kept.exists()
     capsys.readouterr()
     monkeypatch.setattr(sys, "argv", ["all.py", "--list"])
     assert every.main() == 0

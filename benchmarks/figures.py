@@ -7,10 +7,12 @@ from runner import RESULTS
 from xplanes.files import replacing
 
 
-def panels(count: int, width: float, height: float, **shared: bool) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels side by side, each with a grid; sizes in inches."""
+def panels(
+    count: int, width: float, height: float, *, rows: int = 1, **shared: bool
+) -> tuple[Figure, list[Axes]]:
+    """A figure with so many panels in rows, each with a grid; sizes in inches."""
     figure = Figure(figsize=(width, height), layout="constrained")
-    axes = list(figure.subplots(1, count, squeeze=False, **shared)[0])
+    axes = list(figure.subplots(rows, count // rows, squeeze=False, **shared).flat)
     for one in axes:
         one.grid(alpha=0.3)
         one.set_axisbelow(True)

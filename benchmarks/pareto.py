@@ -13,6 +13,7 @@ import os
 os.environ["OMP_NUM_THREADS"] = "1"
 
 import argparse
+import itertools
 import re
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -111,10 +112,11 @@ def on_front(name: str, curves: dict[str, list[tuple[float, float]]]) -> bool:
 
 def plot(scenes: dict[str, dict[str, list[tuple[float, float]]]]) -> None:
     """One panel per scene: runs on the front in colour, the others in grey."""
-    figure, all_axes = panels(len(scenes), 5.2 * len(scenes), 4.6)
+    figure, all_axes = panels(len(scenes), 7, 3.6 * len(scenes), rows=len(scenes))
     best = {scene: [n for n in curves if on_front(n, curves)] for scene, curves in scenes.items()}
     names = dict.fromkeys(name for found in best.values() for name in found)
-    colours = {name: f"C{place}" for place, name in enumerate(names)}
+    # Without C7, which is grey.
+    colours = dict(zip(names, itertools.cycle(f"C{n}" for n in range(10) if n != 7), strict=False))
     for axes, (scene, curves) in zip(all_axes, scenes.items(), strict=True):
         for name, curve in curves.items():
             seen = [point for point in curve if point[0] > 0]

@@ -226,7 +226,7 @@ def document() -> str:
         "Generated from `conf/` and the classes that it names by `python docs/generate.py`.",
         "",
         "Every key can be set on the command line, `python train.py data.views=10 trainer=cpu`.",
-        "Where the options of a group differ, their values stand in the order of the options.",
+        "Where the options of a group differ, values are listed in the order of the options.",
         "",
         *TABLE,
     ]
@@ -265,7 +265,7 @@ def pretraining() -> list[str]:
 
 
 NODES = {
-    "callbacks": "What runs beside training. `callbacks.NAME=null` leaves one out; any callback of "
+    "callbacks": "Callbacks of the Trainer. `callbacks.NAME=null` leaves one out; any callback of "
     "Lightning is added with `+callbacks.NAME={_target_: MODULE.CLASS, ...}`. EarlyStopping and "
     "ModelCheckpoint see `val/psnr` and `val/ssim` after each evaluation "
     "(`callbacks.evaluation.at`).",
@@ -276,7 +276,7 @@ NODES = {
 """Groups of components that have names of their own."""
 
 SETS = {
-    "recipe": "A way to train; see [the method and the paper](paper.md).",
+    "recipe": "The paper's settings, or equal ones; see [the method and the paper](paper.md).",
     "scale": "How large an experiment is.",
     "experiment": "Settings for a purpose; most are sweeps.",
     "entry": "One model with its initialisation, as a row of a table: "
@@ -285,8 +285,8 @@ SETS = {
 """Groups whose files set keys of other groups."""
 
 ENVIRONMENT = {
-    "OMP_NUM_THREADS": "The most threads that torch and the compiled loops use.",
-    "OMP_WAIT_POLICY, GOMP_SPINCOUNT": "How threads wait; set unless one of them is.",
+    "OMP_NUM_THREADS": "Maximum number of threads of torch and the compiled loops.",
+    "OMP_WAIT_POLICY, GOMP_SPINCOUNT": "How threads wait; defaults apply if neither is set.",
     "ONEDNN_PRIMITIVE_CACHE_CAPACITY": "Compiled bfloat16 products that are kept; 256 unless set.",
     "XPLANES_CPU_LOOPS=0": "Plain torch instead of compiled loops on the CPU.",
     "XPLANES_GPU_KERNELS=0": "Plain torch instead of Triton kernels on a GPU.",

@@ -1,12 +1,12 @@
-"""Errors whose message says all: the thing, the value and the way out."""
+"""Errors whose messages name the problem, the value and the remedy."""
 
 
 class XPlanesError(Exception):
-    """The base of all errors whose message says enough; commands print it without a traceback."""
+    """Base class of errors with self-explanatory messages; commands print no traceback."""
 
 
 class ConfigError(XPlanesError, ValueError):
-    """A setting that cannot work; the message names the key, the value and the way out."""
+    """A setting is invalid; the message names the key, the value and the remedy."""
 
 
 class DeviceError(XPlanesError, RuntimeError):

@@ -1,4 +1,4 @@
-"""Writing files so that a reader never finds half of one."""
+"""Atomic file writing: a reader never sees a partially written file."""
 
 import csv
 import errno
@@ -24,7 +24,7 @@ DAY = 86_400.0
 
 
 class StorageError(XPlanesError, OSError):
-    """What cannot be written; the message names it, the reason and the way out."""
+    """A file cannot be written; the message names the file, the reason and the remedy."""
 
 
 def storage_error(problem: OSError, path: Path | None = None) -> StorageError | None:

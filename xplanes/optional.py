@@ -1,4 +1,4 @@
-"""Packages that are only needed for extras."""
+"""Packages that only optional extras need."""
 
 import importlib
 from types import ModuleType
@@ -7,7 +7,7 @@ from xplanes.errors import XPlanesError
 
 
 class MissingExtraError(XPlanesError, ImportError):
-    """A package of an extra is not installed; the message names the extra."""
+    """A package of an optional extra is not installed; the message names the extra."""
 
 
 def require(module: str, *, extra: str) -> ModuleType:

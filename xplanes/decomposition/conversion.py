@@ -1,10 +1,10 @@
-"""From low-rank and sparse triplanes to the planes of a field (g2).
+"""Conversion of low-rank and sparse triplanes to the planes of a field (g2 in X-Planes).
 
-Planes come out channels last: space planes [3, R, R, C] in the order xy, xz, yz, where plane "ab"
-has its FIRST axis a along the width (last spatial dimension) and b along the rows; time planes
-[P, Rt, R, C], where plane "at" has a along the width and time along the rows. Space axes are
-sampled with ``align_corners=False`` and zero outside, as LRM planes are; time t in [0, 1] lies at
-row ``t * (Rt - 1)``, so with Rt = T each frame owns a row.
+The resulting planes are channels-last. Space planes are [3, R, R, C] in the order xy, xz, yz: plane
+"ab" has its FIRST axis a along the width (last spatial dimension) and b along the rows. Time planes
+are [P, Rt, R, C]: plane "at" has a along the width and time along the rows. Like LRM planes, space
+axes are sampled with ``align_corners=False`` and are zero outside. Time t in [0, 1] lies at row
+``t * (Rt - 1)``; with Rt = T, each frame has its own row.
 """
 
 from collections.abc import Sequence
@@ -193,18 +193,19 @@ DYNAMIC = ("random", "ones", "rank1")
 def space_planes(
     low_rank: Tensor, *, static: str = "median", resolution: int | None = None
 ) -> Tensor:
-    """Space planes from the low-rank part (X-Planes, Eq. 16; "middle" is the paper's choice).
+    """Convert the low-rank part to space planes (X-Planes, Eq. 16).
 
     Args:
         low_rank: The static part. [T, 3, C, H, W]
-        static: "middle" (frame T/2), or the elementwise "median" or "mean" over time.
-        resolution: R in cells; None keeps that of the triplanes, which must then be square.
+        static: "middle" (frame T/2, the paper's choice), or the elementwise "median" or "mean" over
+            time.
+        resolution: R, texels per side; None keeps that of the triplanes, which must then be square.
 
     Returns:
         Planes xy, xz, yz. [3, R, R, C]
 
     Raises:
-        ValueError: For a wrong shape or option.
+        ValueError: If the shape or an option is invalid.
     """
     check_triplanes(low_rank, "low_rank")
     if static not in STATIC:
@@ -233,28 +234,28 @@ def time_planes(
     noise: float = 0.01,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """Space-time planes whose products approximate the sparse part (X-Planes, Eq. 15 and 17).
+    """Convert the sparse part to space-time planes (X-Planes, Eq. 15 and 17).
 
-    "rank1" minimises the product loss frame by frame on the triplanes' own grid: in closed form
-    where no two products share a plane, as in "nine", else by alternating least squares. "ones" is
-    K-Planes' initialisation, on which the paper relies: its products are 1. "random" is near zero,
-    where the products leave the space planes as they are. Noise is added to "random" and "rank1",
-    because a product of two zeros has a zero gradient.
+    "rank1" minimises the error of the planes' products for each frame on the triplanes' grid: in
+    closed form if no two products share a plane, as in "nine", else by alternating least squares.
+    "ones" is K-Planes' initialisation, on which the paper relies: all products are 1. "random" is
+    noise around zero, so the products barely change the space planes. The same noise is added to
+    "rank1", because a product of two zeros has a zero gradient.
 
     Args:
         sparse: The dynamic part. [T, 3, C, H, W]
-        plane_set: A plane set of the field with time planes, such as "six" or "nine".
+        plane_set: A plane set with time planes, such as "six" or "nine".
         dynamic: "rank1", "random" or "ones".
-        resolution: R in cells; None keeps that of the triplanes, which must then be square.
-        time_resolution: Rt; None for T, one row per frame.
-        noise: Standard deviation of the noise.
-        generator: Generator of the noise.
+        resolution: R, texels per side; None keeps that of the triplanes, which must then be square.
+        time_resolution: Rt, rows along time; None for T, one row per frame.
+        noise: Standard deviation of the noise, 0 or more.
+        generator: Random generator of the noise; torch's default when None.
 
     Returns:
         Time planes in the order of the plane set. [P, Rt, R, C]
 
     Raises:
-        ValueError: For a wrong shape or option.
+        ValueError: If the shape or an option is invalid.
     """
     check_triplanes(sparse, "sparse")
     for name, value, allowed in (

@@ -13,12 +13,12 @@ ORIENTATIONS = ("xy", "xz", "yz")
 
 @dataclass(frozen=True)
 class Decomposition:
-    """Low-rank and sparse part of a triplane sequence, and reports of robust PCA.
+    """Low-rank and sparse parts of a triplane sequence, with reports of robust PCA.
 
     Attributes:
         low_rank: The static part. [T, 3, C, H, W]
         sparse: The dynamic part. [T, 3, C, H, W]
-        reports: For each of "xy", "xz" and "yz": ``RobustPCA.report``.
+        reports: Output of `RobustPCA.report` for each of "xy", "xz" and "yz".
     """
 
     low_rank: Tensor
@@ -27,19 +27,19 @@ class Decomposition:
 
 
 def decompose(triplanes: Tensor, **options: Any) -> Decomposition:
-    """Robust PCA of each orientation, one column per frame (X-Planes, Eq. 8-12).
+    """Apply robust PCA to each orientation, with one column per frame (X-Planes, Eq. 8-12).
 
-    Frames are rows of the tensor and are read in place: nothing is transposed or copied, unless the
-    tensor is half precision or its planes are not contiguous.
+    The columns are read in place. The tensor is copied only if it has half precision or its planes
+    are not contiguous.
 
     Args:
-        triplanes: One triplane per frame, planes xy, xz, yz, first axis along the width; any
-            floating type, never changed. [T, 3, C, H, W]
-        **options: Options of ``robust_pca``.
+        triplanes: One triplane per frame: planes xy, xz, yz, the first axis along W. Any
+            floating-point type; not modified. [T, 3, C, H, W]
+        **options: Options of `robust_pca` except ``out``.
 
     Raises:
-        ValueError: For a wrong shape, NaN or infinity, or an option out of range.
-        TypeError: For a tensor that is not of a floating type.
+        ValueError: If the shape is wrong, a value is NaN or infinite, or an option is out of range.
+        TypeError: If the tensor is not of a floating-point type.
     """
     check_triplanes(triplanes, "triplanes")
     kind = triplanes.dtype if triplanes.dtype == torch.float64 else torch.float32

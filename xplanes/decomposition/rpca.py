@@ -20,24 +20,24 @@ SCALES = ("rms", "none")
 
 @dataclass(frozen=True)
 class RobustPCA:
-    """Result of robust PCA.
+    """Result of `robust_pca` for a matrix Y.
 
     Attributes:
-        low_rank: L. [M, T]
-        sparse: S. [M, T]
+        low_rank: L, in float32 or float64. [M, T]
+        sparse: S, of the same type. [M, T]
         rank: Rank of L.
         iterations: Iterations made.
         residual: ``|L + S - Y| / |Y|``, Frobenius norms, measured on the result.
         converged: Whether the tolerance was reached within the maximum number of iterations.
-        change: Size of the last measured step (see ``solver.Progress``). A small residual with a
-            large change means that the split is feasible but not yet optimal.
+        change: Relative step size at the last check (see ``solver.Progress``). A small residual
+            with a large change means that the split is feasible but not yet optimal.
         sparsity: Share of non-zero entries in S.
         low_rank_energy: ``|L|^2 / |Y|^2``.
         sparse_energy: ``|S|^2 / |Y|^2``.
-        drift: ``|L - L(T/2)| / |L|``: 0 if L is constant over time.
+        drift: ``|L - L(T/2)| / |L|`` with the middle column L(T/2): 0 if L is constant over time.
         sparsity_weight: The weight used.
         penalty: The final penalty, in units of ``1 / unit``.
-        unit: What Y is measured in: its root mean square, or 1 with ``scale="none"``.
+        unit: Unit of Y for the penalty: its root mean square, or 1 with ``scale="none"``.
         method: The method used.
     """
 
@@ -58,7 +58,7 @@ class RobustPCA:
     method: str
 
     def report(self) -> dict[str, int | float | bool | str]:
-        """All attributes except the two matrices, as builtins."""
+        """All attributes except the two matrices, by name, as plain Python values."""
         names = [field.name for field in fields(self)]
         return {name: getattr(self, name) for name in names if name not in ("low_rank", "sparse")}
 
@@ -81,34 +81,36 @@ def robust_pca(
     The paper prints a Frobenius norm for L, but its update (Eq. 24-25) is singular value
     thresholding, the proximal operator of the nuclear norm. The nuclear norm is minimised here.
 
-    Both norms scale with Y, so the optimal weight does not depend on the scale of Y. The penalty
-    does; ``scale="rms"`` measures it in units of the root mean square of Y. "adaptive" uses it as
-    the initial value only, always in these units.
+    Both norms scale with Y, so the optimal weight does not depend on the scale of Y. The optimal
+    penalty does: with ``scale="rms"``, ``penalty`` is divided by the root mean square of Y.
+    "adaptive" always divides it and uses it only as the initial value.
 
     Besides the two results, which have the size of Y, memory use is four cache-sized blocks. A
     matrix that is neither float32 nor float64, or not contiguous in rows or columns, is copied.
 
     Args:
-        matrix: Y, any floating type; never changed. Half precision is computed and returned in
-            float32. [M, T]
-        sparsity_weight: Weight of S; "auto" is ``1 / sqrt(max(M, T))`` (Candes et al. 2011).
-        penalty: Penalty of ADMM; the initial one for "adaptive", unused by "growing".
-        tolerance: Bound on ``|L + S - Y| / |Y|``; "adaptive" also requires a relative step
+        matrix: Y, of any floating-point type; not modified. Half precision is computed and returned
+            in float32. [M, T]
+        sparsity_weight: Weight of S, above 0; "auto" is ``1 / sqrt(max(M, T))`` (Candes et al.
+            2011).
+        penalty: Penalty of ADMM, above 0; the initial one for "adaptive", unused by "growing".
+        tolerance: Bound on ``|L + S - Y| / |Y|``, above 0; "adaptive" also requires a relative step
             below ten times this. float32 cannot reach much below 1e-6.
-        max_iterations: Maximum number of iterations; a warning is given if it is reached.
+        max_iterations: Maximum number of iterations, at least 1. A warning is given if they do not
+            suffice.
         method: "adaptive" (over-relaxed ADMM with a balanced penalty that then grows no faster
             than the split converges), "growing" (inexact ALM, Lin et al. 2010, growth 1.2: fastest
             to a small residual, but the split is slightly off), "admm" (the paper's Algorithm 1),
-            "exact" (the same with a full singular value decomposition: the slow reference).
-        scale: "rms" or "none": the unit of the penalty.
+            "exact" (Algorithm 1 with a full singular value decomposition: the slow reference).
+        scale: Unit of Y for the penalty: "rms" (root mean square) or "none" (1).
         progress: Show a progress bar after two seconds.
-        out: Output tensors for L and S, with the computation type and layout of the matrix.
-            [M, T], [M, T]
+        out: Output tensors for L and S, with the computation type and layout of the matrix; new
+            tensors when None. [M, T], [M, T]
 
     Raises:
-        ValueError: For a wrong number of dimensions, an empty matrix, NaN or infinity, or an option
-            out of range.
-        TypeError: For a matrix that is not of a floating type.
+        ValueError: If the matrix is not two-dimensional, is empty or holds NaN or infinity, or an
+            option is out of range.
+        TypeError: If the matrix is not of a floating-point type.
     """
     _check_options(sparsity_weight, penalty, tolerance, max_iterations, method, scale)
     peak = _check_matrix(matrix)

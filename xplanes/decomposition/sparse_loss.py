@@ -1,4 +1,4 @@
-"""L_r: keeps products of time planes near the sparse part (X-Planes, Eq. 17)."""
+"""The regulariser L_r: products of time planes stay near the sparse part (X-Planes, Eq. 17)."""
 
 from collections.abc import Sequence
 
@@ -15,21 +15,23 @@ REDUCTIONS = ("mean", "sum")
 def sparse_product_loss(
     time_planes: Tensor, sparse: Tensor, frames: Tensor, *, rows: Rows
 ) -> Tensor:
-    """Mean squared error of the products of time planes against the sparse part at some frames.
+    """Mean squared error between products of time planes and the sparse part at given frames.
 
-    For uniformly drawn frames it is an unbiased estimate of the mean over all frames. Planes are
-    sampled separably, first in time, then in space; only the outer product has the size of a
+    For uniformly drawn frames, the loss is an unbiased estimate of the mean over all frames. Planes
+    are sampled separably, first in time, then in space; only the outer product has the size of a
     triplane.
 
     Args:
         time_planes: Time planes of any resolution. [P, Rt, R, C]
-        sparse: The sparse part of all frames, held fixed. [T, 3, C, H, W]
-        frames: Indices of the frames; may repeat. [B]
-        rows: For xy, xz and yz the positions of the time planes of its first and second axis:
-            ``PLANE_SETS[plane_set]``.
+        sparse: The sparse part of all frames, the target. [T, 3, C, H, W]
+        frames: Indices of the frames, from 0 to T - 1; may repeat. int64 [B]
+        rows: For each of xy, xz and yz, the indices of the two time planes that are multiplied,
+            first axis first: ``PLANE_SETS[plane_set]``.
 
     Returns:
         The loss, differentiable with respect to the time planes. []
+
+    Source: X-Planes, Eq. 17, with a mean in place of the sum.
     """
     frames = frames.to(sparse.device, non_blocking=True)
     target = sparse[frames].to(time_planes.dtype)

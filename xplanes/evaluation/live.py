@@ -25,14 +25,14 @@ TOLD_SECONDS = 0.5
 
 
 class LiveViewer(Callback):
-    """Shows the field in the browser while it trains, where training can be paused.
+    """Shows the field in the browser during training, which can be paused there.
 
-    Pictures are drawn between steps, off the training clock, and change nothing in what is trained.
+    Images are rendered between steps, off the training clock, and do not affect training.
 
     Args:
-        enabled: Whether there is a viewer; `viewer=true` sets it.
-        host: Address that is served; 0.0.0.0 for all of this machine's.
-        port: Port that is served; 0 for any free one.
+        enabled: Whether the viewer runs; `viewer=true` sets it.
+        host: Address to serve on; 0.0.0.0 for all addresses of this machine.
+        port: Port to serve on; 0 for any free one.
 
     Attributes:
         viewer: The viewer; None before training and after it.

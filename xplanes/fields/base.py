@@ -1,4 +1,4 @@
-"""What renderers and training ask of a field."""
+"""Base classes of fields: what renderers and training require of them."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -8,15 +8,18 @@ from torch import Tensor, nn
 
 
 class Representation(nn.Module, ABC):
-    """What is trained: a scene in time that a renderer turns into images.
+    """Base class of trainable representations of a dynamic scene, such as radiance fields.
 
-    It lives in the cube [-1, 1]^3 of its frame. Parameters and parts of a field may not take the
-    names of the properties below; a field overrides those that do not describe it.
+    A representation lives in the cube [-1, 1]^3 of its frame. Subclasses override the properties
+    below where the defaults do not apply. Parameters and submodules must not use these names.
+
+    Raises:
+        AttributeError: If a submodule is assigned to the name of a property.
     """
 
     @property
     def planes(self) -> Mapping[str, Tensor]:
-        """Feature planes, or slices of a feature grid, to look at. [C, rows, columns] each"""
+        """Feature planes, or slices of a feature grid, for display. [C, rows, columns] each"""
         return {}
 
     @property
@@ -26,12 +29,12 @@ class Representation(nn.Module, ABC):
 
     @property
     def precision(self) -> str:
-        """Number format of its matrix products: "32" or "bf16"."""
+        """Precision of its matrix products: "32" (float32) or "bf16" (bfloat16)."""
         return "32"
 
     @property
     def outline(self) -> str:
-        """Its size in a few words."""
+        """Short description for reports, such as the number of channels."""
         return type(self).__name__
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -42,9 +45,11 @@ class Representation(nn.Module, ABC):
 
 
 class RadianceField(Representation):
-    """From points and times, and directions where it looks at them, to colour and density.
+    """Maps points and times, and optionally viewing directions, to colour and density.
 
-    Its density is per unit length of its frame.
+    Subclasses define ``forward(points, times)``, or ``forward(points, times, directions)`` if
+    view-dependent. It takes positions in the field's frame [N, 3], times from 0 to 1 [N] and unit
+    directions [N, 3]. It returns colour [N, 3] and density per unit length of the frame [N].
 
     Attributes:
         view_dependent: Whether ``forward`` takes directions as its third argument.

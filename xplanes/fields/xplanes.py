@@ -1,4 +1,4 @@
-"""The X-Planes field: three space planes, six or nine space-time factors, one decoder."""
+"""The X-Planes field: three space planes, up to six space-time planes, one decoder."""
 
 from collections.abc import Mapping, Sequence
 
@@ -31,20 +31,22 @@ TIME_PLANES: dict[str, tuple[str, ...]] = {
 
 
 class XPlanes(RadianceField):
-    """A dynamic radiance field of additively combined planes.
+    """A dynamic radiance field: products of space-time planes are added to space planes.
 
-    The field lives in the cube [-1, 1]^3. Outside it the planes are zero; renderers skip what lies
-    there.
+    The field lives in the cube [-1, 1]^3. The planes are zero outside it, and renderers take no
+    samples of the field there.
 
     Args:
-        planes: Initial values by name, axis "a" of plane "ab" along the columns: xy, xz, yz
-            [C, H, H] and the plane set's time planes [C, T, H'], T rows of time.
-        decoder: From features [N, 3 C] to colour [N, 3] and density [N].
-        plane_set: "six" (K-Planes' set), "nine" (Tensor4D's) or "three" (no time).
-        background: What lies behind the cube; None for the plain colour that renderers are given.
+        planes: Initial values by name: space planes xy, xz, yz [C, H, H] and the plane set's time
+            planes [C, T, H'] with time along the rows. Axis "a" of plane "ab" runs along the
+            columns.
+        decoder: Maps features [N, 3 C] to colour [N, 3] and density [N].
+        plane_set: "six" (as in K-Planes), "nine" (as in Tensor4D) or "three" (no time planes).
+        background: Model of what lies behind the cube; None for the renderer's plain colour.
 
     Raises:
-        ValueError: If a plane is missing or superfluous, or the shapes do not fit one another.
+        ValueError: If the plane set is unknown, a plane is missing or superfluous, or shapes
+            disagree.
 
     Source: X-Planes, Eq. 14 and 15.
     """
@@ -110,15 +112,15 @@ class XPlanes(RadianceField):
         return plane_features(self.space, self.time, points, times, self.rows).flatten(1)
 
     def forward(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
-        """Colour and density of points at times.
+        """Colour and density at points and times.
 
         Args:
             points: Positions in the field's frame, the cube [-1, 1]^3. [N, 3]
             times: Times from 0 to 1. [N]
 
         Returns:
-            Colour in [0, 1] (up to the decoder's margin) and density per unit length of the field's
-            frame. [N, 3], [N]
+            Colour in [0, 1], widened by the decoder's ``colour_margin``, and density per unit
+            length of the field's frame. [N, 3], [N]
         """
         return self.decoder(self.features(points, times))
 

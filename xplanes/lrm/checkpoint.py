@@ -1,4 +1,4 @@
-"""Reading published weights, strictly."""
+"""Strict loading of published weights."""
 
 import pickle
 from collections.abc import Mapping
@@ -34,20 +34,20 @@ class MismatchError(LRMError):
 
 
 def load(config: Mapping[str, Any] | LRMConfig, weights: Path) -> LRM:
-    """Load a Large Reconstruction Model.
+    """Load a Large Reconstruction Model from published weights.
 
     Args:
-        config: The checkpoint's own configuration as published (`parse_config`); or
-            ``{"architecture": NAME}`` with a name of `PUBLISHED`, in which case a configuration
-            that the file itself carries (OpenLRM 1.0) is used.
+        config: The checkpoint's published configuration (`parse_config`), or
+            ``{"architecture": NAME}`` with a name from `PUBLISHED`. In the second case, a
+            configuration of the same sizes inside the file (OpenLRM 1.0) takes precedence.
         weights: The published file: model.safetensors, pytorch_model.bin, model.pth or model.ckpt.
 
     Returns:
-        The model in evaluation mode, without gradients, on the CPU.
+        The model in float32 and evaluation mode, on the CPU, with frozen parameters.
 
     Raises:
-        LRMError: If the file is missing, damaged, holds more than tensors, or does not fit the
-            configuration; the message says which published model it fits.
+        LRMError: If the configuration is invalid, or the file is missing, is damaged, holds more
+            than weights, or does not fit; the message then names the published models that fit.
     """
     path = Path(weights)
     state, carried = read_weights(path)

@@ -13,13 +13,13 @@ from xplanes.lrm.vit import VisionTransformer
 
 
 class LRM(nn.Module):
-    """From one image to a triplane, and from the triplane's features to colour and density.
+    """Predicts a triplane from one image; its decoder maps features to colour and density.
 
     Args:
         config: Sizes of the model.
-        view: The model's canonical camera and box.
-        decoder: Maps features [N, 3 C] to colour [N, 3] and density [N], the latter per unit
-            length of the model's frame.
+        view: The model's canonical camera and bounding cube.
+        decoder: Maps features [N, 3 C] to colour [N, 3] and density per unit length of the model's
+            frame [N].
 
     Attributes:
         config: As given.
@@ -52,22 +52,36 @@ class LRM(nn.Module):
         return self.view.background
 
     def encode(self, images: Tensor, camera: Tensor | None = None) -> Tensor:
-        """Predict triplanes.
+        """Predict triplanes from images.
 
         Args:
-            images: RGB from 0 to 1, composited on `background`. [N, 3, S, S]
-            camera: OpenLRM's camera vectors; the canonical camera when None. [N, 16]
+            images: RGB from 0 to 1, composited on `background`. OpenLRM requires S to be a multiple
+                of its patch size. [N, 3, S, S]
+            camera: Camera vectors of OpenLRM; the canonical camera when None. TripoSR has no camera
+                input. [N, 16]
 
         Returns:
-            Planes xy, xz, yz, first axis along the columns. [N, 3, C, H, H]
+            Planes xy, xz, yz, the first axis along the columns. [N, 3, C, H, H]
 
         Raises:
-            LRMError: If the shapes do not fit.
+            LRMError: If a shape does not fit, images are not floating-point, or TripoSR is given a
+                camera.
         """
         raise NotImplementedError
 
     def prepare(self, rgba: Tensor) -> Tensor:
-        """Preprocess RGBA images for the model. [N, 4, H, W] -> [N, 3, S, S]"""
+        """Preprocess RGBA images for the model. [N, 4, H, W] -> [N, 3, S, S]
+
+        Args:
+            rgba: Images with straight (not premultiplied) alpha; uint8, or floats in [0, 1].
+                [N, 4, H, W]
+
+        Returns:
+            RGB from 0 to 1. [N, 3, S, S]
+
+        Raises:
+            LRMError: If the shape is wrong.
+        """
         return prepare(rgba, self.config.architecture, self.image_size)
 
     def field_decoder(self, half_side: float | None = None) -> Decoder:

@@ -11,13 +11,13 @@ from xplanes.streams import Stream, initial_values
 
 @dataclass(frozen=True, kw_only=True)
 class BackgroundSettings(Settings):
-    """A static world behind the field, for opaque images of a scene in a world."""
+    """A static field behind the cube, for opaque images with a real background."""
 
-    resolution: Count  # Texels along each side of its planes, over contracted space.
+    resolution: Count  # Texels along each side of its planes, in contracted space.
     channels: Count  # Channels of each plane.
-    samples: Steps  # Samples of a ray behind the field; 0: its colour depends on direction alone.
+    samples: Steps  # Samples per ray behind the field; 0: colour depends on direction only.
     width: Count  # Neurons of the decoder's hidden layer.
-    total_variation: Weight  # Weight of total variation of its planes.
+    total_variation: Weight  # Weight of its planes' total variation.
     plane_lr: Positive  # Learning rate of its planes.
     decoder_lr: Positive  # Learning rate of its decoder.
 

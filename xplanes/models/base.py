@@ -1,4 +1,4 @@
-"""What training asks of a model: a field, its losses, its learning rates."""
+"""Base classes of models: the field, its losses and its learning rates."""
 
 import math
 from abc import ABC, abstractmethod
@@ -39,10 +39,10 @@ class InitialValues:
 
 
 class Model(ABC):
-    """A field with what its training consists of.
+    """A field with its loss terms, optimiser and learning rates.
 
     Attributes:
-        advice: What to change when the loss is not finite.
+        advice: What to change when the loss is not finite, for the error message.
     """
 
     advice: str = "Lower the model's learning rates"
@@ -50,17 +50,22 @@ class Model(ABC):
     @property
     @abstractmethod
     def field(self) -> Representation:
-        """What is trained."""
+        """The field that is trained."""
 
     @abstractmethod
     def groups(self) -> list[Group]:
-        """The field's trainable parameters: ``params``, ``lr`` and ``name`` of each group.
+        """Parameter groups of the field, each with ``params``, ``lr`` (peak) and ``name``.
 
-        A group may hold arguments of the optimiser besides.
+        Names must be unique, also among the sampler's groups. A group may hold further arguments of
+        the optimiser.
         """
 
     def optimizer(self, groups: list[Group]) -> torch.optim.Optimizer:
-        """The optimiser of the field's and the sampler's parameters."""
+        """The optimiser of the field's and the sampler's parameters; Adam by default.
+
+        Args:
+            groups: Parameter groups of the field and the sampler.
+        """
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     @abstractmethod
@@ -68,85 +73,110 @@ class Model(ABC):
         """Factor on all learning rates.
 
         Args:
-            step: Optimiser steps done.
-            progress: Share of the budget that is spent.
+            step: Number of optimiser steps done.
+            progress: Share of the training budget that is spent, from 0 to 1.
         """
 
     def rate_of(self, group: str, step: int, progress: float) -> float:
-        """The same for the learning rate of one group, by its name."""
+        """Factor on the learning rate of one parameter group; `rate` by default.
+
+        Args:
+            group: Name of the group.
+            step: As for `rate`.
+            progress: As for `rate`.
+        """
         return self.rate(step, progress)
 
     def losses(self, rendering: Any, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
-        """Weighted terms of the loss that need the rays, by name; their sum is minimised."""
+        """Weighted loss terms that need the rays, by name; training minimises their sum. [] each
+
+        Args:
+            rendering: The rendering of the rays.
+            rays: The batch.
+            state: Seed and progress of training.
+        """
         return {"colour": colour_error(rendering, rays)}
 
     def regularise(self, state: TrainingState) -> None:
-        """Add the gradients of the terms that need no rays to ``.grad``."""
+        """Add the gradients of loss terms that need no rays to the parameters' ``.grad``."""
         return
 
     def regularisers(self, state: TrainingState) -> dict[str, float]:
-        """Weighted values of the terms that `regularise` adds, by name, for the logger."""
+        """Weighted values of the terms in `regularise`, by name, for the logger."""
         return {}
 
     def before_step(self, state: TrainingState, optimizer: torch.optim.Optimizer) -> None:
-        """Change the field as its schedule asks, before a batch is rendered."""
+        """Apply scheduled changes to the field before a batch is rendered.
+
+        Args:
+            state: Seed and progress of training.
+            optimizer: The optimiser; its state must match parameters that are replaced.
+        """
         return
 
     def scalars(self) -> dict[str, float]:
-        """Further values for the logger."""
+        """Further values for the logger, by name."""
         return {}
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelSettings(Settings, ABC):
-    """Base of the settings of models."""
+    """Base class of the settings of models."""
 
     takes: ClassVar[Literal["planes", "points"] | None] = None
-    """What of an initialisation the field can begin with; None for nothing."""
+    """Kind of initialisation that the field accepts; None if only random."""
     devices: ClassVar[int | None] = 1
-    """Devices that it can be trained on at most; None for any number."""
+    """Maximum number of devices for training; None for no limit."""
     field_class: ClassVar[type[Representation] | None] = None
-    """What is built, so that samplers can refuse it early; None leaves that to them."""
+    """Class of the field, to check the sampler before the scene is read; None skips this."""
 
     name: str  # Name in run directories and tables.
-    precision: Literal["auto", "32", "bf16"]  # Of products; auto: bf16 where it is fast.
+    precision: Literal["auto", "32", "bf16"]  # Precision of matrix products; auto: bf16 if fast.
     rays: RaySettings
     sampler: SamplerSettings
 
     @property
     def is_static(self) -> bool:
-        """Whether these settings leave time out of the field."""
+        """Whether the field ignores time."""
         return False
 
     @abstractmethod
     def build(self, site: Site, initial: InitialValues | None = None) -> Model:
-        """The model for a scene."""
+        """Build the model for a scene.
+
+        Args:
+            site: Context of the field: frame, times, training views, seed and device.
+            initial: Initial values; random when None.
+        """
 
     def stronger(self) -> "ModelSettings | None":
-        """These settings with what helps where a field came to show nothing, or fog.
+        """Settings for a restart after the field collapsed to empty space or fog.
 
-        None where no such settings are known: the field is then left as it is.
+        None if there are none: training then continues with the collapsed field.
         """
         return None
 
     def frame(self, views: Views, half_side: float | None, points: Tensor | None = None) -> Frame:
-        """The frame in which the field lives: the scene's cube, if the model has none of its own.
+        """The field's frame: the scene's cube, unless the model defines another.
 
         Args:
             views: Training views.
-            half_side: Half the side of the scene's cube in world units; None finds it.
-            points: World points on surfaces, if known. [N, 3]
+            half_side: Half the side of the scene's cube in world units; estimated when None.
+            points: Surface points in the world, if known. [N, 3]
+
+        Raises:
+            SceneError: If the cameras see no common volume.
         """
         return scene_cube(views, half_side, points)
 
     def bounds(self, views: Views) -> Tensor | None:
-        """Box in world units that the field covers, where it needs one. [2, 3]"""
+        """Least and largest corner of the field's box in the world, if it needs one. [2, 3]"""
         return None
 
 
 @dataclass(frozen=True, kw_only=True)
 class LossTerm(Settings, ABC):
-    """A further term of the loss, for any model: ``+losses.NAME={_target_: module.Class, ...}``."""
+    """An additional loss term for any model: ``+losses.NAME={_target_: module.Class, ...}``."""
 
     weight: Weight  # Factor on its value.
 
@@ -154,13 +184,13 @@ class LossTerm(Settings, ABC):
     def value(
         self, field: Representation, rendering: Any, rays: Batch, state: TrainingState
     ) -> Tensor:
-        """The term without its weight, differentiable. []
+        """The unweighted value of the term, differentiable. []
 
         Args:
             field: The field.
-            rendering: What the rays of this step see.
-            rays: The rays, with their ``target`` colours.
-            state: How far training is.
+            rendering: The rendering of this batch.
+            rays: The batch of rays, with their ``target`` colours [R, 3].
+            state: Seed and progress of training.
         """
 
 

@@ -24,14 +24,15 @@ RESET_OPACITY = 0.01
 class DensifySettings(Settings):
     """When Gaussians are cloned, split and removed."""
 
-    every: Count  # Steps from one time to the next.
-    first: Steps  # Steps before the first time.
-    until: Share  # Share of the budget after which their number stays.
-    threshold: Positive  # Mean gradient of projected means from which on a Gaussian is doubled.
-    large: Positive  # Share of the cameras' extent above which it is split, not cloned.
-    least_opacity: Share  # Opacity below which it is removed.
-    reset_every: Count | None  # Steps between resets of opacity; null for none.
-    most: Count  # Gaussians at most.
+    every: Count  # Steps between densifications.
+    first: Steps  # Steps before the first densification.
+    until: Share  # Share of the budget after which densification stops.
+    threshold: Positive  # Mean screen-space gradient above which a Gaussian is cloned or split.
+    # Size above which a Gaussian is split, not cloned, relative to the cameras' extent.
+    large: Positive
+    least_opacity: Share  # Opacity below which a Gaussian is removed.
+    reset_every: Count | None  # Steps between opacity resets; null for none.
+    most: Count  # Maximum number of Gaussians.
 
 
 @torch.no_grad()

@@ -26,7 +26,7 @@ EXTENT = 1.1
 class GaussiansLoss(Settings):
     """Weights of the terms of the loss."""
 
-    dissimilarity: Share  # Share of 1 - SSIM; the rest is the mean absolute error of colours.
+    dissimilarity: Share  # Share of 1 - SSIM; the rest is the mean absolute colour error.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,17 +36,17 @@ class GaussiansSettings(ModelSettings):
     takes: ClassVar = "points"
 
     rays: ViewSettings  # pyright: ignore[reportIncompatibleVariableOverride]
-    # First means, where lrm gives none: on the visual hull, or in the cube.
+    # Initial means if lrm gives none: on the visual hull, or random in the cube.
     points: Literal["silhouettes", "random"]
-    count: Count  # Their number.
+    count: Count  # Number of these initial means.
     degree: Steps  # Highest degree of the spherical harmonics.
-    degree_every: Count  # Steps after which the next degree is used.
+    degree_every: Count  # Steps between increases of the degree.
     mean_lr: Positive  # Learning rate of means, times the cameras' extent.
-    colour_lr: Positive  # Learning rate of colours; a twentieth for what depends on direction.
-    opacity_lr: Positive  # Learning rate of opacities, before the sigmoid.
-    scale_lr: Positive  # Learning rate of scales, before the exponential.
+    colour_lr: Positive  # Learning rate of colours; a twentieth for their view-dependent part.
+    opacity_lr: Positive  # Learning rate of opacity logits.
+    scale_lr: Positive  # Learning rate of log scales.
     rotation_lr: Positive  # Learning rate of quaternions.
-    final_lr: Share  # Final share of the learning rates that decay.
+    final_lr: Share  # Final value of decaying learning rates relative to the initial one.
     densify: DensifySettings
     loss: GaussiansLoss
 

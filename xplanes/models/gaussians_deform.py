@@ -17,19 +17,19 @@ MEANS_UNTIL = 0.75
 
 @dataclass(frozen=True, kw_only=True)
 class DeformedGaussiansSettings(GaussiansSettings):
-    """Deformable 3D Gaussians: a static stage, then a network of place and time moves them."""
+    """Deformable 3D Gaussians: a static stage, then a network deforms them over time."""
 
     field_class: ClassVar = DeformedGaussians
 
     static_share: Share  # Share of the budget before the deformation begins.
-    depth: Count  # Hidden layers of the network.
-    width: Count  # Neurons of each of them.
+    depth: Count  # Number of hidden layers of the deformation network.
+    width: Count  # Neurons of each hidden layer.
     point_octaves: Steps  # Frequencies of the position encoding.
     time_octaves: Steps  # Frequencies of the time encoding.
-    time_noise: Weight  # Noise on times in training, in units of the mean interval of two views.
+    time_noise: Weight  # Noise on training times, in units of the mean interval between views.
     time_noise_until: Share  # Share of the budget over which the noise fades.
-    network_lr: Positive  # Learning rate of the network.
-    final_network_lr: Share  # Final share of it.
+    network_lr: Positive  # Learning rate of the deformation network.
+    final_network_lr: Share  # Its final value relative to the initial one.
 
     def check(self) -> None:
         super().check()

@@ -26,26 +26,27 @@ from xplanes.streams import Stream, TrainingState, initial_values
 class HexPlaneLoss(GaussiansLoss):
     """Weights of the terms of the loss."""
 
-    space_smoothness: Weight  # Weight of squared second differences of space planes.
-    time_smoothness: Weight  # Weight of squared second differences of time planes along time.
+    space_smoothness: Weight  # Weight of the space planes' squared second differences.
+    time_smoothness: Weight  # Weight of the time planes' squared second differences along time.
     time_identity: Weight  # Weight of the distance of time planes from 1.
-    every: Count  # Steps between the gradients of the planes' terms, which count as many times.
+    every: Count  # Steps between gradients of the planes' terms; weights are scaled to match.
 
 
 @dataclass(frozen=True, kw_only=True)
 class HexPlaneGaussiansSettings(GaussiansSettings):
-    """4D-GS: canonical Gaussians, a static stage, then their deformation by a six-plane field."""
+    """4D-GS: canonical Gaussians that a six-plane field deforms after a static stage."""
 
     field_class: ClassVar = HexPlaneGaussians
 
     static_share: Share  # Share of the budget before the deformation begins.
     resolution: Count  # Texels along each space axis at the first scale.
     scales: list[Count]  # Factors on the space resolution.
-    time_resolution: Count | None  # Rows of time; null: half the timesteps.
+    # Rows along time; null: half the distinct times, or all if four or more views show each.
+    time_resolution: Count | None
     channels: Count  # Channels of each plane and scale.
     width: Count  # Neurons of the hidden layers.
-    plane_lr: Positive  # Learning rate of planes.
-    network_lr: Positive  # Learning rate of the network behind them.
+    plane_lr: Positive  # Learning rate of the planes.
+    network_lr: Positive  # Learning rate of the network after the planes.
     loss: HexPlaneLoss
 
     def check(self) -> None:

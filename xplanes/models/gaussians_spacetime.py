@@ -13,15 +13,15 @@ from xplanes.streams import Stream, initial_values
 
 @dataclass(frozen=True, kw_only=True)
 class SpacetimeGaussiansSettings(GaussiansSettings):
-    """Spacetime Gaussians: opacity is a radial basis in time, motion a polynomial."""
+    """Spacetime Gaussians: opacity is a radial basis function of time, motion a polynomial."""
 
     field_class: ClassVar = SpacetimeGaussians
 
-    first_width: Positive  # First width of the radial basis in time; the whole time is 1.
+    first_width: Positive  # Initial width of the radial basis; the whole sequence has length 1.
     centre_lr: Positive  # Learning rate of the centres of the radial bases.
-    width_lr: Positive  # Learning rate of their widths, before the exponential.
-    motion_lr: Positive  # Learning rate of the polynomials of means, times the cameras' extent.
-    spin_lr: Positive  # Learning rate of the polynomials of quaternions.
+    width_lr: Positive  # Learning rate of the log widths of the radial bases.
+    motion_lr: Positive  # Learning rate of the motion polynomials, times the cameras' extent.
+    spin_lr: Positive  # Learning rate of the rotation polynomials.
 
     def build(self, site: Site, initial: InitialValues | None = None) -> "SpacetimeGaussiansModel":
         with initial_values(site.seed, Stream.BASELINE_FIELD):

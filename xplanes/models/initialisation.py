@@ -127,15 +127,17 @@ class RandomSettings(InitialiserSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class PreparationSettings(Settings):
-    """What happens before training, for an initialisation that is not random."""
+    """Steps before training, unless the initialisation is random."""
 
     cache: str | None  # Folder of cached stages; null disables the cache.
-    frames: Count | None  # Timesteps of the fixed-view video; null: as many as the views have.
-    fixed_view: Literal["auto", "video", "train"]  # The scene's video, or one rendered by a field.
-    fixed_view_model: str  # Model of that field: a file of conf/model.
-    fixed_view_seconds: Positive | None  # Maximum training time of that field; null: no limit.
-    fixed_view_steps: Count  # Maximum number of training steps of that field.
-    azimuth: float | None  # Azimuth of the fixed view in degrees; null: a world axis.
+    frames: Count | None  # Timesteps of the fixed-view video; null: the views' distinct times.
+    # Fixed-view video. video: the scene's; train: rendered by a trained field; auto: the scene's if
+    # usable.
+    fixed_view: Literal["auto", "video", "train"]
+    fixed_view_model: str  # Model of the trained field: a file of conf/model.
+    fixed_view_seconds: Positive | None  # Maximum training seconds of the field; null: no limit.
+    fixed_view_steps: Count  # Maximum number of training steps of the trained field.
+    azimuth: float | None  # Azimuth of the fixed view in degrees; null: along a world axis.
     elevation: Annotated[float, Range(-90, 90)]  # Elevation of the fixed view in degrees.
 
     def check(self) -> None:
@@ -148,17 +150,18 @@ class PreparationSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class DecompositionSettings(Settings):
-    """From a triplane sequence to low-rank and sparse parts, and from these to planes."""
+    """Decomposition of triplanes into low-rank and sparse parts, and their conversion to planes."""
 
     name: str  # Name of the settings.
-    method: Literal["adaptive", "growing", "admm", "exact"]  # admm: the paper's; exact: reference.
-    sparsity_weight: Positive | Literal["auto"]  # Weight of the sparse part; auto: from the size.
-    penalty: Positive  # Penalty of ADMM; the initial one for adaptive.
-    scale: Literal["rms", "none"]  # Unit of the penalty: rms of the features, or 1.
-    tolerance: Positive  # Relative residual of convergence.
+    # Robust PCA solver. admm: the paper's; exact: slow reference.
+    method: Literal["adaptive", "growing", "admm", "exact"]
+    sparsity_weight: Positive | Literal["auto"]  # Weight of the sparse part; auto: by matrix size.
+    penalty: Positive  # Penalty of ADMM; for adaptive, its initial value.
+    scale: Literal["rms", "none"]  # Unit of the penalty. rms: RMS of the features; none: 1.
+    tolerance: Positive  # Relative residual at convergence.
     max_iterations: Count  # Maximum number of iterations.
     static: Literal["middle", "median", "mean"]  # Space planes: frame T/2, median or mean.
-    # Time planes: rank1 fits the sparse part, random is near 0, ones is 1 as in K-Planes.
+    # Time planes. rank1: fitted to the sparse part; random: near 0; ones: 1, as in K-Planes.
     dynamic: Literal["random", "ones", "rank1"]
     noise: Annotated[float, Range(0)]  # Standard deviation of the noise on time planes.
     cache: bool  # Cache both parts (twice the size of the triplanes).

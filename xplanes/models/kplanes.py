@@ -35,12 +35,13 @@ class KPlanesSettings(ModelSettings):
     field_class: ClassVar = KPlanes
 
     variant: Literal["hybrid", "explicit"]  # MLP decoder, or linear decoder with learned bases.
-    # Contract space around the cube where images show a world: planes then cover all of space.
+    # Contract space outside the cube if images have a real background; planes then cover all space.
     contract: bool
     half_side: Positive | None  # Half the side of a cube at the origin; null: the scene's cube.
     resolution: Count  # Texels along each space axis at the first scale.
     scales: list[Count]  # Factors on the space resolution.
-    time_resolution: Count | None  # Rows of time; null: half the distinct times, all if seen often.
+    # Rows along time; null: half the distinct times, or all if four or more views show each.
+    time_resolution: Count | None
     channels: Count  # Channels of each plane and scale.
     space_low: float  # Lower bound of the uniform initialisation of space planes.
     space_high: float  # Upper bound. Time planes are initialised to 1.

@@ -23,13 +23,13 @@ from xplanes.streams import Stream, TrainingState, initial_values
 
 @dataclass(frozen=True, kw_only=True)
 class Tensor4DDensitySettings(ModelSettings):
-    """The nine planes of Tensor4D with density in place of a surface."""
+    """Tensor4D's nine planes with a density instead of a surface."""
 
     field_class: ClassVar = Tensor4DDensity
 
     resolution: Count  # Texels along each space axis of the coarse planes.
     fine_resolution: Count  # Texels along each space axis of the fine planes.
-    time_resolution: Count  # Rows of time.
+    time_resolution: Count  # Rows along time.
     channels: Count  # Channels of the coarse planes.
     fine_channels: Count  # Channels of the fine planes.
     width: Count  # Neurons of the hidden layers.
@@ -73,20 +73,20 @@ class Tensor4DLoss(Settings):
 
     masked: bool  # Restrict the colour loss to the silhouettes.
     eikonal: Weight  # Weight of the eikonal loss.
-    opacity: Weight  # Weight of the cross-entropy of opacity and silhouette.
-    smoothness: Weight  # Weight of the change of features over a small distance.
-    smoothness_distance: Positive  # That distance; the cube is 2 wide.
+    opacity: Weight  # Weight of the cross-entropy between opacity and silhouette.
+    smoothness: Weight  # Weight of feature differences over a small distance.
+    smoothness_distance: Positive  # Distance of the smoothness term; the cube is 2 wide.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tensor4DSettings(Tensor4DDensitySettings):
-    """Tensor4D: a surface in canonical space, and a flow that leads there."""
+    """Tensor4D: a surface in canonical space, and a flow that maps points to it."""
 
     field_class: ClassVar = Tensor4D
 
     flow_planes: bool  # Train the flow planes; the released code does not.
     radius: Positive  # Radius of the initial sphere; the cube is 2 wide.
-    sharpness: Positive  # The surface's initial width is exp(-10 times this).
+    sharpness: Positive  # Initial width of the surface: exp(-10 * sharpness).
     loss: Tensor4DLoss
 
     def check(self) -> None:

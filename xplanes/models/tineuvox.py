@@ -28,18 +28,18 @@ LEAST_LIGHT = 1e-6
 class TiNeuVoxLoss(Settings):
     """Weights of the terms of the loss beyond the colour's mean squared error."""
 
-    entropy: Weight  # Weight of the entropy of rays' opacity.
-    sample_colour: Weight  # Weight of the squared colour errors of single samples.
+    entropy: Weight  # Weight of the entropy of the rays' opacity.
+    sample_colour: Weight  # Weight of the squared colour error of individual samples.
 
 
 @dataclass(frozen=True, kw_only=True)
 class TiNeuVoxSettings(ModelSettings):
-    """TiNeuVox: a grid of features in canonical space, a deformation, and small networks."""
+    """TiNeuVox: a feature grid in canonical space, a deformation network and small decoders."""
 
     field_class: ClassVar = TiNeuVox
 
     near: Weight  # Near bound of the camera frusta that define the grid's bounding box.
-    far: Positive  # Far bound of these frusta, in world units.
+    far: Positive  # Far bound of these camera frusta, in world units.
     margin: Positive  # Factor on the size of the bounding box.
     half_side: Positive | None  # Half the side of a cube at the origin; null: the bounding box.
     resolution: Count  # Cube root of the final number of cells.
@@ -54,8 +54,8 @@ class TiNeuVoxSettings(ModelSettings):
     grid_learning_rate: Positive  # Learning rate of the grid.
     deformation_learning_rate: Positive  # Learning rate of the deformation network.
     network_learning_rate: Positive  # Learning rate of the other networks.
-    decay_steps: Count  # Steps over which learning rates decay to a tenth.
-    # What lies behind the box, for opaque images of a scene in a world; null: a plain colour.
+    decay_steps: Count  # Steps over which the learning rates decay to a tenth.
+    # Learnt background, for opaque images with a real background; null: a plain colour.
     background: BackgroundSettings | None = None
     loss: TiNeuVoxLoss
 

@@ -50,8 +50,9 @@ class DecoderSettings(Settings):
     activation: Literal["relu", "silu"]  # Activation between layers.
     density: Literal["softplus", "exp"]  # Activation of the density.
     density_scale: Positive  # Factor on the density.
-    density_bias: float  # Initial bias of the density logit; lower is emptier.
-    # Initial bias of the colour logits; above 0 nears the white background. 0 before a world.
+    density_bias: float  # Initial bias of the density logit; lower: an emptier field.
+    # Initial bias of the colour logits; above 0: nearer to the white background. Unused if a
+    # background is learnt.
     colour_bias: float
     colour_margin: Weight  # Margin by which colours may exceed [0, 1].
     freeze: bool  # Do not train the decoder.
@@ -61,46 +62,45 @@ class DecoderSettings(Settings):
 class XPlanesLoss(Settings):
     """Weights of the terms of the loss beyond the colour's mean squared error."""
 
-    opacity: Weight  # Weight of the opacity's squared error against the images' alpha.
+    opacity: Weight  # Weight of the squared error of opacity against the images' alpha.
     floaters: Weight  # Weight of the mean opacity of rays at pixels with alpha 0.
-    # mean: differences along space, mean over planes. coded: as in K-Planes' released code, summed
-    # over planes, along time too.
+    # Total variation. mean: along space, averaged over planes; coded: as in K-Planes' released
+    # code, also along time, summed over planes.
     variation: Literal["mean", "coded"]
     total_variation: Weight  # Weight of the space planes' total variation.
-    # Replaces `model.loss.total_variation` where a background is learnt.
-    world_variation: Weight
+    world_variation: Weight  # Replaces `model.loss.total_variation` if a background is learnt.
     time_variation: Weight  # Weight of the time planes' total variation.
     time_smoothness: Weight  # Weight of time smoothness (squared second differences).
-    time_magnitude: Weight  # Weight of the squared values of time planes.
+    time_magnitude: Weight  # Weight of the time planes' mean square.
     time_identity: Weight  # Weight of the time planes' mean distance from 1, as in K-Planes.
     sparse_weight: Weight  # Weight of L_r (X-Planes, Eq. 17).
-    sparse_reduction: Literal["mean", "sum"]  # Over entries: sum as in the paper.
+    sparse_reduction: Literal["mean", "sum"]  # Reduction of L_r over entries; the paper: sum.
     sparse_frames: Count | None  # Random timesteps per evaluation of L_r; null: all.
     initial_weight: Weight  # Weight of the distance to the initial planes; divided by views^2.
-    # L_r and the distance to the initial planes fade out over this number divided by the number of
-    # training views, in steps; null: never.
+    # L_r and the distance to the initial planes fade out over this many steps divided by the number
+    # of training views; null: never.
     initial_steps: Count | None
-    every: Count  # Steps between evaluations of these terms; weights are scaled to match.
+    every: Count  # Steps between evaluations of the regularisers; weights are scaled to match.
 
 
 @dataclass(frozen=True, kw_only=True)
 class XPlanesSettings(ModelSettings):
-    """X-Planes with six or nine planes (three without time)."""
+    """X-Planes with six or nine planes (three for static scenes)."""
 
     takes: ClassVar = "planes"
     devices: ClassVar[int | None] = None
     field_class: ClassVar = XPlanes
 
-    plane_set: Literal["six", "nine", "three"]
+    plane_set: Literal["six", "nine", "three"]  # Planes; three: a static field.
     resolution: Count  # Texels along each space axis.
-    # Rows of time. half: half the number of distinct times, as in K-Planes, or all of them where
-    # each is seen by four or more views; null: the same, but never fewer than the LRM's timesteps.
+    # Rows along time. half: half the distinct times, as in K-Planes, or all if four or more views
+    # show each; null: the same, but at least the LRM's timesteps.
     time_resolution: Count | Literal["half"] | None
     channels: Count  # Channels of each plane.
     space_scale: Weight  # Standard deviation of randomly initialised space planes.
     time_scale: Weight  # Standard deviation of randomly initialised time planes.
     decoder: DecoderSettings
-    # What lies behind the cube, for opaque images of a scene in a world; null: a plain colour.
+    # Learnt background, for opaque images with a real background; null: a plain colour.
     background: BackgroundSettings | None = None
     loss: XPlanesLoss
     plane_lr: Positive  # Learning rate of the space planes.

@@ -48,14 +48,14 @@ WIDEST = 1.5
 
 @dataclass(frozen=True, kw_only=True)
 class FieldSettings(InitialiserSettings):
-    """Points on the surfaces of an X-Planes field that is trained for this; for Gaussians."""
+    """Initial points for Gaussians, on the surfaces of a briefly trained X-Planes field."""
 
     gives: ClassVar = "points"
 
     model: Literal["six_planes", "nine_planes"]  # Model of the field.
-    source: str  # What the field is initialised from: a file of conf/lrm; none: random.
-    steps: Count  # Maximum number of its training steps.
-    seconds: Positive | None  # Maximum time of its training; null: no limit.
+    source: str  # Initialisation of the field: a file of conf/lrm; none: random.
+    steps: Count  # Maximum number of training steps of the field.
+    seconds: Positive | None  # Maximum training time of the field in seconds; null: no limit.
 
     def check(self) -> None:
         sources = sorted(path.stem for path in (CONF / "lrm").glob("*.yaml"))

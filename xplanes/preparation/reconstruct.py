@@ -70,11 +70,12 @@ class Reconstruction:
 class ImageLRMSettings(InitialiserSettings, ABC):
     """Settings of an LRM and of its input images."""
 
-    weights: str | None  # A local file of weights; null: downloaded or bundled.
-    matching: Literal["scale", "pad"]  # If focal lengths differ: scale, or pad (exact).
-    crop: bool  # Crop images to the object size of the training data.
+    weights: str | None  # Local file of weights; null: downloaded or bundled weights.
+    # For focal lengths other than the LRM's. scale: sizes match at the scene's depth; pad: exact.
+    matching: Literal["scale", "pad"]
+    crop: bool  # Crop images to the object size in the LRM's training.
     batch: Count  # Images per batch.
-    precision: Literal["auto", "32", "bf16"]  # auto: bf16 if the hardware supports it.
+    precision: Literal["auto", "32", "bf16"]  # Precision of matrix products; auto: bf16 if fast.
 
     def check(self) -> None:
         if self.crop and self.matching == "pad":

@@ -34,9 +34,9 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class BundledLRMSettings(ImageLRMSettings):
-    """A bundled model, or with ``weights`` another model in the same format."""
+    """A bundled LRM, or another LRM in the same format from ``weights``."""
 
-    bundled: str  # Name of its files in the package.
+    bundled: str  # Name of the bundled LRM.
 
     def load_model(self, say: Callable[[str], None]) -> LoadedLRM:
         began = time.perf_counter()
@@ -58,7 +58,7 @@ class BundledLRMSettings(ImageLRMSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class PublishedLRMSettings(ImageLRMSettings):
-    """A published model."""
+    """A published LRM."""
 
     architecture: str  # One of openlrm-{small,base,large}-{1.0,1.1} and triposr.
     repository: str  # Repository on the Hugging Face hub.

@@ -49,7 +49,7 @@ class PoolSettings(Settings):
 
     root: str  # Folder of the pool.
     objects: Count  # Training objects, a multiple of 256.
-    views: Count  # Images per object, at least 2: scores are of views that the model did not see.
+    views: Count  # Images per object, at least 2: scores use views that the model did not see.
 
     def check(self) -> None:
         if self.views < 2:
@@ -103,7 +103,7 @@ class PretrainingSettings(Settings):
 
     seed: Steps  # Seed of all random numbers.
     init_from: str | None  # Weights of a model with coarser planes; null: random initialisation.
-    run: str  # Folder of checkpoints and logs; a run in it is resumed.
+    run: str  # Folder of checkpoints and logs; an existing run is resumed.
     model: SizeSettings
     pool: PoolSettings
     batch: BatchSettings

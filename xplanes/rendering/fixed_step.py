@@ -141,12 +141,12 @@ class FixedStepRenderer(RayRenderer):
 
 @dataclass(frozen=True, kw_only=True)
 class FixedStepSettings(SamplerSettings):
-    """Equal steps through a field's box; samples that add nothing get no colour."""
+    """Equal steps through a field's bounding box; negligible samples are dropped."""
 
     near: Weight  # Near bound in world units.
     far: Positive  # Far bound in world units.
     step: Positive  # Distance between samples, in cells.
-    # Opacity, and weight, at which samples are dropped.
+    # Opacity, and weight, up to which samples are dropped.
     threshold: Annotated[float, Range(0, 1, open=True)]
 
     def check(self) -> None:

@@ -156,26 +156,25 @@ Fraction = Annotated[float, Range(0, 1, open=True)]
 
 @dataclass(frozen=True, kw_only=True)
 class OccupancySettings(SamplerSettings):
-    """Where rays are sampled, and which samples are never computed."""
+    """Equal steps along rays; samples that cannot contribute are skipped."""
 
     samples: Count  # Samples along the diagonal of the cube in training.
     render_samples: Count  # Samples along the diagonal in evaluation and videos.
     grid_resolution: Count  # Cells of the occupancy grid along each side.
     time_bins: Count  # Bins of the occupancy grid along time.
-    threshold: Fraction  # Opacity of one step below which a cell is empty.
-    # Replaces `model.sampler.threshold` where a background is learnt.
-    world_threshold: Fraction
-    decay: Share  # Decay of the density of a cell at each update.
+    threshold: Fraction  # Opacity per step below which a cell is empty.
+    world_threshold: Fraction  # Replaces `model.sampler.threshold` if a background is learnt.
+    decay: Share  # Decay of a cell's density at each update.
     skip_empty: bool  # Skip samples in empty cells.
-    skip_unseen: bool  # Images show no cell that no training ray has seen.
+    skip_unseen: bool  # Leave cells that no training ray has seen out of rendered images.
     skip_occluded: bool  # Skip samples behind opaque surfaces.
-    occlusion: Annotated[float, Range(0, 1)]  # Transmittance below which a surface is opaque.
-    thinning: Weight  # Gradients below this times the mean are subsampled; 0: none.
+    occlusion: Annotated[float, Range(0, 1)]  # Transmittance below which samples are occluded.
+    thinning: Weight  # Subsample gradients below this times the mean, on the CPU; 0: off.
     silhouettes: bool  # Prune cells outside the silhouettes (alpha).
     fill: bool  # Prune empty cells of an initialised field.
     coarse_steps: Steps  # Initial steps with half the number of samples.
     sweep_at: list[int]  # Steps at which all occupied cells are updated.
-    sweep_every: Count  # Steps between such updates afterwards.
+    sweep_every: Count  # Steps between updates of all occupied cells afterwards.
     update_every: Count  # Steps between updates of random cells.
     update_cells: Count  # Maximum number of cells per update.
 

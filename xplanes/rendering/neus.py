@@ -170,7 +170,7 @@ def _points(origins: Tensor, directions: Tensor, distances: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class NeusSettings(SamplerSettings):
-    """Samples near a surface, which a coarse round finds."""
+    """Coarse samples, then importance samples near the surface that they find."""
 
     samples: Count  # Uniform coarse samples per ray.
     more_samples: Count  # Importance samples near the surface.

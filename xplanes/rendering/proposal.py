@@ -230,26 +230,26 @@ def dense_samples(points: Tensor, distances: Tensor) -> Samples:
 
 @dataclass(frozen=True, kw_only=True)
 class ProposalSettings(SamplerSettings):
-    """Samples where small density fields, trained along, expect something."""
+    """Samples placed by small density fields, which are trained jointly."""
 
     devices: ClassVar[int | None] = 1
 
-    near: Weight | None  # Near bound in world units; null: the cube. Not of contracted space.
-    far: Positive | None  # Far bound in world units; null: the cube. Not of contracted space.
+    near: Weight | None  # Near bound in world units; null: the cube. Unused if space is contracted.
+    far: Positive | None  # Far bound in world units; null: the cube. Unused if space is contracted.
     samples: Count  # Samples per ray in the field.
     proposal_samples: list[Count]  # Samples per ray in each density field.
     resolutions: list[Count]  # Texels along each space axis of each density field.
-    time_resolution: Count  # Rows of time of the density fields.
-    channels: Count  # Channels of their planes.
-    width: Count  # Neurons of their hidden layer.
-    linear: bool  # No activation, as in the explicit K-Planes.
-    space_low: float  # Lower bound of their uniform initialisation.
+    time_resolution: Count  # Rows along time of the density fields.
+    channels: Count  # Channels of the density fields' planes.
+    width: Count  # Neurons of the density fields' hidden layer.
+    linear: bool  # Density fields without activation, as in K-Planes (explicit).
+    space_low: float  # Lower bound of the uniform initialisation of space planes.
     space_high: float  # Upper bound. Time planes are initialised to 1.
     padding: Positive  # Padding of the histogram of weights.
     anneal_steps: Count  # Steps over which the exponent of the weights anneals to 1.
     anneal_slope: Positive  # Initial slope of the annealing.
     update_every: Count  # Final number of steps between updates of the density fields.
-    update_warmup: Count  # Steps over which that interval grows.
+    update_warmup: Count  # Steps over which this interval grows to its final value.
     histogram: Weight  # Weight of the proposal loss.
     variation: Literal["coded", "corrected"]  # Form of the total variation.
     total_variation: Weight  # Weight of total variation.

@@ -1,4 +1,4 @@
-"""What training asks of a sampler, and what fields and samplers are built for."""
+"""Base classes of samplers, and the context in which fields and samplers are built."""
 
 import logging
 import math
@@ -30,21 +30,22 @@ Group = dict[str, Any]
 
 @dataclass(frozen=True)
 class Site:
-    """What a field is built for.
+    """The context in which a field is built: the scene's frame, times and views, and the run.
 
     Attributes:
         frame: The field's frame.
-        times: Times of the training views. [V]
+        times: Times of the training views, from 0 to 1. [V]
         seed: The run's seed.
-        precision: Of matrix products: "32" or "bf16".
-        bounds: Box in world units that some fields cover; None for those that need none. [2, 3]
-        views: Training views; None where a checkpoint is loaded without its data.
+        precision: Precision of matrix products: "32" or "bf16".
+        bounds: Least and largest corner of the field's box in the world; None for fields that need
+            none. [2, 3]
+        views: Training views; None if a checkpoint is loaded without its data.
         initialised: Whether the initial field already shows the scene.
-        surrounded: Whether the training images show a world around the scene, so that there is
-            something to see behind the field's cube.
-        device: Where it is going to be trained; the CPU when None.
-        samples_per_batch: Samples of a training batch on average; None if not known.
-        batch_scale: Size of a batch over that for which schedules are made, see `steps`.
+        surrounded: Whether the training images show surroundings, which lie behind the field's
+            cube.
+        device: Device on which the field will be trained; the CPU when None.
+        samples_per_batch: Maximum average number of samples per training batch; None if unknown.
+        batch_scale: Batch size relative to the one that schedules assume, see `steps`.
     """
 
     frame: Frame
@@ -60,22 +61,26 @@ class Site:
     batch_scale: float = 1.0
 
     def steps(self, count: int) -> int:
-        """Steps that show as many rays as so many steps of the batches of the schedules."""
+        """Convert a number of steps to this batch size, for the same number of rays.
+
+        Args:
+            count: Steps at the batch size that schedules assume.
+        """
         return math.ceil(count / self.batch_scale)
 
     @property
     def unit(self) -> float:
-        """World units per unit of the frame."""
+        """World units per unit of the field's frame."""
         return 1 / self.frame.scale
 
     @property
     def moves(self) -> bool:
-        """Whether there are views of more than one time."""
+        """Whether the training views show more than one timestep."""
         return len(self.times.unique()) > 1
 
     @property
     def time_rows(self) -> int:
-        """Rows of time where the settings leave them open."""
+        """Default number of rows along time."""
         return time_rows(self.times)
 
 
@@ -93,89 +98,102 @@ def time_rows(times: Tensor) -> int:
 
 
 class Sampler(ABC):
-    """How a step places samples, what that adds to the loss, and the upkeep between steps."""
+    """Renders training batches, adds its own loss terms, and updates itself between steps."""
 
     @property
     @abstractmethod
     def renderer(self) -> Renderer:
-        """Renders images."""
+        """Renderer for whole images."""
 
     @property
     def parts(self) -> dict[str, nn.Module]:
-        """Modules that belong into checkpoints, by name."""
+        """Modules to store in checkpoints, by name."""
         return {}
 
     @property
     def outline(self) -> str:
-        """What the sampler does, in a few words."""
+        """Short description for reports."""
         return ""
 
     def groups(self) -> list[Group]:
-        """Parameters that train along."""
+        """Parameter groups of the sampler, trained together with the field; see `Model.groups`."""
         return []
 
     def first_rays(self, most: int) -> int:
-        """Rays of the first batch, of ``most`` at most."""
+        """Number of rays in the first batch, at most ``most``."""
         return most
 
     def renderer_at(self, step: int) -> Renderer:
-        """Renders images when so many steps are done."""
+        """Renderer for whole images after ``step`` optimiser steps."""
         return self.renderer
 
     @abstractmethod
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
-        """Render the rays of a batch, with jitter."""
+        """Render the rays of a training batch.
+
+        Args:
+            field: The field.
+            rays: The batch: rays, or a whole view.
+            state: Seed and progress of training, for jitter and schedules.
+        """
 
     def pass_on(self, rendering: Any, state: TrainingState) -> int | Tensor:
-        """Take gradients to the field where rendering cut them off.
+        """Propagate gradients to the field, if `render` has detached them from it.
+
+        Args:
+            rendering: What `render` returned, after the backward pass.
+            state: Seed and progress of training.
 
         Returns:
-            Number of samples that the field got gradients of.
+            Number of samples whose gradients reached the field.
         """
         return rendering.samples.count
 
     def losses(self, rendering: Any) -> dict[str, Tensor]:
-        """The sampler's own terms of the loss, weighted, by name. [] each"""
+        """Weighted loss terms of the sampler, by name. [] each"""
         return {}
 
     def regularise(self) -> None:
-        """Add gradients of the sampler's own parameters."""
+        """Add the gradients of loss terms that need no rays to the sampler's parameters."""
         return
 
     def observe(self, rendering: Any) -> None:
-        """Learn from what a batch showed."""
+        """Update the sampler from the rendering of a batch, before the optimiser step."""
         return
 
     def update(self, field: Any, state: TrainingState) -> None:
-        """Do what is due after an optimiser step."""
+        """Update the sampler after an optimiser step, such as its occupancy grid."""
         return
 
     def expect(self, samples: float) -> None:
-        """Make ready for batches of so many samples on average."""
+        """Prepare for batches with this average number of samples."""
         return
 
     def scalars(self) -> dict[str, float]:
-        """Values for the logger."""
+        """Values for the logger, by name."""
         return {}
 
 
 @dataclass(frozen=True, kw_only=True)
 class SamplerSettings(Settings, ABC):
-    """Base of the settings of samplers."""
+    """Base class of the settings of samplers."""
 
     devices: ClassVar[int | None] = None
-    """Devices that it can train on at most; None for any number."""
+    """Maximum number of devices for training; None for no limit."""
 
     kind: ClassVar[type[Representation]] = RadianceField
-    """What it takes: a class from which that of the field must be derived."""
+    """Base class of the fields that the sampler accepts."""
 
     name: str  # Name in tables.
 
     def require_kind(self, field: type[Representation]) -> None:
-        """Refuse a class of fields that is not of the sampler's `kind`.
+        """Check that the class of a field is derived from `kind`.
+
+        Args:
+            field: Class of the field.
 
         Raises:
-            ConfigError: With the way out.
+            ConfigError: If it is not; the message names the remedy.
         """
         if not issubclass(field, self.kind):
             takes = "radiance fields" if self.kind is RadianceField else "Gaussians"
@@ -185,22 +203,29 @@ class SamplerSettings(Settings, ABC):
             )
 
     def require(self, field: Any) -> None:
-        """Refuse a field, or a class of fields, of its `kind` that cannot be sampled so.
+        """Check that the sampler supports a field of its `kind`.
+
+        Args:
+            field: A field, or the class of a field.
 
         Raises:
-            ConfigError: With the samplers that can.
+            ConfigError: If it does not; the message names samplers that do.
         """
 
     @abstractmethod
     def build(self, field: Any, site: Site) -> Sampler:
-        """The sampler for a field.
+        """Build the sampler for a field.
+
+        Args:
+            field: The field.
+            site: What the field was built for.
 
         Raises:
-            ConfigError: If it cannot serve this field or these cameras.
+            ConfigError, SceneError: If the sampler does not support this field or these cameras.
         """
 
     def for_video(self) -> "SamplerSettings":
-        """These settings where a model looks at few pixels of what is rendered."""
+        """Settings for the low-resolution fixed-view video of an LRM; unchanged by default."""
         return self
 
 

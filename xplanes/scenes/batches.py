@@ -110,16 +110,16 @@ class BatchSettings(Settings, ABC):
 class RaySettings(BatchSettings):
     """Which rays a training step gets."""
 
-    # Maximum number of rays per batch. auto: 1365 on the CPU, 32768 on a GPU, where schedules of
-    # X-Planes and of the occupancy grid take 1/24 of their steps.
+    # Maximum rays per batch. auto: 1365 on the CPU; 32768 on a GPU, with the schedules of X-Planes
+    # and of the occupancy grid shortened to 1/24.
     per_batch: Count | Literal["auto"]
-    # Maximum number of samples per batch, on average. auto: 8192 on the CPU, 524288 on a GPU.
+    # Maximum samples per batch, on average. auto: 8192 on the CPU, 524288 on a GPU.
     samples_per_batch: Count | Literal["auto"]
-    background: Literal["white", "random", "one"]  # random: per ray; one: random per batch.
-    # Sample rays near silhouettes, at texture, and where something changes, more often.
-    skip_background: bool
-    background_share: Share  # Share of rays far from the silhouettes.
-    background_jitter: Share  # Maximum random offset of the times of these rays.
+    # Background colour. random: drawn per ray; one: drawn per batch.
+    background: Literal["white", "random", "one"]
+    skip_background: bool  # Sample more rays near silhouettes, on texture and where images change.
+    background_share: Share  # Share of rays far from silhouettes.
+    background_jitter: Share  # Maximum random time offset of these rays.
 
     def on(self, device: torch.device) -> "RaySettings":
         if device.type == "cpu":
@@ -152,7 +152,7 @@ class RaySettings(BatchSettings):
 class ViewSettings(BatchSettings):
     """Whole training views, one per batch."""
 
-    background: Literal["white", "one"]  # one: random per batch.
+    background: Literal["white", "one"]  # Background colour; one: drawn per batch.
 
     @property
     def most(self) -> int:

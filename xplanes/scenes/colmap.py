@@ -46,25 +46,24 @@ KINDS = (".png", ".jpg", ".jpeg")
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapSettings(SceneSettings):
-    """A capture that COLMAP has registered."""
+    """A capture registered with COLMAP."""
 
-    model: str | None  # Folder of the model; null for sparse/0, sparse or colmap/sparse/0.
+    model: str | None  # Folder of the COLMAP model; null: sparse/0, sparse or colmap/sparse/0.
     images: str  # Folder of the images that COLMAP was run on.
-    # Folder of masks: NAME.png for each image NAME, black where nothing is to be shown. Null for
-    # none: masks that hid moving things from COLMAP would hide them here, too.
+    # Folder of masks: NAME.png for each image NAME, black outside the foreground; null for none.
+    # Masks that hid moving objects from COLMAP would hide them here, too.
     masks: str | None
-    mask_use: MaskUse  # Masks become alpha, or cut the thing out for LRMs alone.
-    # Times of the images: a CSV file with the columns file and time, or rank, for the order in each
-    # camera's folder. Null for the numbers in the file names.
+    mask_use: MaskUse  # alpha: masks become alpha; lrm: they only cut out the LRM's input.
+    # Times of the images: a CSV file with the columns file and time; rank: the order within each
+    # camera's folder; null: the numbers in the file names.
     times: str | None
-    # Regular expression whose group is the number in a file name, such as frame_(\d+); null for the
+    # Regular expression whose group is the number in a file name, such as frame_(\d+); null: the
     # last number.
     time_pattern: str | None
-    # Folders within that of the images whose images are the test split.
-    test_cameras: list[str]
-    # One image in so many is held out as val, by time, then file name; not the first and the last.
+    test_cameras: list[str]  # Subfolders of the image folder that form the test split.
+    # Hold out every n-th image as val, in order of time and file name; never the first or last.
     eval_every: Count
-    orient: bool  # Turn the world so that the cameras' mean up vector becomes its z axis.
+    orient: bool  # Rotate the world so that the cameras' mean up vector becomes its z axis.
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:

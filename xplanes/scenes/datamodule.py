@@ -1,4 +1,4 @@
-"""A scene as a LightningDataModule: training rays, and whole views to score."""
+"""A scene as a LightningDataModule: rays for training and whole views for evaluation."""
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,28 +36,27 @@ UNIFORM = RaySettings(
 
 
 class SceneDataModule(LightningDataModule):
-    """Reads a scene, checks it, and serves rays to train on and views to score.
+    """Reads a scene, checks it, and serves rays for training and views for evaluation.
 
-    A training batch is what `RayBatches.draw` returns, or `ViewBatches.draw`. It is a function of
-    the seed, the number of batches before it and the rank, so that a resumed run draws the very
-    rays of an uninterrupted one. Rays or whole views, how many rays and which, the LightningModule
-    says as ``ray_settings`` and ``frame``; without these it gets 1024 rays over all pixels, in the
-    frame of the scene's cube. The batches are endless; an epoch is as many as the training views
-    have pixels.
+    A training batch is what `RayBatches.draw` or `ViewBatches.draw` returns. It depends only on the
+    seed, the rank and the number of batches before it, so a resumed run draws the same rays as an
+    uninterrupted one. The LightningModule specifies the batches by its attributes ``ray_settings``
+    (rays or whole views, which and how many) and ``frame``. Without them, a batch has 1024 rays
+    through random pixels, in the frame of the scene's cube. Batches are endless; an epoch has about
+    as many rays as the training views have pixels.
 
-    A batch of `val_dataloader`, `test_dataloader` and `predict_dataloader` is one whole view of its
-    own size:
-    ``origins`` and unit ``directions`` in the world [H W, 3], the ``camera`` that they come from,
-    ``time`` [], ``target`` in front of the scene's background [H, W, 3], ``background`` [3] and its
-    number ``index``.
+    `val_dataloader`, `test_dataloader` and `predict_dataloader` serve one whole view per batch:
+    ``origins`` and unit ``directions`` in the world [H W, 3], the ``camera``, ``time`` from 0 to 1
+    [], ``target`` colours composited on the scene's background [H, W, 3], ``background`` [3] and
+    the view's ``index``. If a lens leaves pixels dark, ``shown`` marks the others: bool [H, W].
 
     Args:
         scene: Settings of the scene, or the group ``data`` of a configuration.
-        seed: Source of the rays' randomness.
-        plugins: Modules of the user's own whose classes ``scene`` may name.
+        seed: Seed for drawing rays.
+        plugins: Names of the user's modules whose classes ``scene`` may name.
 
     Raises:
-        ConfigError: If a setting cannot work.
+        ConfigError: If a setting is invalid, or a plug-in cannot be imported.
     """
 
     def __init__(
@@ -83,7 +82,12 @@ class SceneDataModule(LightningDataModule):
 
     @classmethod
     def of(cls, scene: Scene, *, seed: int = 0) -> "SceneDataModule":
-        """The data of a scene that was read already, whatever its source."""
+        """Build from a scene that is already loaded, whatever its source.
+
+        Args:
+            scene: The scene.
+            seed: Seed for drawing rays.
+        """
         data = cls.__new__(cls)
         LightningDataModule.__init__(data)
         data._begin(_GivenScene.around(scene), seed)
@@ -92,24 +96,29 @@ class SceneDataModule(LightningDataModule):
 
     @classmethod
     def compose(cls, *overrides: str, seed: int = 0) -> "SceneDataModule":
-        """The data of the command line's settings: ``compose("data=dnerf", "data.scene=hook")``.
+        """Build from command-line overrides: ``compose("data=dnerf", "data.scene=hook")``.
 
         Args:
-            overrides: ``key=value`` each; ``plugins=[MODULE]`` makes classes of one's own known.
-            seed: Source of the rays' randomness.
+            *overrides: ``key=value`` each; ``plugins=[MODULE]`` allows classes of your own modules.
+            seed: Seed for drawing rays.
 
         Raises:
-            ConfigError: If a setting does not exist or cannot work.
+            ConfigError: If a setting does not exist or is invalid.
         """
         config = compose_plain("train", overrides)
         return cls(config["data"], seed=seed, plugins=config["plugins"] or ())
 
     @classmethod
     def from_run(cls, run: str | Path, plugins: Sequence[str] = ()) -> "SceneDataModule":
-        """The data of a run directory, its split and resolution included.
+        """Rebuild the data of a run, with its split and resolution.
+
+        Args:
+            run: The run directory.
+            plugins: Names of the user's modules whose classes the run's settings may name.
 
         Raises:
-            ConfigError: If the folder holds no run, or it cannot be read.
+            ConfigError: If the folder is not a run directory, or its config.yaml is damaged or
+                invalid.
         """
         path = Path(run) / "config.yaml"
         try:

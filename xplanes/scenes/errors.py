@@ -1,4 +1,4 @@
-"""Errors that problems with scene data are reported as."""
+"""Errors in scene data."""
 
 from xplanes.errors import XPlanesError
 

@@ -70,7 +70,7 @@ class MultiCameraSettings(SceneSettings):
     """Synchronised videos of several fixed cameras."""
 
     frames: list[int] | None  # First frame, last frame and stride; null for all frames.
-    test_cameras: list[str]  # Names of the cameras that are scored and not trained on.
+    test_cameras: list[str]  # Names of the held-out cameras: scored, not trained on.
     video_camera: str | None  # Camera whose video the LRM sees; null: the most central one.
 
     def check(self) -> None:

@@ -54,16 +54,16 @@ DOWNLOAD = "Download or unpack the capture again."
 class NerfiesSettings(SceneSettings):
     """A capture in the format of Nerfies, HyperNeRF or DyCheck."""
 
-    # DyCheck's splits of this name, such as mono or intl. Null for those in splits/train.json,
-    # where there is one, or dataset.json.
+    # Name of DyCheck's splits to use, such as mono or intl; null: those in splits/train.json if it
+    # exists, otherwise those in dataset.json.
     protocol: str | None
-    # Folder of masks, with the folders and names of rgb, black where nothing is to be shown; null
-    # for none. DyCheck's co-visibility masks say what views share, not what is there.
+    # Folder of masks, with the subfolders and file names of rgb, black outside the foreground; null
+    # for none. DyCheck's co-visibility masks are unsuitable: they do not mark the foreground.
     masks: str | None
-    mask_use: MaskUse  # Masks become alpha, or cut the thing out for LRMs alone.
-    # One image in so many is held out as val, by time, then name, where the capture lists none.
+    mask_use: MaskUse  # alpha: masks become alpha; lrm: they only cut out the LRM's input.
+    # Without listed val images: hold out every n-th image as val, in order of time and name.
     eval_every: Count
-    orient: bool  # Turn the world so that the cameras' mean up vector becomes its z axis.
+    orient: bool  # Rotate the world so that the cameras' mean up vector becomes its z axis.
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:

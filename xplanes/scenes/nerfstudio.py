@@ -23,10 +23,11 @@ OTHER_AXES = ("from_mitsuba", "from_na")
 class NerfstudioSettings(SceneSettings):
     """A capture in the format of nerfstudio or instant-ngp."""
 
-    # One frame in so many is held out as val, by time, then file name; not the first and the last.
-    # Captures that list their splits (train_filenames, ...) keep them.
+    # Hold out every n-th frame as val, in order of time and file name; never the first or last.
+    # Splits listed in the capture (train_filenames, ...) take precedence.
     eval_every: Count
-    mask_use: MaskUse  # Masks of mask_path become alpha, or cut the thing out for LRMs alone.
+    # alpha: masks of mask_path become alpha; lrm: they only cut out the LRM's input.
+    mask_use: MaskUse
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:

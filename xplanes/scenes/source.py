@@ -1,4 +1,4 @@
-"""Base class of the data formats: their common settings and the handling of static scenes."""
+"""Base class of data formats: common settings and handling of static scenes."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -59,7 +59,7 @@ def as_static(scene: Scene, reason: str) -> Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSettings(Settings, ABC):
-    """Base of the settings in the group ``data``: one subclass for each format."""
+    """Base class of the settings in the group ``data``, with one subclass for each format."""
 
     name: str  # Name of the format in run directories and tables.
     root: str  # Folder that holds the scenes.
@@ -67,11 +67,11 @@ class SceneSettings(Settings, ABC):
     resolution: Count | None  # Width of the images in pixels; null keeps the native size.
     views: Count | None  # Training views, spread over time; null for all.
     train_on_video: bool  # Also train on the frames of the fixed camera.
-    static: bool | None  # Static scene; null: if all frames of the fixed camera are equal.
-    eval_split: Literal["test", "val"] | None  # Scored split; null: val in training, test after it.
-    eval_views: Count | None  # Views of a scored split at most, spread over time; null for all.
+    static: bool | None  # Static scene; null: static if the fixed camera's frames are equal.
+    eval_split: Literal["test", "val"] | None  # Split to score; null: val, then test at the end.
+    eval_views: Count | None  # Maximum views per scored split, spread over time; null for all.
     half_side: Positive | None  # Half the side of the scene's bounding cube; null estimates it.
-    cache: str | None  # Folder of images too large for memory; null: the user's cache.
+    cache: str | None  # Folder for images too large for memory; null: the user's cache.
 
     @property
     def folder(self) -> Path:
@@ -80,19 +80,19 @@ class SceneSettings(Settings, ABC):
 
     @property
     def image_cache(self) -> Path | None:
-        """The folder of decoded images; None for that of the user."""
+        """Folder for decoded images; None for the user's cache folder."""
         return None if self.cache is None else Path(self.cache)
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:
-        """Whether a folder looks like a scene of this format, by the names of what is in it.
+        """Whether a folder looks like a scene of this format, judged by its file names.
 
-        Formats whose scenes are no folders of the user's recognise none.
+        False for formats that read no folders of the user.
         """
         return False
 
     def prepare(self) -> None:
-        """Download or render missing data; called in one process per machine.
+        """Download or render missing data; called by one process per machine.
 
         Raises:
             SceneError: If the data cannot be obtained.
@@ -100,21 +100,25 @@ class SceneSettings(Settings, ABC):
 
     @abstractmethod
     def load(self, splits: Sequence[str]) -> Scene:
-        """Read some splits, and the video of the fixed camera if there is one.
+        """Read the given splits, and the video of the fixed camera if there is one.
+
+        Args:
+            splits: Names of splits: "train", "val", "test".
 
         Raises:
-            SceneError: If anything is missing, damaged or inconsistent.
+            MissingSplitError: If a split does not exist.
+            SceneError: If anything else is missing, damaged or inconsistent.
         """
 
     def read(self, splits: Sequence[str] | None = None) -> Scene:
-        """The scene according to these settings.
+        """Read the scene as these settings specify.
 
         Args:
-            splits: Splits to read; the training views and what is scored when None: `eval_split`,
-                or those of ``val`` and ``test`` that there are.
+            splits: Names of splits. None reads "train" and the scored split: `eval_split`, or
+                whichever of "val" and "test" exist.
 
         Raises:
-            SceneError: If it cannot be used.
+            SceneError: If the scene cannot be used.
         """
         scene = self.load(tuple(splits)) if splits else self._load_scored()
         parts = dict(scene.splits)

@@ -1,4 +1,4 @@
-"""Posed, timed images of a scene, as bytes in memory or in a file of tiles."""
+"""Images of a scene with poses and times, in memory or in a file of tiles."""
 
 import math
 from dataclasses import dataclass, field
@@ -164,21 +164,24 @@ def _joined_lenses(first: Intrinsics, second: Intrinsics) -> Lenses | None:
 
 @dataclass(frozen=True)
 class Views:
-    """The images of one split with their cameras.
+    """The images of one split with their cameras and times.
 
-    Images may differ in size: smaller ones are padded with zeros at the bottom and on the right,
-    which nothing may take for pixels. `image`, `composite` and `image_rays` leave the padding out.
+    Images may differ in size. Smaller ones are padded with zeros at the bottom and on the right.
+    `image`, `composite` and `image_rays` leave the padding out.
 
     Attributes:
-        images: Colour, already multiplied by alpha, and alpha: a tensor, or what reads them from a
-            file of tiles. uint8 [V, H, W, 4]
-        camera_to_world: Rigid camera poses. [V, 4, 4]
+        images: RGB premultiplied by alpha, and alpha, as a tensor or a reader of a file of tiles.
+            uint8 [V, H, W, 4]
+        camera_to_world: Rigid camera poses with OpenGL axes. [V, 4, 4]
         times: Time of each image, from 0 to 1. [V]
-        intrinsics: Focal lengths, principal points and sizes. A number stands for centred images
-            of size H x W that share this focal length in pixels.
-        files: Name of each image, relative to the scene's folder.
-        thing: Share of each pixel that shows the thing, where that is known of images that show
-            more; for scores alone. None where it is not. uint8 [V, H, W]
+        intrinsics: Focal lengths and principal points in pixels, image sizes and lenses. A number
+            is the shared focal length in pixels of centred images of size H x W.
+        files: Name of each image, relative to the scene's folder. [V]
+        thing: Share of each pixel that the foreground object covers, from 0 to 255; used only for
+            scores. None if unknown. uint8 [V, H, W]
+
+    Raises:
+        ValueError: If the shapes of ``images``, ``intrinsics`` and ``thing`` disagree.
     """
 
     images: Tensor | StoredImages
@@ -281,14 +284,17 @@ class Views:
         return height, width
 
     def image(self, index: int) -> Tensor:
-        """Image ``index`` without padding, for reading only. uint8 [h, w, 4]"""
+        """Image ``index`` without padding; do not modify it. uint8 [h, w, 4]"""
         if isinstance(self.images, StoredImages):
             return self.images.image(index)
         height, width = self.size(index)
         return self.images[index, :height, :width]
 
     def thing_in(self, index: int) -> Tensor | None:
-        """Share of each pixel of image ``index`` that shows the thing, if known. uint8 [h, w]"""
+        """Share of each pixel of image ``index`` that shows the foreground object. uint8 [h, w]
+
+        None if unknown.
+        """
         if self.thing is None:
             return None
         height, width = self.size(index)
@@ -343,7 +349,11 @@ class Views:
         )
 
     def subset(self, indices: Tensor) -> "Views":
-        """The views at ``indices``, in that order. [K]"""
+        """Select views by index.
+
+        Args:
+            indices: Indices of views, in the order of the result. int64 [K]
+        """
         intrinsics = self.intrinsics.subset(indices)
         if isinstance(self.images, StoredImages):
             images = self.images.subset(indices)
@@ -385,7 +395,11 @@ class Views:
         return PosedCamera(self.camera_to_world[index], focal, height, width, centre, lens)
 
     def image_rays(self, index: int) -> tuple[Tensor, Tensor]:
-        """Rays through every pixel of image ``index``, row by row. [h w, 3], [h w, 3]"""
+        """Rays through every pixel of image ``index``, row by row. [h w, 3], [h w, 3]
+
+        Returns:
+            Origins and unit directions in the world. [h w, 3], [h w, 3]
+        """
         return self.camera(index).rays()
 
     def outline_rays(self, index: int) -> tuple[Tensor, Tensor]:
@@ -464,18 +478,18 @@ def _padded(images: Tensor, height: int, width: int) -> Tensor:
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene: its views and what is known about it.
+    """A scene: its views by split, and what else is known about it.
 
     Attributes:
         name: Name for titles and run directories.
-        splits: Views by split name: train, val, test.
-        video: Frames of a fixed camera, where the scene has one.
-        background: What lies behind the scene in scores and pictures. [3]
-        static_reason: Why the scene is known to be static; empty if it may move.
-        points: Points on surfaces, as structure from motion finds them, in the world; None where
-            there are none. float32 [N, 3]
-        cut: The training views with all but the thing cut out, for LRMs, where those of ``splits``
-            are whole; None where masks are in the alpha of ``splits``, or there are none.
+        splits: Views by split name: "train", "val", "test".
+        video: Frames of a fixed camera; None if there are none.
+        background: Background colour in scores and rendered images, from 0 to 1. [3]
+        static_reason: Why the scene is known to be static; empty if it may be dynamic.
+        points: Surface points in the world, such as from structure from motion; None if unknown.
+            float32 [N, 3]
+        cut: Training views masked to the foreground object, for LRMs, while ``splits`` show whole
+            images; None if the alpha of ``splits`` holds the masks, or there are no masks.
     """
 
     name: str
@@ -488,9 +502,10 @@ class Scene:
 
     @cached_property
     def is_surrounded(self) -> bool:
-        """Whether the training images show a world around the scene, not a plain background.
+        """Whether the training images show surroundings, not a plain background.
 
-        They are opaque then, and most of them do not end in the background's colour.
+        True if no pixel is fully transparent and, in a sample of the images, at most half have
+        edges of the background's colour.
         """
         views = self.splits["train"]
         if not views.is_opaque:

@@ -15,7 +15,7 @@ PIPED_SECONDS = 30.0
 
 
 class StepBar(ProgressBar):
-    """Steps, rays per second, PSNR and time left.
+    """Shows steps, rays per second, PSNR and time left.
 
     On a terminal one line is redrawn; elsewhere a plain line appears every 30 s, without control
     codes.

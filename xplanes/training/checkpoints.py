@@ -73,7 +73,7 @@ def _kind_in(error: pickle.UnpicklingError) -> str:
 
 
 class Checkpoints(Checkpoint):
-    """Writes ``last.ckpt`` every so many steps and at the end, ``best.ckpt`` at a better score.
+    """Writes ``last.ckpt`` at fixed intervals and at the end, ``best.ckpt`` at a new best score.
 
     They go to ``checkpoints`` in the trainer's ``default_root_dir``; writing them is off the
     training clock. The best is what `Evaluation` scored highest. Lightning's ModelCheckpoint works

@@ -26,18 +26,18 @@ FIRST_FOG = 400
 
 
 class CollapseWatch(Callback):
-    """Notices a field that shows nothing where the images show something, or fog where they do not.
+    """Detects a field that is empty where the images show an object, or fog where they do not.
 
-    The field is then initialised anew with another seed and with the settings that its model holds
-    against this (`ModelSettings.stronger`). If that does not help, or the model has none, as the
-    published baselines, a warning says so, and training goes on to the end of its budget.
+    The field is then re-initialised with another seed and the model's settings for this case
+    (`ModelSettings.stronger`). If that does not help, or the model has none, like the published
+    baselines, a warning says so, and training continues to the end of its budget.
 
     Args:
-        restarts: How often the field may begin anew; 0 for a warning alone.
+        restarts: Maximum number of re-initialisations; 0 for a warning only.
 
     Attributes:
-        restarted: Steps at which it did.
-        collapsed: What was seen last, in words; empty while all is well.
+        restarted: Steps of re-initialisations.
+        collapsed: What was detected last, in words; empty if nothing was.
     """
 
     def __init__(self, restarts: int = 1) -> None:

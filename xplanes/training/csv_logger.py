@@ -12,9 +12,9 @@ from xplanes.files import read_rows
 
 
 class CSVLogger(loggers.CSVLogger):
-    """Lightning's, but a resumed run goes on with ``metrics.csv``, which Lightning would delete.
+    """Lightning's CSVLogger; a resumed run continues ``metrics.csv``, which Lightning deletes.
 
-    Rows of steps that the run does again are replaced.
+    Rows of repeated steps are replaced.
     """
 
     @property

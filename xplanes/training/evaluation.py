@@ -218,7 +218,7 @@ class Curve:
 
 
 class Evaluation(Callback):
-    """Scores validation views at set shares of the budget, off the training clock.
+    """Scores validation views at given shares of the budget, off the training clock.
 
     These are views of `SceneDataModule.validation_split`. Where there are none it scores test
     views, and no evaluation counts as the best.
@@ -229,7 +229,7 @@ class Evaluation(Callback):
 
     Args:
         at: Shares of the budget, from 0 to 1; 1 is always scored.
-        views: Views scored, spread evenly; None for all.
+        views: Number of views scored, spread evenly; None for all.
 
     Attributes:
         latest: Scores of the last evaluation.

@@ -37,22 +37,22 @@ from xplanes.training.module import RadianceModule, require_whole_floats
 
 
 class Trainer(lightning.Trainer):
-    """Lightning's Trainer with a limit in seconds, and devices that a field can be trained on.
+    """Lightning's Trainer with a limit in seconds and a check of the devices.
 
     Args:
         max_steps: Steps after which training ends; -1 for no limit.
         max_seconds: Seconds of the training clock after which training ends; None for no limit.
-        accelerator: auto (CUDA where there is a GPU, else the CPU), cpu, or gpu.
-        devices: Processes; rays are split between them.
-        deterministic: The same digits each time; CPU only, with a budget in steps.
-        tf32: Let GPUs round the factors of float32 products to 10 bits (TF32), which is faster.
-        log_every_n_steps: Steps from one log to the next; 0 for none.
+        accelerator: auto (CUDA if there is a GPU, otherwise the CPU), cpu or gpu.
+        devices: Number of processes; they split the rays.
+        deterministic: Bit-identical runs; CPU only, with a budget in steps.
+        tf32: On GPUs, round the factors of float32 products to TF32 (10 bits), which is faster.
+        log_every_n_steps: Steps between log entries; 0 for none.
         callbacks: Callbacks; a `TrainingClock` and an `Interrupt` are added.
-        plugins: Lightning's; checkpoints are written atomically unless one of them writes them.
+        plugins: Lightning's plugins; checkpoints are atomic unless a plugin writes them.
         **others: As for Lightning's Trainer.
 
     Raises:
-        ConfigError: If the machine has not what is asked for.
+        ConfigError: If the machine lacks what is asked for.
     """
 
     def __init__(

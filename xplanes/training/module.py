@@ -1,4 +1,4 @@
-"""The LightningModule: one field, trained on rays."""
+"""The LightningModule that trains one field on rays."""
 
 import copy
 import math
@@ -47,25 +47,26 @@ OPACITIES = 5
 
 
 class TrainingError(XPlanesError, RuntimeError):
-    """Training cannot go on; the message says what was seen and what to change."""
+    """Training cannot continue; the message says what was observed and what to change."""
 
 
 class RadianceModule(LightningModule):
-    """Trains a field on rays against the images' colours.
+    """Trains a field on rays, supervised by the images' colours.
 
-    The field is built in `setup`, when the scene is known: the LRM is run there, if there is one.
-    What data and LRM decide about the field travels in checkpoints, so that
-    ``RadianceModule.load_from_checkpoint(path)`` needs nothing but the file (and ``plugins``).
-    Optimisation is manual, so that a step is what this file says and nothing else; the Trainer's
-    gradient clipping and accumulation do not apply (``model.rays.accumulate`` does).
+    The field is built in `setup`, when the scene is known. An LRM, if configured, runs there too.
+    Checkpoints store what the data and the LRM determine about the field, so
+    ``RadianceModule.load_from_checkpoint(path)`` needs only the file (and ``plugins``, if used).
+    Optimisation is manual: the Trainer's gradient clipping and accumulation do not apply. Set
+    ``model.rays.accumulate`` to accumulate gradients.
 
     Args:
-        config: The groups ``seed``, ``model``, ``lrm``, ``preparation``, ``decomposition`` and
-            ``losses`` of a configuration, as builtins; others are ignored.
-        plugins: Modules of the user's own whose classes the configuration may name.
+        config: The keys ``seed``, ``model``, ``lrm``, ``preparation``, ``decomposition`` and
+            ``losses`` (optional) of a configuration, as dicts, lists, numbers and strings; others
+            are ignored.
+        plugins: Names of the user's modules whose classes the configuration may name.
 
     Raises:
-        ConfigError: If a setting cannot work.
+        ConfigError: If a setting is missing or invalid, or a plug-in cannot be imported.
     """
 
     field: Representation
@@ -103,32 +104,43 @@ class RadianceModule(LightningModule):
 
     @classmethod
     def compose(cls, *overrides: str) -> "RadianceModule":
-        """The module of the command line's settings: ``compose("model=nine_planes")``.
+        """Build from command-line overrides: ``compose("model=nine_planes")``.
 
         Args:
-            *overrides: ``key=value`` each; ``plugins=[MODULE]`` makes classes of one's own known.
+            *overrides: ``key=value`` each; ``plugins=[MODULE]`` allows classes of your own modules.
 
         Raises:
-            ConfigError: If a setting does not exist or cannot work.
+            ConfigError: If a setting does not exist or is invalid.
         """
         config = compose_plain("train", overrides)
         return cls(config, plugins=config["plugins"] or ())
 
     @classmethod
     def of(cls, method: Method) -> "RadianceModule":
-        """The module of settings that were read already."""
+        """Build from settings that are already parsed.
+
+        Args:
+            method: All settings except those of the data and the Trainer.
+
+        Raises:
+            ConfigError: If a settings class belongs to a plug-in.
+        """
         return cls(method.plain())
 
     @classmethod
     def load_from_checkpoint(
         cls, checkpoint_path: Any, *args: Any, weights_only: bool = True, **kwargs: Any
     ) -> "RadianceModule":
-        """As Lightning does, of tensors and builtins alone: no code in the file is run.
+        """Load a checkpoint as Lightning does; by default no code in the file is executed.
 
-        Classes of one's own, which a file cannot make known by itself, take ``plugins=[MODULE]``.
+        Args:
+            checkpoint_path: As in Lightning.
+            *args: As in Lightning.
+            weights_only: Read only tensors and plain values. False can execute code in the file.
+            **kwargs: As in Lightning. ``plugins=[MODULE]`` allows classes of your own modules.
 
         Raises:
-            ConfigError: If the file needs such classes, or does not fit.
+            ConfigError: If the checkpoint needs a plug-in that is not named, or does not fit.
         """
         try:
             return super().load_from_checkpoint(
@@ -169,19 +181,20 @@ class RadianceModule(LightningModule):
         initialise: Callable[[Method, Place], Initialisation] | None = None,
         say: Callable[[str], None] = print,
     ) -> None:
-        """Build the field for a scene, initialised as the settings say.
+        """Build the field for a scene, with the configured initialisation.
 
         Args:
-            scene: The scene.
-            frame: The field's frame; the model's choice when None.
-            half_side: Half the side of the scene's cube in world units; None finds it.
-            device: Where the field is going to be trained; the CPU when None.
-            devices: Processes that share the run.
-            initialise: Makes the initialisation; found by the settings when None.
-            say: Takes a line before something slow begins.
+            scene: The scene, with a ``train`` split.
+            frame: The field's frame; chosen by the model when None.
+            half_side: Half the side of the scene's cube in world units; estimated when None.
+            device: Device on which the field will be trained; the CPU when None.
+            devices: Number of processes that share the run.
+            initialise: Function that makes the initialisation; taken from ``lrm`` when None.
+            say: Function that receives a status line before each slow operation.
 
         Raises:
-            ConfigError, SceneError, LRMError: If settings, scene and source do not fit.
+            ConfigError, SceneError, LRMError: If settings, scene and initialisation do not fit
+                together.
         """
         views, method = scene.splits["train"], self.method
         device = device or torch.device("cpu")

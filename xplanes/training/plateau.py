@@ -21,13 +21,13 @@ COOLING = 0.25
 
 
 class PlateauStop(Callback):
-    """Ends training once the last doubling of its batches has gained little on their own rays.
+    """Ends training once doubling its steps has gained little PSNR on the training rays.
 
-    No scored view is looked at. The learning rates then fall over a last quarter, because an end at
-    full rates would lose what training had reached.
+    Scored views are not used. The learning rates then decay over a last quarter, because ending at
+    full rates would lose quality.
 
     Args:
-        gain: PSNR in dB below which a doubling counts as little; None never ends training.
+        gain: Gain in dB below which training ends; None: it never ends early.
 
     Attributes:
         ending: Step and progress at which training was told to end early, and the step of the end.

@@ -114,8 +114,8 @@ class ThreadChoice:
 class StepThreads(Callback):
     """Chooses the number of threads by timing steps: ``callbacks=threads``.
 
-    Sums come out differently with another number of threads, in their last digits, so that runs
-    with it are not deterministic. Does nothing on GPUs and in several processes.
+    The number of threads changes the last digits of sums, so runs with it are not deterministic.
+    Does nothing on GPUs and in several processes.
 
     Attributes:
         count: Threads of the steps so far.

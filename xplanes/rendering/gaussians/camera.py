@@ -1,4 +1,4 @@
-"""The camera of a rasteriser: a pinhole with OpenCV's axes."""
+"""The camera of the rasteriser: a pinhole with OpenCV axes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,18 +9,22 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera. Its axes are OpenCV's: x right, y down, looking along +z.
+    """A pinhole camera with OpenCV axes: x right, y down, looking along +z.
 
     Attributes:
-        world_to_camera: Rotation and translation of the world into the camera's axes. [4, 4]
+        world_to_camera: Rigid transform from world to camera coordinates. [4, 4]
         fx: Focal length along x, in pixels.
         fy: Focal length along y, in pixels.
-        cx: Principal point in pixels from the left edge; the first column's centre is 0.5.
+        cx: Principal point in pixels from the left edge; the first column's centre lies at 0.5.
         cy: Principal point in pixels from the top edge.
         width: Columns of the image.
         height: Rows of the image.
-        near: Least depth at which a Gaussian's mean is drawn.
-        far: Largest depth at which a Gaussian's mean is drawn.
+        near: Depth that a Gaussian's mean must exceed to be drawn, in world units.
+        far: Depth below which a Gaussian's mean must lie to be drawn, in world units.
+
+    Raises:
+        ValueError: If the pose is not [4, 4] or not finite, ``fx``, ``fy``, ``width``, ``height``
+            or ``near`` is not positive, or ``far`` does not exceed ``near``.
     """
 
     world_to_camera: Tensor
@@ -57,7 +61,7 @@ class Camera:
         near: float = 0.01,
         far: float = 1e10,
     ) -> "Camera":
-        """The camera of a pose with OpenGL's axes (y up, looking along -z), as views have them.
+        """Convert a pose with OpenGL axes (y up, looking along -z), as in `Views`.
 
         Args:
             camera_to_world: A rigid pose. [4, 4]
@@ -67,6 +71,9 @@ class Camera:
             height: Rows of the image.
             near: See `Camera`.
             far: See `Camera`.
+
+        Raises:
+            ValueError: See `Camera`.
         """
         pose = camera_to_world.double()
         rotation = (pose[:3, :3] * pose.new_tensor([1.0, -1.0, -1.0])).T
@@ -80,10 +87,10 @@ class Camera:
 
     @property
     def slant(self) -> tuple[float, float, float, float]:
-        """Least and largest x/z, least and largest y/z at which a projection is linearised.
+        """Least and largest x/z, then y/z, at which a projection is linearised.
 
-        The image, and 0.15 of its size beyond each edge: 1.3 times the tangent of half the field of
-        view where the image is centred (Kerbl et al. 2023).
+        Values beyond are clamped. The bounds lie 0.15 of the image size beyond each edge: for a
+        centred image, 1.3 times the tangent of half the field of view (Kerbl et al. 2023).
         """
         x, y = 0.15 * self.width, 0.15 * self.height
         return (

@@ -9,21 +9,22 @@ MAX_DEGREE = 3
 
 
 def spherical_harmonics(degree: int, coefficients: Tensor, directions: Tensor) -> Tensor:
-    """Sum real spherical harmonics up to a degree, in the order and with the signs of 3DGS files.
+    """Evaluate sums of real spherical harmonics, with the order and signs of 3DGS files.
 
-    Within degree l the order m runs from -l to l, with the Condon-Shortley phase. 3DGS adds 0.5 to
-    the sum and clamps it below at 0 to get a colour.
+    Within degree l, the order m runs from -l to l, with the Condon-Shortley phase. To obtain a
+    colour, 3DGS adds 0.5 to the sum and clamps negative values to 0.
 
     Args:
-        degree: From 0 to 3.
-        coefficients: The first (degree + 1)^2 of K are used. [N, K, 3]
+        degree: Highest degree, from 0 to 3.
+        coefficients: Coefficients of each channel; the first (degree + 1)^2 of K are used.
+            [N, K, 3]
         directions: From the camera to the Gaussians, of any length. [N, 3]
 
     Returns:
         The sums. [N, 3]
 
     Raises:
-        ValueError: If the degree is none of these, or too few coefficients are given.
+        ValueError: If the degree is out of range, or there are too few coefficients.
     """
     if degree not in range(MAX_DEGREE + 1):
         raise ValueError(f"degree={degree}: must be 0 to {MAX_DEGREE}")

@@ -21,16 +21,17 @@ MOST = 2**24
 
 @dataclass(frozen=True)
 class RasterisedImage:
-    """What a camera sees of Gaussians.
+    """An image of Gaussians, rendered by `rasterise`.
 
     Attributes:
-        colour: In front of the background if one was given, else premultiplied. [H, W, C]
-        opacity: Share of the light that the Gaussians stop. [H, W]
-        depth: Expected depth along the camera's axis, 0 where nothing is. [H, W]
+        colour: Composited on the background if one was given, else premultiplied by opacity.
+            [H, W, C]
+        opacity: Accumulated opacity, from 0 to 1. [H, W]
+        depth: Expected depth along the optical axis in world units; 0 where opacity is 0. [H, W]
         radii: Three standard deviations of each projected Gaussian along its longest axis, rounded
-            up to pixels; 0 for those that are not drawn. int64 [N]
+            up to pixels; 0 for Gaussians that are not drawn. int64 [N]
         means2d: Projected means in pixels. After ``means2d.retain_grad()`` and the backward pass,
-            ``means2d.grad`` is the gradient by which densification goes. [N, 2]
+            ``means2d.grad`` is the gradient that densification uses. [N, 2]
     """
 
     colour: Tensor
@@ -51,31 +52,34 @@ def rasterise(
     *,
     antialiased: bool = False,
 ) -> RasterisedImage:
-    """Draw Gaussians; gradients reach all tensors but the camera's.
+    """Rasterise Gaussians; gradients reach all tensors except the camera's.
 
-    A Gaussian is drawn in the pixels in which its alpha is 1/255 or more, so that the image does
-    not depend on tiles. It is not drawn where its mean is not between near and far, or its
-    projection overflows. Gaussians of equal depth are drawn in the order in which they are given.
+    A Gaussian is drawn in the pixels where its alpha is at least 1/255, so the image does not
+    depend on tiles. It is not drawn if its mean does not lie between near and far, or if its
+    projection overflows. Gaussians of equal depth are drawn in the given order.
 
     Args:
-        means: In the world. [N, 3]
-        quaternions: Rotations (w, x, y, z) of any length; shorter than 1e-12, they fade to no
-            rotation. [N, 4]
-        scales: Standard deviations along the rotated axes; zero makes discs, needles and points.
-            [N, 3]
+        means: Positions in the world. [N, 3]
+        quaternions: Rotations (w, x, y, z), normalised internally; below a length of 1e-12 they
+            approach the identity. [N, 4]
+        scales: Standard deviations along the rotated axes in world units, 0 or more; zeros make
+            discs, needles and points. [N, 3]
         opacities: Alpha at the means, before the low-pass filter if ``antialiased``, in [0, 1]. [N]
         colours: Any number of channels. [N, C]
-        camera: Pinhole with OpenCV's axes; `Camera.from_pose` takes those of views.
+        camera: Pinhole camera with OpenCV axes; `Camera.from_pose` accepts the poses of `Views`.
         background: Colour behind the Gaussians. [C]
-        antialiased: Lower the opacity of a Gaussian as the low-pass filter widens it, so that it
-            stops as much light as before (Mip-Splatting, Yu et al. 2024).
+        antialiased: Lower the opacity of each Gaussian to compensate for its widening by the
+            low-pass filter (Mip-Splatting, Yu et al. 2024).
 
-    Float32 goes through compiled loops on the CPU, which come to the same bits each time, and
-    through gsplat (extra ``gaussians``) on CUDA, which does not. Plain torch takes float64.
+    In float32, the CPU uses compiled loops, which are deterministic, and CUDA uses gsplat (extra
+    ``gaussians``), which is not. In float64, both use plain torch.
 
     Raises:
-        GaussianError: If shapes disagree, a number is not finite, or there are too many.
-        MissingExtraError: If the tensors lie on CUDA and gsplat is not installed.
+        GaussianError: If shapes disagree, a number is not finite or out of range, or there are too
+            many Gaussians.
+        MissingExtraError: If float32 tensors lie on CUDA and gsplat is not installed.
+
+    Source: Kerbl et al. 2023 (3D Gaussian splatting).
     """
     given = {
         **{"means": means, "quaternions": quaternions, "scales": scales},

@@ -295,7 +295,7 @@ class ProceduralSettings(SceneSettings, ABC):
 
     seed: Steps  # Seed of colours, motion phases and cameras.
     train_views: Count  # Training views, each at its own timestep.
-    test_views: Count  # Test views, at other timesteps than the training views.
+    test_views: Count  # Test views, at timesteps other than the training views'.
     val_views: Count  # Validation views.
 
     find: ClassVar[Callable[[str], object]]
@@ -361,12 +361,12 @@ class DemoSettings(ProceduralSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteSettings(ProceduralSettings):
-    """A scene of the suite, rendered on first use."""
+    """A procedural scene of the suite, rendered on first use."""
 
     find = staticmethod(suite_scene)
     ensure = staticmethod(ensure_suite_scene)
 
-    # Masks of a thing in a world: for scores alone, alpha of the training images, or for LRMs, too.
+    # Foreground masks, used for scores. alpha: also as training alpha; lrm: also for LRM input.
     mask_use: Literal["score", "alpha", "lrm"]
 
     def load(self, splits: Sequence[str]) -> Scene:

@@ -408,8 +408,8 @@ def _add_sheet(commands: "argparse._SubParsersAction") -> None:
         "--what",
         choices=["runs", "steps", "parts"],
         default="runs",
-        help="a column per run, a column per step, or the low-rank and sparse parts of the LRM's "
-        "triplanes; default: %(default)s",
+        help="a column per run (one seed per setting), a column per step, or the low-rank and "
+        "sparse parts of the LRM's triplanes; default: %(default)s",
     )
     parser.add_argument(
         "--show",

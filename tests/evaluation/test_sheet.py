@@ -1,5 +1,6 @@
 """Contact sheets: tiles cut from the pictures of runs, and errors that name what is missing."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +23,15 @@ def green(step: int) -> tuple[int, int, int]:
 
 
 def pictured(
-    folder: Path, *, scene: str = "lego", model: str = "a", steps=(0, 50), views=("v0", "v1")
+    folder: Path,
+    *,
+    scene: str = "lego",
+    model: str = "a",
+    seed: int = 0,
+    steps=(0, 50),
+    views=("v0", "v1"),
 ) -> Path:
-    run = make(folder, model=model)
+    run = make(folder, model=model, seed=seed)
     config = yaml.safe_load((run / "config.yaml").read_text())
     config["data"]["scene"] = scene
     (run / "config.yaml").write_text(yaml.safe_dump(config))
@@ -59,6 +66,17 @@ def test_runs_stand_side_by_side_a_row_per_scene(tmp_path: Path) -> None:
     assert found[TRUE] == 2 * 40 * 40
     assert found[green(50)] == 3 * 40 * 40
     assert not {ERROR, DEPTH, green(0)} & set(found)
+
+
+def test_a_setting_is_shown_with_its_first_seed(tmp_path: Path) -> None:
+    for number, (model, seed) in enumerate([("a", 0), ("a", 1), ("b", 0), ("b", 1)]):
+        pictured(tmp_path / f"{number}", model=model, seed=seed)
+    assert areas(write_sheet(tmp_path, size=40))[green(50)] == 2 * 40 * 40
+    assert areas(write_sheet(tmp_path, what="steps", size=40))[green(50)] == 4 * 40 * 40
+    # Runs that differ in nothing else are all shown.
+    for number in (2, 3):
+        shutil.rmtree(tmp_path / f"{number}")
+    assert areas(write_sheet(tmp_path, size=40))[green(50)] == 2 * 40 * 40
 
 
 def test_steps_stand_side_by_side_a_row_per_run(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from xplanes.errors import ConfigError
 from xplanes.evaluation.curves import SCENE, run_label
 from xplanes.evaluation.render import write_video
 from xplanes.evaluation.sweep import RunRow, read_rows
-from xplanes.evaluation.tabulate import SEED, align, differing
+from xplanes.evaluation.tabulate import SEED, align, differing, seed_groups
 from xplanes.files import replacing
 from xplanes.metrics import psnr
 from xplanes.rendering.pictures import STRIP
@@ -59,6 +59,8 @@ def write_sheet(
 ) -> Path:
     """Write a contact sheet of all runs in a folder.
 
+    With "runs", of runs that differ only in their seed the first is shown, unless all do.
+
     Args:
         folder: A run, a sweep, or any folder of runs.
         out: The picture, a PNG, or for steps a film, a WebP with a frame per step;
@@ -86,6 +88,8 @@ def write_sheet(
     rows = align(read_rows(folder))
     if not rows:
         raise ConfigError(f"{folder}: no runs in it (folders with run.json)")
+    if what == "runs":
+        rows = _one_seed(rows)
     found = {_path(folder, row): row for row in rows}
     over = [name for name in differing(rows) if name not in (SEED, SCENE)]
     if what == "parts":
@@ -98,6 +102,15 @@ def write_sheet(
     with replacing(out) as temporary:
         _assemble(lines, _cell(lines)).save(temporary, format="PNG", optimize=True)
     return out
+
+
+def _one_seed(rows: list[RunRow]) -> list[RunRow]:
+    """Runs without those that repeat another one with a different seed, if settings differ too."""
+    groups = seed_groups(rows)
+    if len(groups) < 2:
+        return rows
+    repeats = {id(row) for group in groups for row in group[1:]}
+    return [row for row in rows if id(row) not in repeats]
 
 
 def check_what(what: str | None) -> None:

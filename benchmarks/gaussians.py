@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import torch
 from figures import bars, panels, save
 from lightning.pytorch.callbacks import Callback
-from runner import RESULTS, command, lego, machine, markdown
+from runner import RESULTS, command, lego, machine, markdown, spread
 
 from xplanes.config import compose_plain
 from xplanes.fields.gaussians import Gaussians
@@ -232,10 +232,9 @@ def begins(found: dict[Case, dict[str, Any]]) -> str:
         group.setdefault(name or "hull", []).append(row["psnr"])
     lines = []
     for key, group in groups.items():
-        cells = []
-        for name in INITIALISATIONS:
-            spread = f" ± {statistics.stdev(group[name]):.2f}" if len(group[name]) > 1 else ""
-            cells.append(f"{statistics.mean(group[name]):.2f}{spread}")
+        cells = [
+            f"{statistics.mean(group[name]):.2f}{spread(group[name])}" for name in INITIALISATIONS
+        ]
         lines.append((*key, *cells))
     return markdown(("scene", "model", *INITIALISATIONS), lines)
 

@@ -31,11 +31,20 @@ def fake_gpu(monkeypatch: pytest.MonkeyPatch) -> torch.device:
 
 
 @pytest.fixture(scope="session")
-def trained_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where demo scenes are rendered once for all processes. Copy one before changing it."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "scenes"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def trained_run(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small finished run. Copy it before changing anything in it."""
     from tests.training.runs import small_config
     from xplanes.pipeline import run
 
     folder = tmp_path_factory.mktemp("trained")
-    run(small_config(folder / "scenes"), folder / "outputs" / "run", ["seed=0"], resume=False)
+    run(small_config(scenes), folder / "outputs" / "run", ["seed=0"], resume=False)
     return folder / "outputs" / "run"

@@ -110,7 +110,7 @@ def test_devices_that_disagree_are_said_to(gpu, faked, found_gpu, tmp_path):
 
 def test_a_part_that_fails_stops_no_other_and_sets_the_exit_code(gpu, faked, found_gpu, tmp_path):
     faked.fail["training (random, GPU)"] = "RuntimeError: no memory"
-    assert gpu.main(["--out", str(tmp_path)]) == 1
+    assert gpu.main(["--out", str(tmp_path), "--lego", str(tmp_path / "lego")]) == 1
     page = (tmp_path / "gpu.md").read_text(encoding="utf-8")
     assert "* training (random, GPU): RuntimeError: no memory\n" in page
     assert faked.begun[-1] == gpu.PARTS[-1].name

@@ -34,11 +34,6 @@ class Numbers(callbacks.Callback):
         return {"mean": np.mean([1.0, 2.0]) if self.kind == "numpy" else 1.5}
 
 
-@pytest.fixture(scope="module")
-def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("scenes")
-
-
 def rows(folder: Path) -> list[dict[str, str]]:
     return list(csv.DictReader((folder / "csv" / "metrics.csv").open()))
 

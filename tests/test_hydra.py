@@ -143,8 +143,10 @@ def test_other_configurations_have_suggestions_of_their_own() -> None:
     ],
     ids=str,
 )
-def test_arguments_of_lightnings_trainer_and_its_callbacks_work(extra, tmp_path: Path) -> None:
-    base = small_config(tmp_path / "scenes")
+def test_arguments_of_lightnings_trainer_and_its_callbacks_work(
+    extra, scenes: Path, tmp_path: Path
+) -> None:
+    base = small_config(scenes)
     kept = [f"data.root={base['data']['root']}"]
     from tests.training.runs import SMALL
 
@@ -154,7 +156,7 @@ def test_arguments_of_lightnings_trainer_and_its_callbacks_work(extra, tmp_path:
     assert metrics["step"] == (1 if "fast" in extra[0] else 3)
 
 
-def test_misfits_of_the_trainer_are_said_with_a_message(tmp_path: Path) -> None:
+def test_misfits_of_the_trainer_are_said_with_a_message(scenes: Path, tmp_path: Path) -> None:
     cases = [
         ({"gradient_clip_val": 1.0}, "gradient_clip_val=1.0"),
         ({"accumulate_grad_batches": 2}, "accumulate_grad_batches"),
@@ -163,7 +165,7 @@ def test_misfits_of_the_trainer_are_said_with_a_message(tmp_path: Path) -> None:
         ({"max_seconds": -1}, "trainer.max_seconds=-1: must be above 0"),
     ]
     for more, words in cases:
-        config = small_config(tmp_path / "scenes")
+        config = small_config(scenes)
         config["trainer"] |= more
         with pytest.raises(ConfigError) as caught:
             run(config, tmp_path / f"run_{words[:12]}", [], resume=False)
@@ -172,9 +174,10 @@ def test_misfits_of_the_trainer_are_said_with_a_message(tmp_path: Path) -> None:
 
 
 def test_an_unknown_argument_of_a_logger_is_refused_before_anything_is_written(
+    scenes: Path,
     tmp_path: Path,
 ) -> None:
-    config = small_config(tmp_path / "scenes", "logger=tensorboard")
+    config = small_config(scenes, "logger=tensorboard")
     config["logger"]["tensorboard"]["foo"] = 1
     with pytest.raises(ConfigError, match=r"logger\.tensorboard\.foo=1: .* no such argument"):
         run(config, tmp_path / "run", [], resume=False)
@@ -182,10 +185,10 @@ def test_an_unknown_argument_of_a_logger_is_refused_before_anything_is_written(
 
 
 def test_the_last_lines_name_tensorboard_only_where_it_has_something_to_show(
-    tmp_path: Path, capsys
+    scenes: Path, tmp_path: Path, capsys
 ) -> None:
     for logger, shown in (("none", False), ("tensorboard", True)):
-        config = small_config(tmp_path / "scenes", f"logger={logger}", "trainer.max_steps=2")
+        config = small_config(scenes, f"logger={logger}", "trainer.max_steps=2")
         run(config, tmp_path / logger, [], resume=False)
         lines = capsys.readouterr().out.splitlines()
         (line,) = [line for line in lines if line.startswith("next ")]
@@ -193,8 +196,10 @@ def test_the_last_lines_name_tensorboard_only_where_it_has_something_to_show(
         assert f"xplanes render {tmp_path / logger}" in "\n".join(lines)
 
 
-def test_without_checkpoints_the_last_lines_offer_none(tmp_path: Path, capsys) -> None:
-    config = small_config(tmp_path / "scenes", "trainer.max_steps=2")
+def test_without_checkpoints_the_last_lines_offer_none(
+    scenes: Path, tmp_path: Path, capsys
+) -> None:
+    config = small_config(scenes, "trainer.max_steps=2")
     config["callbacks"]["checkpoints"] = None
     run(config, tmp_path / "run", [], resume=False)
     shown = capsys.readouterr().out
@@ -211,9 +216,11 @@ def test_a_run_of_an_earlier_version_is_refused_with_its_version(tmp_path: Path)
         prepare([f"resume={tmp_path}"])
 
 
-def test_a_run_that_failed_before_its_first_checkpoint_blocks_nothing(tmp_path: Path) -> None:
-    config = small_config(tmp_path / "scenes", "trainer.max_steps=3")
-    broken = small_config(tmp_path / "scenes", "data.scene=excavator", "data.views=999")
+def test_a_run_that_failed_before_its_first_checkpoint_blocks_nothing(
+    scenes: Path, tmp_path: Path
+) -> None:
+    config = small_config(scenes, "trainer.max_steps=3")
+    broken = small_config(scenes, "data.scene=excavator", "data.views=999")
     with pytest.raises(Exception, match=r"data\.views=999"):
         run(broken, tmp_path / "run", [], resume=False)
     assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "failed"
@@ -223,9 +230,9 @@ def test_a_run_that_failed_before_its_first_checkpoint_blocks_nothing(tmp_path: 
 
 
 def test_the_header_estimates_time_and_the_end_says_what_memory_it_took(
-    tmp_path: Path, capsys
+    scenes: Path, tmp_path: Path, capsys
 ) -> None:
-    config = small_config(tmp_path / "scenes", "trainer.max_steps=3")
+    config = small_config(scenes, "trainer.max_steps=3")
     run(config, tmp_path / "run", [], resume=False)
     printed = capsys.readouterr().out
     line = next(line for line in printed.splitlines() if line.startswith("estimate"))

@@ -27,8 +27,8 @@ CALLBACKS = "lightning.pytorch.callbacks"
 
 
 @pytest.fixture(scope="module")
-def config(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    return small_config(tmp_path_factory.mktemp("scenes"), "model.rays.per_batch=1024")
+def config(scenes: Path) -> dict:
+    return small_config(scenes, "model.rays.per_batch=1024")
 
 
 def trainer(folder: Path, **options) -> lightning.Trainer:
@@ -158,10 +158,8 @@ def test_a_resumed_fit_ends_with_the_same_numbers(config: dict, tmp_path: Path) 
         assert torch.equal(resumed[name], value), name
 
 
-def test_callbacks_that_watch_a_metric_see_every_evaluation(tmp_path: Path) -> None:
-    config = small_config(
-        tmp_path, "trainer.max_steps=60", "callbacks.evaluation.at=[0,0.2,0.4,0.6]"
-    )
+def test_callbacks_that_watch_a_metric_see_every_evaluation(scenes: Path, tmp_path: Path) -> None:
+    config = small_config(scenes, "trainer.max_steps=60", "callbacks.evaluation.at=[0,0.2,0.4,0.6]")
     watched = {"monitor": "val/psnr", "mode": "max"}
     config["callbacks"] |= {
         "stop": watched
@@ -212,7 +210,7 @@ def test_clipping_and_accumulation_are_refused_with_a_message(config: dict, tmp_
 def test_views_are_held_out_where_there_is_no_validation_split(
     config: dict, tmp_path: Path
 ) -> None:
-    made = SceneDataModule({**config["data"], "train_views": 24, "val_views": 2})
+    made = SceneDataModule({**config["data"], "train_views": 20, "val_views": 1, "test_views": 1})
     folder = tmp_path / "scene"
     shutil.copytree(made.settings.folder, folder)
     (folder / "transforms_val.json").unlink()
@@ -223,7 +221,7 @@ def test_views_are_held_out_where_there_is_no_validation_split(
     data = SceneDataModule(settings)
     data.setup("fit")
     train, val = data.scene.splits["train"], data.scene.splits["val"]
-    assert (len(train), len(val)) == (21, 3)
+    assert (len(train), len(val)) == (18, 2)
     assert not set(train.files) & set(val.files)
 
 
@@ -285,15 +283,13 @@ def test_the_data_serve_other_modules(config: dict, tmp_path: Path) -> None:
     assert float(module.colour.min()) > 0.5  # Most of the images is white.
 
 
-def test_the_script_of_the_docs_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_script_of_the_docs_runs(
+    config: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
     (script,) = re.findall(r"```python\n(import lightning.*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)
-    small = SceneDataModule.compose(
-        "data.resolution=32", "data.train_views=10", "data.val_views=2", "data.test_views=2"
-    )
-    small.prepare_data()
-    folder = small.settings.folder
+    folder = SceneDataModule(config["data"]).settings.folder
     script = script.replace('"data.root=data/dnerf"', f'"data.root={folder.parent.resolve()}"')
     script = script.replace(
         '"data.scene=lego"', f'"data.scene={folder.name}", "data.resolution=null"'

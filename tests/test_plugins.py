@@ -130,7 +130,7 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "CONTRIBUTING.md"
 
 
 @pytest.fixture
-def small_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict:
+def small_model(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict:
     """The model of the docs, written to files as they say; its configuration."""
     section = PAGE.read_text(encoding="utf-8").split("### A model\n")[1].split("\n### ")[0]
     (code,) = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
@@ -148,7 +148,7 @@ def small_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict:
             f"hydra.searchpath=[file://{package.parent}/conf]",
             "plugins=[my_package]",
             "model=mlp",
-            f"data.root={tmp_path}",
+            f"data.root={scenes}",
             "data.resolution=24",
             "data.train_views=8",
             "data.test_views=2",

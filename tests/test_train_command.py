@@ -32,9 +32,9 @@ def exact(folder: Path) -> tuple:
     return content["test"], content["views"], content["samples_per_ray"], content["skipped"]
 
 
-@pytest.fixture(scope="module")
-def scenes(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return f"data.root={tmp_path_factory.mktemp('scenes')}"
+@pytest.fixture
+def root(scenes: Path) -> str:
+    return f"data.root={scenes}"
 
 
 def test_misspelled_key_names_its_neighbours() -> None:
@@ -175,9 +175,8 @@ def test_a_sweep_does_not_take_other_jobs_for_its_own(tmp_path: Path) -> None:
             launch._require_same_job(tmp_path, other)
 
 
-def test_what_hydra_knows_may_stand_in_settings(scenes: str, tmp_path: Path) -> None:
-    root = scenes.partition("=")[2]
-    (tmp_path / "link").symlink_to(root)
+def test_what_hydra_knows_may_stand_in_settings(scenes: Path, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(scenes)
     result = train(
         *(option for option in SMALL if not option.startswith("trainer.max_steps")),
         *("trainer.max_steps=2", "callbacks.evaluation.at=[]"),
@@ -197,10 +196,10 @@ def test_a_group_set_to_null_is_answered_with_its_choices() -> None:
             prepare([f"{group}=null"])
 
 
-def test_a_run_goes_on_from_another_directory(scenes: str, tmp_path: Path) -> None:
+def test_a_run_goes_on_from_another_directory(scenes: Path, tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
-    (tmp_path / "a" / "scenes").symlink_to(scenes.partition("=")[2])
+    (tmp_path / "a" / "scenes").symlink_to(scenes)
     own = [option for option in SMALL if not option.startswith("trainer.max_steps")]
     own += ["callbacks.evaluation.at=[]", "data.root=scenes"]
     run = tmp_path / "a" / "run"
@@ -268,19 +267,19 @@ def test_the_configuration_of_an_experiment_is_shown_as_hydra_shows_it(tmp_path:
 
 
 @pytest.mark.slow
-def test_an_experiment_needs_no_flag(scenes: str, tmp_path: Path) -> None:
+def test_an_experiment_needs_no_flag(root: str, tmp_path: Path) -> None:
     place = f"hydra.sweep.dir={tmp_path}"
     result = train(
-        "experiment=planes", *SMALL, scenes, "model=six_planes", "model.resolution=8,9", place
+        "experiment=planes", *SMALL, root, "model=six_planes", "model.resolution=8,9", place
     )
     assert result.returncode == 0, result.stderr
     assert len(list(tmp_path.glob("*/metrics.json"))) == 2
     assert (tmp_path / "table.md").is_file()
 
 
-def test_piped_output_is_plain_and_ends_with_scores_and_paths(scenes: str, tmp_path: Path) -> None:
+def test_piped_output_is_plain_and_ends_with_scores_and_paths(root: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    result = train(scenes, *SMALL, "trainer.max_steps=5", f"hydra.run.dir={run}")
+    result = train(root, *SMALL, "trainer.max_steps=5", f"hydra.run.dir={run}")
     assert result.returncode == 0, result.stderr
     assert "\x1b" not in result.stdout
     assert "\r" not in result.stdout
@@ -303,13 +302,13 @@ exec(compile(open({train!r}).read(), {train!r}, "exec"), globals())
 """
 
 
-def test_two_processes_share_the_rays_and_end_with_one_model(scenes: str, tmp_path: Path) -> None:
+def test_two_processes_share_the_rays_and_end_with_one_model(root: str, tmp_path: Path) -> None:
     run, script = tmp_path / "run", tmp_path / "each_rank.py"
     script.write_text(
         EACH_RANK.format(root=str(ROOT), train=str(ROOT / "train.py"), folder=str(tmp_path))
     )
     # Between updates each process's grid sees its own samples.
-    settings = [scenes, *SMALL, "trainer=ddp", "trainer.max_steps=20", f"hydra.run.dir={run}"]
+    settings = [root, *SMALL, "trainer=ddp", "trainer.max_steps=20", f"hydra.run.dir={run}"]
     settings.append("model.sampler.update_every=1")
     result = subprocess.run(
         [sys.executable, str(script), *settings],
@@ -333,12 +332,12 @@ def test_two_processes_share_the_rays_and_end_with_one_model(scenes: str, tmp_pa
 
 
 @pytest.mark.slow
-def test_two_processes_stop_together_and_resume(scenes: str, tmp_path: Path) -> None:
+def test_two_processes_stop_together_and_resume(root: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     checkpoint = run / "checkpoints" / "last.ckpt"
     process = subprocess.Popen(
         [
-            *(sys.executable, str(ROOT / "train.py"), scenes, *SMALL, "trainer=ddp"),
+            *(sys.executable, str(ROOT / "train.py"), root, *SMALL, "trainer=ddp"),
             *("trainer.max_steps=100000", "callbacks.checkpoints.every=20"),
             f"hydra.run.dir={run}",
         ],
@@ -362,16 +361,16 @@ def test_two_processes_stop_together_and_resume(scenes: str, tmp_path: Path) -> 
     assert torch.load(checkpoint, weights_only=True)["global_step"] == step + 5
 
 
-def start(run: Path, scenes: str) -> warm.Running:
+def start(run: Path, root: str) -> warm.Running:
     return warm.start(
-        *(str(ROOT / "train.py"), scenes, *SMALL, "trainer.max_steps=400"),
+        *(str(ROOT / "train.py"), root, *SMALL, "trainer.max_steps=400"),
         *("callbacks.checkpoints.every=20", f"hydra.run.dir={run}"),
     )
 
 
-def test_ctrl_c_saves_and_says_how_to_go_on(scenes: str, tmp_path: Path) -> None:
+def test_ctrl_c_saves_and_says_how_to_go_on(root: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    process = start(run, scenes)
+    process = start(run, root)
     warm.wait_for(run / "checkpoints" / "last.ckpt", process)
     process.send_signal(signal.SIGINT)
     assert process.wait(60) == 130
@@ -379,10 +378,10 @@ def test_ctrl_c_saves_and_says_how_to_go_on(scenes: str, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_killed_and_resumed_run_ends_with_the_same_numbers(scenes: str, tmp_path: Path) -> None:
+def test_killed_and_resumed_run_ends_with_the_same_numbers(root: str, tmp_path: Path) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    assert start(whole, scenes).wait(240) == 0
-    process = start(killed, scenes)
+    assert start(whole, root).wait(240) == 0
+    process = start(killed, root)
     warm.wait_for(killed / "checkpoints" / "last.ckpt", process)
     time.sleep(0.3)
     process.kill()
@@ -393,12 +392,12 @@ def test_killed_and_resumed_run_ends_with_the_same_numbers(scenes: str, tmp_path
 
 
 @pytest.mark.slow
-def test_a_resumed_run_finds_groups_of_the_users_own_again(scenes: str, tmp_path: Path) -> None:
+def test_a_resumed_run_finds_groups_of_the_users_own_again(root: str, tmp_path: Path) -> None:
     conf, run = tmp_path / "conf", tmp_path / "run"
     (conf / "model").mkdir(parents=True)
     (conf / "model" / "own.yaml").write_text("defaults: [six_planes]\nname: own\n")
     path = f"hydra.searchpath=[file://{conf}]"
-    result = train(scenes, path, "model=own", *SMALL, "trainer.max_steps=2", f"hydra.run.dir={run}")
+    result = train(root, path, "model=own", *SMALL, "trainer.max_steps=2", f"hydra.run.dir={run}")
     assert result.returncode == 0, result.stderr
     again = prepare([f"resume={run}", "trainer.max_steps=3"])
     assert again[0] == path
@@ -411,11 +410,11 @@ def test_a_resumed_run_finds_groups_of_the_users_own_again(scenes: str, tmp_path
 
 
 @pytest.mark.slow
-def test_a_field_renders_the_scene_inside_a_job(scenes: str, tmp_path: Path) -> None:
+def test_a_field_renders_the_scene_inside_a_job(root: str, tmp_path: Path) -> None:
     # That field's own settings are composed while Hydra's job is under way.
     folder = tmp_path / "run"
     result = train(
-        scenes,
+        root,
         *(line for line in SMALL if line not in ("lrm=none", "trainer.max_steps=40")),
         "lrm=tiny",
         "preparation.cache=null",

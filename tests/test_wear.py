@@ -90,7 +90,7 @@ def test_overrides_that_were_cut_short_are_not_taken_for_whole(tmp_path: Path) -
 
 
 def test_a_disk_that_fills_up_ends_a_run_with_a_message(
-    trained_run: Path, tmp_path: Path, monkeypatch, capsys
+    scenes: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     from lightning import Trainer
 
@@ -103,7 +103,7 @@ def test_a_disk_that_fills_up_ends_a_run_with_a_message(
 
     monkeypatch.setattr(Trainer, "save_checkpoint", fill_up)
     folder = tmp_path / "run"
-    config = small_config(trained_run.parents[1] / "scenes", "callbacks.evaluation.at=[]")
+    config = small_config(scenes, "callbacks.evaluation.at=[]")
     with pytest.raises(StorageError, match=r"last\.ckpt cannot be written.*Free some space"):
         run(config, folder, [], resume=False)
     assert f"resume={folder}" in capsys.readouterr().out

@@ -49,9 +49,9 @@ class Recorded(Viewer):
 
 
 @pytest.fixture(scope="module")
-def viewer(trained_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recorded]:
+def viewer(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recorded]:
     """The viewer of a run that trains until the tests are done."""
-    scenes, folder = trained_run.parents[1] / "scenes", tmp_path_factory.mktemp("browser")
+    folder = tmp_path_factory.mktemp("browser")
     config = small_config(
         scenes,
         "viewer=true",

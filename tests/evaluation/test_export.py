@@ -182,11 +182,11 @@ def covered_pixels(mesh: Any, views: Views, index: int, fine: int = 4) -> Tensor
 
 
 @pytest.mark.slow
-def test_the_silhouettes_of_a_demo_scene_are_those_of_its_field(trained_run: Path, tmp_path: Path):
+def test_the_silhouettes_of_a_demo_scene_are_those_of_its_field(scenes: Path, tmp_path: Path):
     config = changed(
         (),
         *("lrm=none", "trainer.accelerator=cpu", "trainer.max_seconds=null"),
-        f"data.root={trained_run.parents[1] / 'scenes'}",
+        f"data.root={scenes}",
         *("data.resolution=100", "trainer.max_steps=600", "callbacks.evaluation.at=[1]"),
         *("callbacks.evaluation.views=1", "media=false", "logger=none"),
     )

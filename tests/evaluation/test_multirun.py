@@ -15,12 +15,12 @@ from xplanes.evaluation.table import SweepTable, choose_gpu
 CHANGED = ("model.channels", "trainer.max_steps", "callbacks.evaluation.at")
 
 
-def test_a_failed_job_is_a_row_and_the_others_go_on(trained_run: Path, tmp_path: Path):
+def test_a_failed_job_is_a_row_and_the_others_go_on(scenes: Path, tmp_path: Path):
     done = train(
         *("-m", "model.channels=0,4"),
         *(option for option in SMALL if not option.startswith(CHANGED)),
         *("trainer.max_steps=2", "callbacks.evaluation.at=[]"),
-        *(f"data.root={trained_run.parents[1] / 'scenes'}", f"hydra.sweep.dir={tmp_path}"),
+        *(f"data.root={scenes}", f"hydra.sweep.dir={tmp_path}"),
         cwd=tmp_path,
     )
     assert done.returncode == 1, done.stderr

@@ -345,9 +345,8 @@ def test_training_is_the_same_with_a_viewer_to_the_last_bit(
 
 
 def test_a_run_has_a_viewer_when_asked_to(
-    trained_run: Path, tmp_path: Path, watched: list[Watched], capsys
+    scenes: Path, tmp_path: Path, watched: list[Watched], capsys
 ):
-    scenes = trained_run.parents[1] / "scenes"
     short = ("trainer.max_steps=2", "callbacks.evaluation.at=[1]", "callbacks.viewer.port=0")
     run(small_config(scenes, *short), tmp_path / "plain", [], resume=False)
     assert not watched

@@ -343,7 +343,9 @@ def test_processes_share_an_initialisation_through_a_folder_that_takes_files(tmp
     initialised(tmp_path, SEQUENCE, devices=2)
 
 
-def test_the_video_of_a_run_shows_the_field_in_its_own_frame(tmp_path: Path, monkeypatch):
+def test_the_video_of_a_run_shows_the_field_in_its_own_frame(
+    scenes: Path, tmp_path: Path, monkeypatch
+):
     frame = Frame(0.4, torch.eye(3), torch.tensor([0.1, 0.2, 0.3]))
     save_triplanes(tmp_path / "a.pt", TriplaneSequence(moving_sequence(), frame=frame))
     shown, original = [], pipeline.render_path
@@ -355,7 +357,7 @@ def test_the_video_of_a_run_shows_the_field_in_its_own_frame(tmp_path: Path, mon
     monkeypatch.setattr(pipeline, "render_path", render)
     monkeypatch.setattr(pipeline, "VIDEO_FRAMES", 2)
     plain = small_config(
-        tmp_path,
+        scenes,
         "lrm=file",
         f"lrm.triplanes={tmp_path}/a.pt",
         "preparation.cache=null",

@@ -17,7 +17,7 @@ from xplanes.scenes.images import load_images, load_premultiplied, shrink
 from xplanes.scenes.lenses import COEFFICIENTS
 from xplanes.scenes.transforms import read_transforms
 
-LEGO = Path(__file__).parents[3] / "shared" / "scenes" / "lego"
+LEGO = Path(__file__).parents[2] / "data" / "dnerf" / "lego"
 ANGLE = 0.7
 
 

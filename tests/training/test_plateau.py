@@ -47,8 +47,8 @@ def test_errors_of_zero_and_rising_errors_are_convergence():
     assert converged([1.0 + n for n in range(LEAST)], 0.1)
 
 
-def test_a_resumed_run_remembers_its_last_batch(tmp_path: Path):
-    config = small_config(tmp_path, "trainer.max_steps=3", "media=false", "lrm=none")
+def test_a_resumed_run_remembers_its_last_batch(scenes: Path, tmp_path: Path):
+    config = small_config(scenes, "trainer.max_steps=3", "media=false", "lrm=none")
     run(config, tmp_path / "run", [], resume=False)
     trained = load_run(tmp_path / "run").module
     assert trained.last["psnr"] > 0

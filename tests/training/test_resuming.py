@@ -173,8 +173,8 @@ class Fails(Callback):
             raise RuntimeError("a fault of one's own")
 
 
-def test_a_fault_of_ones_own_says_how_to_go_on(tmp_path: Path, capsys) -> None:
-    config = small_config(tmp_path, *FEW, "media=false", "lrm=none", "trainer.max_steps=5")
+def test_a_fault_of_ones_own_says_how_to_go_on(scenes: Path, tmp_path: Path, capsys) -> None:
+    config = small_config(scenes, *FEW, "media=false", "lrm=none", "trainer.max_steps=5")
     config["callbacks"] |= {"fails": {"_target_": f"{__name__}.Fails"}}
     config["plugins"] = [__name__]
     with pytest.raises(RuntimeError, match="a fault of one's own"):
@@ -184,8 +184,8 @@ def test_a_fault_of_ones_own_says_how_to_go_on(tmp_path: Path, capsys) -> None:
     run(config, tmp_path / "run", [], resume=True)
 
 
-def test_a_limit_that_a_run_has_passed_is_refused(tmp_path: Path) -> None:
-    config = small_config(tmp_path, *FEW, "media=false", "lrm=none", "trainer.max_steps=4")
+def test_a_limit_that_a_run_has_passed_is_refused(scenes: Path, tmp_path: Path) -> None:
+    config = small_config(scenes, *FEW, "media=false", "lrm=none", "trainer.max_steps=4")
     run(config, tmp_path / "run", [], resume=False)
     before = (tmp_path / "run" / "config.yaml").read_bytes()
     config["trainer"]["max_steps"] = 3
@@ -208,11 +208,13 @@ def test_another_start_in_a_folder_begins_its_own_record(tmp_path: Path) -> None
     assert "files" not in anew.content
 
 
-def test_a_scene_of_training_views_alone_is_scored_on_views_held_out(tmp_path: Path) -> None:
+def test_a_scene_of_training_views_alone_is_scored_on_views_held_out(
+    scenes: Path, tmp_path: Path
+) -> None:
     few = (*FEW, "callbacks.evaluation.at=[0]", "media=false", "lrm=none")
     for count in (10, 20):
         options = (f"data.train_views={count}", "data.val_views=1", "data.test_views=1")
-        demo = small_config(tmp_path / "demo", *few, *options)
+        demo = small_config(scenes, *few, *options)
         made = SceneDataModule(demo["data"]).settings.folder
         folder = Path(shutil.copytree(made, tmp_path / "scenes" / str(count)))
         for split in ("val", "test"):
@@ -237,12 +239,13 @@ def test_a_scene_of_training_views_alone_is_scored_on_views_held_out(tmp_path: P
 
 
 def test_without_a_validation_split_training_views_are_held_out_or_nothing_is_the_best(
+    scenes: Path,
     tmp_path: Path,
 ) -> None:
     few = (*FEW, "callbacks.evaluation.at=[0]", "media=false", "lrm=none")
     for views, held_out in ((10, 0), (20, 2)):
-        options = (f"data.train_views={views}", "data.val_views=1", "data.test_views=2")
-        demo = small_config(tmp_path / "demo", *few, *options)
+        options = (f"data.train_views={views}", "data.val_views=1", "data.test_views=1")
+        demo = small_config(scenes, *few, *options)
         made = SceneDataModule(demo["data"]).settings.folder
         folder = Path(shutil.copytree(made, tmp_path / "scenes" / str(views)))
         (folder / "transforms_val.json").unlink()

@@ -73,7 +73,7 @@ def scripts(folder: Path) -> dict[str, list[list[str]]]:
     given["captures"] = [
         [*several, "--scenes", "phone,rig", "--variants", own],
         [
-            *(*several, "--seconds", "30", "--variants", "world,kplanes,tineuvox_s"),
+            *("--together", "2", "--seconds", "30", "--variants", "world,kplanes,tineuvox_s"),
             *("--scenes", "phone_test,rig_test,dark_test,topology_test,occlusion_test"),
             *("--name", "captures_models", "--title", "Test scenes in three models"),
         ],

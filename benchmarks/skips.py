@@ -172,10 +172,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("outputs/benchmarks/skips"))
     args = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"
-    scenes = {
-        "demo excavator": ("data.scene=excavator",),
-        "demo balls": ("data.scene=balls",),
-    }
+    scenes = {"demo excavator": ("data.scene=excavator",)}
     if args.lego.is_dir():
         scenes["lego (val)"] = tuple(lego(args.lego.resolve()))
     cases = [(name, label) for name in scenes for label in args.only]

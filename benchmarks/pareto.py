@@ -162,7 +162,7 @@ def main() -> None:
     parser.add_argument("--together", type=int, default=1, help="runs side by side")
     parser.add_argument("--work", type=Path, default=Path("outputs/benchmarks/pareto"))
     args = parser.parse_args()
-    scenes = {"excavator": ["data.scene=excavator"], "balls": ["data.scene=balls"]}
+    scenes = {"excavator": ["data.scene=excavator"]}
     if args.lego.is_dir():
         scenes = {"lego": lego(args.lego.resolve())} | scenes
     common = [

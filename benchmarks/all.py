@@ -52,7 +52,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "lrm_sizes": ("xplanes/lrm",),
     "decomposition_speed": ("xplanes/decomposition",),
     "decomposition_stress": ("xplanes/decomposition",),
-    "conversion_options": (*TRAINING, *START[1:]),
+    "conversion_options": ("xplanes/fields", "xplanes/decomposition"),
     "paper": (*TRAINING, *START[1:]),
     "rank_curve": START,
     "stability": (*TRAINING, "xplanes/decomposition", "tests/stress"),

@@ -2,19 +2,22 @@
 
     python benchmarks/conversion_options.py
 
-Each sequence has a known background triplane (smooth random features, root mean square 1), a
-moving ball whose features cover the background on all three planes, a slow flicker of the whole
-triplane as per-frame predictions have it, and noise.
+Writes docs/results/conversion_options.md and .png. Each sequence has a known background triplane
+(smooth random features, root mean square 1), a moving ball whose features cover the background on
+all three planes, a slow flicker of the whole triplane as per-frame predictions have it, and noise.
 """
 
 import argparse
+import itertools
 import math
 import time
 import warnings
 from collections.abc import Callable
+from statistics import fmean
 
 import torch
-from runner import RESULTS, command, machine
+from figures import bars, panels, save
+from runner import RESULTS, command, machine, markdown
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -29,6 +32,8 @@ from xplanes.fields.xplanes import PLANE_SETS
 from xplanes.files import write_text
 
 FRAMES, CHANNELS, SIZE = 50, 32, 64
+STEPS = (0, 100, 400)
+"""After how many steps of Adam the products are compared."""
 AXES = ((0, 1), (0, 2), (1, 2))
 Path3D = Callable[[float], tuple[float, float, float]]
 SEQUENCES: dict[str, tuple[Path3D, float, float]] = {
@@ -92,78 +97,93 @@ def train(planes: Tensor, sparse: Tensor, plane_set: str, steps: int) -> float:
     return unexplained_energy(planes.detach(), sparse, rows=rows)
 
 
+def static_errors(triplanes: Tensor, low_rank: Tensor, truth: Tensor) -> dict[str, float]:
+    """Relative error of the space planes against the true background, by option."""
+    sources = {f"{static} of L": (low_rank, static) for static in ("middle", "median", "mean")}
+    sources["median of the input frames"] = (triplanes, "median")
+    found = {}
+    for name, (sequence, static) in sources.items():
+        planes = space_planes(sequence, static=static).permute(0, 3, 1, 2)
+        found[name] = ((planes - truth).norm() / truth.norm()).item()
+    return found
+
+
+def dynamic_errors(sparse: Tensor, plane_set: str, dynamic: str) -> tuple[float, list[float]]:
+    """Seconds of an initialisation, and what its products do not explain after each of STEPS."""
+    generator = torch.Generator().manual_seed(0)
+    begin = time.perf_counter()
+    planes = time_planes(sparse, plane_set=plane_set, dynamic=dynamic, generator=generator)
+    seconds = time.perf_counter() - begin
+    return seconds, [train(planes, sparse, plane_set, steps) for steps in STEPS]
+
+
+def plot(static: dict[str, list[float]], dynamic: dict[str, list[float]]) -> None:
+    """Errors of the options, a group of bars for each sequence; weight auto."""
+    figure, (left, right) = panels(2, 10, 5, sharey=True)
+    bars(left, list(SEQUENCES), static)
+    bars(right, list(SEQUENCES), dynamic)
+    left.set_xlabel("space planes: relative error")
+    right.set_xlabel("time planes: unexplained share of the energy of S")
+    for axes in (left, right):
+        axes.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1))
+    save(figure, "conversion_options")
+
+
 def main() -> None:
     argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0]).parse_args()
     warnings.simplefilter("ignore")
-    static_rows, dynamic_rows, totals = [], [], {}
+    static_rows, dynamic_rows = [], []
+    totals: dict[float | str, dict[str, list[float]]] = {0.009: {}, "auto": {}}
+    left: dict[str, list[float]] = {}
     for name in SEQUENCES:
         triplanes, truth = make(name)
-        norm = truth.norm()
-        for weight in (0.009, "auto"):
+        for weight, total in totals.items():
             parts = decompose(triplanes, sparsity_weight=weight, progress=False)
             report = parts.reports["xy"]
-            errors = {}
-            for static in ("middle", "median", "mean"):
-                planes = space_planes(parts.low_rank, static=static).permute(0, 3, 1, 2)
-                errors[static] = ((planes - truth).norm() / norm).item()
-            raw = space_planes(triplanes, static="median").permute(0, 3, 1, 2)
-            errors["median of the input frames"] = ((raw - truth).norm() / norm).item()
-            for key, value in errors.items():
-                totals.setdefault((weight, key), []).append(value)
-            cells = " | ".join(f"{value:.4f}" for value in errors.values())
-            static_rows.append(
-                f"| {name} | {weight} | {cells} | {report['rank']} | {report['sparsity']:.2f} "
-                f"| {report['drift']:.3f} |"
-            )
-            print(static_rows[-1], flush=True)
-        for plane_set in ("six", "nine"):
-            for dynamic in ("random", "rank1"):
-                begin = time.perf_counter()
-                planes = time_planes(
-                    parts.sparse,
-                    plane_set=plane_set,
-                    dynamic=dynamic,
-                    generator=torch.Generator().manual_seed(0),
-                )
-                seconds = time.perf_counter() - begin
-                cells = [unexplained_energy(planes, parts.sparse, rows=PLANE_SETS[plane_set])]
-                cells += [train(planes, parts.sparse, plane_set, steps) for steps in (100, 400)]
-                dynamic_rows.append(
-                    f"| {name} | {plane_set} | {dynamic} | {seconds:.2f} | "
-                    + " | ".join(f"{cell:.3f}" for cell in cells)
-                    + " |"
-                )
-                print(dynamic_rows[-1], flush=True)
-    means = [
-        f"| mean | {weight} | "
-        + " | ".join(f"**{sum(v) / len(v):.4f}**" for (w, _), v in totals.items() if w == weight)
-        + " | | | |"
-        for weight in (0.009, "auto")
-    ]
-    lines = [
-        "# Conversion: error of each option against the ground truth",
-        "",
-        f"Synthetic sequences: {FRAMES} frames, {CHANNELS} channels, {SIZE} x {SIZE} texels.",
-        f"{machine()}.",
-        f"`{command()}`",
-        "",
-        "## Static: relative error of the space planes against the true background",
-        "",
-        "| sequence | sparsity weight | middle frame of L | median of L | mean of L "
-        "| median of the input frames | rank xy | sparsity xy | drift xy |",
-        "|---|---|---|---|---|---|---|---|---|",
-        *static_rows,
-        *means,
-        "",
-        "## Dynamic: share of the energy of S (weight auto) that the products do not explain",
-        "",
-        "The products are then optimised with Adam (rate 0.01, four random frames per step).",
-        "",
-        "| sequence | planes | initialisation | seconds | step 0 | after 100 steps | after 400 |",
-        "|---|---|---|---|---|---|---|",
-        *dynamic_rows,
-    ]
-    write_text(RESULTS / "conversion_options.md", "\n".join(lines) + "\n")
+            errors = static_errors(triplanes, parts.low_rank, truth)
+            for option, error in errors.items():
+                total.setdefault(option, []).append(error)
+            about = (report["rank"], f"{report['sparsity']:.2f}", f"{report['drift']:.3f}")
+            cells = [f"{error:.4f}" for error in errors.values()]
+            static_rows.append((name, weight, *cells, *about))
+            print(*static_rows[-1], flush=True)
+        for plane_set, dynamic in itertools.product(("six", "nine"), ("random", "rank1")):
+            seconds, shares = dynamic_errors(parts.sparse, plane_set, dynamic)
+            cells = [f"{share:.3f}" for share in shares]
+            dynamic_rows.append((name, plane_set, dynamic, f"{seconds:.2f}", *cells))
+            print(*dynamic_rows[-1], flush=True)
+            # Rank-1 planes hardly change; random ones explain nothing before they are trained.
+            shown = 0 if dynamic == "rank1" else STEPS[-1]
+            share = shares[STEPS.index(shown)]
+            left.setdefault(f"{plane_set}, {dynamic}, step {shown}", []).append(share)
+    for weight, total in totals.items():
+        means = [f"**{fmean(errors):.4f}**" for errors in total.values()]
+        static_rows.append(("mean", weight, *means, "", "", ""))
+    plot(totals["auto"], left)
+    options = tuple(totals["auto"])
+    static_columns = ("sequence", "sparsity weight", *options, "rank xy", "sparsity xy", "drift xy")
+    dynamic_columns = ("sequence", "planes", "initialisation", "seconds")
+    dynamic_columns += tuple(f"step {steps}" for steps in STEPS)
+    text = f"""# Conversion: error of each option against the ground truth
+
+    {command()}
+
+Synthetic sequences: {FRAMES} frames, {CHANNELS} channels, {SIZE} x {SIZE} texels, one seed.
+{machine()}. The plot has the sparsity weight `auto`.
+
+![Errors of the options](conversion_options.png)
+
+## Static: relative error of the space planes against the true background
+
+{markdown(static_columns, static_rows)}
+
+## Dynamic: share of the energy of S (weight auto) that the products do not explain
+
+The products are then optimised with Adam (rate 0.01, four random frames per step).
+
+{markdown(dynamic_columns, dynamic_rows)}
+"""
+    write_text(RESULTS / "conversion_options.md", text)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ os.environ.update(defaults(os.environ))
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
-from runner import machine, markdown
+from runner import command, machine, markdown
 from tally import Gatherer, write_page
 
 COLUMNS = ("fault", "cases", "same end", "messages in words", "failed", "skipped")
@@ -34,6 +34,8 @@ def page(found: Gatherer) -> str:
         notes += f"\nFailed without a count: {', '.join(found.other_failures)}.\n"
     return f"""# Recovery from faults
 
+    {command()}
+
 Runs of 40 steps on a scene of 32 pixels, a checkpoint every 3 steps, random initialisation or
 `tiny`, each forked from one fully loaded process. "Same end": after the fault is removed, the run
 (resumed if it had started) reaches bit-identical parameters, scores and curve to an uninterrupted
@@ -41,7 +43,7 @@ run and leaves no unfinished file; a truncated curve.csv loses rows. "Messages i
 user saw, checked for the file, the reason and the remedy. Cases without "same end" are files and
 folders that must be refused.
 
-{machine()}; {found.seconds:.0f} s on one thread. Script: `benchmarks/faults.py`; tests:
+{machine()}; {found.seconds:.0f} s on one thread. The tests alone:
 `python -m pytest -m stress tests/faults`.
 
 {markdown(COLUMNS, rows)}

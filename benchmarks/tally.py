@@ -59,7 +59,13 @@ def gather(arguments: list[str]) -> Gatherer:
     return gatherer
 
 
-def write_page(folder: str, page: Callable[[Gatherer], str], name: str, words: str) -> None:
+def write_page(
+    folder: str,
+    page: Callable[[Gatherer], str],
+    name: str,
+    words: str,
+    plot: Callable[[Gatherer], None] | None = None,
+) -> None:
     """Run a folder of the stress suite, write its page, and exit with whether anything failed.
 
     Args:
@@ -67,6 +73,7 @@ def write_page(folder: str, page: Callable[[Gatherer], str], name: str, words: s
         page: From what was counted to markdown.
         name: File below docs/results.
         words: What the script does, for its help.
+        plot: Draws what was counted.
     """
     parser = argparse.ArgumentParser(description=words)
     parser.add_argument("--select", help="as pytest -k: these tests alone, printed, not written")
@@ -78,4 +85,6 @@ def write_page(folder: str, page: Callable[[Gatherer], str], name: str, words: s
         print(text)
     else:
         write_text(ROOT / "docs" / "results" / name, text)
+        if plot is not None:
+            plot(found)
     sys.exit(bool(found.other_failures) or any(row.failed for row in found.rows.values()))

@@ -75,7 +75,7 @@ def test_lookup(tally, plane_set, dtype) -> None:
 @pytest.mark.parametrize("dtype", TOLERANCE)
 @pytest.mark.parametrize("value", [0.0, 1e-5, 1.0, 1e5])
 def test_products(tally, value, dtype) -> None:
-    """Products of six planes of 0 to 1e5, 1 to 300 rows of time, two types"""
+    """Products: six planes of 0 to 1e5, 1 to 300 rows of time, two types"""
     names = ("xy", "xz", "xt", "yz", "yt", "zt")
     for rows in ROWS:
         generator = torch.Generator().manual_seed(rows)

@@ -11,7 +11,8 @@ from xplanes.process import defaults
 
 os.environ.update(defaults(os.environ))
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-
+# What one thread computes is compared with what two compute.
+os.environ.setdefault("NUMBA_NUM_THREADS", "2")
 
 from figures import panels, save
 from runner import command, machine, markdown

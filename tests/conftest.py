@@ -3,12 +3,20 @@
 import os
 from pathlib import Path
 
+from xplanes.process import defaults
+
+os.environ.update(defaults(os.environ))  # Before torch is imported, as the command line does.
+
 import pytest
 import torch
 
 if not torch.cuda.is_available():
     # Triton reads this when it is imported, and torch imports triton where it is installed.
     os.environ.setdefault("TRITON_INTERPRET", "1")
+
+# Processes side by side share the cores: threads that wait for one another would slow all of them.
+_processes = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+torch.set_num_threads(max(1, torch.get_num_threads() // _processes))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

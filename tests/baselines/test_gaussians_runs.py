@@ -27,7 +27,14 @@ MODELS = {
 }
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "gaussians_hexplane",
+        pytest.param("gaussians_deform", marks=pytest.mark.slow),
+        pytest.param("gaussians_spacetime", marks=pytest.mark.slow),
+    ],
+)
 def test_run_learns_grows_resumes_and_is_loaded(scenes, tmp_path, monkeypatch, name):
     cache = f"preparation.cache={tmp_path}/cache"
     config = baseline_config(scenes, f"model={name}", *SMALL, *MODELS[name], cache)

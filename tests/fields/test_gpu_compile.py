@@ -22,6 +22,7 @@ def compiled(cache, *options):
     return [line for line in lines if len(line) == 8][1:]
 
 
+@pytest.mark.slow
 def test_kernels_with_most_numbers_fit_the_registers_of_a_common_gpu(tmp_path):
     cases = ("nine planes, 40", "compositing", "marching")
     rows = compiled(tmp_path, "--arch", "86", "--only", *cases)

@@ -291,7 +291,7 @@ def test_results_are_bit_identical_for_any_number_of_threads():
     for threads in [1, 2]:
         before, torch_before = numba.get_num_threads(), torch.get_num_threads()
         try:
-            numba.set_num_threads(min(threads, before))
+            numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
             torch.set_num_threads(threads)
             again = both("nine", space, time, points, times)[0]
         finally:

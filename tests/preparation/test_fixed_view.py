@@ -216,6 +216,7 @@ def test_the_field_that_renders_has_the_users_cube(tmp_path: Path, monkeypatch):
     assert [1 / place.frame.scale for place in frames] == [pytest.approx(0.9)]
 
 
+@pytest.mark.slow
 def test_kplanes_render_in_their_own_cube(tmp_path: Path, small_fields):
     options = ("preparation.fixed_view_model=kplanes", "preparation.fixed_view_steps=200")
     made, _ = video_of(

@@ -178,25 +178,24 @@ def test_colmap_may_have_registered_an_image_of_each_camera(tmp_path: Path) -> N
     with_transforms(folder, lambda camera: f"cam{camera:02d}")
     expected = read(folder)
     (folder / "transforms.json").unlink()
-    for name in (
-        lambda camera: f"cam{camera:02d}.jpg",
-        lambda camera: f"cam{camera:02d}/0005.png",
-        lambda camera: f"first frames/cam{camera:02d}.png",
+    for text, name in (
+        (False, lambda camera: f"cam{camera:02d}.jpg"),
+        (False, lambda camera: f"cam{camera:02d}/0005.png"),
+        (True, lambda camera: f"first frames/cam{camera:02d}.png"),
     ):
-        for text in (False, True):
-            with_colmap(folder, name, text=text)
-            found = read(folder)
-            assert choose([str(folder)]).overrides[0] == "data=multicamera"
-            for split, views in expected.splits.items():
-                assert found.splits[split].files == views.files
-                assert torch.equal(found.splits[split].in_memory(), views.in_memory())
-                assert torch.equal(found.splits[split].times, views.times)
-                for index in range(len(views)):
-                    mine, theirs = found.splits[split].image_rays(index), views.image_rays(index)
-                    for one, other in zip(mine, theirs, strict=True):
-                        assert (one - other).abs().max() < 1e-5
-            for path in (folder / "sparse" / "0").iterdir():
-                path.unlink()
+        with_colmap(folder, name, text=text)
+        found = read(folder)
+        assert choose([str(folder)]).overrides[0] == "data=multicamera"
+        for split, views in expected.splits.items():
+            assert found.splits[split].files == views.files
+            assert torch.equal(found.splits[split].in_memory(), views.in_memory())
+            assert torch.equal(found.splits[split].times, views.times)
+            for index in range(len(views)):
+                mine, theirs = found.splits[split].image_rays(index), views.image_rays(index)
+                for one, other in zip(mine, theirs, strict=True):
+                    assert (one - other).abs().max() < 1e-5
+        for path in (folder / "sparse" / "0").iterdir():
+            path.unlink()
     assert found.video.files == expected.video.files
 
 

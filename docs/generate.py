@@ -30,6 +30,7 @@ GROUPS = ("data", "model", "model/sampler", "lrm", "preparation", "decomposition
 
 _FIELD = re.compile(r"    (\w+): .*?(?:  # (.+))?$")
 _ARGUMENT = re.compile(r"^    (\w+): (.+?)(?=^    \w|\Z)", re.MULTILINE | re.DOTALL)
+_CODE = re.compile(r"\+\S+=\{.*?\}|\b_\w+_\b")  # Markdown would set `_target_` in italics.
 _TOP_LEVEL = re.compile(r"^(\w+): (.*?)(?:  # (.+))?$", re.MULTILINE)
 
 LIGHTNING = (
@@ -233,7 +234,8 @@ def document() -> str:
     text = (CONF / "train.yaml").read_text(encoding="utf-8")
     for key, value, words in _TOP_LEVEL.findall(text):
         if value:
-            parts.append(f"| `{key}` | {sentence(words)} | {value} |")
+            meaning = _CODE.sub(r"`\g<0>`", sentence(words))
+            parts.append(f"| `{key}` | {meaning} | {value} |")
     for group in GROUPS:
         parts += section(group)
     parts += trainer()

@@ -85,7 +85,7 @@ def _download(options: argparse.Namespace) -> None:
 
 def _add_inspect(commands: "argparse._SubParsersAction") -> None:
     parser = commands.add_parser(
-        "inspect", help="print and draw what was read of a capture, and warn of what may be wrong"
+        "inspect", help="print and draw what was read from a capture, and warn of common problems"
     )
     parser.add_argument(
         "arguments",
@@ -94,7 +94,9 @@ def _add_inspect(commands: "argparse._SubParsersAction") -> None:
         help="the folder of a scene, settings of train.py, or both",
     )
     parser.add_argument(
-        "--out", type=Path, help="the picture, a PNG; default: inspect_SCENE.png, here"
+        "--out",
+        type=Path,
+        help="the picture, a PNG; default: inspect_SCENE.png in the current directory",
     )
     parser.add_argument("--json", action="store_true", help="print the facts as JSON")
     parser.set_defaults(command=_inspect)
@@ -188,7 +190,9 @@ def _add_evaluate(commands: "argparse._SubParsersAction") -> None:
     )
     _add_run(parser)
     parser.add_argument(
-        "--split", choices=["test", "val", "train"], help="default: the split evaluated in training"
+        "--split",
+        choices=["test", "val", "train"],
+        help="default: the split scored at the end of training",
     )
     parser.add_argument(
         "--lpips",
@@ -326,8 +330,8 @@ def _add_export(commands: "argparse._SubParsersAction") -> None:
         "--what",
         choices=["mesh", "points", "planes", "gaussians", "path"],
         default="mesh",
-        help="what to write: mesh and points (extra: export), planes of X-Planes alone, Gaussians "
-        "of models that have such, or a path of the training cameras; default: %(default)s",
+        help="what to write: mesh or points (extra: export), planes (X-Planes only), gaussians "
+        "(models of Gaussians only), or a path of the training cameras; default: %(default)s",
     )
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="empty or new; default: RUN/export/WHAT"
@@ -346,7 +350,7 @@ def _add_export(commands: "argparse._SubParsersAction") -> None:
     parser.add_argument(
         "--threshold",
         type=float,
-        help="density of the surface; default: the one with the field's silhouettes",
+        help="density of the surface; default: the one whose silhouettes match the field's best",
     )
     parser.add_argument(
         "--points",
@@ -421,7 +425,9 @@ def _add_sheet(commands: "argparse._SubParsersAction") -> None:
         "--view",
         help="a view, as named in RUN/media, or the end of its name; default: one that all show",
     )
-    parser.add_argument("--steps", help="steps, separated by commas; default: all, or the last")
+    parser.add_argument(
+        "--steps", help="numbers of steps, separated by commas; default: all, or the last"
+    )
     parser.add_argument(
         "--size", type=int, default=160, help="pixels of a picture; default: %(default)s"
     )
@@ -429,7 +435,7 @@ def _add_sheet(commands: "argparse._SubParsersAction") -> None:
         "--out",
         type=Path,
         metavar="FILE",
-        help="FILE.png, or with --what steps FILE.webp, a film; default: sheet_WHAT.png in FOLDER",
+        help="FILE.png, or with --what steps a video, FILE.webp; default: sheet_WHAT.png in FOLDER",
     )
     parser.set_defaults(command=_sheet)
 

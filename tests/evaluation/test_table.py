@@ -90,7 +90,7 @@ def test_a_score_of_the_thing_has_a_column_where_any_run_has_one(tmp_path):
     metrics["test"]["psnr_thing"] = 17.5
     path.write_text(json.dumps(metrics))
     assert [row["psnr_thing"] for row in table(tmp_path)] == ["", "17.5"]
-    assert "psnr thing" in (tmp_path / "table.md").read_text()
+    assert "psnr object" in (tmp_path / "table.md").read_text()
 
 
 CURVE = "seconds,step,split,psnr,ssim\n"

@@ -221,7 +221,7 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
     prepare = sum(seconds["prepare"].values())
     more_scores = ""
     if "psnr_thing" in metrics["test"]:
-        more_scores += f"  of the thing {metrics['test']['psnr_thing']:.2f}"
+        more_scores += f"  of the object {metrics['test']['psnr_thing']:.2f}"
     if "floaters" in metrics["test"]:
         more_scores += f"  floaters {100 * metrics['test']['floaters']:.2f}%"
     warnings = []

@@ -29,7 +29,7 @@ LINE, GAP = 16, 4
 """Pixels of a line of text, and between tiles."""
 
 FPS, HELD = 2, 4
-"""Frames of a film per second, and how often its last one is shown."""
+"""Frames per second of a video, and how often its last one is shown."""
 
 Line = tuple[str, Sequence["Tile"]]
 """A row of tiles with its title."""
@@ -63,7 +63,7 @@ def write_sheet(
 
     Args:
         folder: A run, a sweep, or any folder of runs.
-        out: The picture, a PNG, or for steps a film, a WebP with a frame per step;
+        out: The picture, a PNG, or for steps a video, a WebP with a frame per step;
             ``folder/sheet_WHAT.png`` when None.
         what: One of `WHAT`.
         show: One of `xplanes.rendering.pictures.STRIP`: what is shown of a view.
@@ -79,7 +79,7 @@ def write_sheet(
     out = out or folder / f"sheet_{what}.png"
     if out.suffix not in ((".png", ".webp") if what == "steps" else (".png",)):
         raise ConfigError(
-            f"{out}: a contact sheet must end in .png, or with --what steps in .webp for a film"
+            f"{out}: a contact sheet must end in .png, or with --what steps in .webp for a video"
         )
     if size < 16:
         raise ConfigError(f"size={size}: a tile must have 16 pixels at least")
@@ -97,7 +97,7 @@ def write_sheet(
     else:
         lines = _views(found, over, what, show, view, steps, size)
     if out.suffix == ".webp":
-        frames = (torch.from_numpy(np.array(sheet)) for sheet in _film(lines))
+        frames = (torch.from_numpy(np.array(sheet)) for sheet in _video(lines))
         return write_video(out, frames, fps=FPS)
     with replacing(out) as temporary:
         _assemble(lines, _cell(lines)).save(temporary, format="PNG", optimize=True)
@@ -255,7 +255,7 @@ def _score(strip: Image.Image) -> float:
     return psnr(both[:, width : 2 * width], both[:, :width])
 
 
-def _film(lines: Sequence[Line]) -> Iterator[Image.Image]:
+def _video(lines: Sequence[Line]) -> Iterator[Image.Image]:
     """Sheets of the truth beside one step after another; runs with fewer steps wait at the end."""
     last = max(len(tiles) for _, tiles in lines) - 1
     for step in [*range(1, last), *[last] * HELD]:

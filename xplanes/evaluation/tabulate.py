@@ -24,7 +24,7 @@ SPREAD = ("psnr", "ssim", "psnr_thing")
 """Scores whose standard deviation over seeds is shown."""
 
 LABELS = {
-    "psnr_thing": "psnr thing",
+    "psnr_thing": "psnr object",
     "start_psnr": "step 0",
     "seconds_to_20": "s to 20 dB",
     "prepare_seconds": "prepare s",
@@ -110,7 +110,7 @@ def run_table(
 
 
 def _measures(rows: Iterable[RunRow]) -> list[str]:
-    """Columns of a table: that of the thing is there if any run scores it alone."""
+    """Columns of a table: that of the foreground object is there if any run scores it alone."""
     known = any("psnr_thing" in row.scores for row in rows)
     return [name for name in MEASURES if known or name != "psnr_thing"]
 

@@ -302,6 +302,7 @@ exec(compile(open({train!r}).read(), {train!r}, "exec"), globals())
 """
 
 
+@pytest.mark.slow
 def test_two_processes_share_the_rays_and_end_with_one_model(root: str, tmp_path: Path) -> None:
     run, script = tmp_path / "run", tmp_path / "each_rank.py"
     script.write_text(

@@ -12,6 +12,7 @@ from xplanes.rendering.sampler import Site, scene_cube
 from xplanes.streams import TrainingState
 
 
+@pytest.mark.slow
 def test_surface_run_learns_resumes_and_is_loaded(scenes, tmp_path, monkeypatch):
     schedule = ("model.fine_from=6", "model.blur_until=15", "trainer.max_steps=20")
     config = baseline_config(scenes, "model=tensor4d", *TENSOR4D, *NEUS, *schedule)

@@ -1,4 +1,4 @@
-"""PSNR against seconds and memory: planes, starts, resolutions, samples, precision, baselines.
+"""PSNR against seconds and memory: planes, initialisations, resolutions, samples, precision, baselines.
 
     python benchmarks/pareto.py [--lego FOLDER] [--seconds 20] [--resolution 100] [--together 1]
         [--work FOLDER]
@@ -207,7 +207,10 @@ views of the test split (lego: val), one seed; {machine()}.
 "on front": at some time, preparation included, the run is within {MARGIN:g} dB of the best; PSNR is
 interpolated linearly between evaluations. During training four views are scored; for baselines two,
 and less often. Runs initialised from the LRM see frames of a video that the others do not, except
-on lego, which has none ([effect of these frames](initialisation.md)).
+on lego, which has none ([effect of these frames](initialisation.md)). `smaller` is K-Planes at a
+size that learns within a minute on a CPU; `our grid` replaces the published sampler by the
+occupancy grid of X-Planes; `from a field` places Gaussians on the surfaces of a six-plane field that
+is trained beforehand (`lrm=field`).
 
     {command()}
 

@@ -1,4 +1,4 @@
-"""PSNR against seconds and memory: planes, initialisations, resolutions, samples, precision, baselines.
+"""PSNR against seconds and memory: planes, initialisations, sampling, precision, baselines.
 
     python benchmarks/pareto.py [--lego FOLDER] [--seconds 20] [--resolution 100] [--together 1]
         [--work FOLDER]
@@ -209,8 +209,8 @@ interpolated linearly between evaluations. During training four views are scored
 and less often. Runs initialised from the LRM see frames of a video that the others do not, except
 on lego, which has none ([effect of these frames](initialisation.md)). `smaller` is K-Planes at a
 size that learns within a minute on a CPU; `our grid` replaces the published sampler by the
-occupancy grid of X-Planes; `from a field` places Gaussians on the surfaces of a six-plane field that
-is trained beforehand (`lrm=field`).
+occupancy grid of X-Planes; `from a field` places Gaussians on the surfaces of a six-plane field
+that is trained beforehand (`lrm=field`).
 
     {command()}
 

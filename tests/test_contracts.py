@@ -665,7 +665,7 @@ LAYERS = (
     ("cli",),
     ("__main__",),
 )
-"""Rooms of the house: imports only point up this list.
+"""Layers: imports only point up this list.
 
 An LRM brings a decoder of the fields' kind, so fields stand above it.
 """

@@ -2,7 +2,7 @@
 
     python benchmarks/stability.py [--select EXPRESSION]
 
-Writes docs/results/stability.md and .png. One process, one thread, ten to fifteen minutes.
+Writes docs/results/stability.md and .png. One process, one thread, half an hour.
 """
 
 import os

@@ -52,7 +52,7 @@ def test_contraction(tally, kind) -> None:
 
 
 def test_expansion(tally) -> None:
-    """Expansion undoes contraction: points 0 to 1e6 away, and at infinity, in float64"""
+    """Contraction undone: points 0 to 1e6 away, and at infinity, in float64"""
     for length in (each for each in LENGTHS if each <= 1e6):
         points = torch.from_numpy(length * towards())
         back = expand(contract(points))

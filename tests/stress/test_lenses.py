@@ -54,7 +54,7 @@ EXTREMES = {
 
 @pytest.mark.parametrize("name", EXTREMES)
 def test_extreme_lenses(tally, name):
-    """Rays through corners, edges and middles of images with extreme lenses, both precisions"""
+    """Lenses: rays through corners, edges and middles, extreme distortion, both precisions"""
     model, k = EXTREMES[name]
     places = torch.tensor([0.0, 1.0, 250.0, 499.5, 500.0, 731.25, 998.0, 999.0])
     rows, columns = (
@@ -78,7 +78,7 @@ def test_extreme_lenses(tally, name):
 
 
 def test_fisheye_lenses_up_to_the_antipole(tally):
-    """Fisheye rays at angles up to 180 degrees from the axis, and back to their pixels"""
+    """Lenses: fisheye rays at angles up to 180 degrees from the axis, and back to their pixels"""
     k = {"k1": 0.01, "k2": 0.001}
     lenses = lens("fisheye", k)
     for away in (1e-12, 1e-6, 1e-3, 0.1, 1.0, 2.0, 3.0, math.pi - 1e-3, math.pi - 1e-6):
@@ -105,7 +105,7 @@ def test_fisheye_lenses_up_to_the_antipole(tally):
 
 
 def test_no_lens_gives_rays_that_are_not_finite(tally):
-    """Random coefficients, foldable or not, at pixels far inside and far outside of images"""
+    """Lenses: random coefficients, foldable or not, pixels far inside and outside of images"""
     generator = torch.Generator().manual_seed(0)
     for case in range(300):
         scale = 10 ** (6 * torch.rand(1, generator=generator).item() - 4)

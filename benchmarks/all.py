@@ -136,10 +136,9 @@ def kind_of(machine: str) -> str:
     return re.sub(r"^\d+ of ", "", machine)
 
 
-def recorded() -> dict[str, dict[str, Any] | None]:
-    """What `state_of` was when each script last made its results; None for those never made."""
-    made = json.loads(MADE.read_text(encoding="utf-8")) if MADE.is_file() else {}
-    return {name: made.get(name) for name in PARTS}
+def recorded() -> dict[str, dict[str, Any]]:
+    """What `state_of` was when each script last made its results."""
+    return json.loads(MADE.read_text(encoding="utf-8")) if MADE.is_file() else {}
 
 
 def why_stale(now: dict[str, Any], then: dict[str, Any] | None) -> str:
@@ -168,7 +167,8 @@ def main() -> int:
     parser.add_argument("--list", action="store_true", help="say what is stale, and make nothing")
     parser.add_argument("--only", nargs="+", choices=list(PARTS))
     args = parser.parse_args()
-    stale = {name: why_stale(state_of(name), then) for name, then in recorded().items()}
+    made = recorded()
+    stale = {name: why_stale(state_of(name), made.get(name)) for name in PARTS}
     for name, reason in stale.items():
         print(f"{name:<22}{reason or 'up to date'}")
     if args.list:
@@ -190,8 +190,7 @@ def main() -> int:
             continue
         shutil.rmtree(WORK / name)
         made = recorded() | {name: state}  # Another process may have made other results.
-        known = {key: then for key, then in sorted(made.items()) if then is not None}
-        write_text(MADE, json.dumps(known, indent=1) + "\n")
+        write_text(MADE, json.dumps(dict(sorted(made.items())), indent=1) + "\n")
     if failed:
         print(f"failed: {', '.join(failed)}")
     return bool(failed)

@@ -36,7 +36,6 @@ from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 from xplanes.rendering.compositing import composite_gpu
 from xplanes.rendering.marching import march_gpu
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.rendering.visibility import Visibility
 
 ARCHITECTURES = (80, 86, 90, 120)
 """Compute capabilities: A100, RTX 3090, H100, RTX 5090."""
@@ -142,7 +141,7 @@ def marching() -> None:
     grid, rays = OccupancyGrid(4, 2, step=0.1), [torch.zeros(5, 3), torch.ones(5, 3)]
     rays += [torch.zeros(5), torch.zeros(5)]
     given = {"step": 0.1, "occupied": grid.occupied, "limit": 7.0}
-    march_gpu(*rays, grid, room=9, visibility=Visibility(8), **given)
+    march_gpu(*rays, grid, room=9, **given)
 
 
 CASES: dict[str, Callable[[], None]] = {

@@ -52,7 +52,6 @@ from xplanes.lrm.bundled import load_bundled
 from xplanes.rendering.compositing import composite_gpu, composite_reference
 from xplanes.rendering.marching import Samples, march_gpu, march_into
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.rendering.visibility import Visibility
 from xplanes.scenes.batches import DeviceBatches
 
 BEGAN = time.monotonic()
@@ -385,14 +384,13 @@ def measure_compositing(record: Record, part: "Part", args: argparse.Namespace) 
 
 def marching_case(rays: int, device: torch.device) -> tuple[Callable[[], Samples], ...]:
     """Kernel and twin, for rays through a cube in which a tenth of the cells holds something."""
-    grid, visibility = OccupancyGrid(64, 8, step=STEP).to(device), Visibility(128).to(device)
+    grid = OccupancyGrid(64, 8, step=STEP).to(device)
     grid.occupied.copy_(torch.rand(len(grid.occupied), device=device) < 0.1)
     grid.least.copy_(grid.occupied * torch.rand(len(grid.least), device=device) / STEP)
-    visibility.last.copy_(torch.rand(len(visibility.last), device=device) < 0.7)
     origins = 3 * functional.normalize(torch.randn(rays, 3, device=device), dim=1)
     directions = functional.normalize(torch.rand(rays, 3, device=device) - 0.5 - origins, dim=1)
     times, jitter = torch.rand(2, rays, device=device)
-    options = {"step": STEP, "occupied": grid.occupied, "limit": 7.0, "visibility": visibility}
+    options = {"step": STEP, "occupied": grid.occupied, "limit": 7.0}
     given = (origins, directions, times, jitter, grid)
 
     def call(function: Callable[..., Samples]) -> Callable[[], Samples]:

@@ -24,7 +24,6 @@ from xplanes.files import write_rows, write_text
 ONE_OFF = {
     "empty space off": ("model.sampler.skip_empty=false",),
     "occlusion off": ("model.sampler.skip_occluded=false",),
-    "unseen cells off": ("model.sampler.skip_unseen=false",),
     "silhouettes off": ("model.sampler.silhouettes=false",),
     "background off": ("model.rays.skip_background=false",),
     "coarse steps off": ("model.sampler.coarse_steps=0",),

@@ -23,7 +23,6 @@ from tests.oracles import ray_box
 from xplanes.rendering import marching
 from xplanes.rendering.marching import march, march_gpu, march_into, march_reference
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.rendering.visibility import Visibility
 
 try:
     import triton
@@ -138,30 +137,6 @@ def test_loops_and_twin_agree_on_many_rays():
             )
         for name in ("candidates", "empty", "occluded"):
             assert getattr(ours, name) == getattr(theirs, name), (case, name)
-
-
-@pytest.mark.parametrize(("skip_empty", "occlusion"), OPTIONS)
-def test_samples_in_unseen_cells_are_dropped_where_asked(skip_empty, occlusion):
-    """Cells that are finer than the grid's, and not a whole number of them to each."""
-    grid, rays, visibility = grid_of(), rays_of(300), Visibility(13)
-    given = {"step": STEP, "skip_empty": skip_empty, "occlusion": occlusion}
-    every = march(*rays, grid, **given)
-    assert len(march(*rays, grid, **given, visibility=visibility)) == len(every)
-    visibility.last.copy_(torch.rand(13**3, generator=torch.Generator().manual_seed(2)) < 0.5)
-    shown = visibility.sees(every.points)
-    seen = march(*rays, grid, **given, visibility=visibility)
-    assert visibility.sees(seen.points).all()
-    if occlusion == 0:
-        assert torch.equal(seen.points, every.points[shown])
-        assert torch.equal(seen.ray, every.ray[shown])
-    else:  # What is not seen hides nothing.
-        assert len(seen) > shown.sum() > 0
-    given["visibility"] = visibility
-    for other in (twin(rays, grid, **given), into(rays, grid, len(seen), **given)):
-        assert torch.equal(other.cells, seen.cells)
-        torch.testing.assert_close(other.points, seen.points, atol=1e-12, rtol=0)
-        for name in ("candidates", "empty", "occluded"):
-            assert int(getattr(other, name)) == int(getattr(seen, name))
 
 
 def test_in_float32_only_samples_on_borders_differ():
@@ -422,9 +397,7 @@ def same_places(found, expected):
 @needs_triton
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_kernel_fills_a_fixed_number_of_places_as_the_twin_does(dtype):
-    grid, rays, visibility = grid_of(7, 3), rays_of(16, dtype), Visibility(13)
-    visibility.last.copy_(torch.rand(13**3, generator=torch.Generator().manual_seed(2)) < 0.7)
-    given = {"occlusion": 0.001, "visibility": visibility}
+    grid, rays, given = grid_of(7, 3), rays_of(16, dtype), {"occlusion": 0.001}
     number = len(twin(rays, grid, **given))
     assert number > 20
     for room in (number + 9, number, number - 1, number // 2, 0):

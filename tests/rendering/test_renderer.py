@@ -2,20 +2,15 @@
 
 import itertools
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 
-from xplanes.config import compose_plain
 from xplanes.rendering.grid_renderer import (
     DIAGONAL,
     GridRenderer,
-    OccupancySampler,
-    OccupancySettings,
 )
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.rendering.visibility import Visibility
 
 COLOUR = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
 WHITE = torch.ones(3, dtype=torch.float64)
@@ -223,55 +218,3 @@ def test_jitter_moves_samples_within_their_steps():
     first = samples.distances[samples.starts]
     expected = 2 * math.sqrt(3) + jitter * renderer.step
     torch.testing.assert_close(first, expected)
-
-
-def sampler_of(renderer, resolution):
-    options = compose_plain("train", [])["model"]["sampler"]
-    known = {key: value for key, value in options.items() if key not in ("_target_", "name")}
-    settings = OccupancySettings(name="occupancy", **known)
-    visibility = Visibility(resolution)
-    visibility.forget()
-    return OccupancySampler(renderer, settings, visibility=visibility)
-
-
-def test_what_lets_light_through_is_seen_to_its_end():
-    """Fog of which no cell stops much, and each its share."""
-    renderer, rays = renderer_of(), rays_of(400)
-    sampler = sampler_of(renderer, 9)
-    seen = renderer.render(fog(0.3), *rays, WHITE)
-    assert seen.weights.max() < 0.02
-    sampler.observe(seen)
-    assert sampler.visibility.sees(seen.samples.points).all()
-    images = replace(renderer, visibility=sampler.visibility)
-    again = images.render(fog(0.3), *rays, WHITE)
-    assert torch.equal(again.opacity, seen.opacity)
-
-
-@pytest.mark.parametrize("skip_unseen", [True, False])
-def test_images_show_nothing_that_no_training_ray_has_seen(skip_unseen):
-    """A slab seen from above alone, with untrained matter below it, which another view looks at.
-
-    Cells of visibility are finer than those of the grid: what they cut is thinner than those.
-    """
-    renderer = renderer_of(256)
-
-    def slab(points, times):
-        density = torch.where(points[:, 2] < 0.3, 200.0, 0.0).to(points)
-        return COLOUR.expand(len(points), 3), density
-
-    count = 20_000
-    generator = torch.Generator().manual_seed(0)
-    origins = 1.8 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.9
-    origins[:, 2] = 2
-    down = torch.tensor([0, 0, -1.0]).double().expand(count, 3)
-    times = torch.zeros(count, dtype=torch.float64)
-    sampler = sampler_of(renderer, 40)
-    sampler.observe(renderer.render(slab, origins, down, times, WHITE))
-    images = replace(renderer, visibility=sampler.visibility if skip_unseen else None)
-    above = images.render(slab, origins, down, times, WHITE)
-    assert (above.opacity > 0.999).all()
-    heights = torch.linspace(-0.95, 0.2, 13, dtype=torch.float64)
-    origins = torch.stack([torch.full_like(heights, 2), torch.zeros_like(heights), heights], dim=1)
-    sideways = torch.tensor([-1.0, 0, 0]).double().expand(13, 3)
-    below = images.render(slab, origins, sideways, times[:13], WHITE)
-    assert (below.opacity == 0 if skip_unseen else below.opacity > 0.999).all()

@@ -20,9 +20,7 @@ def cell(place, size):
 
 
 @njit(inline="always", **EXACT)
-def cell_to_sample(
-    r, distance, origins, directions, start, slope, bins, occupied, size, seen, finest, skip
-):
+def cell_to_sample(r, distance, start, slope, bins, occupied, size, skip):
     """Index of the cell in which ray r is at a distance; -1 where no sample is wanted there."""
     x = cell(start[r, 0] + distance * slope[r, 0], size)
     y = cell(start[r, 1] + distance * slope[r, 1], size)
@@ -30,20 +28,11 @@ def cell_to_sample(
     index = ((bins[r] * size + z) * size + y) * size + x
     if skip and not occupied[index]:
         index = -1
-    elif finest > 0:
-        half = 0.5 * finest
-        x = cell((origins[r, 0] + distance * directions[r, 0] + 1) * half, finest)
-        y = cell((origins[r, 1] + distance * directions[r, 1] + 1) * half, finest)
-        z = cell((origins[r, 2] + distance * directions[r, 2] + 1) * half, finest)
-        if seen[(z * finest + y) * finest + x] == 0:
-            index = -1
     return index
 
 
 @njit(parallel=True, **EXACT)
 def count_samples(
-    origins,
-    directions,
     start,
     slope,
     bins,
@@ -52,38 +41,20 @@ def count_samples(
     step,
     occupied,
     size,
-    seen,
-    finest,
     skip,
     far,
     least,
     limit,
     counts,
 ):
-    """Candidates, samples in cells to look into, and those not behind a surface, for each ray.
-
-    No cell is unseen where ``finest`` is 0.
-    """
+    """Candidates, samples in cells to look into, and those not behind a surface, for each ray."""
     for r in prange(len(near)):
         candidates, found, visible = 0, 0, 0
         depth = 0.0
         distance = near[r] + jitter[r] * step
         while distance < far[r]:
             candidates += 1
-            index = cell_to_sample(
-                r,
-                distance,
-                origins,
-                directions,
-                start,
-                slope,
-                bins,
-                occupied,
-                size,
-                seen,
-                finest,
-                skip,
-            )
+            index = cell_to_sample(r, distance, start, slope, bins, occupied, size, skip)
             if index >= 0:
                 found += 1
                 if depth < limit:
@@ -105,8 +76,6 @@ def fill_samples(
     step,
     occupied,
     size,
-    seen,
-    finest,
     skip,
     starts,
     counts,
@@ -122,41 +91,12 @@ def fill_samples(
         while place < end:
             distance = near[r] + (candidate + jitter[r]) * step
             candidate += 1
-            index = cell_to_sample(
-                r,
-                distance,
-                origins,
-                directions,
-                start,
-                slope,
-                bins,
-                occupied,
-                size,
-                seen,
-                finest,
-                skip,
-            )
+            index = cell_to_sample(r, distance, start, slope, bins, occupied, size, skip)
             if index >= 0:
                 ray[place], distances[place], cells[place] = r, distance, index
                 for axis in range(3):
                     points[place, axis] = origins[r, axis] + distance * directions[r, axis]
                 place += 1
-
-
-@njit(parallel=True, **EXACT)
-def mark_seen(points, weights, starts, enough, mark, size, last):
-    half = 0.5 * size
-    for r in prange(len(starts)):
-        end = starts[r + 1] if r + 1 < len(starts) else len(points)
-        light = 1.0
-        for i in range(starts[r], end):
-            if light > enough:
-                x = cell((points[i, 0] + 1) * half, size)
-                y = cell((points[i, 1] + 1) * half, size)
-                z = cell((points[i, 2] + 1) * half, size)
-                # Whoever writes here writes the same.
-                last[(z * size + y) * size + x] = mark
-            light -= weights[i]
 
 
 @njit(parallel=True, **COMPILE)

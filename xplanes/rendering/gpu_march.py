@@ -70,11 +70,8 @@ def look(
     time_bin,
     inside,
     occupied,
-    seen,
     size,
-    finest,
     SKIP: tl.constexpr,
-    SEEN: tl.constexpr,
 ):
     """Cells of a block of places on a ray, and whether samples are wanted there."""
     x, y, z = (
@@ -87,10 +84,6 @@ def look(
     wanted = inside
     if SKIP:
         wanted = wanted & (tl.load(occupied + cell, mask=wanted, other=0) != 0)
-    if SEEN:
-        column, row = within(x * (0.5 * finest), finest), within(y * (0.5 * finest), finest)
-        fine = (within(z * (0.5 * finest), finest) * finest + row) * finest + column
-        wanted = wanted & (tl.load(seen + fine, mask=wanted, other=0) != 0)
     return cell, wanted
 
 
@@ -109,7 +102,7 @@ def not_hidden(least, cell, wanted, step, limit, depth, opaque, LIMITED: tl.cons
     return kept, depth
 
 
-@triton.jit(do_not_specialize=["rays", "size", "bins", "finest", "room"])
+@triton.jit(do_not_specialize=["rays", "size", "bins", "room"])
 def march(
     origins,
     directions,
@@ -117,7 +110,6 @@ def march(
     jitter,
     occupied,
     least,
-    seen,
     step,
     limit,
     counts,
@@ -129,11 +121,9 @@ def march(
     rays,
     size,
     bins,
-    finest,
     opaque,
     room,
     SKIP: tl.constexpr,
-    SEEN: tl.constexpr,
     LIMITED: tl.constexpr,
     FILL: tl.constexpr,
     BLOCK: tl.constexpr,
@@ -159,9 +149,7 @@ def march(
         n = first + tl.arange(0, BLOCK)
         distance = near + (n.to(near.dtype) + shift) * spacing
         inside = distance < far
-        cell, wanted = look(
-            origin, direction, distance, time_bin, inside, occupied, seen, size, finest, SKIP, SEEN
-        )
+        cell, wanted = look(origin, direction, distance, time_bin, inside, occupied, size, SKIP)
         shown, depth = not_hidden(least, cell, wanted, exact_step, limit, depth, opaque, LIMITED)
         number = shown.to(tl.int32)
         if FILL:
@@ -188,13 +176,12 @@ def march(
         tl.store(counts + 2 * rays + ray, kept)
 
 
-def launch(rays, grid, seen, spacing, counts, room, found=None):
+def launch(rays, grid, spacing, counts, room, found=None):
     """Launches `march`: to count, or with ``found`` to write down.
 
     Args:
         rays: Origins, directions, times and jitter.
         grid: Flags of cells to look into (None: all), least densities, resolution and time bins.
-        seen: Flags of fine cells and how many lie along each side; None: all are seen.
         spacing: Distance of the places and largest optical depth in front, float64 [] each.
         counts: Places in the cube, samples wanted, and those not hidden. int64 [3, R]
         room: Places to write to.
@@ -203,10 +190,9 @@ def launch(rays, grid, seen, spacing, counts, room, found=None):
     number = len(rays[0])
     occupied, least, size, bins, opaque, limited = grid
     unused = counts
-    fine, finest = (unused, 1) if seen is None else seen
-    given = (*rays, unused if occupied is None else occupied, least, fine, *spacing, counts)
+    given = (*rays, unused if occupied is None else occupied, least, *spacing, counts)
     written = [unused] * 5 if found is None else found
-    flags = {"SKIP": occupied is not None, "SEEN": seen is not None, "LIMITED": limited}
+    flags = {"SKIP": occupied is not None, "LIMITED": limited}
     if number:
         with torch.cuda.device_of(counts):
             march[(number,)](
@@ -215,7 +201,6 @@ def launch(rays, grid, seen, spacing, counts, room, found=None):
                 number,
                 size,
                 bins,
-                finest,
                 opaque,
                 room,
                 **flags,

@@ -19,7 +19,6 @@ from xplanes.rendering.marching import march
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
 from xplanes.rendering.thinning import Cut
-from xplanes.rendering.visibility import Visibility, finest_cells
 from xplanes.rendering.warming import render_one_ray
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Range, Share, Steps, Weight
@@ -31,22 +30,8 @@ SPARE = 1.25
 STEP_OF_ROOM = 1024
 """Their number is a multiple of this."""
 
-UNSEEN_FROM = 400
-"""Step of the first sweep after which a cell may count as unseen: before, few have met a ray."""
-
 DIAGONAL = 2 * math.sqrt(3)
 """Longest way through the field's cube."""
-
-
-@dataclass(frozen=True)
-class GridRendering(Rendering):
-    """What rays see, and which samples they see it by.
-
-    Attributes:
-        weights: Share of its ray's light that each sample stops, without gradient. [N]
-    """
-
-    weights: Tensor
 
 
 @dataclass(frozen=True)
@@ -57,7 +42,6 @@ class GridRenderer(RayRenderer):
         grid: Which cells hold something, and when.
         samples: Steps along the diagonal of the field's cube.
         skip_empty: Skip samples in empty cells.
-        visibility: Skip samples in cells that it has not seen; None skips none.
         occlusion: Skip samples behind surfaces that leave less light than this; 0 skips none.
         thinning: Where gradients are wanted, samples whose own is below this times the mean may be
             left out, see `Cut.pass_on`; 0 leaves none out. On the CPU alone: elsewhere choosing
@@ -68,7 +52,6 @@ class GridRenderer(RayRenderer):
     grid: OccupancyGrid
     samples: int
     skip_empty: bool = True
-    visibility: Visibility | None = None
     occlusion: float = 0.001
     thinning: float = 0.0
     room: int | None = None
@@ -90,7 +73,7 @@ class GridRenderer(RayRenderer):
         times: Tensor,
         background: Tensor,
         jitter: Tensor | None = None,
-    ) -> GridRendering:
+    ) -> Rendering:
         """Render rays.
 
         Args:
@@ -113,7 +96,6 @@ class GridRenderer(RayRenderer):
             self.grid,
             step=self.step,
             skip_empty=self.skip_empty,
-            visibility=self.visibility,
             occlusion=self.occlusion,
             room=self.room,
         )
@@ -127,7 +109,7 @@ class GridRenderer(RayRenderer):
         colour, density = (cut.colour, cut.density) if cut else ask(slice(None))
         if samples.live is not None:
             density = torch.where(samples.live, density, 0)
-        total, weights = composite(
+        total, _ = composite(
             density * self.step,
             colour,
             samples.distances,
@@ -140,13 +122,12 @@ class GridRenderer(RayRenderer):
         if samples.shown is not None:
             # A ray without room sees nothing but the background, which must not learn from it.
             background = torch.where(samples.shown[:, None], background, background.detach())
-        return GridRendering(
+        return Rendering(
             colour=total[:, :3] + (1 - opacity)[:, None] * background,
             opacity=opacity,
             depth=(total[:, 4] / opacity.clamp_min(1e-6)).detach(),
             density=density.detach(),
             samples=samples,
-            weights=weights,
             cut=cut,
         )
 
@@ -166,7 +147,6 @@ class OccupancySettings(SamplerSettings):
     world_threshold: Fraction  # Replaces `model.sampler.threshold` if a background is learnt.
     decay: Share  # Decay of a cell's density at each update.
     skip_empty: bool  # Skip samples in empty cells.
-    skip_unseen: bool  # Leave cells that no training ray has seen out of rendered images.
     skip_occluded: bool  # Skip samples behind opaque surfaces.
     occlusion: Annotated[float, Range(0, 1)]  # Transmittance below which samples are occluded.
     thinning: Weight  # Subsample gradients below this times the mean, on the CPU; 0: off.
@@ -210,20 +190,7 @@ class OccupancySettings(SamplerSettings):
                 carve(grid, site.views, site.frame)
             if site.initialised and self.fill:
                 _fill(renderer, field, site)
-        return OccupancySampler(
-            renderer,
-            self.scaled(site),
-            site.samples_per_batch,
-            visibility=self._visibility(site),
-            unseen_from=site.steps(UNSEEN_FROM),
-        )
-
-    def _visibility(self, site: Site) -> Visibility | None:
-        if not self.skip_unseen:
-            return None
-        if site.views is None:
-            return Visibility(self.grid_resolution)
-        return Visibility(finest_cells(site.views, site.frame, self.grid_resolution))
+        return OccupancySampler(renderer, self.scaled(site), site.samples_per_batch)
 
     def scaled(self, site: Site) -> "OccupancySettings":
         """The same schedule in steps of the batches of a site.
@@ -261,8 +228,6 @@ class OccupancySampler(Sampler):
         renderer: Its grid is changed in place.
         settings: Upkeep of the grid.
         samples: Samples of a batch on average at most; None if not known.
-        visibility: Changed in place; images leave out what it has not seen.
-        unseen_from: Step of the first sweep after which a cell may count as unseen.
     """
 
     def __init__(
@@ -270,19 +235,14 @@ class OccupancySampler(Sampler):
         renderer: GridRenderer,
         settings: OccupancySettings,
         samples: int | None = None,
-        visibility: Visibility | None = None,
-        unseen_from: int = UNSEEN_FROM,
     ) -> None:
         self.settings, self.grid, self.samples = settings, renderer.grid, samples
-        self.visibility = visibility
-        self.unseen_from = unseen_from
         room = None if samples is None else self._room(samples)
         self._training = replace(renderer, thinning=settings.thinning, room=room)
         self._coarse = replace(self._training, samples=math.ceil(renderer.samples / 2))
-        images = replace(renderer, visibility=visibility)
-        self._images = replace(images, samples=settings.render_samples)
+        self._images = replace(renderer, samples=settings.render_samples)
         self._is_coarse = settings.coarse_steps > 0
-        self._coarse_images = replace(images, samples=self._coarse.samples)
+        self._coarse_images = replace(renderer, samples=self._coarse.samples)
 
     @property
     def renderer(self) -> GridRenderer:
@@ -290,8 +250,7 @@ class OccupancySampler(Sampler):
 
     @property
     def parts(self) -> dict[str, nn.Module]:
-        parts = {"grid": self.grid, "visibility": self.visibility}
-        return {name: part for name, part in parts.items() if part is not None}
+        return {"grid": self.grid}
 
     @property
     def outline(self) -> str:
@@ -304,7 +263,7 @@ class OccupancySampler(Sampler):
         # At first the grid hides little, and images of all samples would take longer than steps.
         return self._coarse_images if step < self.settings.coarse_steps else self._images
 
-    def render(self, field: Any, rays: Batch, state: TrainingState) -> GridRendering:
+    def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
         self._is_coarse = state.step < self.settings.coarse_steps
         return (self._coarse if self._is_coarse else self._training).render(
             field,
@@ -320,13 +279,9 @@ class OccupancySampler(Sampler):
             return rendering.samples.count
         return rendering.cut.pass_on(state.generator(rendering.density.device, Stream.THINNING))
 
-    def observe(self, rendering: GridRendering) -> None:
+    def observe(self, rendering: Rendering) -> None:
         samples = rendering.samples
         self.grid.observe(samples.cells, rendering.density, samples.live)
-        if self.visibility is not None:
-            self.visibility.observe(
-                samples.points, rendering.weights, samples.ray, samples.starts, samples.live
-            )
 
     def update(self, field: Any, state: TrainingState) -> None:
         step, settings = state.step, self.settings
@@ -336,8 +291,6 @@ class OccupancySampler(Sampler):
         self._agree()
         generator = step_generator(state.seed, step, Stream.GRID)
         if sweeping:
-            if step >= self.unseen_from:
-                self._forget_unseen()
             self.grid.sweep(field, generator)
         elif (device := self.grid.density.device).type != "cpu":
             shape = (settings.update_cells, 8)
@@ -351,14 +304,6 @@ class OccupancySampler(Sampler):
         if distributed.is_available() and distributed.is_initialized():
             for part in (self.grid.density, self.grid.least, self.grid.occupied):
                 distributed.broadcast(part, src=0)
-
-    def _forget_unseen(self) -> None:
-        """Forget what no process has seen of late."""
-        if self.visibility is None:
-            return
-        if distributed.is_available() and distributed.is_initialized():
-            distributed.all_reduce(self.visibility.last, distributed.ReduceOp.MAX)
-        self.visibility.forget()
 
     def expect(self, samples: float) -> None:
         if self.samples is None:

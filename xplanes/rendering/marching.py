@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,7 +12,6 @@ from xplanes.backend import compiled, cpu_loops, gpu_kernels, gpu_module, proven
 from xplanes.rendering.box import ray_box
 from xplanes.rendering.compositing import OPAQUE, depth_before
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.rendering.visibility import Visibility
 
 OUTSIDE = 3.0
 """Coordinate of places without a sample, beyond the planes: nothing is read or added there."""
@@ -74,7 +72,6 @@ def march(
     *,
     step: float,
     skip_empty: bool = True,
-    visibility: Visibility | None = None,
     occlusion: float = 0.0,
     room: int | None = None,
 ) -> Samples:
@@ -88,7 +85,6 @@ def march(
         grid: Tells which cells are empty.
         step: Distance between samples.
         skip_empty: Whether samples in empty cells are dropped.
-        visibility: Samples in cells that it has not seen are dropped as well.
         occlusion: Samples that the grid's least densities leave less light than this are dropped;
             0 keeps all.
         room: Places set apart for samples on a device other than the CPU, so that nothing waits for
@@ -102,20 +98,12 @@ def march(
     rays = origins, directions, times, jitter
     occupied = grid.occupied if skip_empty else None
     if cpu_loops(origins):
-        return _march_cpu(
-            *rays, grid, step=step, occupied=occupied, limit=limit, visibility=visibility
-        )
+        return _march_cpu(*rays, grid, step=step, occupied=occupied, limit=limit)
     if gpu_kernels(origins) and _kernels_hold(origins.device, origins.dtype):
-        return march_gpu(
-            *rays, grid, step=step, occupied=occupied, limit=limit, room=room, visibility=visibility
-        )
+        return march_gpu(*rays, grid, step=step, occupied=occupied, limit=limit, room=room)
     if room is not None and origins.device.type != "cpu":
-        return march_into(
-            *rays, grid, step=step, occupied=occupied, limit=limit, room=room, visibility=visibility
-        )
-    return march_reference(
-        *rays, grid, step=step, occupied=occupied, limit=limit, visibility=visibility
-    )
+        return march_into(*rays, grid, step=step, occupied=occupied, limit=limit, room=room)
+    return march_reference(*rays, grid, step=step, occupied=occupied, limit=limit)
 
 
 def march_reference(
@@ -128,7 +116,6 @@ def march_reference(
     step: float,
     occupied: Tensor | None,
     limit: float,
-    visibility: Visibility | None = None,
 ) -> Samples:
     """The same as `march`, in whole-tensor operations."""
     near, far = ray_box(origins, directions)
@@ -137,8 +124,6 @@ def march_reference(
         origins, directions, times, jitter, near, far, grid, step, steps
     )
     live = inside if occupied is None else inside & occupied[cells]
-    if visibility is not None:
-        live = live & _seen(visibility, origins, directions, distances)
     ray, place = live.nonzero(as_tuple=True)
     distances, cells = distances[ray, place], cells[ray, place]
     candidates, found = int(inside.sum()), len(ray)
@@ -181,12 +166,6 @@ def _all_samples(
     return distances, cells, distances < far[:, None]
 
 
-def _seen(visibility: Visibility, origins: Tensor, directions: Tensor, distances: Tensor) -> Tensor:
-    """Whether samples lie in cells that training rays have seen. bool [R, S]"""
-    points = torch.addcmul(origins[:, None], directions[:, None], distances[..., None])
-    return visibility.sees(points.flatten(0, 1)).view_as(distances)
-
-
 def march_into(
     origins: Tensor,
     directions: Tensor,
@@ -198,7 +177,6 @@ def march_into(
     occupied: Tensor | None,
     limit: float,
     room: int,
-    visibility: Visibility | None = None,
 ) -> Samples:
     """The same as `march_reference` into a fixed number of places, without waiting for the device.
 
@@ -210,8 +188,6 @@ def march_into(
         origins, directions, times, jitter, near, far, grid, step, steps
     )
     met = inside if occupied is None else inside & occupied[cells]
-    if visibility is not None:
-        met = met & _seen(visibility, origins, directions, distances)
     kept = met
     if math.isfinite(limit):
         depth = (grid.least[cells].double() * step).clamp_max(OPAQUE) * met
@@ -253,7 +229,6 @@ def march_gpu(
     occupied: Tensor | None,
     limit: float,
     room: int | None,
-    visibility: Visibility | None = None,
 ) -> Samples:
     """The same as `march_into`, or as `march_reference` without ``room``, in a Triton kernel.
 
@@ -262,12 +237,11 @@ def march_gpu(
     gpu = gpu_module("xplanes.rendering.gpu_march")
     rays, device = len(origins), origins.device
     given = [t.contiguous() for t in (origins, directions, times, jitter)]
-    seen = None if visibility is None else (visibility.last, visibility.resolution)
     limited = math.isfinite(limit)
     cells_of = (occupied, grid.least, grid.resolution, grid.time_bins, OPAQUE, limited)
     spacing = [torch.full((), n, dtype=torch.float64, device=device) for n in (step, limit)]
     counts = torch.zeros(3, rays, dtype=torch.int64, device=device)
-    gpu.launch(given, cells_of, seen, spacing, counts, 0)
+    gpu.launch(given, cells_of, spacing, counts, 0)
     ends = counts[2].cumsum(0)
     tally = counts.sum(dim=1)
     if room is None:
@@ -283,9 +257,7 @@ def march_gpu(
     distances, points = origins.new_zeros(places), origins.new_full((places, 3), OUTSIDE)
     cells = torch.zeros(places, dtype=torch.int64, device=device)
     kept = counts if shown is None else counts * shown
-    gpu.launch(
-        given, cells_of, seen, spacing, kept, places, (starts, ray, distances, cells, points)
-    )
+    gpu.launch(given, cells_of, spacing, kept, places, (starts, ray, distances, cells, points))
     return Samples(
         ray=ray,
         starts=starts,
@@ -308,23 +280,13 @@ def _kernels_hold(device: torch.device, dtype: torch.dtype) -> bool:
     def attempt(function: Callable[..., Samples], precision: torch.dtype) -> list[Tensor]:
         grid = OccupancyGrid(6, 3, step=STEP_OF_TRIAL).to(device)
         grid.least.copy_(20 * waves(device, len(grid.least)).abs())
-        visibility = Visibility(13).to(device)
-        visibility.last.copy_(waves(device, len(visibility.last)) > -0.5)
         origins = 2 * waves(device, 50, 3)
         ahead = 0.9 * waves(device, 57, 3)[7:] - origins
         directions = torch.nn.functional.normalize(ahead, dim=-1)
         times, jitter = (numbers.clone() for numbers in waves(device, 2, 50).abs())
         rays = [t.to(precision) for t in (origins, directions, times, jitter)]
         occupied = waves(device, len(grid.least)) > 0
-        found = function(
-            *rays,
-            grid,
-            step=STEP_OF_TRIAL,
-            occupied=occupied,
-            limit=3.0,
-            room=400,
-            visibility=visibility,
-        )
+        found = function(*rays, grid, step=STEP_OF_TRIAL, occupied=occupied, limit=3.0, room=400)
         assert found.live is not None
         here = found.live
         numbers = [found.candidates, found.empty, found.occluded, found.count]
@@ -354,7 +316,6 @@ def _march_cpu(
     step: float,
     occupied: Tensor | None,
     limit: float,
-    visibility: Visibility | None = None,
 ) -> Samples:
     cpu = compiled("xplanes.rendering.cpu")
     near, far = ray_box(origins, directions)
@@ -362,15 +323,11 @@ def _march_cpu(
     origins, directions = origins.contiguous(), directions.contiguous()
     rays = (origins, directions, (origins + 1) * half, directions * half, grid.bins(times), near)
     wanted = (grid.occupied if occupied is None else occupied).numpy()
-    if visibility is None:
-        seen, finest = np.empty(0, np.uint8), 0
-    else:
-        seen, finest = visibility.last.numpy(), visibility.resolution
     ways = [t.numpy() for t in (*rays, jitter.contiguous())]
-    cells_to_sample = (wanted, grid.resolution, seen, finest, occupied is not None)
+    cells_to_sample = (wanted, grid.resolution, occupied is not None)
     counts = torch.empty(3, len(near), dtype=torch.int64)
     surfaces = (far.numpy(), grid.least.numpy(), limit)
-    cpu.count_samples(*ways, step, *cells_to_sample, *surfaces, counts.numpy())
+    cpu.count_samples(*ways[2:], step, *cells_to_sample, *surfaces, counts.numpy())
     candidates, found, kept = counts.sum(dim=1).tolist()
     starts = counts[2].cumsum(0) - counts[2]
     ray, cells = torch.empty(2, kept, dtype=torch.int64)

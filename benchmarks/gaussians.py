@@ -34,9 +34,9 @@ from xplanes.fields.gaussians import Gaussians
 from xplanes.files import read_json, write_json, write_rows, write_text
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Views
-from xplanes.training.evaluation import ViewScore, mean_scores, render_view, score_view
 from xplanes.training.fit import Trainer
 from xplanes.training.module import RadianceModule
+from xplanes.training.scores import ViewScore, mean_scores, render_view, score_view
 
 GAUSSIANS = ("gaussians_hexplane", "gaussians_deform", "gaussians_spacetime")
 MODELS = {"six_planes": ("model=six_planes", "lrm=none")}

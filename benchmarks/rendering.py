@@ -25,7 +25,7 @@ from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.files import write_rows, write_text
 from xplanes.rendering.grid_renderer import GridRenderer
 from xplanes.scenes.views import Views
-from xplanes.training.evaluation import mean, render_view, score_view
+from xplanes.training.scores import mean, render_view, score_view
 
 SIZES = (100, 200, 400, 800)
 SAMPLES = (64, 128, 256)

@@ -18,7 +18,7 @@ import torch
 from xplanes.backend import fast_bf16
 from xplanes.config import CONF, compose_plain
 from xplanes.files import read_rows
-from xplanes.pipeline import run
+from xplanes.run import run
 
 RESULTS = Path(__file__).resolve().parent.parent / "docs" / "results"
 TRAIN, CPU_CLOCK = CONF.parent / "train.py", Path(__file__).resolve().parent / "cpu_clock.py"

@@ -53,7 +53,7 @@ STAGES = (
     ("checkpoints", "xplanes.training.checkpoints", "Checkpoints._save"),
     ("TensorBoard", "xplanes.training.module", "RadianceModule._log_terms"),
     ("TensorBoard", "lightning.pytorch.loggers.tensorboard", "TensorBoardLogger.log_metrics"),
-    ("video", "xplanes.pipeline", "_video"),
+    ("video", "xplanes.run", "_video"),
     ("Lightning's loop", "xplanes.training.fit", "Trainer.train"),
 )
 """Name of the stage, module and function."""

@@ -51,7 +51,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trained_run(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small finished run. Copy it before changing anything in it."""
     from tests.training.runs import small_config
-    from xplanes.pipeline import run
+    from xplanes.run import run
 
     folder = tmp_path_factory.mktemp("trained")
     run(small_config(scenes), folder / "outputs" / "run", ["seed=0"], resume=False)

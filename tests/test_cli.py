@@ -33,7 +33,7 @@ def test_help_loads_nothing_heavy(tmp_path):
 def test_the_error_of_a_quick_command_waits_for_nothing_heavy(tmp_path):
     code = (
         "import sys; from xplanes.cli import main; code = main(['inspect', 'nowhere']);"
-        "heavy = {'lightning', 'xplanes.pipeline'} & set(sys.modules);"
+        "heavy = {'lightning', 'xplanes.run'} & set(sys.modules);"
         "sys.exit(f'loaded {heavy}' if heavy else code)"
     )
     done = python("-c", code, cwd=tmp_path)

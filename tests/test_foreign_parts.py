@@ -18,7 +18,7 @@ from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError
 from xplanes.evaluation.evaluate import evaluate
 from xplanes.evaluation.runs import load_run
-from xplanes.pipeline import run
+from xplanes.run import run
 from xplanes.training.fit import Trainer
 
 PLAIN = {"accelerator": "cpu", "enable_progress_bar": False, "enable_model_summary": False}

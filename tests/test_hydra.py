@@ -11,7 +11,7 @@ from tests.training.runs import small_config
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.launch import prepare
-from xplanes.pipeline import run
+from xplanes.run import run
 
 ROOT = Path(__file__).resolve().parents[1]
 

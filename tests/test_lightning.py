@@ -18,7 +18,7 @@ from tests.training.runs import small_config
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
-from xplanes.pipeline import run
+from xplanes.run import run
 from xplanes.scenes.errors import SceneError
 from xplanes.training.fit import Trainer
 

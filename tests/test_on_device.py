@@ -37,10 +37,10 @@ from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes import batches
 from xplanes.scenes.batches import DeviceBatches
 from xplanes.training.clock import TrainingClock
-from xplanes.training.evaluation import score_view
 from xplanes.training.fit import warm_up
 from xplanes.training.meters import due
 from xplanes.training.module import TrainingError
+from xplanes.training.scores import score_view
 
 NOWHERE = Path("nowhere")
 """Folder of a scene that is handed over instead."""

@@ -16,7 +16,7 @@ from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.evaluation.runs import load_run
 from xplanes.fields.base import RadianceField
-from xplanes.pipeline import run
+from xplanes.run import run
 
 BLOB = {
     "_target_": "tests.plugins.gaussian_blob.BlobSettings",

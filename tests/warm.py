@@ -24,7 +24,7 @@ from xplanes.process import defaults
 ROOT = Path(__file__).resolve().parent.parent
 
 HEAVY = (
-    *("torch.utils.tensorboard.writer", "xplanes.fields.cpu", "xplanes.pipeline"),
+    *("torch.utils.tensorboard.writer", "xplanes.fields.cpu", "xplanes.run"),
     "xplanes.rendering.cpu",
 )
 

@@ -70,17 +70,24 @@ def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
         raise
 
 
+_prepared: dict[str, Any] = {}
+"""What the check has parsed and built, for the job that follows, by its folder."""
+
+
 class SettingsCheck(Callback):
     """Refuses settings before Hydra makes the run directory; jobs of a sweep check their own."""
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        from xplanes.pipeline import KNOWN_ERRORS, check
+        from xplanes.run import KNOWN_ERRORS, prepare
 
         names = [str(name) for name in config if name != "hydra"]
         HydraConfig.instance().set_config(config)  # As Hydra does for the job, for ${hydra:...}.
         try:
             if (plain := _resolved(OmegaConf.masked_copy(config, names))) is not None:
-                check(plain, Path.cwd())  # Settings may lack what the run's own name consists of.
+                # Settings may lack what the run's own name consists of.
+                _prepared[config.hydra.run.dir] = prepare(
+                    plain, Path(config.hydra.run.dir).absolute()
+                )
         except KNOWN_ERRORS as error:
             sys.exit(f"error: {error}")  # Hydra makes warnings of other exceptions.
 
@@ -117,7 +124,7 @@ class _Copied(io.TextIOBase):
 
 def _job(config: DictConfig) -> float:
     """Run one job; the score goes to sweepers."""
-    from xplanes.pipeline import KNOWN_ERRORS, run
+    from xplanes.run import KNOWN_ERRORS, run
 
     settings = HydraConfig.get()
     sweep = settings.mode == RunMode.MULTIRUN
@@ -136,7 +143,8 @@ def _job(config: DictConfig) -> float:
         # A run that goes on must find the user's own groups again.
         own = [text for text in settings.overrides.hydra if _split(text)[0] == SEARCHPATH]
         task = [text for text in settings.overrides.task if _split(text)[0] != "resume"]
-        return run(plain, folder, [*own, *task], resume=resume)
+        job = None if sweep else _prepared.pop(settings.run.dir, None)
+        return run(plain, folder, [*own, *task], resume=resume, job=job)
     except KNOWN_ERRORS as error:
         if sweep:
             raise

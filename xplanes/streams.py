@@ -37,8 +37,6 @@ class Stream(IntEnum):
     """Directions in which Tensor4D's features must not change."""
     PRETRAINING = 1_000_211
     """Positions of samples in the pretraining of LRMs."""
-    THINNING = 1_000_241
-    """Samples whose gradients are passed on."""
     NOISE = 1_000_271
     """Noise of time planes that are initialised from an LRM."""
     BACKGROUND = 1_000_289

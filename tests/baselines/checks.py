@@ -14,7 +14,7 @@ from xplanes.evaluation.evaluate import evaluate
 from xplanes.evaluation.render import VideoOptions, render_video
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.experiment import Experiment
-from xplanes.pipeline import run
+from xplanes.run import run
 from xplanes.training.clock import TrainingClock
 
 

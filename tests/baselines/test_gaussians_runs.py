@@ -5,7 +5,7 @@ import torch
 
 from tests.baselines.checks import check_reload, check_resume, metrics, scores
 from tests.baselines.runs import baseline_config
-from xplanes.pipeline import run
+from xplanes.run import run
 
 SMALL = (
     "data.resolution=24",

@@ -16,8 +16,8 @@ from tests.training.runs import small_config
 from xplanes.evaluation import live
 from xplanes.evaluation import viewer as module
 from xplanes.evaluation.viewer import Viewer
-from xplanes.pipeline import run
 from xplanes.rendering.pictures import to_bytes
+from xplanes.run import run
 
 pytestmark = pytest.mark.slow
 

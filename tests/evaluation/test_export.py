@@ -35,7 +35,6 @@ from xplanes.fields.kplanes import HybridDecoder, KPlanes
 from xplanes.fields.tineuvox import TiNeuVox
 from xplanes.fields.xplanes import random_planes
 from xplanes.optional import MissingExtraError
-from xplanes.pipeline import run
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.behind import look
 from xplanes.rendering.fixed_step import FixedStepRenderer
@@ -43,10 +42,11 @@ from xplanes.rendering.grid_renderer import GridRenderer
 from xplanes.rendering.neus import NeusRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.pictures import to_bytes
+from xplanes.run import run
 from xplanes.scenes.cameras import orbit, project
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Intrinsics, Views, camera_rays
-from xplanes.training.evaluation import render_view
+from xplanes.training.scores import render_view
 
 trimesh: Any = pytest.importorskip("trimesh")
 pytest.importorskip("skimage")

@@ -26,7 +26,7 @@ from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.optional import MissingExtraError
 from xplanes.rendering.pictures import to_bytes
 from xplanes.scenes.views import Views
-from xplanes.training.evaluation import render_view
+from xplanes.training.scores import render_view
 
 
 @pytest.fixture(scope="module")

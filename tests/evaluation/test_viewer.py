@@ -30,12 +30,12 @@ from xplanes.evaluation.render import orbit_poses
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.evaluation.viewer import HOST, Viewer, camera_pose, check_address
 from xplanes.optional import MissingExtraError
-from xplanes.pipeline import run
 from xplanes.rendering.pictures import to_bytes
+from xplanes.run import run
 from xplanes.training.clock import TrainingClock, find_callback
-from xplanes.training.evaluation import render_view
 from xplanes.training.fit import Trainer
 from xplanes.training.interrupt import Interrupt
+from xplanes.training.scores import render_view
 
 pytest.importorskip("viser")
 

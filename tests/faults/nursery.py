@@ -21,7 +21,7 @@ def run_one(job: dict[str, Any]) -> int:
     output = os.open(job["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(output, 1)
     os.dup2(output, 2)
-    from xplanes.pipeline import KNOWN_ERRORS, run
+    from xplanes.run import KNOWN_ERRORS, run
 
     if job.get("file_limit"):
         resource.setrlimit(resource.RLIMIT_FSIZE, (job["file_limit"],) * 2)
@@ -53,10 +53,6 @@ def main() -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     import torch.utils.tensorboard.writer
-
-    import xplanes.fields.cpu
-    import xplanes.pipeline
-    import xplanes.rendering.cpu  # noqa: F401
 
     print(0, flush=True)
     for line in sys.stdin:

@@ -16,9 +16,9 @@ from tests.lrm.reduced import CONFIGS
 from xplanes.errors import ConfigError
 from xplanes.lrm import LRMError, load
 from xplanes.lrm.bundled import FOLDER, load_bundled
-from xplanes.pipeline import run
 from xplanes.preparation.sequence import TriplaneSequence, load_triplanes, save_triplanes
 from xplanes.pretraining.pool import SHARD, ensure_pool
+from xplanes.run import run
 from xplanes.scenes.errors import SceneError
 from xplanes.training.checkpoints import load_checkpoint
 

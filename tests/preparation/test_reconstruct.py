@@ -19,11 +19,11 @@ from xplanes.fields import Decoder, XPlanes
 from xplanes.lrm import LRMError
 from xplanes.lrm.triposr import CHORD
 from xplanes.models.initialisation import Method, Place
-from xplanes.pipeline import train
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.encode import straight_alpha
 from xplanes.preparation.fixed_view import FixedView
 from xplanes.preparation.reconstruct import align_to, picture_crop, reconstruct
+from xplanes.run import train
 from xplanes.scenes.frame import scene_frame
 
 CHOICES = {

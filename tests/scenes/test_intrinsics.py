@@ -29,7 +29,7 @@ from xplanes.scenes.frame import cube_frame, optical_centre, scene_frame
 from xplanes.scenes.silhouettes import foreground, may_hold
 from xplanes.scenes.source import frames_are_equal
 from xplanes.scenes.views import Intrinsics, Scene, Views, camera_rays, joined
-from xplanes.training.evaluation import score_view
+from xplanes.training.scores import score_view
 
 RADIUS = 0.5
 COLOUR = [200, 100, 50, 255]

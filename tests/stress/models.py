@@ -10,7 +10,7 @@ from torch import Tensor
 from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX
 from xplanes.config import compose_plain
 from xplanes.experiment import Experiment
-from xplanes.pipeline import run
+from xplanes.run import run
 from xplanes.training.module import RadianceModule
 
 XPLANES = (

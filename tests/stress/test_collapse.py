@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from xplanes.config import compose_plain
-from xplanes.pipeline import run
+from xplanes.run import run
 from xplanes.scenes.demo.suite import KINDS
 
 pytestmark = pytest.mark.stress

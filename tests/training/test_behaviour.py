@@ -16,9 +16,9 @@ import torch
 from tests.training.runs import small_config
 from xplanes import pipeline
 from xplanes.errors import ConfigError
-from xplanes.pipeline import run
 from xplanes.rendering import warming
 from xplanes.rendering.grid_renderer import OccupancySampler
+from xplanes.run import run
 from xplanes.scenes import store
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.training import evaluation, fit

@@ -12,14 +12,14 @@ from tests.baselines.runs import KPLANES, PROPOSAL, baseline_config
 from tests.training.runs import small_config
 from xplanes.errors import ConfigError
 from xplanes.models.base import background_opacity, opacity_error, opacity_shortfall
-from xplanes.pipeline import run
 from xplanes.rendering.base import Rendering
+from xplanes.run import run
 from xplanes.training import collapse
 from xplanes.training.checkpoints import Checkpoints
 from xplanes.training.collapse import CollapseWatch, verdict
-from xplanes.training.evaluation import blank_psnr, floaters, psnr_thing
 from xplanes.training.meters import mean_opacities
 from xplanes.training.module import RadianceModule
+from xplanes.training.scores import blank_psnr, floaters, psnr_thing
 
 QUICK = ("trainer.max_steps=24", "callbacks.evaluation.at=[]", "callbacks.checkpoints.every=14")
 

@@ -9,7 +9,7 @@ from tests.training.runs import composed, small_config
 from xplanes.evaluation.runs import load_run
 from xplanes.files import read_rows
 from xplanes.lrm.bundled import bundled_models
-from xplanes.pipeline import run
+from xplanes.run import run
 
 SETTINGS = (
     "model.channels=32",

@@ -19,9 +19,9 @@ from xplanes.fields import Decoder, XPlanes
 from xplanes.fields.xplanes import PLANE_SETS
 from xplanes.files import read_rows
 from xplanes.models.x_planes import XPlanesModel
-from xplanes.pipeline import run
 from xplanes.preparation import TriplaneSequence, save_triplanes
 from xplanes.preparation import stages as stages_module
+from xplanes.run import run
 from xplanes.scenes.frame import Frame
 from xplanes.streams import TrainingState
 from xplanes.training.clock import TrainingClock

@@ -17,7 +17,7 @@ from tests.training.runs import small_config
 from xplanes.errors import ConfigError
 from xplanes.models.base import LossTerm
 from xplanes.models.x_planes import XPlanesModel
-from xplanes.pipeline import run
+from xplanes.run import run
 from xplanes.training.checkpoints import find_resumable, load_checkpoint
 from xplanes.training.clock import TrainingClock
 from xplanes.training.finite import (

@@ -23,10 +23,10 @@ from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 from xplanes.models.base import InitialValues
 from xplanes.models.initialisation import Initialisation
 from xplanes.models.tensor4d import FeatureSmoothness
-from xplanes.pipeline import run
 from xplanes.preparation import TriplaneSequence, save_triplanes
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.stages import convert_stage, decompose_stage
+from xplanes.run import run
 from xplanes.streams import TrainingState
 from xplanes.training.module import RadianceModule
 

@@ -15,8 +15,8 @@ from tests.training.runs import small_config
 from xplanes.errors import ConfigError
 from xplanes.evaluation.runs import load_run
 from xplanes.files import read_rows
-from xplanes.pipeline import run
 from xplanes.process import resume_command
+from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.scenes.errors import SceneError

@@ -9,9 +9,9 @@ import torch
 from tests.training.runs import small_config
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.files import read_rows
-from xplanes.pipeline import run
-from xplanes.training.evaluation import mean, score_view
+from xplanes.run import run
 from xplanes.training.module import RadianceModule
+from xplanes.training.scores import mean, score_view
 
 BOUND = 0.05
 """In dB."""

@@ -17,8 +17,8 @@ from xplanes.rendering.behind import look
 from xplanes.rendering.proposal import spaced, unspaced
 from xplanes.scenes.views import Scene
 from xplanes.training.collapse import CollapseWatch
-from xplanes.training.evaluation import render_view
 from xplanes.training.fit import Trainer
+from xplanes.training.scores import render_view
 
 STEPS = 30
 

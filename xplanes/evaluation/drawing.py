@@ -14,8 +14,8 @@ from xplanes.rendering.grid_renderer import GridRenderer
 from xplanes.rendering.pictures import depth_picture
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.silhouettes import may_hold
-from xplanes.scenes.views import PosedCamera, Views
-from xplanes.training.evaluation import VISIBLE, spread
+from xplanes.scenes.views import PosedCamera, Views, spread
+from xplanes.training.scores import VISIBLE
 
 MODES = ("colour", "depth", "opacity", "floaters")
 

@@ -8,7 +8,7 @@ from xplanes.evaluation.perceptual import Metric, UnavailableError, lpips
 from xplanes.evaluation.progress import progress
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.files import write_json
-from xplanes.training.evaluation import ViewImages, ViewScore, mean, score_view
+from xplanes.training.scores import ViewImages, ViewScore, mean, score_view
 
 DEFAULT_NETWORK = "vgg"
 

@@ -69,7 +69,7 @@ class LiveViewer(Callback):
         self.viewer = Viewer(
             pl_module,
             data.scene,
-            lambda: pl_module.renderer_now,
+            lambda: pl_module.renderer,
             host=self.host,
             port=self.port,
             trains=True,

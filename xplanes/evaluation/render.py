@@ -24,7 +24,8 @@ from xplanes.rendering.pictures import colour_map, to_bytes
 from xplanes.scenes.cameras import orbit
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.lenses import Lenses
-from xplanes.scenes.views import PosedCamera, Views
+from xplanes.scenes.views import PosedCamera, Scene, Views
+from xplanes.training.module import RadianceModule
 
 ELEVATION = 20.0
 """Height angle of the turning camera, in degrees."""
@@ -505,3 +506,31 @@ def times(name: str, count: int) -> Tensor:
     if not 0 <= time <= 1:
         raise ConfigError(f"--time {name}: must be sweep, back-and-forth or a number from 0 to 1")
     return torch.full((count,), time)
+
+
+VIDEO_FRAMES, VIDEO_FPS, VIDEO_SIZE = 48, 16, 200
+"""Frames of a run's own video, those of a second, and the longer side of its pictures."""
+
+
+def write_orbit(module: RadianceModule, scene: Scene, run: Path) -> Path:
+    """Write media/orbit.webp: one camera orbit while time runs from 0 to 1 and back.
+
+    Args:
+        module: What was trained.
+        scene: The scene.
+        run: The run directory.
+    """
+    views, frame = scene.splits["train"], module.frame
+    assert frame is not None
+    size = min(VIDEO_SIZE, max(views.height, views.width))
+    frames = render_path(
+        module.field,
+        module.renderer,
+        frame,
+        orbit_poses(views, frame, VIDEO_FRAMES),
+        video_times(VIDEO_FRAMES),
+        focal=views.intrinsics.focal_at(size),
+        size=size,
+        background=scene.background,
+    )
+    return write_video(run / "media" / "orbit.webp", frames, fps=VIDEO_FPS)

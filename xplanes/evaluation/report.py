@@ -17,19 +17,11 @@ from xplanes.process import resume_command
 from xplanes.rendering.pictures import write_png
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.training.checkpoints import LAST
-from xplanes.training.clock import TrainingClock, find_callback, training_seconds
-from xplanes.training.evaluation import (
-    ViewScore,
-    blank_psnr,
-    device_memory,
-    log_image,
-    mean_colour,
-    mean_scores,
-)
+from xplanes.training.clock import training_seconds
+from xplanes.training.evaluation import device_memory, log_image
 from xplanes.training.fit import Estimate, Trainer
 from xplanes.training.module import RadianceModule
-from xplanes.training.plateau import PlateauStop
-from xplanes.training.step_threads import StepThreads
+from xplanes.training.scores import ViewScore, blank_psnr, mean_colour, mean_scores
 
 LITTLE = 0.5
 """PSNR in dB above that of empty images below which a run shows nothing."""
@@ -51,7 +43,6 @@ def header(
 ) -> str:
     """The lines printed before training: what is about to happen, on what, from what."""
     assert module.frame is not None
-    assert module.sampler is not None
     assert module.initialisation is not None
     scene = data.scene
     frame, device, trainer = module.frame, experiment.device, experiment.trainer
@@ -99,9 +90,9 @@ def _estimated(experiment: Experiment, data: SceneDataModule, expected: Estimate
     train = min(steps * expected.step, trainer.get("max_seconds") or math.inf)
     final = data.scene.splits[data.test_split]
     views = data.scene.splits[data.validation_split or data.test_split]
-    node = experiment.callbacks.get("evaluation", {})
-    times, count = len(node.get("at", [])), node.get("views") or len(views)
-    pixels = views.height * views.width * times * min(count, len(views))
+    times = len(experiment.callbacks.get("evaluation", {}).get("at", []))
+    count = scored_views(experiment.trainer.get("limit_val_batches", 1.0), len(views))
+    pixels = views.height * views.width * times * count
     if final is not views or count < len(views):
         pixels += final.height * final.width * len(final)
     if experiment.media:
@@ -109,6 +100,11 @@ def _estimated(experiment: Experiment, data: SceneDataModule, expected: Estimate
     images = pixels / expected.image_rays
     whole = f"{train + images:.0f} s" if train < math.inf else "no end of training"
     return f"at most {whole}, {images:.0f} s of it for scores and images"
+
+
+def scored_views(limit: float, views: int) -> int:
+    """Validation views scored each time: ``trainer.limit_val_batches`` is a number or a share."""
+    return min(limit, views) if isinstance(limit, int) else int(limit * views)
 
 
 def summary(
@@ -121,9 +117,6 @@ def summary(
 ) -> dict[str, Any]:
     """The content of metrics.json."""
     clock = training_seconds(trainer)
-    plateau = find_callback(trainer, PlateauStop)
-    ending = None if plateau is None else plateau.ending
-    threads = find_callback(trainer, StepThreads)
     counts = module.counts
     candidates = max(1, counts["candidates"])
     tested, blank = data.scene.splits[data.test_split], data.scene.background
@@ -142,26 +135,16 @@ def summary(
             "empty": counts["empty"] / candidates,
             "occluded": counts["occluded"] / candidates,
             "no_room": counts["no_room"] / max(1, counts["rays"] + counts["no_room"]),
-            "gradients": 1 - counts["passed"] / counts["samples"] if counts["samples"] else 0.0,
             "background": background_skipped,
             "static": float(not module.field.moves),
-            "budget": 0.0 if ending is None else max(0.0, 1 - spent(trainer)),
         },
-        "converged": None if ending is None else ending[0],
         "steps_skipped": module.unusable,
         "restarts": module.restarts,
-        "threads": torch.get_num_threads() if threads is None else threads.count,
+        "threads": torch.get_num_threads(),
         "loops": backend.name(module.device),
         "parameters": sum(p.numel() for p in module.parameters()),
         "peak_memory_bytes": device_memory(module.device),
     }
-
-
-def spent(trainer: Trainer) -> float:
-    """Share of the budget that is used: of steps or of the training clock, the larger."""
-    clock = find_callback(trainer, TrainingClock)
-    steps = trainer.global_step / trainer.max_steps if trainer.max_steps > 0 else 0.0
-    return max(steps, 0.0 if clock is None else clock.progress)
 
 
 def write_pictures(trainer: Trainer, pictures: Mapping[str, Tensor], *, log: bool) -> None:
@@ -211,13 +194,6 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
         more += f" trainer.max_steps={2 * metrics['step']}"
     if (most := limits.get("max_seconds")) is not None and 2 * seconds["train"] > most:
         more += f" trainer.max_seconds={2 * most:g}"
-    plateau = ""
-    if metrics["converged"] is not None:
-        more = " callbacks.plateau.gain=null"
-        plateau = (
-            f"; {100 * skipped['budget']:.0f}% of the budget, as training had converged at step "
-            f"{metrics['converged']}"
-        )
     prepare = sum(seconds["prepare"].values())
     more_scores = ""
     if "psnr_thing" in metrics["test"]:
@@ -243,8 +219,7 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
         f"skipped  {100 * skipped['empty']:.0f}% of samples in empty space, "
         f"{100 * skipped['occluded']:.0f}% behind surfaces, "
         f"{100 * skipped['background']:.0f}% of pixels as background; "
-        f"{metrics['samples_per_ray']:.1f} samples a ray remained, gradients of "
-        f"{100 * (1 - skipped['gradients']):.0f}% of them{plateau}"
+        f"{metrics['samples_per_ray']:.1f} samples a ray remained"
     )
     # Without callbacks.checkpoints there is nothing to render or to go on with.
     kept = "checkpoints/last.ckpt  " if (run / "checkpoints" / LAST).is_file() else ""

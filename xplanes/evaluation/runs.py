@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from xplanes import __version__
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
@@ -19,7 +17,7 @@ from xplanes.scenes.views import Scene, Views
 from xplanes.training.checkpoints import load_checkpoint
 from xplanes.training.fit import find_device
 from xplanes.training.module import RadianceModule
-from xplanes.training.record import require_same_views
+from xplanes.training.record import read_config, require_same_views
 
 OUTPUTS = Path("outputs")
 LISTED = 5
@@ -103,25 +101,6 @@ def _listed(runs: list[Path]) -> str:
     return "".join(f"\n  {run}" for run in runs)
 
 
-def read_config(run: Path) -> dict[str, Any]:
-    """config.yaml of a run directory.
-
-    Raises:
-        ConfigError: If it is missing or damaged.
-    """
-    path = run / "config.yaml"
-    if not path.is_file():
-        raise ConfigError(f"{run} is not a run directory: no config.yaml in it")
-    try:
-        text = path.read_text(encoding="utf-8")
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is damaged: {error}") from error
-    if not isinstance(content, dict) or not text.endswith("\n"):
-        raise ConfigError(f"{path} is damaged: not a mapping, or cut short")
-    return content
-
-
 def load_run(
     run: Path,
     *,
@@ -164,7 +143,7 @@ def load_run(
     served.read_split(name)
     scene = served.scene
     require_same_views(run, _record(run), scene.splits["train"])
-    module = RadianceModule(experiment.config, plugins)
+    module = RadianceModule(experiment.method, plugins)
     try:
         module.on_load_checkpoint(state)
         module.load_state_dict(state["state_dict"])

@@ -120,8 +120,6 @@ class GaussiansModel(Model):
 
     def before_step(self, state: TrainingState, optimizer: torch.optim.Optimizer) -> None:
         settings, field, step = self._settings, self._field, state.step
-        if state.batch % settings.rays.accumulate:
-            return  # Gradients wait, row by row.
         field.degree.fill_(min(settings.degree, step // settings.degree_every))
         if field.moves and not field.deforms and state.progress >= self.static_share:
             field.deforms.fill_(True)

@@ -290,7 +290,7 @@ def trained_field(
         steps: Training steps at most.
         seconds: Seconds of training at most; None for no limit.
     """
-    module = RadianceModule.of(method)
+    module = RadianceModule(method)
     module.build(place.scene, place.frame, device=place.device, say=place.say)
     fit_quietly(
         module,

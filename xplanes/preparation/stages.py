@@ -23,8 +23,8 @@ from xplanes.models.initialisation import DecompositionSettings
 from xplanes.models.x_planes import XPlanesSettings
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.encode import straight_alpha
+from xplanes.scenes.views import spread
 from xplanes.streams import Stream, step_generator
-from xplanes.training.evaluation import spread
 
 
 def parts_sheet(low_rank: Tensor, sparse: Tensor, timesteps: int = 4, side: int = 128) -> Tensor:

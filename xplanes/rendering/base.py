@@ -1,14 +1,13 @@
 """What all renderers share: what rays see, and whole images of it."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from xplanes.rendering.marching import Samples
-from xplanes.rendering.thinning import Cut
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import PosedCamera
 
@@ -23,7 +22,6 @@ class Rendering:
         depth: Mean distance of what is seen, 0 where nothing is. [R]
         density: Density of each sample, without gradient. [N]
         samples: The samples that reached the field.
-        cut: Where gradients wait to be passed on to the field; None if they reach it by themselves.
     """
 
     colour: Tensor
@@ -31,7 +29,6 @@ class Rendering:
     depth: Tensor
     density: Tensor
     samples: Samples
-    cut: Cut | None = field(default=None, kw_only=True)
 
 
 class Renderer(ABC):

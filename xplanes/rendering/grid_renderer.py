@@ -18,10 +18,9 @@ from xplanes.rendering.filling import fill
 from xplanes.rendering.marching import march
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
-from xplanes.rendering.thinning import Cut
 from xplanes.rendering.warming import render_one_ray
 from xplanes.scenes.batches import Batch
-from xplanes.settings import Count, Range, Share, Steps, Weight
+from xplanes.settings import Count, Range, Share
 from xplanes.streams import Stream, TrainingState, counted_uniform, step_generator
 
 SPARE = 1.25
@@ -43,9 +42,6 @@ class GridRenderer(RayRenderer):
         samples: Steps along the diagonal of the field's cube.
         skip_empty: Skip samples in empty cells.
         occlusion: Skip samples behind surfaces that leave less light than this; 0 skips none.
-        thinning: Where gradients are wanted, samples whose own is below this times the mean may be
-            left out, see `Cut.pass_on`; 0 leaves none out. On the CPU alone: elsewhere choosing
-            costs more than what it saves.
         room: Places for samples where nothing may wait for their number, see `march`.
     """
 
@@ -53,7 +49,6 @@ class GridRenderer(RayRenderer):
     samples: int
     skip_empty: bool = True
     occlusion: float = 0.001
-    thinning: float = 0.0
     room: int | None = None
 
     @property
@@ -85,8 +80,7 @@ class GridRenderer(RayRenderer):
             jitter: Place of each ray's samples within their steps; the middle when None. [R]
 
         Returns:
-            One value per ray; gradients reach the field, with `thinning` once ``cut`` passes them
-            on.
+            One value per ray.
         """
         samples = march(
             origins,
@@ -99,14 +93,7 @@ class GridRenderer(RayRenderer):
             occlusion=self.occlusion,
             room=self.room,
         )
-
-        def ask(chosen: Tensor | slice) -> tuple[Tensor, Tensor]:
-            points, ray = samples.points[chosen], samples.ray[chosen]
-            return shade(field, points, times, directions, ray)
-
-        thin = self.thinning > 0 and torch.is_grad_enabled() and origins.device.type == "cpu"
-        cut = Cut.of(ask, self.thinning) if thin else None
-        colour, density = (cut.colour, cut.density) if cut else ask(slice(None))
+        colour, density = shade(field, samples.points, times, directions, samples.ray)
         if samples.live is not None:
             density = torch.where(samples.live, density, 0)
         total, _ = composite(
@@ -128,7 +115,6 @@ class GridRenderer(RayRenderer):
             depth=(total[:, 4] / opacity.clamp_min(1e-6)).detach(),
             density=density.detach(),
             samples=samples,
-            cut=cut,
         )
 
 
@@ -149,10 +135,8 @@ class OccupancySettings(SamplerSettings):
     skip_empty: bool  # Skip samples in empty cells.
     skip_occluded: bool  # Skip samples behind opaque surfaces.
     occlusion: Annotated[float, Range(0, 1)]  # Transmittance below which samples are occluded.
-    thinning: Weight  # Subsample gradients below this times the mean, on the CPU; 0: off.
     silhouettes: bool  # Prune cells outside the silhouettes (alpha).
     fill: bool  # Prune empty cells of an initialised field.
-    coarse_steps: Steps  # Initial steps with half the number of samples.
     sweep_at: list[int]  # Steps at which all occupied cells are updated.
     sweep_every: Count  # Steps between updates of all occupied cells afterwards.
     update_every: Count  # Steps between updates of random cells.
@@ -199,7 +183,6 @@ class OccupancySettings(SamplerSettings):
         """
         return replace(
             self,
-            coarse_steps=site.steps(self.coarse_steps),
             sweep_at=[site.steps(step) for step in self.sweep_at],
             sweep_every=site.steps(self.sweep_every),
         )
@@ -238,11 +221,8 @@ class OccupancySampler(Sampler):
     ) -> None:
         self.settings, self.grid, self.samples = settings, renderer.grid, samples
         room = None if samples is None else self._room(samples)
-        self._training = replace(renderer, thinning=settings.thinning, room=room)
-        self._coarse = replace(self._training, samples=math.ceil(renderer.samples / 2))
+        self._training = replace(renderer, room=room)
         self._images = replace(renderer, samples=settings.render_samples)
-        self._is_coarse = settings.coarse_steps > 0
-        self._coarse_images = replace(renderer, samples=self._coarse.samples)
 
     @property
     def renderer(self) -> GridRenderer:
@@ -259,13 +239,8 @@ class OccupancySampler(Sampler):
     def first_rays(self, most: int) -> int:
         return min(most, 256)
 
-    def renderer_at(self, step: int) -> GridRenderer:
-        # At first the grid hides little, and images of all samples would take longer than steps.
-        return self._coarse_images if step < self.settings.coarse_steps else self._images
-
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
-        self._is_coarse = state.step < self.settings.coarse_steps
-        return (self._coarse if self._is_coarse else self._training).render(
+        return self._training.render(
             field,
             rays["origins"],
             rays["directions"],
@@ -273,11 +248,6 @@ class OccupancySampler(Sampler):
             rays["background"],
             rays["jitter"],
         )
-
-    def pass_on(self, rendering: Rendering, state: TrainingState) -> int | Tensor:
-        if rendering.cut is None:
-            return rendering.samples.count
-        return rendering.cut.pass_on(state.generator(rendering.density.device, Stream.THINNING))
 
     def observe(self, rendering: Rendering) -> None:
         samples = rendering.samples
@@ -306,13 +276,9 @@ class OccupancySampler(Sampler):
                 distributed.broadcast(part, src=0)
 
     def expect(self, samples: float) -> None:
-        if self.samples is None:
-            return
-        # What coarse steps show comes to twice as much in those after them.
-        finer = self._training.samples / self._coarse.samples if self._is_coarse else 1.0
-        for name, more in (("_coarse", 1.0), ("_training", finer)):
-            room = self._room(min(more * samples, self.samples))
-            setattr(self, name, replace(getattr(self, name), room=room))
+        if self.samples is not None:
+            room = self._room(min(samples, self.samples))
+            self._training = replace(self._training, room=room)
 
     def _room(self, samples: float) -> int:
         """Places for batches of so many samples on average: some hold more."""

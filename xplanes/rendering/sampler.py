@@ -123,10 +123,6 @@ class Sampler(ABC):
         """Number of rays in the first batch, at most ``most``."""
         return most
 
-    def renderer_at(self, step: int) -> Renderer:
-        """Renderer for whole images after ``step`` optimiser steps."""
-        return self.renderer
-
     @abstractmethod
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
         """Render the rays of a training batch.
@@ -136,18 +132,6 @@ class Sampler(ABC):
             rays: The batch: rays, or a whole view.
             state: Seed and progress of training, for jitter and schedules.
         """
-
-    def pass_on(self, rendering: Any, state: TrainingState) -> int | Tensor:
-        """Propagate gradients to the field, if `render` has detached them from it.
-
-        Args:
-            rendering: What `render` returned, after the backward pass.
-            state: Seed and progress of training.
-
-        Returns:
-            Number of samples whose gradients reached the field.
-        """
-        return rendering.samples.count
 
     def losses(self, rendering: Any) -> dict[str, Tensor]:
         """Weighted loss terms of the sampler, by name. [] each"""

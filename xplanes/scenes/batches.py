@@ -62,15 +62,18 @@ class Batches(ABC):
     skipped: float
 
     @abstractmethod
-    def draw(self, step: int) -> Batch:
-        """The batch of a step."""
+    def draw(self, step: int, rays: int | None = None) -> Batch:
+        """The batch of a step.
+
+        Args:
+            step: Its number.
+            rays: Rays to draw; as many as there may be when None.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)
 class BatchSettings(Settings, ABC):
     """What a training step gets to see."""
-
-    accumulate: Count  # Batches per optimiser step.
 
     def on(self, device: torch.device) -> "BatchSettings":
         """The same with sizes that suit a device, where these are open."""
@@ -96,10 +99,6 @@ class BatchSettings(Settings, ABC):
             seed: The run's seed.
             rank: Number of the process among those that split the rays.
         """
-
-    @abstractmethod
-    def part(self, batch: Batch, rays: int) -> Batch:
-        """The first rays of a batch, or the whole of it where it cannot be cut."""
 
     @abstractmethod
     def fitting(self, rays: int, samples: int) -> int:
@@ -139,9 +138,6 @@ class RaySettings(BatchSettings):
     def batches(self, views: Views, frame: Frame, *, seed: int, rank: int) -> "RayBatches":
         return RayBatches(views, frame, self, seed=seed, rank=rank)
 
-    def part(self, batch: Batch, rays: int) -> Batch:
-        return {name: value[:rays] for name, value in batch.items()}
-
     def fitting(self, rays: int, samples: int) -> int:
         """As many as keep the samples near their maximum."""
         room = self.most_samples * rays / max(1, samples)
@@ -165,9 +161,6 @@ class ViewSettings(BatchSettings):
     def batches(self, views: Views, frame: Frame, *, seed: int, rank: int) -> "ViewBatches":
         return ViewBatches(views, self, seed=seed, rank=rank)
 
-    def part(self, batch: Batch, rays: int) -> Batch:
-        return batch
-
     def fitting(self, rays: int, samples: int) -> int:
         return rays
 
@@ -189,7 +182,7 @@ class ViewBatches(Batches):
         self.background = settings.background
         self.rays = max(1, views.pixels // len(views))
 
-    def draw(self, step: int) -> Batch:
+    def draw(self, step: int, rays: int | None = None) -> Batch:
         """The view of a step.
 
         Returns:
@@ -273,22 +266,27 @@ class RayBatches(Batches):
             shares = (self.far_share, self.plain_share)
             self.pools = PixelPools(self.far, self.near, plain_pixels, shares)
 
-    def draw(self, step: int) -> Batch:
+    def draw(self, step: int, rays: int | None = None) -> Batch:
         """The batch of a step.
+
+        Args:
+            step: Its number.
+            rays: Rays to draw; as many as there may be when None.
 
         Returns:
             ``origins`` and unit ``directions`` in the field's frame [R, 3], ``times`` [R],
             ``target`` colour before ``background`` [R, 3] each, its ``alpha`` [R], and ``jitter``
             from 0 to 1 [R].
         """
+        rays = rays or self.rays
         generator = step_generator(self.seed, step, self.rank)
-        uniform = torch.rand(self.rays, 3, generator=generator, dtype=torch.float64)
+        uniform = torch.rand(rays, 3, generator=generator, dtype=torch.float64)
         if isinstance(self.views.images, StoredImages):
-            self._prefetch(step)
+            self._prefetch(step, rays)
             drawn = self._from_tiles(self.views.images, uniform, generator)
         else:
             drawn = self._from_memory(self.views.images, uniform)
-        shape = (self.rays, 3)
+        shape = (rays, 3)
         if self.background == "random":
             background = torch.rand(shape, generator=generator)
         elif self.background == "one":
@@ -297,7 +295,7 @@ class RayBatches(Batches):
             background = torch.ones(shape)
         move = None
         if self.background_jitter:
-            move = torch.rand(self.rays, generator=generator)
+            move = torch.rand(rays, generator=generator)
         return self._served(drawn, background, move, uniform[:, 2].float())
 
     def _served(
@@ -338,7 +336,8 @@ class RayBatches(Batches):
         self, images: StoredImages, uniform: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, ...]:
         """Far, view, row, column and colour of rays, some through each of few tiles."""
-        per_tile = self._per_tile
+        number = len(uniform)
+        per_tile = _per_tile(number)
         far, place = self._choose(uniform[::per_tile])
         view, tile = place[:, :2].unbind(dim=1)
         cells = unpacked(place[:, 2:].byte().numpy())
@@ -351,7 +350,7 @@ class RayBatches(Batches):
         else:
             row, column = self._with_rays(view, top, left, cells, inside)
         colour = images.pixels(view, tile, row * TILE + column)
-        rays = slice(0, self.rays)  # The last tile may have to give fewer.
+        rays = slice(0, number)  # The last tile may have to give fewer.
         far, view = (of_tile.repeat_interleave(per_tile)[rays] for of_tile in (far, view))
         row, column = (top[:, None] + row).flatten()[rays], (left[:, None] + column).flatten()[rays]
         return far, view, row, column, colour.flatten(0, 1)[rays]
@@ -377,19 +376,15 @@ class RayBatches(Batches):
         pixel = torch.stack(found)
         return pixel // TILE, pixel % TILE
 
-    @property
-    def _per_tile(self) -> int:
-        return max(1, min(PER_TILE, self.rays // LEAST_TILES))
-
-    def _prefetch(self, step: int) -> None:
+    def _prefetch(self, step: int, rays: int) -> None:
         """Let the system read the tiles of the next batches, as far as it was not told yet."""
         assert isinstance(self.views.images, StoredImages)
         if not step <= self._prefetched <= step + AHEAD:
             self._prefetched = step
         for later in range(self._prefetched + 1, step + AHEAD + 1):
             generator = step_generator(self.seed, later, self.rank)
-            uniform = torch.rand(self.rays, 3, generator=generator, dtype=torch.float64)
-            _, place = self._choose(uniform[:: self._per_tile])
+            uniform = torch.rand(rays, 3, generator=generator, dtype=torch.float64)
+            _, place = self._choose(uniform[:: _per_tile(rays)])
             self.views.images.prefetch(*place[:, :2].unbind(dim=1))
         self._prefetched = step + AHEAD
 
@@ -430,15 +425,21 @@ class DeviceBatches(RayBatches):
             return False
         return views.nbytes < LARGEST_SHARE * memory_left(device)
 
-    def draw(self, step: int) -> Batch:
-        shape = (self.rays, 7)
+    def draw(self, step: int, rays: int | None = None) -> Batch:
+        rays = rays or self.rays
+        shape = (rays, 7)
         uniform = counted_uniform(self.seed, step, self.rank, shape, self.device)
         assert isinstance(self.views.images, Tensor)
         drawn = self._from_memory(self.views.images, uniform)
         background = uniform[:, 3:6].float()
         if self.background == "one":
-            background = background[:1].expand(self.rays, 3)
+            background = background[:1].expand(rays, 3)
         elif self.background == "white":
             background = torch.ones_like(background)
         move = uniform[:, 6].float() if self.background_jitter else None
         return self._served(drawn, background, move, uniform[:, 2].float())
+
+
+def _per_tile(rays: int) -> int:
+    """Rays of a batch from one tile."""
+    return max(1, min(PER_TILE, rays // LEAST_TILES))

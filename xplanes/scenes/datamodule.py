@@ -26,7 +26,6 @@ from xplanes.scenes.views import Scene, Views
 UNIFORM = RaySettings(
     per_batch=1024,
     samples_per_batch=8192,
-    accumulate=1,
     background="white",
     skip_background=False,
     background_share=1.0,
@@ -45,10 +44,9 @@ class SceneDataModule(LightningDataModule):
     through random pixels, in the frame of the scene's cube. Batches are endless; an epoch has about
     as many rays as the training views have pixels.
 
-    `val_dataloader`, `test_dataloader` and `predict_dataloader` serve one whole view per batch:
-    ``origins`` and unit ``directions`` in the world [H W, 3], the ``camera``, ``time`` from 0 to 1
-    [], ``target`` colours composited on the scene's background [H, W, 3], ``background`` [3] and
-    the view's ``index``. If a lens leaves pixels dark, ``shown`` marks the others: bool [H, W].
+    `val_dataloader`, `test_dataloader` and `predict_dataloader` serve one whole view per batch, see
+    `whole_view`. Validation views come in an order whose first ones, however many, are spread
+    evenly (`limit_val_batches`). Several processes share the views.
 
     Args:
         scene: Settings of the scene, or the group ``data`` of a configuration.
@@ -79,6 +77,12 @@ class SceneDataModule(LightningDataModule):
         """Training views that serve for validation, because the scene has no split for it."""
         self._scene: Scene | None = None
         self._batches: dict[int, Batches] = {}
+
+    @property
+    def rays(self) -> int | None:
+        """Rays of the next batch, where the LightningModule says so (``rays``)."""
+        module = None if self.trainer is None else self.trainer.lightning_module
+        return getattr(module, "rays", None)
 
     @classmethod
     def of(cls, scene: Scene, *, seed: int = 0) -> "SceneDataModule":
@@ -238,19 +242,26 @@ class SceneDataModule(LightningDataModule):
         warnings.filterwarnings("ignore", message=".*does not have many workers.*")
         return DataLoader(_Endless(batches, self), batch_size=None)
 
-    def val_dataloader(self) -> DataLoader | list[DataLoader]:
-        split = self.validation_split
-        return [] if split is None else self._views(split)
+    def val_dataloader(self) -> DataLoader:
+        split, tag = self.validation_split, "val"
+        if split is None:
+            # What is scored on the way must not choose a checkpoint: nothing looks for this name.
+            split, tag = self.test_split, "test"
+        return self._views(split, tag, spread_order(len(self.read_split(split))))
 
     def test_dataloader(self) -> DataLoader:
-        return self._views(self.test_split)
+        return self._views(self.test_split, "test")
 
     def predict_dataloader(self) -> DataLoader:
-        return self._views(self.test_split)
+        return self._views(self.test_split, "predict")
 
-    def _views(self, split: str) -> DataLoader:
-        views = _WholeViews(self.read_split(split), self.scene.background)
-        return DataLoader(views, batch_size=None)
+    def _views(self, split: str, tag: str, order: Sequence[int] | None = None) -> DataLoader:
+        views = self.read_split(split)
+        order = range(len(views)) if order is None else order
+        if self.trainer is not None and tag != "predict":
+            # Processes score views of their own.
+            order = order[self.trainer.global_rank :: self.trainer.world_size]
+        return DataLoader(_WholeViews(views, self.scene.background, tag, order), batch_size=None)
 
     def state_dict(self) -> dict[str, Any]:
         module = None if self.trainer is None else self.trainer.lightning_module
@@ -267,36 +278,65 @@ class _Endless(IterableDataset):
         self.batches, self.data = batches, data
 
     def __len__(self) -> int:
+        # With a length, Lightning draws no batch ahead: how many rays fit is known after each step.
         return max(1, self.batches.views.pixels // self.batches.rays)
 
     def __iter__(self) -> Iterator[Batch]:
         while True:
             step = self.data.first
             self.data.first += 1
-            yield self.batches.draw(step)
+            yield self.batches.draw(step, self.data.rays)
 
 
 class _WholeViews(Dataset):
-    """Views as rays and images."""
+    """Views as `whole_view` gives them."""
 
-    def __init__(self, views: Views, background: Tensor) -> None:
-        self.views, self.background = views, background
+    def __init__(self, views: Views, background: Tensor, tag: str, order: Sequence[int]) -> None:
+        self.views, self.background, self.tag, self.order = views, background, tag, order
 
     def __len__(self) -> int:
-        return len(self.views)
+        return len(self.order)
 
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        origins, directions = self.views.image_rays(index)
-        return {
-            "origins": origins,
-            "directions": directions,
-            "camera": self.views.camera(index),
-            "time": self.views.times[index],
-            "target": self.views.composite(index, self.background),
-            "background": self.background,
-            "index": index,
-            **({} if (shown := self.views.intrinsics.has_ray(index)) is None else {"shown": shown}),
-        }
+    def __getitem__(self, place: int) -> dict[str, Any]:
+        item = whole_view(self.views, self.order[place], self.background)
+        return item | {"tag": self.tag}
+
+
+def whole_view(views: Views, index: int, background: Tensor) -> dict[str, Any]:
+    """A view whole.
+
+    Args:
+        views: Some views.
+        index: Which of them.
+        background: Colour behind the scene. [3]
+
+    Returns:
+        Its ``camera``, ``time`` from 0 to 1 [], ``target`` colours before ``background`` [H, W, 3],
+        ``alpha`` uint8 [H, W], ``background`` [3], ``index`` and ``file``; where known ``shown``,
+        pixels that the lens does not leave dark, bool [H, W], and ``thing``, the share of each
+        pixel that shows the foreground object, uint8 [H, W].
+    """
+    item = {
+        "camera": views.camera(index),
+        "time": views.times[index],
+        "target": views.composite(index, background),
+        "alpha": views.image(index)[..., 3],
+        "background": background,
+        "index": index,
+        "file": views.files[index],
+    }
+    more = {"shown": views.intrinsics.has_ray(index), "thing": views.thing_in(index)}
+    return item | {name: value for name, value in more.items() if value is not None}
+
+
+def spread_order(count: int) -> list[int]:
+    """An order in which the first places, however many, are spread evenly over all.
+
+    Bit-reversed counting (van der Corput): 0, the middle, the quarters, ...
+    """
+    bits = max(1, (count - 1).bit_length())
+    order = (int(f"{place:0{bits}b}"[::-1], 2) for place in range(2**bits))
+    return [place for place in order if place < count]
 
 
 @dataclass(frozen=True, kw_only=True)

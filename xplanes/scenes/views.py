@@ -579,3 +579,10 @@ def camera_rays(
         centre=(0.5 * width, 0.5 * height) if centre is None else centre,
         lenses=lens,
     )
+
+
+def spread(count: int, total: int) -> list[int]:
+    """``count`` indices spread evenly over ``total``, both ends included."""
+    if count >= total:
+        return list(range(total))
+    return torch.linspace(0, total - 1, count).round().long().tolist()

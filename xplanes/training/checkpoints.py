@@ -12,13 +12,13 @@ from typing import Any
 
 import torch
 from lightning import LightningModule, Trainer
-from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from xplanes.errors import ConfigError
 from xplanes.files import replacing
-from xplanes.training.clock import find_callback, off_clock
-from xplanes.training.evaluation import Evaluation
+from xplanes.training.clock import off_clock
+from xplanes.training.diagnosis import require_finite
 from xplanes.training.interrupt import Stopped
 from xplanes.training.module import RadianceModule
 
@@ -72,12 +72,11 @@ def _kind_in(error: pickle.UnpicklingError) -> str:
     return f" ({kind[1]})" if kind else ""
 
 
-class Checkpoints(Checkpoint):
+class Checkpoints(ModelCheckpoint):
     """Writes ``last.ckpt`` at fixed intervals and at the end, ``best.ckpt`` at a new best score.
 
     They go to ``checkpoints`` in the trainer's ``default_root_dir``; writing them is off the
-    training clock. The best is what `Evaluation` scored highest. Lightning's ModelCheckpoint works
-    as well, but its triggers by time and steps do not go together with manual optimisation.
+    training clock. The best is that with the highest ``val/psnr``.
 
     Args:
         every: Steps between checkpoints.
@@ -86,53 +85,65 @@ class Checkpoints(Checkpoint):
     def __init__(self, every: int = 1000) -> None:
         if every < 1:
             raise ConfigError(f"every={every}: must be above 0")
+        super().__init__(
+            filename=BEST.removesuffix(".ckpt"),
+            monitor="val/psnr",
+            mode="max",
+            save_on_train_epoch_end=False,
+            enable_version_counter=False,
+        )
         self.every = every
-        self._last, self._best = -1, -1
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._save_best(trainer)
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        self.dirpath = str(Path(trainer.default_root_dir) / "checkpoints")
+        super().setup(trainer, pl_module, stage)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        # The best comes first: a run that is killed in between scores the model again, but would
-        # not write it again if the last one said that it was written.
-        self._save_best(trainer)
-        step = trainer.global_step
-        due = step and step % self.every == 0 and step != self._last
         # Gradients of batches that wait for others are in no checkpoint.
-        if due and getattr(pl_module, "between_updates", True):
-            self._save_last(trainer, pl_module)
+        if trainer.global_step % self.every == 0 and getattr(pl_module, "between_updates", True):
+            self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self.monitor in trainer.callback_metrics:
+            super().on_validation_end(trainer, pl_module)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._save_best(trainer)
-        self._save_last(trainer, pl_module)
+        self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
 
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
         # Any other interrupt may have come in the middle of a step.
         if isinstance(exception, Stopped) and trainer.global_step:
-            self._save_best(trainer)  # Lightning puts these callbacks last, after `Interrupt`.
-            self._save_last(trainer, pl_module)
+            self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
 
-    def _save_best(self, trainer: Trainer) -> None:
-        """Keep the model if its score is the best so far."""
-        evaluation = find_callback(trainer, Evaluation)
-        step = -1 if evaluation is None else evaluation.best_step
-        if step > self._best and step == trainer.global_step:
-            self._save(trainer, BEST)
-            self._best = step
+    def _should_skip_saving_checkpoint(self, trainer: Trainer) -> bool:
+        # Saved after the same step, ``last.ckpt`` is another file.
+        self._last_global_step_saved = -1
+        return super()._should_skip_saving_checkpoint(trainer)
 
-    def _save_last(self, trainer: Trainer, module: LightningModule) -> None:
-        if isinstance(module, RadianceModule):
-            module.require_finite()
-        self._save(trainer, LAST)
-        self._last = trainer.global_step
-
-    def _save(self, trainer: Trainer, name: str) -> None:
+    def _save_checkpoint(self, trainer: Trainer, filepath: str) -> None:
+        if trainer.fast_dev_run:  # type: ignore[attr-defined]
+            return
         with off_clock(trainer):
-            trainer.save_checkpoint(Path(trainer.default_root_dir) / "checkpoints" / name)
+            if isinstance(module := trainer.lightning_module, RadianceModule):
+                require_finite(module)
+            super()._save_checkpoint(trainer, filepath)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        # The run directory may have moved.
+        best = f"{self.dirpath}/{BEST}"
+        score = state_dict["best_model_score"]
+        moved = {"dirpath": self.dirpath, "kth_best_model_path": best, "best_model_path": best}
+        if score is not None:
+            super().load_state_dict({**state_dict, **moved, "best_k_models": {best: score}})
+
+
+def has_checkpoint(run: Path) -> bool:
+    """Whether a run directory holds a checkpoint to go on from."""
+    return (run / "checkpoints" / LAST).is_file()
 
 
 def find_resumable(folder: Path) -> Path | None:

@@ -1,4 +1,4 @@
-"""Whether parameters and gradients are finite."""
+"""Whether parameters and gradients are finite, and steps without those that are not."""
 
 from collections.abc import Iterable
 
@@ -20,18 +20,32 @@ def usable(gradient: Tensor) -> bool:
     return bool(torch.linalg.vector_norm(gradient).isfinite())
 
 
-def all_usable(parameters: Iterable[nn.Parameter]) -> bool:
-    """Whether all gradients are `usable`; one pass over each, and one wait for the device."""
+def broken_flag(parameters: Iterable[nn.Parameter], finite: Tensor) -> Tensor:
+    """1 if a gradient is not `usable` or the loss was not finite, on its device. float32 []
+
+    Args:
+        parameters: Parameters, some of which may have no gradient.
+        finite: Whether the loss was finite. bool []
+    """
     gradients = [p.grad for p in parameters if p.grad is not None]
-    if not gradients or gradients[0].device.type == "cpu":
-        return all(usable(gradient) for gradient in gradients)
-    return usable_together(gradients)
+    if finite.device.type == "cpu":
+        sound = bool(finite) and all(usable(gradient) for gradient in gradients)
+        return torch.tensor(float(not sound))
+    if gradients:
+        finite = finite & nn.utils.get_total_norm(gradients).float().square().isfinite()
+    return (~finite).float()
 
 
-def usable_together(gradients: Iterable[Tensor]) -> bool:
-    """Whether all of some gradients, at least one, are `usable`, with one wait for the device."""
-    norms = [torch.linalg.vector_norm(gradient, dtype=torch.float32) for gradient in gradients]
-    return bool(torch.stack(norms).square().isfinite().all())
+def leave_out(optimizer: torch.optim.Optimizer, broken: Tensor) -> None:
+    """Let an optimiser leave out its next step where a flag is 1.
+
+    Fused Adam takes the flag as that of a gradient scaler, and nothing waits for the device. Others
+    find no gradients.
+    """
+    if getattr(optimizer, "_step_supports_amp_scaling", False):
+        optimizer.found_inf = broken  # type: ignore[attr-defined]
+    elif bool(broken):
+        optimizer.zero_grad(set_to_none=True)
 
 
 def unusable_gradients(named: Iterable[tuple[str, nn.Parameter]]) -> list[str]:

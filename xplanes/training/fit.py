@@ -1,5 +1,6 @@
 """Lightning's Trainer with our budget, and fields that are trained on the way to something else."""
 
+import copy
 import logging
 import sys
 import time
@@ -11,14 +12,8 @@ from typing import Any, Literal
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import (
-    Callback,
-    GradientAccumulationScheduler,
-    ProgressBar,
-    StochasticWeightAveraging,
-)
+from lightning.pytorch.callbacks import Callback, ProgressBar, StochasticWeightAveraging
 from lightning.pytorch.plugins.io import CheckpointIO
-from lightning.pytorch.strategies import DDPStrategy
 
 from xplanes.backend import cpu_loops, synchronize
 from xplanes.errors import ConfigError
@@ -33,7 +28,8 @@ from xplanes.training.clock import TrainingClock, find_callback
 from xplanes.training.collapse import CollapseWatch
 from xplanes.training.evaluation import Evaluation
 from xplanes.training.interrupt import Interrupt
-from xplanes.training.module import RadianceModule, require_whole_floats
+from xplanes.training.loading import require_whole_floats
+from xplanes.training.module import RadianceModule
 
 
 class Trainer(lightning.Trainer):
@@ -71,13 +67,6 @@ class Trainer(lightning.Trainer):
     ) -> None:
         if max_seconds is not None and not max_seconds > 0:
             raise ConfigError(f"max_seconds={max_seconds}: must be above 0, or null for no limit")
-        clip = others.get("gradient_clip_val")
-        accumulate = others.get("accumulate_grad_batches", 1)
-        if clip is not None or accumulate != 1:
-            raise ConfigError(
-                f"gradient_clip_val={clip} with accumulate_grad_batches={accumulate}: optimisation "
-                "is manual, so that neither applies; leave both out, or set model.rays.accumulate"
-            )
         if others.get("overfit_batches", 0) != 0:
             raise ConfigError(
                 f"overfit_batches={others['overfit_batches']}: rays are drawn anew at each step; "
@@ -106,13 +95,10 @@ class Trainer(lightning.Trainer):
         # Of the whole process: the LRM, too, computes in what precision=32 says.
         torch.set_float32_matmul_precision("high" if tf32 else "highest")
         torch.backends.cudnn.allow_tf32 = tf32
-        if others.get("strategy") == "ddp":
-            # The processes agree on the occupancy grid themselves, before it is maintained.
-            others["strategy"] = DDPStrategy(broadcast_buffers=False)
-        if others.get("limit_val_batches") == 0:
-            # Scores come from `Evaluation`, at any step: callbacks wait for them, not for epochs.
-            others.setdefault("check_val_every_n_epoch", None)
-            others.setdefault("val_check_interval", sys.maxsize)
+        # `Evaluation` says when views are scored; without it, nothing does.
+        others.setdefault("check_val_every_n_epoch", None)
+        others.setdefault("val_check_interval", sys.maxsize)
+        others.setdefault("num_sanity_val_steps", 0)
         # Lightning ends after 1000 epochs where no number of steps is given.
         others.setdefault("max_epochs", -1)
         self.interrupt = Interrupt()
@@ -141,24 +127,16 @@ class Trainer(lightning.Trainer):
         warm_up(module, data, device)
         with self.interrupt.exits():
             self.fit(module, data, ckpt_path=None if checkpoint is None else str(checkpoint))
+            evaluation = find_callback(self, Evaluation)
+            if evaluation is not None and evaluation.step != self.global_step:
+                # Lightning trains nothing where no step is left, though the end was not scored yet.
+                self.validate(module, data, verbose=False)
         module.to(device)  # Lightning leaves it on the CPU.
-        evaluation = find_callback(self, Evaluation)
-        if evaluation is not None and evaluation.step != self.global_step:
-            # Lightning calls no hooks where no step was left, though the end may not be scored yet.
-            evaluation.on_train_end(self, module)
-            for callback in self.checkpoint_callbacks:
-                if isinstance(callback, Checkpoints):
-                    callback.on_train_end(self, module)
 
 
 def _refuse_callbacks(callbacks: Sequence[Callback]) -> None:
     for callback in callbacks:
         name = type(callback).__name__
-        if isinstance(callback, GradientAccumulationScheduler):
-            raise ConfigError(
-                f"callbacks: {name}: optimisation is manual, so that it does not apply; set "
-                "model.rays.accumulate"
-            )
         if isinstance(callback, StochasticWeightAveraging):
             raise ConfigError(
                 f"callbacks: {name}: the model's schedules would overrule its learning rates; use "
@@ -229,18 +207,31 @@ def warm_up(module: RadianceModule, data: SceneDataModule, device: torch.device)
         module.to(device)
     elif not cpu_loops(next(module.field.parameters())):
         return
-    assert module.sampler is not None
     batches = data.batches_for(module, 0)
-    rays = _moved(module.ray_settings.part(batches.draw(0), 8), device)
+    rays = _moved(batches.draw(0, 8), device)
     with warming_up():
         if device.type != "cpu":
-            module.rehearse(rays)
+            rehearse(module, rays)
             synchronize(device)
             return
         rendering = module.sampler.render(module.field, rays, module.state)
         rendering.colour.sum().backward()
-        module.sampler.pass_on(rendering, module.state)
         module.zero_grad(set_to_none=True)
+
+
+def rehearse(module: RadianceModule, rays: Batch) -> None:
+    """Do all that a step does on a copy of the field, so that its kernels are compiled."""
+    copied, state = copy.deepcopy(module.parts), module.state
+    model, sampler = copied.model, copied.sampler
+    optimizer = model.optimizer([*model.groups(), *sampler.groups()])
+    rendering = sampler.render(model.field, rays, state)
+    terms = module.loss_terms(rendering, rays, state, copied)
+    torch.stack(list(terms.values())).sum().backward()
+    sampler.observe(rendering)
+    model.regularise(state)
+    sampler.regularise()
+    optimizer.step()
+    sampler.update(model.field, state)
 
 
 @dataclass(frozen=True)
@@ -263,21 +254,18 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
         module: The module, its loops compiled.
         data: Its data.
     """
-    assert module.sampler is not None
     assert module.frame is not None
     device = next(module.field.parameters()).device
-    batch = data.batches_for(module, 0).draw(0)
-    rays = _moved(module.ray_settings.part(batch, module.rays), device)
+    rays = _moved(data.batches_for(module, 0).draw(0, module.rays), device)
     seconds = []
     for _ in range(2):
         began = time.perf_counter()
         rendering = module.sampler.render(module.field, rays, module.state)
         rendering.colour.sum().backward()
-        module.sampler.pass_on(rendering, module.state)
         module.zero_grad(set_to_none=True)
         synchronize(device)
         seconds.append(time.perf_counter() - began)
-    views, renderer = data.scene.splits[data.test_split], module.renderer_now
+    views, renderer = data.scene.splits[data.test_split], module.renderer
     moment, background = float(views.times[0]), data.scene.background.to(device)
     camera = views.camera(0)
     if not isinstance(renderer, RayRenderer):
@@ -316,7 +304,6 @@ def quiet_lightning() -> None:
         ".*litlogger.*",
         ".*`IterableDataset` has `__len__` defined.*",
         ".*Checkpoint directory .* exists and is not empty.*",
-        ".*`training_step` returned `None`.*",
         ".*defined a `validation_step` but.*",
     ):
         warnings.filterwarnings("ignore", message=message)

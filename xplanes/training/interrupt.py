@@ -45,7 +45,19 @@ class Interrupt(Callback):
         if getattr(pl_module, "between_updates", True):
             self.check()
 
-    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_test_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        if trainer.world_size == 1:
+            self.check()
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         self._listen()
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:

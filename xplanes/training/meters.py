@@ -1,6 +1,8 @@
-"""What training steps show: opacities, and sums on a GPU that are read now and then."""
+"""What training steps show: sums that a GPU's host reads now and then, and opacities."""
 
+import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -49,6 +51,75 @@ class Meters:
             found = found | dict(zip(names, total.tolist(), strict=True))
         self._sums, self._known = {}, {}
         return found
+
+
+COUNTS = ("rays", "candidates", "empty", "occluded", "samples", "no_room")
+"""What a run counts: rays, samples in their box, those dropped as empty or occluded, those left,
+and rays left out for want of room on a GPU."""
+
+
+class Tally:
+    """What a run has counted, and what its last batches showed.
+
+    Attributes:
+        counts: Numbers since the start of the run, by the names in `COUNTS`.
+        last: Loss and PSNR of the last batches, mean opacities, and the last scores of views.
+        skipped: Updates that were left out.
+        skipped_in_a_row: The same, since the last one that was not.
+        opacities: Mean opacities of a recent batch, on its device.
+    """
+
+    def __init__(self) -> None:
+        self.counts: dict[str, int] = dict.fromkeys(COUNTS, 0)
+        self.last: dict[str, float] = {}
+        self.skipped = self.skipped_in_a_row = 0
+        self.opacities: dict[str, Tensor] = {}
+        self._batches, self._updates = Meters(), Meters()
+
+    def add_batch(self, values: Mapping[str, Tensor | float]) -> None:
+        """Take in a batch: its number of ``batches``, ``all_rays``, ``loss``, ``error``, counts."""
+        self._batches.add(values)
+
+    def add_update(self, broken: Tensor) -> None:
+        """Take in an update, which was left out where the flag is 1. []"""
+        self._updates.add({"updates": 1, "skipped": broken})
+        if broken.device.type == "cpu":
+            self._read_updates()
+
+    def read(self) -> tuple[int, int] | None:
+        """Look at what was taken in since the last look.
+
+        Returns:
+            Numbers of rays and of samples; None if there was no batch.
+        """
+        self._read_updates()
+        if not (found := self._batches.read()):
+            return None
+        batches, rays = int(found["batches"]), int(found["rays"])
+        error = max(found["error"] / batches, 1e-10)
+        self.last |= {"loss": found["loss"] / batches, "psnr": -10 * math.log10(error)}
+        self.last |= {name: float(value) for name, value in self.opacities.items()}
+        for name in COUNTS:
+            if name in found:
+                self.counts[name] += int(found[name])
+        self.counts["no_room"] += int(found["all_rays"]) - rays
+        return rays, int(found["samples"])
+
+    def _read_updates(self) -> None:
+        if found := self._updates.read():
+            skipped = int(found["skipped"])
+            self.skipped += skipped
+            all_of_them = skipped == int(found["updates"])
+            self.skipped_in_a_row = self.skipped_in_a_row + skipped if all_of_them else 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Counts and last values."""
+        return {"counts": dict(self.counts), "skipped": self.skipped, "last": dict(self.last)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state."""
+        self.counts = dict.fromkeys(COUNTS, 0) | state["counts"]
+        self.skipped, self.last = state["skipped"], dict(state["last"])
 
 
 def mean_opacities(rendering: Rendering, rays: Batch) -> dict[str, Tensor]:

@@ -1,21 +1,28 @@
-"""run.json: what ran, where, and how it ended."""
+"""The run directory: who may write it, run.json, config.yaml and train.log."""
 
 import logging
 import os
 import platform
 import subprocess
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
+import yaml
+
+import xplanes
 from xplanes import __version__
 from xplanes.errors import ConfigError
-from xplanes.files import read_json, write_json
+from xplanes.files import read_json, replacing, write_json, write_text
+from xplanes.lrm import LRMError
 from xplanes.process import resume_command
+from xplanes.scenes.errors import SceneError
 from xplanes.scenes.views import Views
+from xplanes.training.checkpoints import LAST, load_checkpoint
 
 logger = logging.getLogger(__name__)
 
@@ -222,3 +229,104 @@ def _git(folder: Path, *words: str) -> str:
         ["git", *words], cwd=folder, capture_output=True, text=True, timeout=5, check=True
     )
     return run.stdout.strip()
+
+
+def read_config(run: Path) -> dict[str, Any]:
+    """config.yaml of a run directory.
+
+    Raises:
+        ConfigError: If it is missing or damaged.
+    """
+    path = run / "config.yaml"
+    if not path.is_file():
+        raise ConfigError(f"{run} is not a run directory: no config.yaml in it")
+    try:
+        text = path.read_text(encoding="utf-8")
+        content = yaml.safe_load(text)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is damaged: {error}") from error
+    if not isinstance(content, dict) or not text.endswith("\n"):
+        raise ConfigError(f"{path} is damaged: not a mapping, or cut short")
+    return content
+
+
+def require_same_run(run: Path, config: Mapping[str, Any], max_steps: int) -> None:
+    """Refuse to go on as another run than that of the checkpoint, or with nothing to train.
+
+    Args:
+        run: The run directory.
+        config: The settings that it is to go on with.
+        max_steps: Steps after which training is to end; -1 for no limit.
+
+    Raises:
+        ConfigError: Saying what differs, or how many steps are done.
+    """
+    # What is damaged is written again, and what does not fit is refused later.
+    try:
+        before = read_config(run)
+    except ConfigError:
+        before = {}
+    require_same_settings(run, before, config)
+    try:
+        done = load_checkpoint(run / "checkpoints" / LAST)["global_step"]
+    except (ConfigError, KeyError):
+        return
+    if 0 <= max_steps < done:
+        raise ConfigError(
+            f"trainer.max_steps={max_steps}: {run} has done {done} steps already. Give more, or "
+            "leave it out"
+        )
+
+
+@contextmanager
+def keeping_settings(run: Path, config: Mapping[str, Any], overrides: list[str]) -> Iterator[None]:
+    """Write down the settings; those of before come back if they turn out to be impossible."""
+    paths = (run / "config.yaml", run / "overrides.txt")
+    before = {path: path.read_bytes() for path in paths if path.is_file()}
+    write_text(paths[0], yaml.safe_dump(dict(config), sort_keys=False))
+    write_text(paths[1], "".join(f"{line}\n" for line in overrides))
+    try:
+        yield
+    except (ConfigError, SceneError, LRMError):
+        for path, content in before.items():
+            with replacing(path) as temporary:
+                temporary.write_bytes(content)
+        raise
+
+
+@contextmanager
+def logged(path: Path) -> Iterator[None]:
+    """Send log records and warnings to a file, our own warnings to the terminal too."""
+    file, terminal = _LogFile(path), logging.StreamHandler()
+    file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    terminal.setFormatter(logging.Formatter("warning: %(message)s"))
+    terminal.addFilter(_own_warning)
+    logging.getLogger("xplanes").setLevel(logging.INFO)
+    root = logging.getLogger()
+    handlers = (file, terminal)
+    for handler in handlers:
+        root.addHandler(handler)
+    logging.captureWarnings(True)
+    try:
+        yield
+    finally:
+        logging.captureWarnings(False)
+        for handler in handlers:
+            root.removeHandler(handler)
+            with suppress(OSError):
+                handler.close()
+
+
+class _LogFile(logging.FileHandler):
+    """A log that a full disk cuts short, without a word for each line on the terminal."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+        return
+
+
+def _own_warning(record: logging.LogRecord) -> bool:
+    """Whether a record is a warning of this package; Python's name the file they come from."""
+    ours = record.name.startswith("xplanes") or (
+        record.name == "py.warnings" and f"{Path(xplanes.__file__).parent}" in record.getMessage()
+    )
+    return ours and record.levelno == logging.WARNING

@@ -1,0 +1,258 @@
+"""A whole run: build, prepare, fit, score, report. Read it from top to bottom."""
+
+import logging
+import os
+import time
+import traceback
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import seed_everything
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+
+from xplanes.backend import warm_up
+from xplanes.errors import ConfigError, XPlanesError
+from xplanes.evaluation.findings import camera_findings, opaque_findings
+from xplanes.evaluation.published import check_published
+from xplanes.evaluation.render import VIDEO_FRAMES, write_orbit
+from xplanes.evaluation.report import closing, header, log_hparams, summary, write_pictures
+from xplanes.evaluation.sheet import check_what
+from xplanes.experiment import Experiment
+from xplanes.files import StorageError, clear_unfinished, storage_error, write_json
+from xplanes.locks import alone_in
+from xplanes.lrm import LRMError
+from xplanes.models.initialisation import Initialisation, Place
+from xplanes.optional import MissingExtraError
+from xplanes.process import resume_command
+from xplanes.scenes.datamodule import SceneDataModule, found_root
+from xplanes.scenes.errors import SceneError
+from xplanes.training.checkpoints import find_resumable, has_checkpoint
+from xplanes.training.clock import find_callback, training_seconds
+from xplanes.training.evaluation import Evaluation
+from xplanes.training.fit import Trainer, estimate
+from xplanes.training.fit import warm_up as warm_up_loops
+from xplanes.training.module import RadianceModule
+from xplanes.training.record import (
+    RunRecord,
+    claim,
+    keeping_settings,
+    logged,
+    require_same_run,
+    require_same_views,
+)
+from xplanes.training.scores import ViewScore
+
+logger = logging.getLogger(__name__)
+
+KNOWN_ERRORS = (XPlanesError, MisconfigurationException)
+"""Errors that are reported by their message; the traceback is written to train.log only."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run that can begin: its settings are parsed, its Trainer is built, nothing is written.
+
+    Attributes:
+        experiment: The settings.
+        trainer: With callbacks and loggers.
+        folder: The run directory, which need not exist yet.
+    """
+
+    experiment: Experiment
+    trainer: Trainer
+    folder: Path
+
+
+def prepare(config: dict[str, Any], folder: Path) -> Job:
+    """Parse the settings of a run and build its Trainer.
+
+    Args:
+        config: The resolved configuration, builtins only.
+        folder: The run directory.
+
+    Raises:
+        ConfigError: If settings are missing, out of range, or contradict one another.
+    """
+    experiment = Experiment.read(config)
+    check_published(config.get("published", []))
+    check_what(config.get("sheet"))
+    return Job(experiment, experiment.build_trainer(folder), folder)
+
+
+def run(
+    config: dict[str, Any],
+    folder: Path,
+    overrides: list[str],
+    *,
+    resume: bool,
+    job: Job | None = None,
+) -> float:
+    """Train and score one field.
+
+    Args:
+        config: The resolved configuration, builtins only.
+        folder: The run directory.
+        overrides: What the command line changed.
+        resume: Whether to continue the run in ``folder``.
+        job: What `prepare` has made of the configuration; made here when None.
+
+    Returns:
+        PSNR of the scored split in dB; NaN in helper processes of a distributed run.
+
+    Raises:
+        ConfigError, SceneError, LRMError, TrainingError, StorageError: With a message that says
+            what to do.
+        KeyboardInterrupt: If the user stopped it; the state is saved.
+    """
+    if resume and isinstance(root := config.get("data", {}).get("root"), str):
+        # It may be relative to where the run was started.
+        found = found_root(folder, root)
+        job = job if found == root else None
+        config = config | {"data": config["data"] | {"root": found}}
+    job = job or prepare(config, folder)
+    if int(os.environ.get("LOCAL_RANK", "0")):
+        train(job, resume=resume)
+        return float("nan")
+    try:
+        with alone_in(folder):
+            claim(folder, resume=resume)
+            if resume and has_checkpoint(folder):
+                require_same_run(folder, config, job.experiment.trainer.get("max_steps", -1))
+            clear_unfinished(folder)
+            with keeping_settings(folder, config, overrides):
+                return _recorded(job, overrides, resume=resume)
+    except OSError as problem:
+        if (words := storage_error(problem)) is None:
+            raise
+        raise words from problem
+
+
+def _recorded(job: Job, overrides: list[str], *, resume: bool) -> float:
+    """Train with run.json and train.log kept, and give PSNR."""
+    folder = job.folder
+    with logged(folder / "train.log"):
+        record = RunRecord(folder, job.experiment.method.seed, resume=resume)
+        try:
+            metrics = train(job, resume=resume, record=record, overrides=overrides)
+            record.end("finished")
+        except KeyboardInterrupt:
+            record.end("interrupted")
+            say(f"\nstopped. Go on with: {resume_command(folder)}")
+            raise
+        except BaseException as error:
+            logger.error("failed\n%s", traceback.format_exc())
+            # On a full disk the record stays "running", as after a power cut; resume= takes both.
+            with suppress(StorageError):
+                record.end("failed", f"{type(error).__name__}: {error}")
+            if not isinstance(error, ConfigError | SceneError | LRMError | MissingExtraError):
+                say(f"\nstopped. Once that is fixed: {resume_command(folder)}")
+            raise
+    return metrics["test"]["psnr"]
+
+
+def train(
+    job: Job, *, resume: bool, record: RunRecord | None = None, overrides: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Build, fit, score and report; only the process with a ``record`` reports.
+
+    Returns:
+        The content of metrics.json; empty without a ``record``.
+    """
+    experiment, trainer, folder = job.experiment, job.trainer, job.folder
+    method, settings, device = experiment.method, experiment.data, experiment.device
+    seed_everything(method.seed, verbose=False)
+    source = method.lrm.load(say)
+
+    # Data
+    warm, started = warm_up.seconds, time.monotonic()
+    data = SceneDataModule(settings, seed=method.seed)
+    data.setup("fit")
+    scene, views = data.scene, data.scene.splits["train"]
+    if resume and record is not None and has_checkpoint(folder):
+        require_same_views(folder, record.content, views)
+    frame = method.model.frame(views, settings.half_side, scene.points)
+    if record is not None:
+        for finding in (*camera_findings(scene, frame), *opaque_findings(scene)):
+            logger.warning("%s", finding.text)
+    loaded = time.monotonic() - started
+
+    # Initialisation and field
+    found = Initialisation(method.model, frame)
+    if source is not None:
+        place = Place(scene, frame, device, experiment.devices, say, settings.half_side)
+        found = source.initialise(method, place)
+    del source
+    began = time.monotonic() - warm_up.seconds
+    module = RadianceModule(method)
+    module.build(scene, frame, device=device, initialise=lambda *_: found)
+    loaded += time.monotonic() - warm_up.seconds - began
+
+    # Training
+    if record is not None:
+        record.note(
+            device=torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
+            precision=module.field.precision,
+            files={name: list(views.files) for name, views in scene.splits.items()},
+        )
+        warm_up_loops(module, data, device)
+        expected = estimate(module, data)
+        text = header(experiment, folder, data, module, overrides, expected)
+        logger.info("\n%s", text)
+        say(text + "\n")
+        write_pictures(trainer, found.pictures, log=not resume)
+    trainer.train(module, data, find_resumable(folder / "checkpoints") if resume else None)
+
+    # Scores
+    began = time.perf_counter()
+    scores = _final_scores(trainer, module, data)
+    if record is None:
+        return {}
+    evaluation = find_callback(trainer, Evaluation)
+    seconds = {
+        "load": loaded,
+        "warm_up": warm_up.seconds - warm,
+        "prepare": dict(found.seconds),
+        "train": training_seconds(trainer),
+        "evaluate": time.perf_counter() - began + (evaluation.seconds if evaluation else 0.0),
+    }
+
+    # Report
+    skipped = data.batches_for(module, 0).skipped
+    metrics = summary(trainer, module, scores, data, seconds, skipped)
+    metrics["skipped"] |= found.skipped
+    metrics["decomposition"] = found.report
+    metrics["lrm"] = found.lrm
+    if experiment.media:
+        say(f"rendering {VIDEO_FRAMES} frames of the orbit video ...")
+        metrics["media"] = str(write_orbit(module, scene, folder).relative_to(folder))
+    seconds["total"] = record.total_seconds
+    write_json(folder / "metrics.json", metrics)
+    log_hparams(trainer, experiment, metrics)
+    text = closing(folder, experiment, metrics)
+    logger.info("\n%s", text)
+    say(text)
+    return metrics
+
+
+def _final_scores(
+    trainer: Trainer, module: RadianceModule, data: SceneDataModule
+) -> list[ViewScore]:
+    """Scores of all views of the split to test, those of the last evaluation if it had them."""
+    views = data.scene.splits[data.test_split]
+    evaluation = find_callback(trainer, Evaluation)
+    same = data.test_split == (data.validation_split or data.test_split)
+    scored = evaluation is not None and evaluation.step == trainer.global_step
+    if not (same and scored and len(module.scores) == len(views)):
+        with trainer.interrupt.exits():
+            trainer.test(module, data, verbose=False)
+    by_file = {score.file: score for score in module.scores}
+    return [by_file[file] for file in views.files if file in by_file]
+
+
+def say(text: str) -> None:
+    """Print a line at once."""
+    print(text, flush=True)

@@ -1,0 +1,171 @@
+"""What a training run is built of: the field with its model, sampler and initialisation."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from xplanes.backend import fast_bf16
+from xplanes.errors import ConfigError
+from xplanes.fields.base import Representation
+from xplanes.models.base import Model, ModelSettings
+from xplanes.models.initialisation import Initialisation, Method, Place
+from xplanes.rendering.sampler import Sampler, Site
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.views import Scene
+
+ANOTHER_SEED = 1_000_003
+"""Added to the seed of a field that is initialised again."""
+
+Initialise = Callable[[Method, Place], Initialisation]
+
+
+@dataclass(frozen=True)
+class Parts:
+    """A field and what trains it.
+
+    Attributes:
+        settings: The model's settings, as the initialisation left them.
+        site: What the field was built for.
+        model: The model, which has the field.
+        sampler: Renders the field.
+        initialisation: Where the initial values came from; None if they were loaded.
+    """
+
+    settings: ModelSettings
+    site: Site
+    model: Model
+    sampler: Sampler
+    initialisation: Initialisation | None = None
+
+    @property
+    def field(self) -> Representation:
+        """The field that is trained."""
+        return self.model.field
+
+    @classmethod
+    def assemble(
+        cls, settings: ModelSettings, site: Site, initialisation: Initialisation | None = None
+    ) -> "Parts":
+        """Build model and sampler.
+
+        Raises:
+            ConfigError: If they do not fit together.
+        """
+        values = None if initialisation is None else initialisation.values
+        model = settings.build(site, values)
+        field = require_field(model)
+        settings.sampler.require_kind(type(field))
+        sampler = settings.sampler.build(field, site)
+        require_groups(model, sampler)
+        return cls(settings, site, model, sampler, initialisation)
+
+    def stronger(self) -> "Parts":
+        """The same with another seed and the model's settings for a field that shows nothing."""
+        settings = self.settings.stronger()
+        assert settings is not None
+        site = replace(self.site, seed=self.site.seed + ANOTHER_SEED)
+        return Parts.assemble(settings, site, self.initialisation)
+
+
+def build_parts(
+    method: Method,
+    scene: Scene,
+    *,
+    half_side: float | None = None,
+    device: torch.device | None = None,
+    devices: int = 1,
+    initialise: Initialise | None = None,
+    frame: Frame | None = None,
+    say: Callable[[str], None] = print,
+) -> Parts:
+    """Build the field of a scene, with its initialisation.
+
+    Args:
+        method: All settings except those of the data and the Trainer.
+        scene: The scene, with a ``train`` split.
+        half_side: Half the side of the scene's cube in world units; estimated when None.
+        device: Device on which the field will be trained; the CPU when None.
+        devices: Number of processes that share the run.
+        initialise: Function that makes the initialisation; taken from ``lrm`` when None.
+        frame: The field's frame; chosen by the model when None.
+        say: Function that receives a status line before each slow operation.
+
+    Raises:
+        ConfigError, SceneError, LRMError: If settings, scene and initialisation do not fit
+            together.
+    """
+    views, rays = scene.splits["train"], method.model.rays
+    device = device or torch.device("cpu")
+    frame = frame or method.model.frame(views, half_side, scene.points)
+    if initialise is None and (source := method.lrm.load(say)) is not None:
+        initialise = source.initialise
+    found = Initialisation(method.model, frame)
+    if initialise is not None:
+        found = initialise(method, Place(scene, frame, device, devices, say, half_side))
+    settled = rays.on(device)
+    site = Site(
+        frame=found.frame,
+        # In a field without time planes all views are of one timestep.
+        times=torch.zeros_like(views.times) if found.model.is_static else views.times,
+        seed=method.seed,
+        precision=precision_of(found.model, device),
+        bounds=found.model.bounds(views),
+        views=views,
+        initialised=found.values is not None,
+        surrounded=scene.is_surrounded,
+        device=device,
+        samples_per_batch=settled.most_samples,
+        batch_scale=settled.most / rays.most if rays.most else 1.0,
+    )
+    return Parts.assemble(found.model, site, found)
+
+
+def precision_of(settings: ModelSettings, device: torch.device) -> str:
+    """The precision of products, settled for a device where the settings say auto."""
+    if settings.precision == "auto":
+        return "bf16" if fast_bf16(device) else "32"
+    return settings.precision
+
+
+def require_field(model: Model) -> Representation:
+    """The field of a model, if it is one.
+
+    Raises:
+        ConfigError: If it is of another class.
+    """
+    field: Any = model.field
+    if not isinstance(field, Representation):
+        raise ConfigError(
+            f"{type(model).__name__}.field: {type(field).__name__} must be derived from "
+            "xplanes.fields.base.RadianceField"
+        )
+    return field
+
+
+def require_groups(model: Model, sampler: Sampler) -> None:
+    """Refuse parameter groups that training cannot work with.
+
+    Raises:
+        ConfigError: With what a group consists of.
+    """
+    wanted = ("params", "lr", "name")
+    whole = '{"params": list(field.parameters()), "lr": 0.001, "name": "field"}'
+    for owner in (model, sampler):
+        place = f"{type(owner).__name__}.groups"
+        for group in owner.groups():
+            if missing := [key for key in wanted if key not in group]:
+                raise ConfigError(f"{place}: a group lacks {' and '.join(missing)}; write {whole}")
+    groups = [*model.groups(), *sampler.groups()]
+    names = [group["name"] for group in groups]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ConfigError(f"{type(model).__name__}.groups: two groups have the name {twice[0]}")
+    keys = [(group["name"], key) for group in groups for key in group if key not in wanted]
+    optimizer = model.optimizer(groups)
+    for name, key in keys:
+        if key not in optimizer.defaults:
+            raise ConfigError(
+                f"{type(model).__name__}.groups: {type(optimizer).__name__} takes no {key!r}, "
+                f"which the group {name} has; it takes {', '.join(optimizer.defaults)}"
+            )

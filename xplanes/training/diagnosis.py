@@ -1,0 +1,92 @@
+"""What to tell a user whose training cannot continue."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from xplanes.errors import XPlanesError
+from xplanes.rendering.base import Rendering
+from xplanes.training.finite import not_finite
+
+if TYPE_CHECKING:
+    from xplanes.training.module import RadianceModule
+
+
+class TrainingError(XPlanesError, RuntimeError):
+    """Training cannot continue; the message says what was observed and what to change."""
+
+
+def diagnosis(
+    module: "RadianceModule",
+    what: str,
+    rendering: Rendering,
+    terms: Mapping[str, Tensor],
+    gradients: Sequence[str] = (),
+) -> str:
+    """What is not finite, and what to change.
+
+    Args:
+        module: What is trained.
+        what: What was observed.
+        rendering: That of the last batch.
+        terms: Terms of its loss by name.
+        gradients: Gradients that are not finite.
+    """
+    density, parameters = rendering.density, not_finite(module.named_parameters())
+    seen = {"colour": rendering.colour, "opacity": rendering.opacity, "density": density}
+    rays = [f"rendered {name}" for name in not_finite(seen.items())]
+    # A term as the configuration names it, or as one of the model's.
+    losses = [
+        f"losses.{name}" if name in module.method.losses else f"loss term {name}"
+        for name in not_finite(terms.items())
+    ]
+    broken = parameters or [*gradients] or [*rays, *losses]
+    return (
+        f"{what}, at step {module.global_step}; not finite: "
+        f"{', '.join(broken) or 'gradients, or something in another process'}; largest density "
+        f"{float(density.max()) if len(density) else 0:.3g}. "
+        f"{_way_out(module, losses, rendered=not (parameters or rays))}"
+    )
+
+
+def require_finite(module: "RadianceModule") -> None:
+    """Refuse to go on with, or to keep, parameters that are not finite.
+
+    Raises:
+        TrainingError: Naming them.
+    """
+    if broken := not_finite(module.named_parameters()):
+        raise TrainingError(
+            f"not finite at step {module.global_step}: {', '.join(broken)}. No checkpoint was "
+            f"written over the last sound one. {_way_out(module)}"
+        )
+
+
+def _way_out(
+    module: "RadianceModule", broken: Sequence[str] = (), *, rendered: bool = False
+) -> str:
+    """What to change.
+
+    Args:
+        module: What is trained.
+        broken: Terms of the loss that are not finite.
+        rendered: Whether parameters and rendering are finite nevertheless.
+    """
+    added = [f"losses.{name}" for name in module.method.losses] if rendered else []
+    begun = module.global_step > module.tally.skipped
+    resume = "; resume= continues from the last checkpoint" if begun else ""
+    if culprits := [name for name in added if name in broken]:
+        return f"The rendering is finite: correct {' and '.join(culprits)} or omit it{resume}"
+    precision = "" if module.field.precision == "32" else ", or set model.precision=32"
+    if begun:
+        more = f", or omit {' and '.join(added)}" if added else ""
+        return f"{module.model.advice}{more}{precision}{resume}"
+    if module.site.initialised and not added and not (rendered and broken):
+        largest = max(float(p.detach().abs().max()) for p in module.field.parameters())
+        return (
+            "No step was done yet, so the initialisation is to blame, whose largest value is "
+            f"{largest:.3g}: set lrm=none, or make another one"
+        )
+    checked = " and ".join([type(module.field).__name__, *added])
+    return f"No step was done yet: check the values and gradients of {checked}{precision}"

@@ -1,0 +1,93 @@
+"""What a checkpoint says of the field, so that it can be built without its data."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+from xplanes.components import build, plugins
+from xplanes.errors import ConfigError
+from xplanes.models.base import ModelSettings
+from xplanes.models.initialisation import Method
+from xplanes.rendering.sampler import Site
+from xplanes.scenes.frame import Frame, frame_content, read_frame
+from xplanes.training.building import Parts, precision_of
+
+
+def site_content(parts: Parts) -> dict[str, Any]:
+    """What data and LRM have settled about a field, as plain values and tensors."""
+    site = parts.site
+    return {
+        "model": parts.settings.plain(),
+        "frame": frame_content(site.frame),
+        "times": site.times,
+        "bounds": site.bounds,
+        "initialised": site.initialised,
+        "surrounded": site.surrounded,
+    }
+
+
+def parts_from(
+    content: Mapping[str, Any], method: Method, modules: Sequence[str], samples: int | None
+) -> Parts:
+    """Build a field without its data, for weights that are about to be loaded.
+
+    Args:
+        content: What `site_content` gave.
+        method: All settings except those of the data and the Trainer.
+        modules: The user's modules whose classes ``content`` may name.
+        samples: Samples per training batch.
+
+    Raises:
+        ConfigError: If the content names a class that may not stand there.
+    """
+    with plugins(modules):
+        settings = build(content["model"], ModelSettings, "model")
+    if not content["initialised"] or settings.name != method.model.name:
+        settings = method.model  # Weights of another one will not fit.
+    site = Site(
+        frame=_frame(content),
+        times=content["times"],
+        seed=method.seed,
+        precision=precision_of(settings, torch.device("cpu")),
+        bounds=content["bounds"],
+        surrounded=content["surrounded"],
+        samples_per_batch=samples,
+    )
+    return Parts.assemble(settings, site)
+
+
+def require_frame(parts: Parts, content: Mapping[str, Any]) -> None:
+    """Refuse planes that were trained in another frame than the initialisation lies in now.
+
+    Raises:
+        ConfigError: Naming what differs.
+    """
+    trained = _frame(content)
+    if not (parts.site.initialised and content["initialised"]):
+        return
+    for name, now in frame_content(parts.site.frame).items():
+        before = torch.as_tensor(getattr(trained, name))
+        if not torch.allclose(before, torch.as_tensor(now), rtol=1e-4, atol=1e-5):
+            raise ConfigError(
+                f"the initialisation was computed again, and its frame is not the checkpoint's "
+                f"({name} {before.tolist()}, now {torch.as_tensor(now).tolist()}): what "
+                "preparation.cache kept is gone. Bring it back, or train anew in another folder"
+            )
+
+
+def _frame(content: Mapping[str, Any]) -> Frame:
+    return read_frame(content["frame"], "the checkpoint")
+
+
+def require_whole_floats(precision: str) -> None:
+    """Refuse a Trainer that changes the precision: the model sets its own.
+
+    Raises:
+        ConfigError: With what to set instead.
+    """
+    if precision not in ("32", "32-true"):
+        raise ConfigError(
+            f"precision={precision}: a field computes in model.precision (auto, 32 or bf16), and "
+            "its planes are float32; leave it out"
+        )

@@ -1,0 +1,190 @@
+"""Scores of views: rendered, compared with the true images, and averaged."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from lightning import Trainer
+from torch import Tensor, distributed
+
+from xplanes.fields.base import Representation
+from xplanes.metrics import psnr, ssim
+from xplanes.rendering.base import Renderer, leave_empty
+from xplanes.scenes.datamodule import whole_view
+from xplanes.scenes.frame import Frame
+from xplanes.scenes.views import Views
+
+VISIBLE = 0.05
+"""Opacity above which a background pixel shows a floater."""
+
+SOLID = 128
+"""Share of a pixel, of 255, from which it shows the thing."""
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """Scores of one view.
+
+    Attributes:
+        file: Name of the true image.
+        time: Its time, from 0 to 1.
+        psnr: In dB.
+        ssim: Structural similarity.
+        psnr_thing: In dB, over the pixels that show the thing; NaN where they are not known.
+        floaters: Share of background pixels (alpha 0 in the true image) that are not transparent;
+            NaN where the image has none.
+    """
+
+    file: str
+    time: float
+    psnr: float
+    ssim: float
+    floaters: float
+    psnr_thing: float = math.nan
+
+    @property
+    def scores(self) -> dict[str, float]:
+        """The numbers by name, those that are known."""
+        found = {"psnr": self.psnr, "ssim": self.ssim}
+        maybe = {"psnr_thing": self.psnr_thing, "floaters": self.floaters}
+        return found | {name: value for name, value in maybe.items() if not math.isnan(value)}
+
+
+@dataclass(frozen=True)
+class ViewImages:
+    """What was compared.
+
+    Attributes:
+        truth: True colours. [H, W, 3]
+        colour: Rendered colours. [H, W, 3]
+        depth: Rendered depth in the field's frame. [H, W]
+        opacity: Rendered opacity. [H, W]
+    """
+
+    truth: Tensor
+    colour: Tensor
+    depth: Tensor
+    opacity: Tensor
+
+
+def render_item(
+    field: Representation, renderer: Renderer, frame: Frame, item: Mapping[str, Any]
+) -> dict[str, Tensor]:
+    """Render a view whole: ``colour`` [h, w, 3], ``opacity`` and ``depth`` [h, w], on the CPU.
+
+    Args:
+        field: The field.
+        renderer: Renders it.
+        frame: The field's frame.
+        item: What `whole_view` gives.
+    """
+    background: Tensor = item["background"].cpu()
+    image = renderer.view(field, frame, item["camera"], float(item["time"]), background)
+    found = {name: value.cpu() for name, value in image.items()}
+    if (shown := item.get("shown")) is not None:
+        leave_empty(found, ~shown.cpu(), background)
+    return found
+
+
+def render_view(
+    field: Representation,
+    renderer: Renderer,
+    frame: Frame,
+    views: Views,
+    index: int,
+    background: Tensor,
+) -> dict[str, Tensor]:
+    """As `render_item`, for one of some views in front of ``background`` [3]."""
+    return render_item(field, renderer, frame, whole_view(views, index, background))
+
+
+def score_image(image: Mapping[str, Tensor], item: Mapping[str, Any]) -> ViewScore:
+    """Compare a rendered view with the true image.
+
+    Args:
+        image: What `render_item` gives.
+        item: What `whole_view` gives.
+    """
+    truth = item["target"].cpu()
+    colour = image["colour"].float().clamp(0, 1)
+    return ViewScore(
+        file=item["file"],
+        time=float(item["time"]),
+        psnr=psnr(colour, truth),
+        ssim=ssim(colour, truth),
+        floaters=floaters(image["opacity"].float(), item["alpha"].cpu()),
+        psnr_thing=psnr_thing(colour, truth, item.get("thing")),
+    )
+
+
+def score_view(
+    field: Representation,
+    renderer: Renderer,
+    frame: Frame,
+    views: Views,
+    index: int,
+    background: Tensor,
+) -> tuple[ViewScore, ViewImages]:
+    """Render one view and compare it with the true image in front of ``background``."""
+    item = whole_view(views, index, background)
+    image = render_item(field, renderer, frame, item)
+    colour, depth, opacity = (image[name].float() for name in ("colour", "depth", "opacity"))
+    images = ViewImages(item["target"], colour.clamp(0, 1), depth, opacity)
+    return score_image(image, item), images
+
+
+def gathered(scores: Sequence[ViewScore], trainer: Trainer) -> list[ViewScore]:
+    """The scores of all processes, each of which scores every so many-th view, in order."""
+    if trainer.world_size == 1:
+        return list(scores)
+    parts: list[Any] = [None] * trainer.world_size
+    distributed.all_gather_object(parts, list(scores))
+    most = max(len(part) for part in parts)
+    return [part[place] for place in range(most) for part in parts if place < len(part)]
+
+
+def psnr_thing(colour: Tensor, truth: Tensor, thing: Tensor | None) -> float:
+    """PSNR in dB of the pixels most of which show the thing; NaN where there are none.
+
+    Args:
+        colour: Rendered colours. [H, W, 3]
+        truth: True colours. [H, W, 3]
+        thing: Share of each pixel that shows the thing; None where it is not known. uint8 [H, W]
+    """
+    if thing is None or not (shown := thing.cpu() >= SOLID).any():
+        return math.nan
+    return psnr(colour[shown], truth[shown])
+
+
+def floaters(opacity: Tensor, alpha: Tensor) -> float:
+    """Share of pixels with alpha 0 whose rendered opacity is above `VISIBLE`. [H, W], uint8 [H, W]
+
+    NaN without such pixels.
+    """
+    return float((opacity[alpha == 0] > VISIBLE).float().mean())
+
+
+def mean_scores(scores: Sequence[ViewScore]) -> dict[str, float]:
+    """Means over views of each score that any of them has."""
+    names = ("psnr", "ssim", "psnr_thing", "floaters")
+    found = {name: [s.scores[name] for s in scores if name in s.scores] for name in names}
+    return {name: mean(values) for name, values in found.items() if values}
+
+
+def mean_colour(views: Views, background: Tensor) -> Tensor:
+    """Mean over images in front of ``background`` [3] of their mean colour. [3]"""
+    images = (views.composite(index, background) for index in range(len(views)))
+    return torch.stack([image.flatten(0, 1).mean(dim=0) for image in images]).mean(dim=0)
+
+
+def blank_psnr(views: Views, background: Tensor) -> float:
+    """Mean PSNR in dB of images that show nothing but the background."""
+    truths = (views.composite(index, background) for index in range(len(views)))
+    return mean([psnr(background.expand_as(truth), truth) for truth in truths])
+
+
+def mean(values: Sequence[float]) -> float:
+    """Plain mean; NaN for none."""
+    return math.fsum(values) / len(values) if values else math.nan

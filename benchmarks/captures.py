@@ -78,7 +78,7 @@ def overrides(scene: str, variant: str, seed: int, args: argparse.Namespace) -> 
         ),
         *VARIANTS[variant],
         *(f"trainer.max_steps={steps or -1}", f"trainer.max_seconds={seconds or 'null'}"),
-        *("callbacks.evaluation.at=[]", "callbacks.evaluation.views=1", "logger=none"),
+        *("callbacks.evaluation.at=[]", "trainer.limit_val_batches=1", "logger=none"),
         *("media=false", f"seed={seed}", *args.overrides),
     ]
 

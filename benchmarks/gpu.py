@@ -658,7 +658,7 @@ def training(
 def throughput(row: str, *overrides: str, **options: Any) -> Part:
     """Some seconds of training; the score on the way marks where the count of steps begins."""
     budget = (f"trainer.max_seconds={SETTLED}", f"callbacks.evaluation.at=[{SHARE}]")
-    views = ("callbacks.evaluation.views=1", "data.eval_views=2")
+    views = ("trainer.limit_val_batches=1", "data.eval_views=2")
     given = (*overrides, "trainer.accelerator=gpu", *budget, *views)
     return Part("throughput", row, overrides=given, **options)
 
@@ -671,7 +671,7 @@ LEGO = (
     NONE,
     f"trainer.max_seconds={LEGO_SECONDS}",
     f"callbacks.evaluation.at={LOOKS}".replace(" ", ""),
-    "callbacks.evaluation.views=8",
+    "trainer.limit_val_batches=8",
 )
 NO_KERNELS = (("XPLANES_GPU_KERNELS", "0"),)
 

@@ -41,7 +41,7 @@ FIRST = 1.0
 MARGIN = 0.05
 """Decibels by which a run may be behind and still count as the best: less than a seed makes."""
 
-SELDOM = ("callbacks.evaluation.at=[0.5,1.0]", "callbacks.evaluation.views=2")
+SELDOM = ("callbacks.evaluation.at=[0.5,1.0]", "trainer.limit_val_batches=2")
 """How often a baseline is scored: a picture takes it seconds."""
 
 CASES: dict[str, tuple[str, ...]] = {
@@ -171,7 +171,7 @@ def main() -> None:
         "trainer.max_steps=1000000",
         "trainer.accelerator=cpu",
         "media=false",
-        "callbacks.evaluation.views=4",
+        "trainer.limit_val_batches=4",
         "data.eval_views=5",
         # A stage taken from the cache would cost its run nothing.
         "preparation.cache=null",

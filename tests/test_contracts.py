@@ -80,7 +80,7 @@ def names(group, *, paper):
 COMPOSITIONS = [
     # The groups that go with all others, as many options of them at once as there are.
     ["data=demo", "lrm=none", "decomposition=default", "trainer=default", "preparation=default"],
-    ["data=dnerf", "lrm=tiny", "decomposition=paper", "trainer=cpu", "callbacks=threads"],
+    ["data=dnerf", "lrm=tiny", "decomposition=paper", "trainer=cpu"],
     ["lrm=mini", "trainer=debug", "model/sampler=occupancy", "logger=none", "model=six_planes"],
     ["data=suite", "lrm=base", "trainer=ddp", "model=nine_planes", "callbacks=default"],
     ["lrm=large", "trainer=gpu", "logger=tensorboard"],
@@ -502,9 +502,7 @@ TRAINING = [
     *(("trainer.log_every_n_steps", value) for value in (-1, "often")),
     ("callbacks.evaluation.at", [0.5, 1.5]),
     ("callbacks.evaluation.at", "often"),
-    *(("callbacks.evaluation.views", value) for value in (0, -1, "all")),
     *(("callbacks.checkpoints.every", value) for value in (0, -1, "often")),
-    *(("callbacks.plateau.gain", value) for value in (0, -1, "some")),
     ("callbacks.evaluation", "yes"),
 ]
 

@@ -117,18 +117,14 @@ def test_a_resumed_run_goes_on_with_its_csv(scenes: Path, tmp_path: Path) -> Non
 def test_scores_are_of_the_averaged_weights_that_checkpoints_hold(
     scenes: Path, tmp_path: Path
 ) -> None:
-    config = small_config(
-        scenes, "trainer.max_steps=60", "data.eval_split=val", "callbacks.evaluation.views=null"
-    )
+    config = small_config(scenes, "trainer.max_steps=60", "data.eval_split=val")
     name = "lightning.pytorch.callbacks.EMAWeightAveraging"
     config["callbacks"]["average"] = {"_target_": name, "decay": 0.98}
     run(config, tmp_path / "run", [], resume=False)
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     again = evaluate(load_run(tmp_path / "run"), "none")
     assert found["test"]["psnr"] == pytest.approx(again["test"]["psnr"], abs=1e-6)
-    plain = small_config(
-        scenes, "trainer.max_steps=60", "data.eval_split=val", "callbacks.evaluation.views=null"
-    )
+    plain = small_config(scenes, "trainer.max_steps=60", "data.eval_split=val")
     run(plain, tmp_path / "plain", [], resume=False)
     raw = json.loads((tmp_path / "plain" / "metrics.json").read_text())
     assert abs(raw["test"]["psnr"] - found["test"]["psnr"]) > 0.1

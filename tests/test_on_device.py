@@ -37,9 +37,9 @@ from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes import batches
 from xplanes.scenes.batches import DeviceBatches
 from xplanes.training.clock import TrainingClock
+from xplanes.training.diagnosis import TrainingError
 from xplanes.training.fit import warm_up
 from xplanes.training.meters import due
-from xplanes.training.module import TrainingError
 from xplanes.training.scores import score_view
 
 NOWHERE = Path("nowhere")
@@ -225,7 +225,7 @@ def test_a_background_is_the_same_without_a_list_of_rays(fake_gpu):
 
 
 def test_loss_and_psnr_are_means_of_all_batches_whose_gradients_add_up(fake_gpu):
-    module, _, _ = trained("six", 8, "model.rays.accumulate=2")
+    module, _, _ = trained("six", 8, "trainer.accumulate_grad_batches=2")
     assert module.batches == 16
     alone, _, _ = trained("six", 8)
     assert module.last["loss"] == pytest.approx(alone.last["loss"], rel=0.3)
@@ -351,7 +351,7 @@ def test_larger_batches_shorten_the_schedules(
         *(f"model.rays.per_batch={size}", "model.rays.samples_per_batch=16384"),
         "model.sampler.samples=24",
         *("model.sampler.sweep_at=[4]", "model.sampler.sweep_every=10"),
-        *("model.sampler.coarse_steps=5", "model.sampler.update_every=6"),
+        "model.sampler.update_every=6",
         *("model.warmup_steps=7", "model.final_lr=1.0"),
     )
     module, _, _ = trained("six", 11, *options, trainer=trainer, watch=[upkeep])

@@ -41,7 +41,6 @@ OCCUPANCY = (
     "model.sampler.grid_resolution=16",
     "model.sampler.samples=48",
     "model.sampler.update_cells=256",
-    "model.sampler.coarse_steps=0",
 )
 
 

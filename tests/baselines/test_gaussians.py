@@ -351,7 +351,7 @@ def test_gradients_of_the_planes_terms_are_those_of_their_values():
 
 def test_batches_are_whole_views_each_once_in_a_turn():
     views = replace(ball_views(5, 0.6, size=12), files=tuple("abcde"))
-    batches = ViewBatches(views, ViewSettings(accumulate=1, background="white"), seed=3)
+    batches = ViewBatches(views, ViewSettings(background="white"), seed=3)
     seen = []
     for step in range(10):
         batch = batches.draw(step)
@@ -365,9 +365,9 @@ def test_batches_are_whole_views_each_once_in_a_turn():
         assert torch.equal(batch["alpha"].view(12, 12), views.image(index)[..., 3] / 255)
     assert sorted(seen[:5]) == sorted(seen[5:]) == list(range(5))
     assert seen[:5] != seen[5:]
-    again = ViewBatches(views, ViewSettings(accumulate=1, background="white"), seed=3)
+    again = ViewBatches(views, ViewSettings(background="white"), seed=3)
     assert torch.equal(again.draw(7)["target"], batches.draw(7)["target"])
-    coloured = ViewBatches(views, ViewSettings(accumulate=1, background="one"), seed=3).draw(7)
+    coloured = ViewBatches(views, ViewSettings(background="one"), seed=3).draw(7)
     away = coloured["alpha"] == 0
     assert (coloured["target"][away] == coloured["background"][away]).all()
     assert len(coloured["background"].unique(dim=0)) == 1

@@ -33,7 +33,6 @@ SMALL_FIELD = (
     "model.sampler.grid_resolution=24",
     "model.sampler.samples=64",
     "model.sampler.update_cells=512",
-    "model.sampler.coarse_steps=10",
     "model.sampler.sweep_at=[15]",
 )
 TIMES = torch.linspace(0, 1, 50)

@@ -24,7 +24,6 @@ FRAME = cube_frame(1.4, torch.zeros(3))
 SETTINGS = RaySettings(
     per_batch=64,
     samples_per_batch=4096,
-    accumulate=1,
     background="white",
     skip_background=True,
     background_share=0.1,

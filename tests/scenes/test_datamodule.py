@@ -17,7 +17,6 @@ FRAME = cube_frame(1.4, torch.zeros(3))
 RAYS = RaySettings(
     per_batch=8,
     samples_per_batch=4096,
-    accumulate=1,
     background="random",
     skip_background=True,
     background_share=0.1,

@@ -114,7 +114,6 @@ def opaque(views):
 RAYS = RaySettings(
     per_batch=500,
     samples_per_batch=4096,
-    accumulate=1,
     background="random",
     skip_background=True,
     background_share=0.1,

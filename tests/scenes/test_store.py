@@ -33,7 +33,6 @@ FRAME = cube_frame(1.4, torch.zeros(3))
 RAYS = RaySettings(
     per_batch=1000,
     samples_per_batch=8192,
-    accumulate=1,
     background="white",
     skip_background=False,
     background_share=0.1,

@@ -10,7 +10,7 @@ from torch import Tensor
 from xplanes.errors import ConfigError
 from xplanes.lrm import LRMError
 from xplanes.scenes.errors import SceneError
-from xplanes.training.module import TrainingError
+from xplanes.training.diagnosis import TrainingError
 
 
 class Tally:

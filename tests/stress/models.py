@@ -20,7 +20,6 @@ XPLANES = (
     "model.sampler.grid_resolution=16",
     "model.sampler.samples=48",
     "model.sampler.update_cells=256",
-    "model.sampler.coarse_steps=10",
     "model.sampler.sweep_at=[15]",
     "model.rays.per_batch=128",
 )

@@ -29,7 +29,6 @@ SMALL = (
     "model.sampler.grid_resolution=24",
     "model.sampler.samples=64",
     "model.sampler.update_cells=512",
-    "model.sampler.coarse_steps=10",
     "model.sampler.sweep_at=[15]",
     "trainer.accelerator=cpu",
     "model.rays.per_batch=256",

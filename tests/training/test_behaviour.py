@@ -14,7 +14,6 @@ import pytest
 import torch
 
 from tests.training.runs import small_config
-from xplanes import pipeline
 from xplanes.errors import ConfigError
 from xplanes.rendering import warming
 from xplanes.rendering.grid_renderer import OccupancySampler
@@ -22,10 +21,11 @@ from xplanes.run import run
 from xplanes.scenes import store
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.training import evaluation, fit
-from xplanes.training.checkpoints import Checkpoints
+from xplanes.training.checkpoints import AtomicCheckpointIO
 from xplanes.training.clock import TrainingClock
+from xplanes.training.diagnosis import TrainingError
 from xplanes.training.evaluation import Evaluation
-from xplanes.training.module import RadianceModule, TrainingError
+from xplanes.training.module import RadianceModule
 
 
 def metrics(folder: Path) -> dict:
@@ -58,7 +58,6 @@ class Watched:
     """A run whose doings were noted."""
 
     folder: Path
-    moves: list[str] = field(default_factory=list)
     pictures: list[weakref.ref] = field(default_factory=list)
     saved: list[tuple[int, str]] = field(default_factory=list)
 
@@ -66,34 +65,22 @@ class Watched:
 @pytest.fixture(scope="module")
 def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Watched:
     notes = Watched(tmp_path_factory.mktemp("runs") / "watched")
-    away, back = RadianceModule.cpu, RadianceModule.to
-    score, save = evaluation.score_view, Checkpoints._save
-    finish, look = Evaluation.on_train_end, pipeline.final_scores
+    score = RadianceModule.validation_step
+    save = AtomicCheckpointIO.save_checkpoint
 
-    def note_picture(*parts):
-        found, images = score(*parts)
-        notes.pictures.append(weakref.ref(images.colour))
-        return found, images
+    def note_picture(self, batch: dict, batch_idx: int) -> dict:
+        image = score(self, batch, batch_idx)
+        notes.pictures.append(weakref.ref(image["colour"]))
+        return image
 
-    def note(text: str, call: Callable) -> Callable:
-        def noted(*parts):
-            notes.moves.append(text.format(*parts))
-            return call(*parts)
-
-        return noted
-
-    def note_checkpoint(self, trainer, name) -> None:
-        notes.saved.append((trainer.global_step, name))
-        save(self, trainer, name)
+    def note_checkpoint(self, checkpoint: dict, path: str, *rest) -> None:
+        notes.saved.append((checkpoint["global_step"], Path(path).name))
+        save(self, checkpoint, path, *rest)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(RadianceModule, "cpu", note("away to the CPU", away))
-        patch.setattr(RadianceModule, "to", note("to {1}", back))
-        patch.setattr(Evaluation, "on_train_end", note("scored", finish))
-        patch.setattr(pipeline, "final_scores", note("looked at all scores", look))
-        patch.setattr(evaluation, "score_view", note_picture)
+        patch.setattr(RadianceModule, "validation_step", note_picture)
         patch.setattr(evaluation, "SHOWN", 2)
-        patch.setattr(Checkpoints, "_save", note_checkpoint)
+        patch.setattr(AtomicCheckpointIO, "save_checkpoint", note_checkpoint)
         run(small_config(scenes), notes.folder, [], resume=False)
     return notes
 
@@ -244,15 +231,15 @@ def interrupt_where(
 def test_a_second_interrupt_saves_no_half_of_a_step(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = RadianceModule.manual_backward
+    original = RadianceModule.on_after_backward
 
-    def press_twice(self, loss, *rest, **options) -> None:
-        original(self, loss, *rest, **options)
+    def press_twice(self) -> None:
+        original(self)
         if self.global_step == 17:
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(RadianceModule, "manual_backward", press_twice)
+    monkeypatch.setattr(RadianceModule, "on_after_backward", press_twice)
     folder = tmp_path / "stopped"
     with pytest.raises(KeyboardInterrupt):
         run(small_config(scenes, "callbacks.evaluation.at=[]"), folder, [], resume=False)
@@ -265,7 +252,7 @@ def test_an_interrupt_waits_for_the_update_of_its_batches(
 ) -> None:
     interrupt_where(lambda module: module.batches == 7, monkeypatch)
     folder = tmp_path / "stopped"
-    config = small_config(scenes, "model.rays.accumulate=3", "callbacks.evaluation.at=[]")
+    config = small_config(scenes, "trainer.accumulate_grad_batches=3", "callbacks.evaluation.at=[]")
     with pytest.raises(KeyboardInterrupt):
         run(config, folder, [], resume=False)
     state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
@@ -275,7 +262,7 @@ def test_an_interrupt_waits_for_the_update_of_its_batches(
 def test_interrupt_saves_the_step_it_stopped_at_and_its_evaluation_is_done_again(
     trained: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The evaluation at step 20 finds that it was asked to stop.
+    # The evaluation at step 20 is due then.
     interrupt_where(lambda module: module.global_step == 20, monkeypatch)
     folder = tmp_path / "stopped"
     config = small_config(scenes, "callbacks.checkpoints.every=1000")
@@ -297,33 +284,34 @@ def test_interrupt_saves_the_step_it_stopped_at_and_its_evaluation_is_done_again
 def test_an_interrupt_after_an_evaluation_leaves_the_best(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = Evaluation.score
+    original = Evaluation.on_validation_end
 
     def press(self, trainer, *rest) -> None:
         original(self, trainer, *rest)
         if trainer.global_step == 20:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(Evaluation, "score", press)
+    monkeypatch.setattr(Evaluation, "on_validation_end", press)
     folder = tmp_path / "stopped"
     with pytest.raises(KeyboardInterrupt):
         run(small_config(scenes), folder, [], resume=False)
     for name in ("last", "best"):
         state = torch.load(folder / "checkpoints" / f"{name}.ckpt", weights_only=True)
-        assert state["global_step"] == 20, name
+        assert state["global_step"] == (21 if name == "last" else 20), name
 
 
 def test_a_final_evaluation_that_was_interrupted_is_made_up_for(
     trained: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Though not a step is left to train."""
-    original = Evaluation.on_train_end
+    original = Evaluation.on_validation_start
 
-    def press(self, *rest) -> None:
-        signal.raise_signal(signal.SIGINT)
-        original(self, *rest)
+    def press(self, trainer, *rest) -> None:
+        if trainer.global_step == 40:
+            signal.raise_signal(signal.SIGINT)
+        original(self, trainer, *rest)
 
-    monkeypatch.setattr(Evaluation, "on_train_end", press)
+    monkeypatch.setattr(Evaluation, "on_validation_start", press)
     folder = tmp_path / "stopped"
     with pytest.raises(KeyboardInterrupt):
         run(small_config(scenes), folder, [], resume=False)
@@ -348,21 +336,22 @@ def test_an_evaluation_waits_for_the_update_of_its_batches(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It may stop where it is, and the best checkpoint holds no gradients."""
-    original, score, batches = TrainingClock.on_train_batch_end, Evaluation.score, []
+    original, start = TrainingClock.on_train_batch_end, Evaluation.on_validation_start
+    batches = []
 
     def go_on(self, trainer, module, *rest) -> None:
         original(self, trainer, module, *rest)
         self.seconds = 600.0 if module.batches >= 7 else 0.0
 
-    def note(self, trainer, module, *rest) -> None:
+    def note(self, trainer, module) -> None:
         batches.append(module.batches)
-        score(self, trainer, module, *rest)
+        start(self, trainer, module)
 
     monkeypatch.setattr(TrainingClock, "on_train_batch_end", go_on)
-    monkeypatch.setattr(Evaluation, "score", note)
+    monkeypatch.setattr(Evaluation, "on_validation_start", note)
     config = small_config(
         scenes,
-        "model.rays.accumulate=3",
+        "trainer.accumulate_grad_batches=3",
         "trainer.max_seconds=1000",
         "trainer.max_steps=4",
         "callbacks.evaluation.at=[0,0.55]",
@@ -371,22 +360,17 @@ def test_an_evaluation_waits_for_the_update_of_its_batches(
     assert batches == [0, 9, 12]
 
 
-def test_scoring_uses_the_device_that_trained(watched: Watched) -> None:
-    ends = ["scored", "away to the CPU", "to cpu", "looked at all scores"]
-    assert watched.moves[-4:] == ends
-
-
 def test_only_displayed_images_are_kept_in_memory(watched: Watched) -> None:
     assert len(watched.pictures) == 3 * 3
     assert not any(colour() is not None for colour in watched.pictures)
     written = sorted((watched.folder / "media" / "step000040").glob("*.png"))
     # Named after the images, which lie in a folder of the split's name.
-    assert [path.name for path in written] == ["val_r_000.png", "val_r_001.png"]
+    assert [path.name for path in written] == ["val_r_000.png", "val_r_002.png"]
 
 
-def test_the_best_is_written_before_the_last(watched: Watched) -> None:
-    """Killed in between, a run whose last checkpoint knows of a best one would never write it."""
-    assert [name for step, name in watched.saved if step == 20] == ["best.ckpt", "last.ckpt"]
+def test_best_and_last_are_written_at_the_steps_that_say_so(watched: Watched) -> None:
+    assert [step for step, name in watched.saved if name == "best.ckpt"] == [20, 40]
+    assert [step for step, name in watched.saved if name == "last.ckpt"] == [10, 20, 30, 40, 40]
 
 
 def test_deterministic_training_is_refused_on_a_gpu(
@@ -424,7 +408,7 @@ def test_few_shot_run_names_its_views_and_accumulated_batches_make_one_step(
     config = small_config(
         scenes,
         "data.views=3",
-        "model.rays.accumulate=2",
+        "trainer.accumulate_grad_batches=2",
         "trainer.max_steps=4",
         "callbacks.evaluation.at=[]",
     )
@@ -463,8 +447,8 @@ def bad_batch(monkeypatch: pytest.MonkeyPatch) -> None:
 
     original = RayBatches.draw
 
-    def spoil(self, step: int):
-        batch = original(self, step)
+    def spoil(self, step: int, *rest):
+        batch = original(self, step, *rest)
         if step == 3:
             batch["target"][0] = float("nan")
         return batch
@@ -480,21 +464,19 @@ def test_one_bad_batch_costs_one_step(scenes: Path, tmp_path: Path, bad_batch) -
 
 
 def test_a_bad_batch_takes_those_of_its_update_along(
-    scenes: Path, tmp_path: Path, bad_batch, monkeypatch: pytest.MonkeyPatch
+    scenes: Path, tmp_path: Path, bad_batch
 ) -> None:
-    left: list[bool] = []
-    refuse = RadianceModule._refuse
-
-    def watched(self, *rest) -> None:
-        left.append(any(p.grad is not None and bool(p.grad.any()) for p in self.parameters()))
-        refuse(self, *rest)
-
-    monkeypatch.setattr(RadianceModule, "_refuse", watched)
     config = small_config(
-        scenes, "model.rays.accumulate=2", "trainer.max_steps=3", "callbacks.evaluation.at=[]"
+        scenes,
+        "trainer.accumulate_grad_batches=2",
+        "trainer.max_steps=3",
+        "callbacks.evaluation.at=[]",
     )
     run(config, tmp_path / "run", [], resume=False)
-    assert left == [False]
+    content = metrics(tmp_path / "run")
+    assert (content["steps_skipped"], content["step"]) == (1, 3)
+    state = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
+    assert {float(each["step"]) for each in state["optimizer_states"][0]["state"].values()} == {2}
 
 
 def test_scene_of_one_timestep_trains_without_time_planes(scenes: Path, tmp_path: Path) -> None:

@@ -391,7 +391,7 @@ def test_triplanes_of_a_trained_field_initialise_a_field_with_equal_renders(
     place: Path, tmp_path: Path, model: str
 ) -> None:
     """Checks end to end that orientation, time, decoder and frame of a file match the field's."""
-    common = (f"model={model}", "model.precision=32", "model.sampler.coarse_steps=0")
+    common = (f"model={model}", "model.precision=32")
     config = small_config(place / "scenes", *common, "trainer.max_steps=80", UNSCORED)
     run(config, tmp_path / "first", [], resume=False)
     first = load_run(tmp_path / "first")

@@ -18,16 +18,20 @@ from xplanes.errors import ConfigError
 from xplanes.models.base import LossTerm
 from xplanes.models.x_planes import XPlanesModel
 from xplanes.run import run
+from xplanes.training import building, module
 from xplanes.training.checkpoints import find_resumable, load_checkpoint
 from xplanes.training.clock import TrainingClock
+from xplanes.training.diagnosis import TrainingError
 from xplanes.training.finite import (
-    all_usable,
+    broken_flag,
     not_finite,
     unusable_gradients,
     usable,
-    usable_together,
 )
-from xplanes.training.module import RadianceModule, TrainingError
+from xplanes.training.module import RadianceModule
+
+LONG = ("trainer.max_steps=40", "callbacks.checkpoints.every=5", "callbacks.evaluation.at=[]")
+"""More steps than may be left out in a row."""
 
 FEW = ("trainer.max_steps=12", "callbacks.checkpoints.every=5", "callbacks.evaluation.at=[]")
 SCORED = (*FEW, "callbacks.evaluation.at=[0.4]")
@@ -45,20 +49,21 @@ def test_a_gradient_is_usable_if_adam_can_square_it() -> None:
             gradient[0, 2, 1, 3] = value
             case = f"{value}, {layout}"
             assert usable(gradient) is expected, case
-            assert usable_together([gradient]) is expected, case
-            assert usable_together([torch.ones(7), gradient, torch.zeros(2, 2)]) is expected, case
+            others = [nn.Parameter(torch.zeros(7)), nn.Parameter(torch.zeros_like(gradient))]
+            others[0].grad, others[1].grad = torch.ones(7), gradient
+            assert float(broken_flag(others, torch.tensor(True))) == float(not expected), case
+            assert float(broken_flag(others, torch.tensor(False))) == 1.0, case
 
 
 def test_names_are_those_of_the_broken() -> None:
-    module = nn.Linear(2, 1)
-    module.bias.grad = torch.tensor([math.inf])
-    assert not all_usable(module.parameters())
-    assert unusable_gradients(module.named_parameters()) == ["bias"]
-    assert not_finite(module.named_parameters()) == []
+    layer = nn.Linear(2, 1)
+    layer.bias.grad = torch.tensor([math.inf])
+    assert unusable_gradients(layer.named_parameters()) == ["bias"]
+    assert not_finite(layer.named_parameters()) == []
     with torch.no_grad():
-        module.weight[0, 1] = math.nan
-        module.bias.fill_(3e38)
-    assert not_finite(module.named_parameters()) == ["weight"]
+        layer.weight[0, 1] = math.nan
+        layer.bias.fill_(3e38)
+    assert not_finite(layer.named_parameters()) == ["weight"]
 
 
 def spoil_gradient(monkeypatch: pytest.MonkeyPatch, value: float, steps: range) -> None:
@@ -85,27 +90,37 @@ def test_one_bad_gradient_costs_one_step(scenes, tmp_path, monkeypatch) -> None:
 
 def test_gradients_that_stay_bad_end_training_with_a_message(scenes, tmp_path, monkeypatch) -> None:
     spoil_gradient(monkeypatch, math.nan, range(7, 1000))
-    with pytest.raises(TrainingError, match=r"20 steps.*step 7.*gradient of field\.space.*resume="):
+    with pytest.raises(
+        TrainingError, match=r"20 steps.*from step 7 on.*gradient of field\.space.*resume="
+    ):
         run(small_config(scenes, *FEW), tmp_path / "all", [], resume=False)
     assert state(tmp_path / "all")["global_step"] == 5
 
 
 def test_gradients_that_are_bad_from_the_first_step_on(scenes, tmp_path, monkeypatch) -> None:
     spoil_gradient(monkeypatch, 1e30, range(1000))
-    words = r"step 0.*gradient of field\.space.*check the values and gradients of XPlanes"
+    words = r"step 0 on.*gradient of field\.space.*check the values and gradients of XPlanes"
     with pytest.raises(TrainingError, match=words):
-        run(small_config(scenes, *FEW), tmp_path / "random", [], resume=False)
-    with pytest.raises(TrainingError, match=r"step 0.*of XPlanes and losses\.mine"):
+        run(small_config(scenes, *LONG), tmp_path / "random", [], resume=False)
+    with pytest.raises(TrainingError, match=r"step 0 on.*of XPlanes and losses\.mine"):
         run(with_loss(scenes, first=99), tmp_path / "loss", [], resume=False)
-    build = RadianceModule.build
+    initialised_as(True, monkeypatch)
+    with pytest.raises(TrainingError, match=r"step 0 on.*initialisation is to blame.*lrm=none"):
+        run(small_config(scenes, *LONG), tmp_path / "start", [], resume=False)
 
-    def initialise(self, *rest, **options) -> None:
-        build(self, *rest, **options)
-        self.site = replace(self.site, initialised=True)
 
-    monkeypatch.setattr(RadianceModule, "build", initialise)
-    with pytest.raises(TrainingError, match=r"step 0.*initialisation is to blame.*lrm=none"):
-        run(small_config(scenes, *FEW), tmp_path / "start", [], resume=False)
+def initialised_as(known: bool, monkeypatch: pytest.MonkeyPatch, spoil: bool = False) -> None:
+    """Fields that were, or were not, initialised with what shows the scene already."""
+    original = building.build_parts
+
+    def build_parts(*rest, **options) -> building.Parts:
+        parts = original(*rest, **options)
+        if spoil:
+            with torch.no_grad():
+                parts.field.decoder.layers[0].bias.fill_(math.nan)
+        return replace(parts, site=replace(parts.site, initialised=known))
+
+    monkeypatch.setattr(module, "build_parts", build_parts)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +150,7 @@ class Shaped(LossTerm):
 
 
 def with_loss(scenes: Path, **settings) -> dict:
-    config = small_config(scenes, *FEW)
+    config = small_config(scenes, *LONG)
     name = "Spoiled" if "first" in settings else "Shaped"
     term = {"_target_": f"{__name__}.{name}", "weight": 1.0, **settings}
     return config | {"losses": {"mine": term}, "plugins": [__name__]}
@@ -144,7 +159,9 @@ def with_loss(scenes: Path, **settings) -> dict:
 @pytest.mark.parametrize(("first", "more"), [(0, r"omit it$"), (7, r"omit it; resume=")])
 def test_an_added_loss_that_is_not_finite_is_named(scenes, tmp_path, first, more) -> None:
     said = refused(with_loss(scenes, first=first), tmp_path / "run")
-    assert re.search(rf"the loss was nan.*step {first}; not finite: losses\.mine; largest", said)
+    assert re.search(
+        rf"the loss was nan.*from step {first} on; not finite: losses\.mine; largest", said
+    )
     assert re.search(rf"The rendering is finite: correct losses\.mine or {more}", said)
     assert "initialisation" not in said
 
@@ -172,20 +189,13 @@ def test_a_term_of_the_loss_takes_no_other_ones_place(scenes, tmp_path) -> None:
 def test_the_initialisation_is_blamed_if_there_was_one_and_it_renders_nothing_finite(
     scenes, tmp_path, monkeypatch
 ) -> None:
-    built = RadianceModule.build
-
-    def spoil(self, *rest, **options) -> None:
-        built(self, *rest, **options)
-        self.site = replace(self.site, initialised=initialised)
-        with torch.no_grad():
-            self.field.decoder.layers[0].bias.fill_(math.nan)
-
-    monkeypatch.setattr(RadianceModule, "build", spoil)
     for initialised, words in (
         (True, "initialisation is to blame.*set lrm=none"),
         (False, r"No step was done yet: check the values and gradients of XPlanes"),
     ):
-        said = refused(small_config(scenes, *FEW), tmp_path / f"{initialised}")
+        with monkeypatch.context() as patch:
+            initialised_as(initialised, patch, spoil=True)
+            said = refused(small_config(scenes, *LONG), tmp_path / f"{initialised}")
         assert re.search(words, said), said
         assert ("initialisation" in said) == initialised
 

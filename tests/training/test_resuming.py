@@ -3,12 +3,11 @@
 import json
 import shutil
 import signal
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from lightning import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from tests.training.runs import small_config
@@ -20,9 +19,9 @@ from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.scenes.errors import SceneError
-from xplanes.training import evaluation
-from xplanes.training.checkpoints import Checkpoints
-from xplanes.training.evaluation import Evaluation
+from xplanes.training import module
+from xplanes.training.checkpoints import AtomicCheckpointIO
+from xplanes.training.module import RadianceModule
 from xplanes.training.record import KEPT, RunRecord, require_same_settings
 
 FEW = ("trainer.max_steps=6", "callbacks.evaluation.at=[]")
@@ -40,6 +39,17 @@ def trained(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def folder(trained: Path, tmp_path: Path) -> Path:
     """A finished run of one's own."""
     return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+def note_checkpoints(written: list[tuple[str, dict]], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Note every checkpoint that is written, by the name of its file."""
+    save = AtomicCheckpointIO.save_checkpoint
+
+    def note(self, checkpoint: dict, path: str, *rest) -> None:
+        written.append((Path(path).name, checkpoint))
+        save(self, checkpoint, path, *rest)
+
+    monkeypatch.setattr(AtomicCheckpointIO, "save_checkpoint", note)
 
 
 def test_a_run_is_not_resumed_with_other_settings(scenes: Path, folder: Path) -> None:
@@ -100,29 +110,22 @@ def test_the_best_is_chosen_by_the_same_views_throughout(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One view is scored on the way, and the others are harder by 10 dB."""
-    original, improved = evaluation.score_view, []
+    original = module.score_image
+    improved: list[tuple[str, dict]] = []
 
-    def score(field, renderer, frame, views, index, background):
-        found, images = original(field, renderer, frame, views, index, background)
-        object.__setattr__(found, "psnr", found.psnr - 10 * (index not in scored))
-        return found, images
+    def score(image, item):
+        found = original(image, item)
+        return replace(found, psnr=found.psnr - 10 * (item["index"] != 0))
 
-    save = Checkpoints._save
-
-    def note(self: Checkpoints, trainer: Trainer, name: str) -> None:
-        improved.append((trainer.global_step, name))
-        save(self, trainer, name)
-
-    scored = evaluation.spread(1, 3)
-    monkeypatch.setattr(evaluation, "score_view", score)
-    monkeypatch.setattr(Checkpoints, "_save", note)
+    monkeypatch.setattr(module, "score_image", score)
+    note_checkpoints(improved, monkeypatch)
     few = (
-        "callbacks.evaluation.views=1",
+        "trainer.limit_val_batches=1",
         "callbacks.evaluation.at=[0,0.5]",
         "callbacks.checkpoints.every=99",
     )
     run(small_config(scenes, *few), tmp_path / "run", [], resume=False)
-    assert [step for step, name in improved if name == "best.ckpt"] == [0, 20, 40]
+    assert [state["global_step"] for name, state in improved if name == "best.ckpt"] == [20, 40]
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert len(metrics["views"]) == 3  # In the end all are looked at.
 
@@ -131,18 +134,13 @@ def test_no_checkpoint_between_the_batches_of_an_update(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A run that goes on from a checkpoint's step has written none for it yet."""
-    batches = []
-    save = Checkpoints._save
-
-    def note(self: Checkpoints, trainer: Trainer, name: str) -> None:
-        batches.append(trainer.lightning_module.batches)
-        save(self, trainer, name)
-
-    every = (*FEW, "model.rays.accumulate=4", "callbacks.checkpoints.every=2")
+    written: list[tuple[str, dict]] = []
+    every = (*FEW, "trainer.accumulate_grad_batches=4", "callbacks.checkpoints.every=2")
     folder = tmp_path / "run"
     run(small_config(scenes, *every, "trainer.max_steps=2"), folder, [], resume=False)
-    monkeypatch.setattr(Checkpoints, "_save", note)
+    note_checkpoints(written, monkeypatch)
     run(small_config(scenes, *every, "trainer.max_steps=3"), folder, [], resume=True)
+    batches = [state["progress"]["batches"] for _, state in written]
     assert batches[-1] == 12
     assert all(count % 4 == 0 for count in batches)
 
@@ -150,13 +148,13 @@ def test_no_checkpoint_between_the_batches_of_an_update(
 def test_a_signal_after_the_last_step_is_heard(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    finish = Evaluation.on_train_end
+    finish = RadianceModule.on_train_end
 
-    def press_ctrl_c(self, *rest) -> None:
-        finish(self, *rest)
+    def press_ctrl_c(self) -> None:
+        finish(self)
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(Evaluation, "on_train_end", press_ctrl_c)
+    monkeypatch.setattr(RadianceModule, "on_train_end", press_ctrl_c)
     with pytest.raises(KeyboardInterrupt):
         run(small_config(scenes, *FEW), tmp_path / "run", [], resume=False)
     assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "interrupted"

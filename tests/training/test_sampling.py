@@ -24,7 +24,6 @@ def sampling(tmp_path) -> OccupancySampler:
         tmp_path,
         "model.sampler.samples=15",
         "model.sampler.render_samples=40",
-        "model.sampler.coarse_steps=10",
     )
     site = Site(cube_frame(1.0, torch.zeros(3)), times=torch.zeros(1), seed=0, precision="32")
     return Method.read(config).model.sampler.build(fog, site)

@@ -1,8 +1,10 @@
 """What to tell a user whose training cannot continue."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from xplanes.errors import XPlanesError
@@ -19,20 +21,22 @@ class TrainingError(XPlanesError, RuntimeError):
 
 def diagnosis(
     module: "RadianceModule",
-    what: str,
     rendering: Rendering,
     terms: Mapping[str, Tensor],
-    gradients: Sequence[str] = (),
+    unusable: Sequence[str] = (),
 ) -> str:
-    """What is not finite, and what to change.
+    """What was not finite for the last updates, and what to change.
 
     Args:
         module: What is trained.
-        what: What was observed.
         rendering: That of the last batch.
         terms: Terms of its loss by name.
-        gradients: Gradients that are not finite.
+        unusable: Parameters whose gradients are not finite.
     """
+    loss, count = float(torch.stack(list(terms.values())).sum()), module.tally.skipped_in_a_row
+    what = "a gradient was infinite, NaN or too large to square"
+    if not math.isfinite(loss):
+        what = f"the loss was {loss}"
     density, parameters = rendering.density, not_finite(module.named_parameters())
     seen = {"colour": rendering.colour, "opacity": rendering.opacity, "density": density}
     rays = [f"rendered {name}" for name in not_finite(seen.items())]
@@ -41,9 +45,11 @@ def diagnosis(
         f"losses.{name}" if name in module.method.losses else f"loss term {name}"
         for name in not_finite(terms.items())
     ]
-    broken = parameters or [*gradients] or [*rays, *losses]
+    gradients = [f"gradient of {name}" for name in unusable if math.isfinite(loss)]
+    broken = parameters or gradients or [*rays, *losses]
     return (
-        f"{what}, at step {module.global_step}; not finite: "
+        f"{what} for {count} steps in a row, from step {module.global_step - count + 1} on; not "
+        "finite: "
         f"{', '.join(broken) or 'gradients, or something in another process'}; largest density "
         f"{float(density.max()) if len(density) else 0:.3g}. "
         f"{_way_out(module, losses, rendered=not (parameters or rays))}"

@@ -326,14 +326,13 @@ class RadianceModule(LightningModule):
         if self.trainer.world_size > 1:
             # All processes must leave a step out together, for their planes must stay equal.
             torch.distributed.all_reduce(broken, op=torch.distributed.ReduceOp.MAX)
-        names = self.named_parameters()
-        gradients: Sequence[str] = ()
+        unusable: list[str] = []
         if broken.device.type == "cpu" and broken:
-            gradients = [f"gradient of {name}" for name in unusable_gradients(names)]
+            unusable = unusable_gradients(self.named_parameters())
         leave_out(optimizer, broken)
         self.tally.add_update(broken)
         if self.tally.skipped_in_a_row >= PATIENCE:
-            self._give_up(gradients)
+            self._give_up(unusable)
 
     def optimizer_step(
         self,
@@ -400,10 +399,9 @@ class RadianceModule(LightningModule):
         if self.rays:
             self.rays = self.ray_settings.fitting(rays, samples)
 
-    def _give_up(self, gradients: Sequence[str] = ()) -> None:
+    def _give_up(self, unusable: Sequence[str] = ()) -> None:
         assert self._seen is not None
-        what = f"the loss or a gradient was not finite for {PATIENCE} steps in a row"
-        raise TrainingError(diagnosis(self, what, *self._seen, gradients))
+        raise TrainingError(diagnosis(self, *self._seen, unusable))
 
     @property
     def _logs_now(self) -> bool:

@@ -196,7 +196,7 @@ def train(
     seed_everything(method.seed, verbose=False)
     source = method.lrm.load(say)
     warm = warm_up.seconds
-    started = time.monotonic()
+    began = time.perf_counter() - warm
     data = SceneDataModule(settings, seed=method.seed)
     data.setup("fit")
     scene, views = data.scene, data.scene.splits["train"]
@@ -206,16 +206,19 @@ def train(
     if record is not None:
         for finding in (*camera_findings(scene, frame), *opaque_findings(scene)):
             logger.warning("%s", finding.text)
-    loaded = time.monotonic() - started
+    loaded = time.perf_counter() - warm_up.seconds - began
     found = Initialisation(method.model, frame)
     if source is not None:
         place = Place(scene, frame, device, experiment.devices, say, settings.half_side)
         found = source.initialise(method, place)
     del source
-    began = time.monotonic() - warm_up.seconds
+    began = time.perf_counter() - warm_up.seconds
     module = RadianceModule(experiment.config, experiment.config.get("plugins") or [])
     module.build(scene, frame, device=device, initialise=lambda *_: found)
-    loaded += time.monotonic() - warm_up.seconds - began
+    loaded += time.perf_counter() - warm_up.seconds - began
+    assert module.initialisation is not None
+    found = module.initialisation
+    loaded -= found.seconds["fill"]  # What an initialised field alone takes is preparation.
     if record is not None:
         record.note(
             device=torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
@@ -250,13 +253,21 @@ def train(
     if experiment.media:
         video = _video(module, found.frame, scene, folder)
         metrics["media"] = str(video.relative_to(folder))
-    seconds["total"] = record.total_seconds
+    seconds |= _rest(seconds, record.total_seconds)
     write_json(folder / "metrics.json", metrics)
     log_hparams(trainer, experiment, metrics)
     text = closing(folder, experiment, metrics)
     logger.info("\n%s", text)
     say(text)
     return metrics
+
+
+def _rest(seconds: dict[str, Any], total: float) -> dict[str, float]:
+    """``other``, what a run did besides the stages of ``seconds``, and ``total``."""
+    # Stages from the cache count with what they took to make: they may exceed the run's own time.
+    named = sum(seconds["prepare"].values())
+    named += sum(value for name, value in seconds.items() if name != "prepare")
+    return {"other": max(0.0, total - named), "total": total}
 
 
 def say(text: str) -> None:

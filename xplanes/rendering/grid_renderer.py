@@ -1,12 +1,14 @@
 """Equal steps through occupied cells: rendering, and the occupancy grid in training."""
 
 import math
+import time
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import torch
 from torch import Tensor, distributed, nn
 
+from xplanes.backend import warm_up
 from xplanes.errors import ConfigError
 from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
@@ -205,17 +207,19 @@ class OccupancySettings(SamplerSettings):
             skip_empty=self.skip_empty,
             occlusion=self.occlusion if self.skip_occluded else 0.0,
         )
+        fill_seconds = 0.0
         if site.views is not None:
             if self.silhouettes:
                 carve(grid, site.views, site.frame)
             if site.initialised and self.fill:
-                _fill(renderer, field, site)
+                fill_seconds = _fill(renderer, field, site)
         return OccupancySampler(
             renderer,
             self.scaled(site),
             site.samples_per_batch,
             visibility=self._visibility(site),
             unseen_from=site.steps(UNSEEN_FROM),
+            fill_seconds=fill_seconds,
         )
 
     def _visibility(self, site: Site) -> Visibility | None:
@@ -241,9 +245,14 @@ class OccupancySettings(SamplerSettings):
         return replace(self, render_samples=self.samples)
 
 
-def _fill(renderer: GridRenderer, field: RadianceField, site: Site) -> None:
-    """Fill the grid of an initialised field on the device where it is going to be trained."""
+def _fill(renderer: GridRenderer, field: RadianceField, site: Site) -> float:
+    """Fill the grid of an initialised field on the device where it is going to be trained.
+
+    Returns:
+        Seconds that it took; warm-up excluded.
+    """
     assert site.views is not None
+    began = time.perf_counter() - warm_up.seconds
     parts = field, renderer.grid
     for part in parts:
         part.to(site.device or "cpu")
@@ -252,6 +261,7 @@ def _fill(renderer: GridRenderer, field: RadianceField, site: Site) -> None:
     fill(renderer.grid, field, site.views, site.frame, step=renderer.step, generator=generator)
     for part in parts:
         part.to("cpu")
+    return time.perf_counter() - warm_up.seconds - began
 
 
 class OccupancySampler(Sampler):
@@ -263,6 +273,7 @@ class OccupancySampler(Sampler):
         samples: Samples of a batch on average at most; None if not known.
         visibility: Changed in place; images leave out what it has not seen.
         unseen_from: Step of the first sweep after which a cell may count as unseen.
+        fill_seconds: Seconds that it took to fill the grid of an initialised field.
     """
 
     def __init__(
@@ -272,10 +283,11 @@ class OccupancySampler(Sampler):
         samples: int | None = None,
         visibility: Visibility | None = None,
         unseen_from: int = UNSEEN_FROM,
+        fill_seconds: float = 0.0,
     ) -> None:
         self.settings, self.grid, self.samples = settings, renderer.grid, samples
         self.visibility = visibility
-        self.unseen_from = unseen_from
+        self.unseen_from, self.fill_seconds = unseen_from, fill_seconds
         room = None if samples is None else self._room(samples)
         self._training = replace(renderer, thinning=settings.thinning, room=room)
         self._coarse = replace(self._training, samples=math.ceil(renderer.samples / 2))

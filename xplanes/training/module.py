@@ -223,6 +223,8 @@ class RadianceModule(LightningModule):
         )
         self.initialisation = found
         self._assemble(found.model, site)
+        seconds = found.seconds | {"fill": self._parts[1].fill_seconds}
+        self.initialisation = replace(found, seconds=seconds)
 
     def _assemble(self, settings: ModelSettings, site: Site) -> None:
         values = None if self.initialisation is None else self.initialisation.values

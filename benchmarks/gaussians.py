@@ -4,10 +4,11 @@
         [--together 1] [--work FOLDER]
 
 Writes docs/results/gaussians.md, gaussians.csv and gaussians.png. Seconds are those that a process
-has computed on one thread, so that others do not count, and the initialisation's are among them;
-scenes of 400 pixels get --large. Models are compared on test scenes of the suite and on lego with
-one seed (pareto.py has demo scenes), initialisations on two demo scenes with --seeds.
-``--together`` so many run side by side; what the work folder holds is not repeated.
+has computed on one thread, so that others do not count, and those for building the model, with its
+initialisation, are among them: training and its schedules get what is left. Scenes of 400 pixels
+get --large. Models are compared on test scenes of the suite and on lego with one seed (pareto.py
+has demo scenes), initialisations on two demo scenes with --seeds. ``--together`` so many run side
+by side; what the work folder holds is not repeated.
 """
 
 import os
@@ -16,6 +17,7 @@ os.environ.update(OMP_NUM_THREADS="1", NUMBA_NUM_THREADS="1")
 
 import argparse
 import gc
+import math
 import statistics
 import tempfile
 import time
@@ -26,7 +28,6 @@ from typing import Any, NamedTuple
 
 import torch
 from figures import bars, panels, save
-from lightning.pytorch.callbacks import Callback
 from runner import RESULTS, command, lego, machine, markdown, spread
 
 from xplanes.config import compose_plain
@@ -34,9 +35,12 @@ from xplanes.fields.gaussians import Gaussians
 from xplanes.files import read_json, write_json, write_rows, write_text
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Views
+from xplanes.training.clock import training_seconds
 from xplanes.training.fit import Trainer
 from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore, mean_scores, render_view, score_view
+
+time.perf_counter = time.process_time  # So that the training clock counts CPU time, too.
 
 GAUSSIANS = ("gaussians_hexplane", "gaussians_deform", "gaussians_spacetime")
 MODELS = {"six_planes": ("model=six_planes", "lrm=none")}
@@ -76,38 +80,24 @@ class Case(NamedTuple):
         return self.scene.startswith("lego")
 
 
-class Computed(Callback):
-    """Ends training after so many seconds of this process; schedules follow its ``progress``."""
-
-    def __init__(self, seconds: float) -> None:
-        self.budget, self.begun = seconds, 0.0
-
-    @property
-    def spent(self) -> float:
-        return time.process_time() - self.begun
-
-    @property
-    def progress(self) -> float:
-        return min(1.0, self.spent / self.budget) if self.begun else 0.0
-
-    def begin(self) -> None:
-        """Count from now on."""
-        self.begun = time.process_time()
-
-    def on_train_batch_end(self, trainer: Any, *_: Any, **__: Any) -> None:
-        trainer.should_stop = self.spent >= self.budget
-
-
-def measure(overrides: list[str], seconds: float, seed: int = 0) -> dict[str, Any]:
-    """Train once, and score all views of the split."""
+def measure(
+    overrides: list[str], seconds: float, seed: int = 0, *, steps: int = -1
+) -> dict[str, Any]:
+    """Train once, for so many steps at most, and score all views of the split."""
     forget_peak()
     config = compose_plain("train", [*overrides, f"seed={seed}"])
     data, module = SceneDataModule(config["data"], seed=seed), RadianceModule(config)
-    clock = Computed(seconds)
+    data.setup("fit")
+    views = data.read_split(data.test_split)
+    began = time.process_time()
+    module.build(data.scene)
+    prepared = time.process_time() - began
+    first = mean_scores(_scores(module, data, views))
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(
             accelerator="cpu",
-            callbacks=[clock],
+            max_steps=steps,
+            max_seconds=seconds - prepared,
             default_root_dir=folder,
             logger=False,
             enable_checkpointing=False,
@@ -115,15 +105,7 @@ def measure(overrides: list[str], seconds: float, seed: int = 0) -> dict[str, An
             enable_model_summary=False,
             limit_val_batches=0,
         )
-        data.setup("fit")
-        views = data.read_split(data.test_split)
-        clock.begin()
-        module.build(data.scene)
-        prepared = clock.spent
-        first = mean_scores(_scores(module, data, views))
-        clock.begun = time.process_time() - prepared
         trainer.train(module, data)
-        spent = clock.spent
     scores = _scores(module, data, views)
     seen = (module.field, module.renderer, module.frame, views)
     began = time.process_time()
@@ -134,7 +116,7 @@ def measure(overrides: list[str], seconds: float, seed: int = 0) -> dict[str, An
         "first psnr": first["psnr"],
         "initialisation s": prepared,
         "steps": trainer.global_step,
-        "seconds": spent,
+        "seconds": prepared + training_seconds(trainer),
         "ms per view": 1000 * (time.process_time() - began) / len(views),
         "gaussians": len(module.field) if isinstance(module.field, Gaussians) else None,
         "peak GB": None if (peak := peak_memory()) is None else peak / 1e9,
@@ -196,8 +178,8 @@ def beginnings(args: argparse.Namespace) -> list[Case]:
 def warm() -> None:
     """What a process does before its first run: loops are compiled on first use."""
     torch.set_num_threads(1)
-    measure(["model=six_planes", "lrm=none", "data.resolution=16"], 0.2)
-    measure(["model=gaussians_hexplane", "data.resolution=16"], 0.2)
+    measure(["model=six_planes", "lrm=none", "data.resolution=16"], math.inf, steps=20)
+    measure(["model=gaussians_hexplane", "data.resolution=16"], math.inf, steps=20)
 
 
 def result(case: Case, work: Path) -> dict[str, Any]:
@@ -283,11 +265,12 @@ def main() -> None:
 
     {command()}
 
-Seconds are CPU time of one core and include the initialisation. One seed. Scores are on the test
-split of the suite's scenes and on the val split of lego; [PSNR against time](pareto.md) has demo
-scenes and smaller images. Six planes are initialised at
-random, Gaussians on the visual hull of the silhouettes; `first psnr` is the initial model's, and
-`peak GB` is given for runs in a process of their own.
+Seconds are CPU time of one core and include building the model, with its initialisation; learning
+rates and stages begin after it and end with the budget. One seed. Scores are on the test split of
+the suite's scenes and on the val split of lego; [PSNR against time](pareto.md) has demo scenes and
+smaller images. Six planes are initialised at random, Gaussians on the visual hull of the
+silhouettes; `first psnr` is the initial model's, and `peak GB` is given for runs in a process of
+their own.
 {machine()}.
 
 ![PSNR and SSIM of Gaussians minus those of six planes](gaussians.png)

@@ -5,12 +5,13 @@
 
 Writes docs/results/initialisation.md, .csv and .png. Each scene is trained from random
 initialisation and from the bundled `tiny`: with all views for --seconds, demo scenes also with five
-of them for --few-seconds. The preparation of `tiny` is part of its time: it is measured first, and
-training gets what is left. Demo scenes bring a video of a fixed camera, whose frames the LRM sees
-and random initialisation does not; lego and the suite's scenes have none, so a field is trained to
-film them, and both see the same images. Each run is a process of its own with one thread, and
-seconds are those of its CPU time (cpu_clock.py); ``--together`` so many run side by side. On demo
-scenes both starts are also trained with the frames of the video among the training views.
+of them for --few-seconds. The preparation of `tiny` is part of its time: training gets what is
+left, and its schedule ends there (total_time.py). Demo scenes bring a video of a fixed camera,
+whose frames the LRM sees and random initialisation does not; lego and the suite's scenes have none,
+so a field is trained to film them, and both see the same images. Each run is a process of its own
+with one thread, and seconds are those of its CPU time (cpu_clock.py); ``--together`` so many run
+side by side. On demo scenes both are also trained with the frames of the video among the training
+views.
 """
 
 import argparse
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from runner import CPU_CLOCK, RESULTS, Measured, command, lego, machine, markdown, run_apart
+from total_time import OVERRIDES as WITHIN_TOTAL
 
 from xplanes.files import replacing, write_rows, write_text
 
@@ -59,30 +61,22 @@ def cases(args: argparse.Namespace) -> list[Case]:
     return every + few
 
 
-def train(case: Case, start: str, seed: int, seconds: float, args: argparse.Namespace) -> Measured:
-    """One run; without seconds, what comes before its first step alone."""
+def measure(case: Case, start: str, seed: int, args: argparse.Namespace) -> Measured:
+    """One run, whose preparation and training take the case's seconds."""
     # A stage taken from the cache would cost its run nothing.
     given = [*case.overrides, f"data.resolution={args.resolution}", "preparation.cache=null"]
     given += [*STARTS[start], f"data.views={case.views or 'null'}", f"seed={seed}"]
-    given += [f"trainer.max_seconds={seconds:.2f}" if seconds else "trainer.max_seconds=null"]
-    given += [f"trainer.max_steps={1000000 if seconds else 1}"]
-    given += ["callbacks.evaluation.at=[0.0]" if seconds else "callbacks.evaluation.at=[]"]
-    given += ["media=false", "logger=none", "trainer.accelerator=cpu"]
+    given += [f"trainer.max_seconds={case.seconds:g}", "trainer.max_steps=1000000", *WITHIN_TOTAL]
+    given += ["callbacks.evaluation.at=[0.0]", "media=false", "logger=none"]
+    given += ["trainer.accelerator=cpu"]
     words = start.replace(", ", " ").replace(" ", "_")
-    name = f"{case.scene.split()[0]}_{case.views or 'all'}_{words}_{seed}_{seconds:.2f}"
+    name = f"{case.scene.split()[0]}_{case.views or 'all'}_{words}_{seed}_{case.seconds:g}s"
     return run_apart(given, args.work.absolute() / name, CPU_CLOCK)
 
 
 def preparation(run: Measured) -> float:
     """Seconds before training that random initialisation does not take."""
     return sum(run.metrics["seconds"]["prepare"].values())
-
-
-def measure(case: Case, start: str, seed: int, args: argparse.Namespace) -> Measured:
-    if "lrm=none" in STARTS[start]:
-        return train(case, start, seed, case.seconds, args)
-    before = preparation(train(case, start, seed, 0, args))
-    return train(case, start, seed, case.seconds - before, args)
 
 
 def row(case: Case, start: str, runs: list[Measured]) -> tuple:
@@ -92,7 +86,7 @@ def row(case: Case, start: str, runs: list[Measured]) -> tuple:
     first = statistics.mean(float(run.curve[0]["psnr"]) for run in runs)
     return (
         *(case.scene, case.views or "all", start),
-        f"{statistics.mean(map(preparation, runs)) if 'lrm=tiny' in STARTS[start] else 0:.1f}",
+        f"{statistics.mean(map(preparation, runs)):.1f}",
         f"{first:.2f}",
         f"{statistics.mean(psnr):.2f}{spread}",
         f"{statistics.mean(run.metrics['test']['ssim'] for run in runs):.3f}",
@@ -174,10 +168,10 @@ def main() -> None:
 
 Six planes at {args.resolution} pixels; {seeds}; {machine()}. The budget is {args.seconds:g} s of
 one core's CPU time with all views and {args.few_seconds:g} s with {FEW}; **it includes the
-preparation**, the time that `tiny` takes before its first step. Demo scenes (the first two) have a
-video of a fixed camera, whose frames the LRM sees and `none` does not; "on the video" adds them
-to the training views. The other scenes have no such video: the preparation trains a field that
-renders one, and both initialisations see the same images.
+preparation**, the time that `tiny` alone takes before its first step, and learning rates end with
+it. Demo scenes (the first two) have a video of a fixed camera, whose frames the LRM sees and `none`
+does not; "on the video" adds them to the training views. The other scenes have no such video: the
+preparation trains a field that renders one, and both initialisations see the same images.
 
 ![Lead of tiny over random initialisation](initialisation.png)
 

@@ -4,8 +4,9 @@
         [--work FOLDER]
 
 Writes docs/results/pareto.md, pareto.csv, pareto_points.csv and pareto.png. Every run is a process
-of its own with one thread, and seconds are those of its CPU time (cpu_clock.py); ``--together`` so
-many run side by side, and those kept in the work folder are not repeated.
+of its own with one thread, and seconds are those of its CPU time (cpu_clock.py); the preparation
+is part of them, and schedules end with them (total_time.py). ``--together`` so many run side by
+side, and those kept in the work folder are not repeated.
 """
 
 import os
@@ -21,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from figures import panels, save
 from runner import CPU_CLOCK, RESULTS, Measured, command, lego, machine, markdown, run_apart
+from total_time import OVERRIDES as WITHIN_TOTAL
 
 from xplanes.files import write_rows, write_text
 
@@ -95,13 +97,13 @@ def points(result: Measured) -> list[tuple[float, float]]:
     return [(prepared + float(row["seconds"]), float(row["psnr"])) for row in result.curve]
 
 
-def on_front(name: str, curves: dict[str, list[tuple[float, float]]]) -> bool:
-    """Whether a run was at some moment after `FIRST` as good as the best, to `MARGIN`.
+def on_front(name: str, curves: dict[str, list[tuple[float, float]]], budget: float) -> bool:
+    """Whether a run was at some time from `FIRST` to the budget as good as the best, to `MARGIN`.
 
     Between two scores a run lies on the line between them; before its first one it has nothing.
+    What a last step takes beyond the budget does not count.
     """
-    last = max(curve[-1][0] for curve in curves.values())
-    seconds = np.geomspace(FIRST, max(last, FIRST), 200)
+    seconds = np.geomspace(FIRST, budget, 200)
     values = {
         run: np.interp(seconds, *zip(*curve, strict=True), left=-np.inf)
         for run, curve in curves.items()
@@ -110,10 +112,13 @@ def on_front(name: str, curves: dict[str, list[tuple[float, float]]]) -> bool:
     return bool((values[name] >= best - MARGIN).any())
 
 
-def plot(scenes: dict[str, dict[str, list[tuple[float, float]]]]) -> None:
+def plot(scenes: dict[str, dict[str, list[tuple[float, float]]]], budget: float) -> None:
     """One panel per scene: runs on the front in colour, the others in grey."""
     figure, all_axes = panels(len(scenes), 7, 3.6 * len(scenes), rows=len(scenes))
-    best = {scene: [n for n in curves if on_front(n, curves)] for scene, curves in scenes.items()}
+    best = {
+        scene: [name for name in curves if on_front(name, curves, budget)]
+        for scene, curves in scenes.items()
+    }
     names = dict.fromkeys(name for found in best.values() for name in found)
     # Without C7, which is grey.
     colours = dict(zip(names, itertools.cycle(f"C{n}" for n in range(10) if n != 7), strict=False))
@@ -168,6 +173,7 @@ def main() -> None:
     common = [
         f"data.resolution={args.resolution}",
         f"trainer.max_seconds={args.seconds}",
+        *WITHIN_TOTAL,
         "trainer.max_steps=1000000",
         "trainer.accelerator=cpu",
         "media=false",
@@ -188,7 +194,7 @@ def main() -> None:
         results = {s: {n: run.result() for n, run in named.items()} for s, named in runs.items()}
     curves = {s: {n: points(run) for n, run in named.items()} for s, named in results.items()}
     rows = [
-        line(scene, name, result, on_front(name, curves[scene]))
+        line(scene, name, result, on_front(name, curves[scene], args.seconds))
         for scene, named in results.items()
         for name, result in named.items()
     ]
@@ -202,15 +208,17 @@ def main() -> None:
     write_rows(RESULTS / "pareto_points.csv", ("scene", "run", "seconds", "psnr"), along)
     page = f"""# PSNR against seconds
 
-{args.seconds:g} s of training for each run, in CPU time of one core, {args.resolution} px, five
-views of the test split (lego: val), one seed; {machine()}.
-"on front": at some time, preparation included, the run is within {MARGIN:g} dB of the best; PSNR is
-interpolated linearly between evaluations. During training four views are scored; for baselines two,
-and less often. Runs initialised from the LRM see frames of a video that the others do not, except
-on lego, which has none ([effect of these frames](initialisation.md)). `smaller` is K-Planes at a
-size that learns within a minute on a CPU; `our grid` replaces the published sampler by the
-occupancy grid of X-Planes; `from a field` places Gaussians on the surfaces of a six-plane field
-that is trained beforehand (`lrm=field`).
+{args.seconds:g} s for each run, preparation included, in CPU time of one core; learning rates end
+there. {args.resolution} px, five views of the test split (lego: val), one seed; {machine()}.
+"on front": at some time up to {args.seconds:g} s the run is within {MARGIN:g} dB of the best; PSNR
+is interpolated linearly between evaluations. A run ends with its first step beyond the budget, and
+baselines have steps of seconds. What all runs do to build their field does not count; Gaussians on
+the visual hull find it then, in about half a second. During training four views are scored; for
+baselines two, and less often. Runs initialised from the LRM see frames of a video that the others
+do not, except on lego, which has none ([effect of these frames](initialisation.md)). `smaller` is
+K-Planes at a size that learns within a minute on a CPU; `our grid` replaces the published sampler
+by the occupancy grid of X-Planes; `from a field` places Gaussians on the surfaces of a six-plane
+field that is trained beforehand (`lrm=field`).
 
     {command()}
 
@@ -219,7 +227,7 @@ that is trained beforehand (`lrm=field`).
 {markdown(COLUMNS, rows)}
 """
     write_text(RESULTS / "pareto.md", page)
-    plot(curves)
+    plot(curves, args.seconds)
 
 
 if __name__ == "__main__":

@@ -168,7 +168,8 @@ def train(
     source = method.lrm.load(say)
 
     # Data
-    warm, started = warm_up.seconds, time.monotonic()
+    warm = warm_up.seconds
+    began = time.perf_counter() - warm
     data = SceneDataModule(settings, seed=method.seed)
     data.setup("fit")
     scene, views = data.scene, data.scene.splits["train"]
@@ -178,7 +179,7 @@ def train(
     if record is not None:
         for finding in (*camera_findings(scene, frame), *opaque_findings(scene)):
             logger.warning("%s", finding.text)
-    loaded = time.monotonic() - started
+    loaded = time.perf_counter() - warm_up.seconds - began
 
     # Initialisation and field
     found = Initialisation(method.model, frame)
@@ -186,10 +187,12 @@ def train(
         place = Place(scene, frame, device, experiment.devices, say, settings.half_side)
         found = source.initialise(method, place)
     del source
-    began = time.monotonic() - warm_up.seconds
+    began = time.perf_counter() - warm_up.seconds
     module = RadianceModule(method)
     module.build(scene, frame, device=device, initialise=lambda *_: found)
-    loaded += time.monotonic() - warm_up.seconds - began
+    loaded += time.perf_counter() - warm_up.seconds - began
+    found = module.initialisation or found
+    loaded -= found.seconds["fill"]  # What an initialised field alone takes is preparation.
 
     # Training
     if record is not None:
@@ -229,7 +232,7 @@ def train(
     if experiment.media:
         say(f"rendering {VIDEO_FRAMES} frames of the orbit video ...")
         metrics["media"] = str(write_orbit(module, scene, folder).relative_to(folder))
-    seconds["total"] = record.total_seconds
+    seconds |= _rest(seconds, record.total_seconds)
     write_json(folder / "metrics.json", metrics)
     log_hparams(trainer, experiment, metrics)
     text = closing(folder, experiment, metrics)
@@ -251,6 +254,14 @@ def _final_scores(
             trainer.test(module, data, verbose=False)
     by_file = {score.file: score for score in module.scores}
     return [by_file[file] for file in views.files if file in by_file]
+
+
+def _rest(seconds: dict[str, Any], total: float) -> dict[str, float]:
+    """``other``, what a run did besides the stages of ``seconds``, and ``total``."""
+    # Stages from the cache count with what they took to make: they may exceed the run's own time.
+    named = sum(seconds["prepare"].values())
+    named += sum(value for name, value in seconds.items() if name != "prepare")
+    return {"other": max(0.0, total - named), "total": total}
 
 
 def say(text: str) -> None:

@@ -15,6 +15,7 @@ import torch
 
 from tests.training.runs import small_config
 from xplanes.errors import ConfigError
+from xplanes.models.initialisation import STAGES
 from xplanes.rendering import warming
 from xplanes.rendering.grid_renderer import OccupancySampler
 from xplanes.run import run
@@ -96,7 +97,8 @@ def test_run_directory_holds_what_it_promises(trained: Path) -> None:
     assert content["split"] == "test"
     assert len(content["views"]) == 3
     assert "warm_up" in content["seconds"]
-    assert set(content["seconds"]["prepare"]) == {"fixed_view", "lrm", "decomposition", "convert"}
+    assert set(content["seconds"]["prepare"]) == set(STAGES)
+    assert content["seconds"]["prepare"]["fill"] == 0  # Random initialisation fills nothing.
     assert set(content["skipped"]) >= {"empty", "occluded", "background"}
     assert all(0 <= share <= 1 for share in content["skipped"].values())
     # Validation views on the way, test views at the end.

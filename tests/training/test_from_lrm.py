@@ -9,11 +9,10 @@ from tests.preparation.test_reconstruct import CHOICES, publish
 from tests.training.runs import small_config
 from xplanes.evaluation.evaluate import evaluate
 from xplanes.evaluation.runs import load_run
+from xplanes.models.initialisation import STAGES
 from xplanes.preparation import reconstruct as reconstruct_module
 from xplanes.preparation import sources as sources_module
 from xplanes.run import run
-
-STAGES = ("fixed_view", "lrm", "decomposition", "convert")
 
 
 @pytest.fixture(scope="module")

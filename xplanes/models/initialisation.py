@@ -16,7 +16,7 @@ from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene
 from xplanes.settings import Count, Positive, Range, Settings
 
-STAGES = ("fixed_view", "lrm", "decomposition", "convert")
+STAGES = ("fixed_view", "lrm", "decomposition", "convert", "fill")
 
 
 def no_time() -> dict[str, float]:
@@ -41,7 +41,8 @@ class Initialisation:
         report: The decomposition for metrics.json: per orientation, and as ``unexplained`` the
             share of the sparse part's energy that the time planes do not explain: ``before`` with
             random planes, ``after`` with the initial ones.
-        seconds: Seconds of each stage; of one from the cache those that it took to make.
+        seconds: Seconds of each stage; of one from the cache those that it took to make. The last
+            one, ``fill``, is the sampler's and known once the field is built.
         words: The initialisation in one line.
         pictures: By name, colours from 0 to 1: the two parts at a few timesteps, and what the model
             was shown. [H, W, 3] each

@@ -1,12 +1,14 @@
 """Equal steps through occupied cells: rendering, and the occupancy grid in training."""
 
 import math
+import time
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import torch
 from torch import Tensor, distributed, nn
 
+from xplanes.backend import warm_up
 from xplanes.errors import ConfigError
 from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
@@ -169,12 +171,14 @@ class OccupancySettings(SamplerSettings):
             skip_empty=self.skip_empty,
             occlusion=self.occlusion if self.skip_occluded else 0.0,
         )
+        fill_seconds = 0.0
         if site.views is not None:
             if self.silhouettes:
                 carve(grid, site.views, site.frame)
             if site.initialised and self.fill:
-                _fill(renderer, field, site)
-        return OccupancySampler(renderer, self.scaled(site), site.samples_per_batch)
+                fill_seconds = _fill(renderer, field, site)
+        samples = site.samples_per_batch
+        return OccupancySampler(renderer, self.scaled(site), samples, fill_seconds)
 
     def scaled(self, site: Site) -> "OccupancySettings":
         """The same schedule in steps of the batches of a site.
@@ -191,9 +195,14 @@ class OccupancySettings(SamplerSettings):
         return replace(self, render_samples=self.samples)
 
 
-def _fill(renderer: GridRenderer, field: RadianceField, site: Site) -> None:
-    """Fill the grid of an initialised field on the device where it is going to be trained."""
+def _fill(renderer: GridRenderer, field: RadianceField, site: Site) -> float:
+    """Fill the grid of an initialised field on the device where it is going to be trained.
+
+    Returns:
+        Seconds that it took; warm-up excluded.
+    """
     assert site.views is not None
+    began = time.perf_counter() - warm_up.seconds
     parts = field, renderer.grid
     for part in parts:
         part.to(site.device or "cpu")
@@ -202,6 +211,7 @@ def _fill(renderer: GridRenderer, field: RadianceField, site: Site) -> None:
     fill(renderer.grid, field, site.views, site.frame, step=renderer.step, generator=generator)
     for part in parts:
         part.to("cpu")
+    return time.perf_counter() - warm_up.seconds - began
 
 
 class OccupancySampler(Sampler):
@@ -211,6 +221,7 @@ class OccupancySampler(Sampler):
         renderer: Its grid is changed in place.
         settings: Upkeep of the grid.
         samples: Samples of a batch on average at most; None if not known.
+        fill_seconds: Seconds that it took to fill the grid of an initialised field.
     """
 
     def __init__(
@@ -218,8 +229,10 @@ class OccupancySampler(Sampler):
         renderer: GridRenderer,
         settings: OccupancySettings,
         samples: int | None = None,
+        fill_seconds: float = 0.0,
     ) -> None:
         self.settings, self.grid, self.samples = settings, renderer.grid, samples
+        self.fill_seconds = fill_seconds
         room = None if samples is None else self._room(samples)
         self._training = replace(renderer, room=room)
         self._images = replace(renderer, samples=settings.render_samples)

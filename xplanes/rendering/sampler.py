@@ -100,6 +100,9 @@ def time_rows(times: Tensor) -> int:
 class Sampler(ABC):
     """Renders training batches, adds its own loss terms, and updates itself between steps."""
 
+    fill_seconds: float = 0.0
+    """Seconds that building it took for an initialised field alone; part of the preparation."""
+
     @property
     @abstractmethod
     def renderer(self) -> Renderer:

@@ -119,7 +119,9 @@ def build_parts(
         samples_per_batch=settled.most_samples,
         batch_scale=settled.most / rays.most if rays.most else 1.0,
     )
-    return Parts.assemble(found.model, site, found)
+    parts = Parts.assemble(found.model, site, found)
+    seconds = found.seconds | {"fill": parts.sampler.fill_seconds}
+    return replace(parts, initialisation=replace(found, seconds=seconds))
 
 
 def precision_of(settings: ModelSettings, device: torch.device) -> str:

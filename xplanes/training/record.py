@@ -112,7 +112,7 @@ class RunRecord:
 
     def __init__(self, run: Path, seed: int, *, resume: bool) -> None:
         self.path = run / "run.json"
-        self._began = time.monotonic()
+        self._began = time.perf_counter()
         earlier = _earlier(self.path) if resume else {}
         self._before = float(earlier.get("total_seconds", 0.0))
         self.content: dict[str, Any] = {
@@ -141,7 +141,7 @@ class RunRecord:
 
     def end(self, status: Status, reason: str | None = None) -> None:
         """Set how the run ended."""
-        total = self._before + time.monotonic() - self._began
+        total = self.total_seconds
         self.content.update(
             status=status, ended=_now(), total_seconds=round(total, 3), reason=reason
         )
@@ -150,7 +150,7 @@ class RunRecord:
     @property
     def total_seconds(self) -> float:
         """Wall time of this run so far, earlier parts included."""
-        return self._before + time.monotonic() - self._began
+        return self._before + time.perf_counter() - self._began
 
 
 def run_status(run: Path) -> str | None:

@@ -439,7 +439,7 @@ reloads.
 
 ::: xplanes.lrm.errors.LRMError
 
-::: xplanes.training.module.TrainingError
+::: xplanes.training.diagnosis.TrainingError
 
 ::: xplanes.files.StorageError
 

@@ -7,12 +7,12 @@ import time
 from pathlib import Path
 
 import pytest
-from xplanes.pipeline import run
 
 from tests.training.runs import SMALL
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.rendering import grid_renderer
+from xplanes.run import run
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 

@@ -46,10 +46,6 @@ def rows(folder: Path) -> list[dict[str, str]]:
         ({"precision": "16-mixed"}, r"precision=16-mixed.*model\.precision"),
         ({"overfit_batches": 1}, r"overfit_batches=1.*data\.views"),
         (
-            {"callbacks": [callbacks.GradientAccumulationScheduler({0: 2})]},
-            r"GradientAccumulationScheduler.*model\.rays\.accumulate",
-        ),
-        (
             {"callbacks": [callbacks.StochasticWeightAveraging(0.1)]},
             r"StochasticWeightAveraging.*EMAWeightAveraging",
         ),

@@ -544,7 +544,7 @@ def test_a_format_of_ones_own_joins(tmp_path, monkeypatch):
 
 def test_a_run_says_what_cameras_and_times_tell(tmp_path, caplog, monkeypatch):
     from tests.training.runs import small_config
-    from xplanes import pipeline
+    from xplanes import run
 
     views = painted(gap(), on_white).splits["train"]
     write_nerfstudio(tmp_path / "ball", views)
@@ -556,9 +556,9 @@ def test_a_run_says_what_cameras_and_times_tell(tmp_path, caplog, monkeypatch):
     def stop(*_: object) -> None:
         raise SceneError("far enough")
 
-    monkeypatch.setattr(pipeline, "Initialisation", stop)
+    monkeypatch.setattr(run, "Initialisation", stop)
     with pytest.raises(SceneError, match="far enough"):
-        pipeline.run(config, tmp_path / "run", [], resume=False)
+        run.run(config, tmp_path / "run", [], resume=False)
     said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert (
         sum("no training view shows the times between 0.25 and 0.75" in text for text in said) == 1

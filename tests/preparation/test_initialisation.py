@@ -13,11 +13,12 @@ from tests.preparation.sequences import blob, moving_sequence, static_features
 from tests.refusals import assert_refused
 from tests.synthetic import ball_scene
 from tests.training.runs import small_config
-from xplanes import decomposition, pipeline
+from xplanes import decomposition, run
 from xplanes.decomposition import unexplained_energy
 from xplanes.decomposition.conversion import DYNAMIC, STATIC
 from xplanes.decomposition.rpca import METHODS, SCALES
 from xplanes.errors import ConfigError
+from xplanes.evaluation import render
 from xplanes.fields import Decoder
 from xplanes.fields.xplanes import PLANE_SETS
 from xplanes.models.initialisation import STAGES, DecompositionSettings, Initialisation, Method
@@ -44,7 +45,7 @@ def settings(folder: Path, *overrides: str) -> Method:
 
 def built(method: Method, *, moving: bool = True, devices: int = 1) -> RadianceModule:
     """A field for a scene whose frame is known."""
-    module = RadianceModule.of(method)
+    module = RadianceModule(method)
     module.build(ball_scene(moving=moving), FRAME, devices=devices)
     return module
 
@@ -348,14 +349,14 @@ def test_the_video_of_a_run_shows_the_field_in_its_own_frame(
 ):
     frame = Frame(0.4, torch.eye(3), torch.tensor([0.1, 0.2, 0.3]))
     save_triplanes(tmp_path / "a.pt", TriplaneSequence(moving_sequence(), frame=frame))
-    shown, original = [], pipeline.render_path
+    shown, original = [], render.render_path
 
-    def render(field, renderer, frame, *others, **options):
+    def note(field, renderer, frame, *others, **options):
         shown.append(frame)
         return original(field, renderer, frame, *others, **options)
 
-    monkeypatch.setattr(pipeline, "render_path", render)
-    monkeypatch.setattr(pipeline, "VIDEO_FRAMES", 2)
+    monkeypatch.setattr(render, "render_path", note)
+    monkeypatch.setattr(render, "VIDEO_FRAMES", 2)
     plain = small_config(
         scenes,
         "lrm=file",
@@ -365,7 +366,7 @@ def test_the_video_of_a_run_shows_the_field_in_its_own_frame(
         "media=true",
         "logger=none",
     )
-    pipeline.run(plain, tmp_path / "run", [], resume=False)
+    run.run(plain, tmp_path / "run", [], resume=False)
     (found,) = shown
     assert found.scale == frame.scale
     assert torch.equal(found.centre, frame.centre)

@@ -9,7 +9,7 @@ import torch
 from tests.synthetic import ball_scene
 from xplanes.errors import ConfigError
 from xplanes.scenes.batches import RayBatches, RaySettings
-from xplanes.scenes.datamodule import UNIFORM, SceneDataModule
+from xplanes.scenes.datamodule import UNIFORM, SceneDataModule, spread_order
 from xplanes.scenes.frame import cube_frame, scene_frame
 from xplanes.scenes.listing import held_out_places
 
@@ -149,16 +149,19 @@ def test_a_module_that_says_nothing_gets_rays_over_all_pixels_in_the_scenes_cube
     assert len(expected["times"]) == 1024
 
 
-def test_whole_views_are_rays_in_the_world_and_their_colours():
+def test_whole_views_are_cameras_and_what_they_saw():
     data = SceneDataModule.of(ball_scene())
     views = data.scene.splits["test"]
     for loader in (data.test_dataloader(), data.predict_dataloader()):
         batches = list(loader)
         assert [batch["index"] for batch in batches] == list(range(len(views)))
         for index, batch in enumerate(batches):
-            origins, directions = views.image_rays(index)
-            assert torch.equal(batch["origins"], origins)
-            assert torch.equal(batch["directions"], directions)
+            for found, expected in zip(
+                batch["camera"].rays(), views.image_rays(index), strict=True
+            ):
+                assert torch.equal(found, expected)
+            assert batch["file"] == views.files[index]
+            assert torch.equal(batch["alpha"], views.image(index)[..., 3])
             assert batch["time"] == views.times[index]
             assert torch.equal(batch["background"], data.scene.background)
             assert torch.equal(batch["target"], views.composite(index, data.scene.background))
@@ -167,3 +170,24 @@ def test_whole_views_are_rays_in_the_world_and_their_colours():
 def test_a_folder_that_holds_no_run_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=f"{tmp_path} is not a run directory"):
         SceneDataModule.from_run(tmp_path)
+
+
+def test_however_few_validation_views_are_scored_they_are_spread():
+    assert spread_order(1) == [0]
+    for count in (5, 8, 11, 100):
+        order = spread_order(count)
+        assert sorted(order) == list(range(count))
+        for first in range(2, count):
+            gaps = torch.tensor(sorted(order[:first]) + [count]).diff()
+            assert gaps.max() <= 4 * count / first, (count, first)
+
+
+def test_processes_share_the_views():
+    data = SceneDataModule.of(ball_scene())
+    whole = [batch["index"] for batch in data.val_dataloader()]
+    found = []
+    for rank in range(2):
+        data.trainer = SimpleNamespace(global_rank=rank, world_size=2)
+        found.append([batch["index"] for batch in data.val_dataloader()])
+    assert sorted(found[0] + found[1]) == sorted(whole)
+    assert not set(found[0]) & set(found[1])

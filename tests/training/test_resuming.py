@@ -45,9 +45,9 @@ def note_checkpoints(written: list[tuple[str, dict]], monkeypatch: pytest.Monkey
     """Note every checkpoint that is written, by the name of its file."""
     save = AtomicCheckpointIO.save_checkpoint
 
-    def note(self, checkpoint: dict, path: str, *rest) -> None:
+    def note(self, checkpoint: dict, path: str, **options) -> None:
         written.append((Path(path).name, checkpoint))
-        save(self, checkpoint, path, *rest)
+        save(self, checkpoint, path, **options)
 
     monkeypatch.setattr(AtomicCheckpointIO, "save_checkpoint", note)
 

@@ -93,6 +93,7 @@ class Checkpoints(ModelCheckpoint):
             enable_version_counter=False,
         )
         self.every = every
+        self._due = False
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         self.dirpath = str(Path(trainer.default_root_dir) / "checkpoints")
@@ -102,12 +103,19 @@ class Checkpoints(ModelCheckpoint):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         # Gradients of batches that wait for others are in no checkpoint.
-        if trainer.global_step % self.every == 0 and getattr(pl_module, "between_updates", True):
+        whole = getattr(pl_module, "between_updates", True)
+        self._due = whole and trainer.global_step % self.every == 0
+        # Else it waits for the scores, so that it knows of the best.
+        validates = trainer.val_check_batch == trainer.fit_loop.epoch_loop.total_batch_idx + 1
+        if self._due and not validates:
             self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self.monitor in trainer.callback_metrics:
             super().on_validation_end(trainer, pl_module)
+        if self._due and not trainer.sanity_checking:
+            self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
+            self._due = False
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
@@ -120,9 +128,8 @@ class Checkpoints(ModelCheckpoint):
             self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
 
     def _should_skip_saving_checkpoint(self, trainer: Trainer) -> bool:
-        # Saved after the same step, ``last.ckpt`` is another file.
-        self._last_global_step_saved = -1
-        return super()._should_skip_saving_checkpoint(trainer)
+        # The last scores may be made up for after training, see `Trainer.train`.
+        return trainer.sanity_checking or not trainer.global_step
 
     def _save_checkpoint(self, trainer: Trainer, filepath: str) -> None:
         if trainer.fast_dev_run:  # type: ignore[attr-defined]

@@ -14,6 +14,7 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, ProgressBar, StochasticWeightAveraging
 from lightning.pytorch.plugins.io import CheckpointIO
+from lightning.pytorch.strategies import DDPStrategy
 
 from xplanes.backend import cpu_loops, synchronize
 from xplanes.errors import ConfigError
@@ -95,6 +96,9 @@ class Trainer(lightning.Trainer):
         # Of the whole process: the LRM, too, computes in what precision=32 says.
         torch.set_float32_matmul_precision("high" if tf32 else "highest")
         torch.backends.cudnn.allow_tf32 = tf32
+        if others.get("strategy") == "ddp":
+            # The processes agree on the occupancy grid themselves: 20 MB a step would take longer.
+            others["strategy"] = DDPStrategy(broadcast_buffers=False)
         # `Evaluation` says when views are scored; without it, nothing does.
         others.setdefault("check_val_every_n_epoch", None)
         others.setdefault("val_check_interval", sys.maxsize)
@@ -126,7 +130,12 @@ class Trainer(lightning.Trainer):
         device = self.strategy.root_device
         warm_up(module, data, device)
         with self.interrupt.exits():
-            self.fit(module, data, ckpt_path=None if checkpoint is None else str(checkpoint))
+            try:
+                self.fit(module, data, ckpt_path=None if checkpoint is None else str(checkpoint))
+            except RuntimeError as error:
+                if "Early stopping conditioned on" not in str(error):
+                    raise
+                raise ConfigError(f"callbacks: EarlyStopping: {error}") from error
             evaluation = find_callback(self, Evaluation)
             if evaluation is not None and evaluation.step != self.global_step:
                 # Lightning trains nothing where no step is left, though the end was not scored yet.

@@ -141,7 +141,8 @@ class RadianceModule(LightningModule):
         require_whole_floats(str(self.trainer.precision))
 
     def configure_model(self) -> None:
-        if self._parts is not None:
+        # Loaded without a Trainer, the field is built in `on_load_checkpoint`.
+        if self._parts is not None or self._trainer is None:
             return
         data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
         if data is None:
@@ -483,8 +484,7 @@ class RadianceModule(LightningModule):
         tag = self.trainer.strategy.broadcast(self._tag)  # A process may have had no view.
         means = {f"{tag}/{name}": value for name, value in mean_scores(self.scores).items()}
         self.tally.last |= means
-        # All processes have the means of all views.
-        self.log_dict(means | {"step": float(self.global_step)}, batch_size=1, rank_zero_only=False)
+        self.log_dict(means, batch_size=1)  # All processes have the means of all views.
 
     # Checkpoints
 

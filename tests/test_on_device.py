@@ -36,9 +36,10 @@ from xplanes.rendering.box import ray_box
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes import batches
 from xplanes.scenes.batches import DeviceBatches
-from xplanes.training.clock import TrainingClock
+from xplanes.training.clock import SHARED, TrainingClock
 from xplanes.training.diagnosis import TrainingError
 from xplanes.training.fit import warm_up
+from xplanes.training.interrupt import Interrupt, Stopped
 from xplanes.training.meters import due
 from xplanes.training.scores import score_view
 
@@ -266,6 +267,35 @@ def test_the_clock_counts_what_the_device_has_still_to_do(fake_gpu, monkeypatch)
     assert lag <= clock.seconds < 1.5 * lag  # What was asked before the block, not what it asked.
     clock.on_train_end(lagging, module)
     assert clock.seconds >= 2 * lag
+
+
+def test_processes_that_share_a_run_end_in_time_however_short_their_epochs_are():
+    batches = SimpleNamespace(total_batch_idx=-1)
+    trainer = SimpleNamespace(
+        should_stop=False,
+        world_size=2,
+        fit_loop=SimpleNamespace(epoch_loop=batches),
+        strategy=SimpleNamespace(
+            reduce=lambda number, reduce_op: number,
+            reduce_boolean_decision=lambda decision, all: decision,
+        ),
+    )
+    module = SimpleNamespace(device=torch.device("cpu"))
+    clock, interrupt = TrainingClock(max_seconds=1e-9), Interrupt()
+    clock.on_train_start(trainer, module)
+
+    def train(count):
+        for number in range(count):
+            batches.total_batch_idx += 1
+            clock.on_train_batch_end(trainer, module, None, None, number % 5)
+            interrupt.on_train_batch_end(trainer, module, None, None, number % 5)
+
+    interrupt.asked = True
+    train(SHARED - 1)
+    assert not trainer.should_stop
+    with pytest.raises(Stopped):
+        train(1)
+    assert trainer.should_stop
 
 
 def test_an_lrm_whose_frames_are_cached_stays_where_it_is(fake_gpu, tmp_path):

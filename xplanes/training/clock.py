@@ -19,6 +19,13 @@ SHARED = 8
 whether to stop."""
 
 
+def agreeing(trainer: Trainer) -> bool:
+    """Whether all processes come to an agreement after this batch; one alone always does."""
+    # An epoch may have fewer batches, so that their number in it would never be reached.
+    batches = trainer.fit_loop.epoch_loop.total_batch_idx + 1 if trainer.world_size > 1 else 0
+    return batches % SHARED == 0
+
+
 class TrainingClock(Callback):
     """Counts the seconds spent on training, and ends training when they are used up.
 
@@ -52,7 +59,7 @@ class TrainingClock(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        if trainer.world_size > 1 and (batch_idx + 1) % SHARED:
+        if not agreeing(trainer):
             return
         now = time.perf_counter()
         spent = now - self._mark

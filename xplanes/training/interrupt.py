@@ -10,7 +10,7 @@ from typing import Any
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
-from xplanes.training.clock import SHARED, find_callback
+from xplanes.training.clock import agreeing, find_callback
 
 
 class Stopped(KeyboardInterrupt):
@@ -36,9 +36,9 @@ class Interrupt(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
+        if not agreeing(trainer):
+            return
         if trainer.world_size > 1:
-            if (batch_idx + 1) % SHARED:
-                return
             # Saving takes all processes: they must stop after the same step.
             self.asked = trainer.strategy.reduce_boolean_decision(self.asked, all=False)
         # Modules that gather batches for an update say where one is whole.

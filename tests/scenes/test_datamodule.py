@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from torch.utils.data import DistributedSampler
 
 from tests.synthetic import ball_scene
 from xplanes.errors import ConfigError
@@ -191,3 +192,8 @@ def test_processes_share_the_views():
         found.append([batch["index"] for batch in data.val_dataloader()])
     assert sorted(found[0] + found[1]) == sorted(whole)
     assert not set(found[0]) & set(found[1])
+    # Lightning would divide them once more.
+    assert isinstance(data.val_dataloader().sampler, DistributedSampler)
+    # Lightning scores nothing in a process without a view, for which the others would wait.
+    data.trainer = SimpleNamespace(global_rank=len(whole), world_size=len(whole) + 1)
+    assert [batch["index"] for batch in data.val_dataloader()] == whole[:1]

@@ -10,7 +10,7 @@ import torch
 import yaml
 from lightning import LightningDataModule
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, IterableDataset
+from torch.utils.data import DataLoader, Dataset, DistributedSampler, IterableDataset
 
 from xplanes.components import build, plugins
 from xplanes.config import compose_plain
@@ -257,11 +257,13 @@ class SceneDataModule(LightningDataModule):
 
     def _views(self, split: str, tag: str, order: Sequence[int] | None = None) -> DataLoader:
         views = self.read_split(split)
-        order = range(len(views)) if order is None else order
-        if self.trainer is not None and tag != "predict":
-            # Processes score views of their own.
-            order = order[self.trainer.global_rank :: self.trainer.world_size]
-        return DataLoader(_WholeViews(views, self.scene.background, tag, order), batch_size=None)
+        order, sampler = range(len(views)) if order is None else order, None
+        if self.trainer is not None and self.trainer.world_size > 1 and tag != "predict":
+            # Processes score views of their own. None may be without, or the others wait for it.
+            order = order[self.trainer.global_rank :: self.trainer.world_size] or order[:1]
+            sampler = _Divided(len(order))
+        dataset = _WholeViews(views, self.scene.background, tag, order)
+        return DataLoader(dataset, batch_size=None, sampler=sampler)
 
     def state_dict(self) -> dict[str, Any]:
         module = None if self.trainer is None else self.trainer.lightning_module
@@ -300,6 +302,19 @@ class _WholeViews(Dataset):
     def __getitem__(self, place: int) -> dict[str, Any]:
         item = whole_view(self.views, self.order[place], self.background)
         return item | {"tag": self.tag}
+
+
+class _Divided(DistributedSampler):
+    """All items of a process in order; Lightning divides them no further, as it does by default."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(range(self.count))
+
+    def __len__(self) -> int:
+        return self.count
 
 
 def whole_view(views: Views, index: int, background: Tensor) -> dict[str, Any]:

@@ -136,13 +136,17 @@ def score_view(
 
 
 def gathered(scores: Sequence[ViewScore], trainer: Trainer) -> list[ViewScore]:
-    """The scores of all processes, each of which scores every so many-th view, in order."""
+    """The scores of all processes, each of which scores every so many-th view, in order.
+
+    A process without a view of its own has scored one of another's, which counts once.
+    """
     if trainer.world_size == 1:
         return list(scores)
     parts: list[Any] = [None] * trainer.world_size
     distributed.all_gather_object(parts, list(scores))
     most = max(len(part) for part in parts)
-    return [part[place] for place in range(most) for part in parts if place < len(part)]
+    found = [part[place] for place in range(most) for part in parts if place < len(part)]
+    return list({score.file: score for score in found}.values())
 
 
 def psnr_thing(colour: Tensor, truth: Tensor, thing: Tensor | None) -> float:

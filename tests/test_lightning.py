@@ -2,20 +2,22 @@
 
 import csv
 import json
+import os
 import re
 import shutil
 from pathlib import Path
+from unittest import mock
 
 import lightning
 import pytest
 import torch
 from lightning.pytorch.callbacks import (
+    Callback,
     EMAWeightAveraging,
     LearningRateMonitor,
     ModelCheckpoint,
 )
 from lightning.pytorch.loggers import CSVLogger, Logger
-from lightning.pytorch.strategies import DDPStrategy
 
 from tests.training.runs import small_config
 from xplanes import RadianceModule, SceneDataModule
@@ -398,8 +400,30 @@ def test_a_list_of_settings_is_refused() -> None:
         SceneDataModule.compose(["seed=1"])  # type: ignore[arg-type]
 
 
+def test_processes_do_not_send_each_other_the_grid_before_each_step(
+    config: dict, tmp_path: Path
+) -> None:
+    """In a group of one process, which torch treats like any other."""
+    sent = []
+
+    class Watch(Callback):
+        def on_train_batch_end(self, trainer, *_):
+            sent.append({buffer.data_ptr() for buffer in trainer.model.modules_buffers})
+
+    module, data = RadianceModule(config), SceneDataModule(config["data"])
+    with mock.patch.dict(os.environ):  # Lightning notes ranks and ports there.
+        shared = trainer(tmp_path, max_steps=2, strategy="ddp", devices=1, callbacks=[Watch()])
+        try:
+            shared.fit(module, data)
+        finally:
+            torch.distributed.destroy_process_group()
+    assert len(sent) == 2
+    grid = {buffer.data_ptr() for buffer in module.sampler.parts["grid"].buffers()}
+    assert len(grid) > 3
+    assert not grid & sent[-1]
+
+
 def test_what_a_trainer_of_ours_settles_for_gpus(tmp_path: Path) -> None:
-    """TF32 is asked for, and processes do not send each other the grid before each step."""
     before = torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
     options = {"accelerator": "cpu", "default_root_dir": tmp_path, "logger": False}
     try:
@@ -407,9 +431,6 @@ def test_what_a_trainer_of_ours_settles_for_gpus(tmp_path: Path) -> None:
             Trainer(**options, tf32=tf32)
             assert torch.get_float32_matmul_precision() == products
             assert torch.backends.cudnn.allow_tf32 is tf32
-        shared = Trainer(**options, devices=2, strategy="ddp")
-        assert isinstance(shared.strategy, DDPStrategy)
-        assert shared.strategy._ddp_kwargs["broadcast_buffers"] is False
     finally:
         torch.set_float32_matmul_precision(before[0])
         torch.backends.cudnn.allow_tf32 = before[1]

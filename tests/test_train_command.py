@@ -293,10 +293,17 @@ EACH_RANK = """
 import sys
 import torch
 sys.path.insert(0, {root!r})
+from lightning import Trainer
 from xplanes.training.module import RadianceModule
 def keep(module):
     torch.save(module.state_dict(), {folder!r} + f"/rank{{module.global_rank}}.pt")
 RadianceModule.on_fit_end = keep
+save = Trainer.save_checkpoint
+def save_apart(trainer, path, *given):
+    save(trainer, path, *given)
+    if trainer.global_step == 13:
+        save(trainer, {folder!r} + "/13.ckpt")
+Trainer.save_checkpoint = save_apart
 # The second process starts with sys.argv[0], so that must stay this file.
 exec(compile(open({train!r}).read(), {train!r}, "exec"), globals())
 """
@@ -308,18 +315,23 @@ def test_two_processes_share_the_rays_and_end_with_one_model(root: str, tmp_path
     script.write_text(
         EACH_RANK.format(root=str(ROOT), train=str(ROOT / "train.py"), folder=str(tmp_path))
     )
+
+    def train_both(*settings: str) -> None:
+        result = subprocess.run(
+            [sys.executable, str(script), *settings],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=240,
+            check=False,
+        )
+        assert result.returncode == 0, result.stderr
+
     # Between updates each process's grid sees its own samples.
     settings = [root, *SMALL, "trainer=ddp", "trainer.max_steps=20", f"hydra.run.dir={run}"]
-    settings.append("model.sampler.update_every=1")
-    result = subprocess.run(
-        [sys.executable, str(script), *settings],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr
+    settings += ["callbacks.checkpoints.every=13", "trainer.deterministic=true"]
+    settings.append("data.val_views=1")  # Fewer than processes.
+    train_both(*settings)
     state = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
     assert state["global_step"] == 20
     assert (run / "metrics.json").is_file()
@@ -329,6 +341,17 @@ def test_two_processes_share_the_rays_and_end_with_one_model(root: str, tmp_path
     for name in first:
         assert torch.equal(first[name], second[name]), name
         assert torch.equal(first[name], state["state_dict"][name]), name
+    metrics = json.loads((run / "metrics.json").read_text())
+    rays = state["progress"]["counts"]["rays"]
+    assert rays > 20 * 256  # Those of both.
+    assert metrics["rays_per_second"] == pytest.approx(rays / metrics["seconds"]["train"])
+    # From a step at which the grid is not updated, and before which it has met other samples.
+    (tmp_path / "13.ckpt").replace(run / "checkpoints" / "last.ckpt")
+    train_both(f"resume={run}")
+    again = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+    assert again["global_step"] == 20
+    for name in first:
+        assert torch.equal(first[name], again["state_dict"][name]), name
 
 
 @pytest.mark.slow

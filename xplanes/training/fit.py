@@ -14,7 +14,6 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, ProgressBar, StochasticWeightAveraging
 from lightning.pytorch.plugins.io import CheckpointIO
-from lightning.pytorch.strategies import DDPStrategy
 
 from xplanes.backend import cpu_loops, synchronize
 from xplanes.errors import ConfigError
@@ -96,9 +95,6 @@ class Trainer(lightning.Trainer):
         # Of the whole process: the LRM, too, computes in what precision=32 says.
         torch.set_float32_matmul_precision("high" if tf32 else "highest")
         torch.backends.cudnn.allow_tf32 = tf32
-        if others.get("strategy") == "ddp":
-            # The processes agree on the occupancy grid themselves: 20 MB a step would take longer.
-            others["strategy"] = DDPStrategy(broadcast_buffers=False)
         # `Evaluation` says when views are scored; without it, nothing does.
         others.setdefault("check_val_every_n_epoch", None)
         others.setdefault("val_check_interval", sys.maxsize)

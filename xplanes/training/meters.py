@@ -1,7 +1,7 @@
 """What training steps show: sums that a GPU's host reads now and then, and opacities."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -86,8 +86,13 @@ class Tally:
         if broken.device.type == "cpu":
             self._read_updates()
 
-    def read(self) -> tuple[int, int] | None:
+    def read(
+        self, of_all: Callable[[dict[str, float]], dict[str, float]] = dict
+    ) -> tuple[int, int] | None:
         """Look at what was taken in since the last look.
+
+        Args:
+            of_all: From one process's numbers to the sums of all.
 
         Returns:
             Numbers of rays and of samples; None if there was no batch.
@@ -95,6 +100,7 @@ class Tally:
         self._read_updates()
         if not (found := self._batches.read()):
             return None
+        found = of_all(found)
         batches, rays = int(found["batches"]), int(found["rays"])
         error = max(found["error"] / batches, 1e-10)
         self.last |= {"loss": found["loss"] / batches, "psnr": -10 * math.log10(error)}

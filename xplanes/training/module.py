@@ -239,6 +239,15 @@ class RadianceModule(LightningModule):
         """Renders images of the field."""
         return self.parts.sampler.renderer
 
+    @property
+    def _ddp_params_and_buffers_to_ignore(self) -> list[str]:
+        """What torch is not to send from the first process to all others before each step.
+
+        The occupancy grid is 20 MB; processes agree on it now and then.
+        """
+        parts = self.sampler.parts.items()
+        return [f"{name}.{key}" for name, part in parts for key, _ in part.named_buffers()]
+
     # Training
 
     @property
@@ -392,13 +401,21 @@ class RadianceModule(LightningModule):
 
     def _read_tally(self) -> None:
         """Look at what the batches since the last look showed, and draw as many rays as fit."""
-        if (found := self.tally.read()) is None:
+        if (found := self.tally.read(self._of_all)) is None:
             return
         rays, samples = found
         # Of batches of as many rays as the next one has.
         self.sampler.expect(samples * self.rays / max(1, rays))
         if self.rays:
             self.rays = self.ray_settings.fitting(rays, samples)
+
+    def _of_all(self, values: dict[str, float]) -> dict[str, float]:
+        """Sums over all processes, so that they go on with the same numbers."""
+        if self.trainer.world_size == 1:
+            return values
+        own = torch.tensor(list(values.values()), dtype=torch.float64, device=self.device)
+        total = torch.as_tensor(self.trainer.strategy.reduce(own, reduce_op="sum"))
+        return dict(zip(values, total.tolist(), strict=True))
 
     def _give_up(self, unusable: Sequence[str] = ()) -> None:
         assert self._seen is not None
@@ -468,9 +485,11 @@ class RadianceModule(LightningModule):
         return image
 
     def on_validation_epoch_start(self) -> None:
+        self._agree()
         self.scores = []
 
     def on_test_epoch_start(self) -> None:
+        self._agree()
         self.scores = []
 
     def on_validation_epoch_end(self) -> None:
@@ -488,8 +507,20 @@ class RadianceModule(LightningModule):
 
     # Checkpoints
 
+    def _agree(self) -> None:
+        """Go on with the first process's sampler, for each has seen the samples of its own rays.
+
+        What is scored, or goes into a checkpoint, is one field.
+        """
+        if self._trainer is None or self._trainer.world_size == 1:
+            return
+        for part in self.sampler.parts.values():
+            for buffer in part.buffers():
+                torch.distributed.broadcast(buffer, src=0)
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self._read_tally()
+        self._agree()
         own = {"batches": self.batches, "rays": self.rays, "restarts": self.restarts}
         checkpoint["progress"] = own | self.tally.state_dict()
         if self._parts is not None:

@@ -26,13 +26,11 @@ ONE_OFF = {
     "occlusion off": ("model.sampler.skip_occluded=false",),
     "silhouettes off": ("model.sampler.silhouettes=false",),
     "background off": ("model.rays.skip_background=false",),
-    "coarse steps off": ("model.sampler.coarse_steps=0",),
-    "thinning off": ("model.sampler.thinning=0",),
 }
 EVERYTHING = tuple(line for lines in ONE_OFF.values() for line in lines)
 SWITCHES: dict[str, tuple[str, ...]] = {"all savings": (), **ONE_OFF, "all off": EVERYTHING}
 
-KINDS = ("empty", "occluded", "background", "gradients")
+KINDS = ("empty", "occluded", "background")
 
 PAIRS = {
     "time planes of a static scene": (("data.scene=still_life",), ("data.static=false",), 1),
@@ -41,11 +39,6 @@ PAIRS = {
         ("data.scene=excavator", "lrm=tiny"),
         ("model.sampler.fill=false",),
         1,
-    ),
-    "steps after convergence": (
-        ("data.scene=excavator", "callbacks.plateau.gain=0.3"),
-        ("callbacks.plateau.gain=null",),
-        4,
     ),
 }
 """Savings beside those of single samples: a scene, what switches it off there, and for how many
@@ -76,7 +69,6 @@ COLUMNS = (
     "empty",
     "occluded",
     "background",
-    "gradients",
 )
 
 
@@ -211,7 +203,7 @@ def main() -> None:
 time of one core; {machine()}. `{command()}`
 
 Columns `empty` and `occluded`: skipped shares of the samples in the cube; `background`: of the
-pixels; `gradients`: share of the remaining samples without a gradient.
+pixels.
 
 All runs use the same number of rays. With background skipping off, the rays cover the whole image.
 Most of them hit nothing and are cheap, so this saving improves PSNR rather than seconds.

@@ -659,7 +659,7 @@ LAYERS = (
     ("preparation",),
     ("evaluation",),
     ("pretraining",),
-    ("pipeline", "launch"),
+    ("run", "launch"),
     ("cli",),
     ("__main__",),
 )
@@ -671,7 +671,7 @@ An LRM brings a decoder of the fields' kind, so fields stand above it.
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 
 EDGES = {
-    "launch": {"config", "errors", "files", "pipeline"},
+    "launch": {"config", "errors", "files", "run"},
     "train": {"cli"},
 }
 """What the ends of the command line may import, which must be quick to start."""

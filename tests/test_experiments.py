@@ -114,7 +114,7 @@ def does_a_step(cases: list[tuple[str, ...]]) -> None:
         module, batches = built(experiment.config, scene)
         rays, state = batches.draw(0), module.state
         rendering = module.sampler.render(module.field, rays, state)
-        loss = sum(module._terms(rendering, rays, state).values())
+        loss = sum(module.loss_terms(rendering, rays, state).values())
         assert torch.isfinite(loss), overrides
         loss.backward()
         module.sampler.pass_on(rendering, state)

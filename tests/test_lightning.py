@@ -231,12 +231,12 @@ def test_gradients_are_clipped_and_accumulated(config: dict, tmp_path: Path) -> 
         max_steps=4,
         limit_val_batches=0,
         gradient_clip_val=1e-3,
-        accumulate_grad_batches=3,
+        accumulate_grad_batches=2,
         callbacks=[steps],
     )
     module = RadianceModule(config)
     used.fit(module, SceneDataModule(config["data"]))
-    assert (used.global_step, module.batches) == (4, 12)
+    assert (used.global_step, module.batches) == (4, 8)
     assert max(steps.norms) < 1.001e-3
     assert module.last["loss"] > 0
 
@@ -374,6 +374,41 @@ def test_the_script_of_the_docs_runs(
     exec(compile(script, "recipes.md", "exec"), {})
     assert (tmp_path / "field.ckpt").is_file()
     assert (tmp_path / "view.png").is_file()
+
+
+def test_the_page_on_your_own_trainer_runs(
+    config: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (ROOT / "docs" / "own_trainer.md").read_text(encoding="utf-8")
+    (script,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    folder = SceneDataModule(config["data"]).settings.folder
+    script = script.replace('"data.root=data/dnerf"', f'"data.root={folder.parent.resolve()}"')
+    script = script.replace(
+        '"data.scene=lego"', f'"data.scene={folder.name}", "data.resolution=null"'
+    )
+    script = script.replace("max_steps=2000", 'max_steps=12, accelerator="cpu"')
+    script = script.replace("val_check_interval=500", "val_check_interval=6")
+    names: dict = {}
+    exec(compile(script, "own_trainer.md", "exec"), names)
+    assert names["trainer"].global_step == 12
+    kept = torch.load(tmp_path / "checkpoints" / "best.ckpt", weights_only=True)
+    assert {"current_model_state", "averaging_state"} <= kept.keys()
+    for name, value in kept["state_dict"].items():
+        assert torch.equal(names["again"].state_dict()[name], value), name
+
+
+def test_a_checkpoint_of_another_version_is_refused_with_its_number(
+    fitted: tuple, tmp_path: Path
+) -> None:
+    fitted[3].save_checkpoint(tmp_path / "old.ckpt")
+    content = torch.load(tmp_path / "old.ckpt", weights_only=True)
+    content["hyper_parameters"]["config"]["model"]["rays"]["accumulate"] = 1
+    for version, words in (("0.1.7", r"xplanes 0\.1\.7"), (None, r"xplanes 0\.2 or older")):
+        content.pop("xplanes", None)
+        torch.save(content | ({"xplanes": version} if version else {}), tmp_path / "old.ckpt")
+        with pytest.raises(ConfigError, match=rf"{words}, whose settings are not those of"):
+            RadianceModule.load_from_checkpoint(tmp_path / "old.ckpt")
 
 
 def test_plugins_of_the_docs_are_composed_and_loaded_again(

@@ -136,7 +136,6 @@ def test_training_there_comes_to_the_numbers_of_plain_torch(fake_gpu, monkeypatc
     monkeypatch.setattr(DeviceBatches, "can_serve", lambda *_: False)
     # What draws other random numbers is left out.
     options = (
-        "model.sampler.thinning=0",
         "model.sampler.update_every=1000",
         "model.sampler.sweep_at=[8]",
         "model.rays.samples_per_batch=16384",
@@ -161,7 +160,7 @@ def test_what_a_step_shows_is_read_now_and_then(fake_gpu):
     assert module.batches == 33
     seen = module.counts
     left = seen["candidates"] - seen["empty"] - seen["occluded"]
-    assert 0 < seen["samples"] == seen["passed"] < left  # The others were of rays without room.
+    assert 0 < seen["samples"] < left  # The others were of rays without room.
     assert seen["no_room"] > 0
     # The last batch is read at the end.
     assert 33 * 128 < seen["rays"] + seen["no_room"] <= 33 * 256

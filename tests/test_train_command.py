@@ -18,7 +18,8 @@ from omegaconf import OmegaConf
 from tests import warm
 from tests.training.runs import SMALL
 from tests.warm import train
-from xplanes import launch, pipeline
+from xplanes import launch
+from xplanes import run as whole_run
 from xplanes.config import CONF, quoted
 from xplanes.errors import ConfigError
 from xplanes.launch import SettingsCheck, file_name, prepare
@@ -220,7 +221,7 @@ def test_a_stopped_sweep_says_how_the_whole_of_it_goes_on(tmp_path, monkeypatch,
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pipeline, "run", stop)
+    monkeypatch.setattr(whole_run, "run", stop)
     own = [name for name in config if name != "hydra"]
     monkeypatch.setattr(HydraConfig.instance(), "cfg", OmegaConf.masked_copy(config, ["hydra"]))
     config = OmegaConf.masked_copy(config, own)

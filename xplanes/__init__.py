@@ -6,7 +6,7 @@ if TYPE_CHECKING:
     from xplanes.scenes.datamodule import SceneDataModule
     from xplanes.training.module import RadianceModule
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 __all__ = ["RadianceModule", "SceneDataModule"]
 
 

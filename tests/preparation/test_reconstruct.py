@@ -14,7 +14,6 @@ from tests.lrm.reference import compare
 from tests.synthetic import ball_scene, ball_views, inside_ball, surrounding
 from tests.training.runs import small_config
 from xplanes.errors import ConfigError
-from xplanes.experiment import Experiment
 from xplanes.fields import Decoder, XPlanes
 from xplanes.lrm import LRMError
 from xplanes.lrm.triposr import CHORD
@@ -23,7 +22,7 @@ from xplanes.preparation.cache import StageCache
 from xplanes.preparation.encode import straight_alpha
 from xplanes.preparation.fixed_view import FixedView
 from xplanes.preparation.reconstruct import align_to, picture_crop, reconstruct
-from xplanes.run import train
+from xplanes.run import prepare, train
 from xplanes.scenes.frame import scene_frame
 
 CHOICES = {
@@ -194,7 +193,7 @@ def test_weights_of_another_size_are_refused_before_any_scene_is_read(tmp_path: 
     (tmp_path / "wrong" / "config.json").unlink()
     plain["lrm"]["weights"] = str(wrong)
     with pytest.raises(LRMError, match=r"does not fit openlrm-small-1\.1"):
-        train(Experiment.read(plain), tmp_path / "run", resume=False)
+        train(prepare(plain, tmp_path / "run"), resume=False)
     assert not (tmp_path / "excavator_32px_s0").exists()
 
 

@@ -179,7 +179,7 @@ def test_however_few_validation_views_are_scored_they_are_spread():
         order = spread_order(count)
         assert sorted(order) == list(range(count))
         for first in range(2, count):
-            gaps = torch.tensor(sorted(order[:first]) + [count]).diff()
+            gaps = torch.tensor([*sorted(order[:first]), count]).diff()
             assert gaps.max() <= 4 * count / first, (count, first)
 
 

@@ -464,7 +464,7 @@ def test_the_data_module_serves_views_at_their_own_size():
     for index, batch in enumerate(data.test_dataloader()):
         height, width = views.size(index)
         assert batch["target"].shape == (height, width, 3)
-        assert batch["origins"].shape == batch["directions"].shape == (height * width, 3)
+        assert [len(rays) for rays in batch["camera"].rays()] == [height * width] * 2
 
 
 def test_frames_with_different_intrinsics_are_not_static():

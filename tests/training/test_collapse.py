@@ -15,7 +15,7 @@ from xplanes.models.base import background_opacity, opacity_error, opacity_short
 from xplanes.rendering.base import Rendering
 from xplanes.run import run
 from xplanes.training import collapse
-from xplanes.training.checkpoints import Checkpoints
+from xplanes.training.checkpoints import AtomicCheckpointIO
 from xplanes.training.collapse import CollapseWatch, verdict
 from xplanes.training.meters import mean_opacities
 from xplanes.training.module import RadianceModule
@@ -26,7 +26,7 @@ QUICK = ("trainer.max_steps=24", "callbacks.evaluation.at=[]", "callbacks.checkp
 
 def rendered(opacity: torch.Tensor, colour: torch.Tensor) -> Rendering:
     empty = torch.zeros(0)
-    return Rendering(colour, opacity, empty, empty, samples=None, cut=None)  # type: ignore[arg-type]
+    return Rendering(colour, opacity, empty, empty, samples=None)  # type: ignore[arg-type]
 
 
 def test_opacity_is_compared_with_alpha_or_with_what_a_colour_takes() -> None:
@@ -127,14 +127,15 @@ def test_a_run_that_began_anew_resumes_to_the_same_numbers(
 ) -> None:
     config = small_config(scenes, *QUICK, "trainer.deterministic=true")
     run(config, tmp_path / "whole", [], resume=False)
-    save = Checkpoints._save_last
+    save = AtomicCheckpointIO.save_checkpoint
 
-    def cut_off(self: Checkpoints, *rest) -> None:
-        save(self, *rest)
-        raise OSError("cut off")
+    def cut_off(self, checkpoint: dict, path: str, **options) -> None:
+        save(self, checkpoint, path, **options)
+        if Path(path).name == "last.ckpt":
+            raise OSError("cut off")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Checkpoints, "_save_last", cut_off)
+        patch.setattr(AtomicCheckpointIO, "save_checkpoint", cut_off)
         with pytest.raises(OSError, match="cut off"):
             run(config, tmp_path / "parts", [], resume=False)
     run(config, tmp_path / "parts", [], resume=True)
@@ -186,7 +187,7 @@ def test_a_run_full_of_floaters_says_so(
     share: float,
     said: bool,
 ) -> None:
-    monkeypatch.setattr("xplanes.training.evaluation.floaters", lambda *_: share)
+    monkeypatch.setattr("xplanes.training.scores.floaters", lambda *_: share)
     run(small_config(scenes, "trainer.max_steps=1"), tmp_path / "run", [], resume=False)
     assert ("30% of the background is not empty" in capsys.readouterr().out) == said
 

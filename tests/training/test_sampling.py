@@ -11,7 +11,7 @@ from xplanes.rendering.sampler import Site
 from xplanes.scenes.frame import cube_frame
 from xplanes.streams import TrainingState
 
-STEPS_OF_A_RAY = {"first": 8, "later": 15, "pictures": 40}
+STEPS_OF_A_RAY = {"training": 15, "pictures": 40}
 
 
 def fog(points, times):
@@ -40,21 +40,11 @@ def along_the_diagonal() -> dict[str, torch.Tensor]:
     }
 
 
-def test_the_first_steps_take_half_the_samples(sampling) -> None:
-    for step, phase in ((0, "first"), (9, "first"), (10, "later")):
-        seen = sampling.render(fog, along_the_diagonal(), TrainingState(0, step, step, 0))
-        assert len(seen.samples) == STEPS_OF_A_RAY[phase], step
-
-
-def test_images_on_the_way_are_as_coarse_as_the_first_steps(sampling) -> None:
-    for step, phase in ((0, "first"), (9, "first"), (10, "pictures")):
-        seen = sampling.renderer_at(step).render(fog, **along_the_diagonal())
-        assert len(seen.samples) == STEPS_OF_A_RAY[phase], step
-
-
 def test_images_of_the_trained_field_have_samples_of_their_own(sampling) -> None:
     seen = sampling.renderer.render(fog, **along_the_diagonal())
     assert len(seen.samples) == STEPS_OF_A_RAY["pictures"]
+    trained = sampling.render(fog, along_the_diagonal(), TrainingState(0, 0, 0, 0))
+    assert len(trained.samples) == STEPS_OF_A_RAY["training"]
     assert sampling.renderer.grid is sampling.grid
 
 
@@ -63,21 +53,11 @@ def test_room_follows_the_samples_of_batches_and_pictures_need_none(tmp_path) ->
     options = {"times": torch.zeros(1), "seed": 0, "precision": "32"}
     settings = Method.read(small_config(tmp_path)).model.sampler
     sampling = settings.build(fog, Site(frame, **options, samples_per_batch=8192))
-    state = TrainingState(0, 0, 0, 0)
-
-    def rooms() -> set[int | None]:
-        return {renderer.room for renderer in (sampling._training, sampling._coarse)}
-
-    assert rooms() == {10240}
-    # Steps after the coarse ones have twice the samples.
-    for samples, some in ((3000, {4096, 8192}), (1, {1024}), (10**6, {10240})):
+    assert sampling._training.room == 10240
+    for samples, room in ((3000, 4096), (1, 1024), (10**6, 10240)):
         sampling.expect(samples)
-        assert rooms() == some, samples
-    sampling.render(fog, along_the_diagonal(), TrainingState(0, 99, 99, 0))
-    sampling.expect(3000)
-    assert rooms() == {4096}
+        assert sampling._training.room == room, samples
     assert sampling.renderer.room is None
-    assert sampling.renderer_at(state.step).room is None
     assert settings.build(fog, Site(frame, **options))._training.room is None
 
 

@@ -9,8 +9,8 @@ import torch
 from tests.training.runs import small_config
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.files import read_rows
+from xplanes.rendering.grid_renderer import OccupancySampler
 from xplanes.run import run
-from xplanes.training.module import RadianceModule
 from xplanes.training.scores import mean, score_view
 
 BOUND = 0.05
@@ -31,11 +31,12 @@ class Watched:
 def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Watched:
     folder = tmp_path_factory.mktemp("savings")
     steps: list[tuple[int, int]] = []
-    count = RadianceModule._count
+    render = OccupancySampler.render
 
-    def note(self, shown, rays) -> None:
-        steps.append((rays, shown["samples"]))
-        count(self, shown, rays)
+    def note(self, field, rays, state):
+        found = render(self, field, rays, state)
+        steps.append((len(rays["times"]), len(found.samples)))
+        return found
 
     # Outside the silhouettes the field keeps its initial values.
     config = small_config(
@@ -48,7 +49,7 @@ def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Watched:
         "callbacks.evaluation.at=[0]",
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(RadianceModule, "_count", note)
+        patch.setattr(OccupancySampler, "render", note)
         run(config, folder / "run", [], resume=False)
     return Watched(load_run(folder / "run", device="cpu"), steps)
 

@@ -86,7 +86,9 @@ def test_a_plain_background_stays_as_it_was(kind):
         assert torch.equal(value, without.state_dict()[name]), name
     assert [group["name"] for group in with_.model.groups()] == ["space", "time", "decoder"]
     batch = SceneDataModule.of(scene(kind)).batches_for(with_, 0).draw(0)
-    terms = with_._terms(with_.sampler.render(with_.field, batch, with_.state), batch, with_.state)
+    terms = with_.loss_terms(
+        with_.sampler.render(with_.field, batch, with_.state), batch, with_.state
+    )
     assert "opacity" in terms
 
 
@@ -105,7 +107,9 @@ def test_a_world_gets_a_background_and_the_planes_are_initialised_as_ever():
     listed = [id(p) for params in groups.values() for p in params]
     assert sorted(listed) == sorted(id(p) for p in with_.parameters())
     batch = SceneDataModule.of(scene("world")).batches_for(with_, 0).draw(0)
-    terms = with_._terms(with_.sampler.render(with_.field, batch, with_.state), batch, with_.state)
+    terms = with_.loss_terms(
+        with_.sampler.render(with_.field, batch, with_.state), batch, with_.state
+    )
     assert set(terms) == {"colour"}
 
 
@@ -151,19 +155,6 @@ def test_a_checkpoint_brings_the_background_back(trained):
     assert torch.equal(picture(again.eval())["colour"], picture(module)["colour"])
 
 
-def test_a_checkpoint_from_before_backgrounds_has_none(tmp_path):
-    module = built("world", "model.background=null")
-    trainer = fitted(module, "world", tmp_path, 3)
-    trainer.save_checkpoint(tmp_path / "old.ckpt")
-    content = torch.load(tmp_path / "old.ckpt", weights_only=True)
-    del content["site"]["surrounded"]
-    del content["hyper_parameters"]["config"]["model"]["background"]
-    torch.save(content, tmp_path / "old.ckpt")
-    again = RadianceModule.load_from_checkpoint(tmp_path / "old.ckpt")
-    assert again.field.background is None
-    assert torch.equal(picture(again.eval())["colour"], picture(module.eval())["colour"])
-
-
 class SaveHalfway(lightning.Callback):
     """Writes a checkpoint after half of the steps."""
 
@@ -204,7 +195,7 @@ def test_baselines_see_the_world_in_their_own_way(model):
     module = baseline(model, "world")
     batch = SceneDataModule.of(scene("world")).batches_for(module, 0).draw(0)
     rendering = module.sampler.render(module.field, batch, module.state)
-    sum(module._terms(rendering, batch, module.state).values()).backward()
+    sum(module.loss_terms(rendering, batch, module.state).values()).backward()
     module.model.regularise(module.state)
     if model == "tineuvox_s":
         assert "a background" in module.field.outline

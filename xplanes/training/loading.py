@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 
+from xplanes import __version__
 from xplanes.components import build, plugins
 from xplanes.errors import ConfigError
 from xplanes.models.base import ModelSettings
@@ -12,6 +13,27 @@ from xplanes.models.initialisation import Method
 from xplanes.rendering.sampler import Site
 from xplanes.scenes.frame import Frame, frame_content, read_frame
 from xplanes.training.building import Parts, precision_of
+
+
+def require_version(path: Any) -> None:
+    """Refuse a checkpoint of a version whose settings were others.
+
+    Args:
+        path: The file; what is no local file, or cannot be read, is left to others.
+
+    Raises:
+        ConfigError: With the version.
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        made = str(content.get("xplanes", "0.2 or older"))
+    except Exception:  # Whoever loads it says what is wrong.
+        return
+    if made.split(".")[:2] != __version__.split(".")[:2]:
+        raise ConfigError(
+            f"{path} was made by xplanes {made}, whose settings are not those of {__version__}: "
+            "load it with that version, or train again"
+        )
 
 
 def site_content(parts: Parts) -> dict[str, Any]:

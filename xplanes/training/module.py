@@ -9,6 +9,7 @@ from lightning import LightningModule
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
+from xplanes import __version__
 from xplanes.components import plugins
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
@@ -28,6 +29,7 @@ from xplanes.training.finite import broken_flag, leave_out, unusable_gradients
 from xplanes.training.loading import (
     parts_from,
     require_frame,
+    require_version,
     require_whole_floats,
     site_content,
 )
@@ -130,6 +132,7 @@ class RadianceModule(LightningModule):
                 checkpoint_path, *args, weights_only=weights_only, **kwargs
             )
         except ConfigError as error:
+            require_version(checkpoint_path)
             words, ask, _ = str(error).partition("plugins=[MODULE]")
             if not ask:
                 raise
@@ -356,6 +359,7 @@ class RadianceModule(LightningModule):
         # Here and not after the batch: a checkpoint that a callback writes must hold it.
         self.sampler.update(self.field, state)
         self.between_updates = True
+        self._seen = None  # Its graph knows the shapes of parameters, which a model may replace.
 
     def on_train_end(self) -> None:
         self._read_tally()
@@ -522,6 +526,7 @@ class RadianceModule(LightningModule):
         self._read_tally()
         self._agree()
         own = {"batches": self.batches, "rays": self.rays, "restarts": self.restarts}
+        checkpoint["xplanes"] = __version__
         checkpoint["progress"] = own | self.tally.state_dict()
         if self._parts is not None:
             checkpoint["site"] = site_content(self._parts)

@@ -117,7 +117,6 @@ def does_a_step(cases: list[tuple[str, ...]]) -> None:
         loss = sum(module.loss_terms(rendering, rays, state).values())
         assert torch.isfinite(loss), overrides
         loss.backward()
-        module.sampler.pass_on(rendering, state)
         module.model.regularise(state)
         gradients = [p.grad for p in module.field.parameters() if p.grad is not None]
         assert any(bool(gradient.any()) for gradient in gradients), overrides

@@ -158,8 +158,6 @@ def test_arguments_of_lightnings_trainer_and_its_callbacks_work(
 
 def test_misfits_of_the_trainer_are_said_with_a_message(scenes: Path, tmp_path: Path) -> None:
     cases = [
-        ({"gradient_clip_val": 1.0}, "gradient_clip_val=1.0"),
-        ({"accumulate_grad_batches": 2}, "accumulate_grad_batches"),
         ({"max_secnds": 3}, "trainer.max_secnds=3: Trainer has no such argument"),
         ({"accelerator": "tpu"}, "trainer.accelerator=tpu: must be one of auto, cpu, gpu"),
         ({"max_seconds": -1}, "trainer.max_seconds=-1: must be above 0"),

@@ -11,7 +11,7 @@ import torch
 import yaml
 
 from tests.training.runs import small_config
-from xplanes import RadianceModule, SceneDataModule
+from xplanes import RadianceModule, SceneDataModule, __version__
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.evaluation.runs import load_run
@@ -88,7 +88,8 @@ def test_a_run_of_somebody_else_names_no_classes_by_itself(config: dict, tmp_pat
         SceneDataModule.from_run(folder)
     path = tmp_path / "theirs.ckpt"
     content = {"hyper_parameters": {"config": config}, "state_dict": {}}
-    torch.save(content | {"pytorch-lightning_version": "2.6.4"}, path)
+    versions = {"pytorch-lightning_version": "2.6.4", "xplanes": __version__}
+    torch.save(content | versions, path)
     with pytest.raises(ConfigError, match=r"model\._target_=tests.*plugins=\[MODULE\]"):
         RadianceModule.load_from_checkpoint(path)
 

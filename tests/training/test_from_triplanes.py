@@ -98,7 +98,7 @@ def test_the_run_reports_its_initialisation(trained: Path, place: Path) -> None:
     unexplained = content["decomposition"]["unexplained"]
     assert unexplained["after"] < 0.3 < 0.9 < unexplained["before"]
     prepare = content["seconds"]["prepare"]
-    assert set(prepare) == {"fixed_view", "lrm", "decomposition", "convert"}
+    assert set(prepare) == {"fixed_view", "lrm", "decomposition", "convert", "fill"}
     assert prepare["decomposition"] > 0
     assert prepare["convert"] > 0
     ranks = [content["decomposition"][name]["rank"] for name in ("xy", "xz", "yz")]

@@ -51,8 +51,10 @@ def test_a_gradient_is_usable_if_adam_can_square_it() -> None:
             assert usable(gradient) is expected, case
             others = [nn.Parameter(torch.zeros(7)), nn.Parameter(torch.zeros_like(gradient))]
             others[0].grad, others[1].grad = torch.ones(7), gradient
-            assert float(broken_flag(others, torch.tensor(True))) == float(not expected), case
-            assert float(broken_flag(others, torch.tensor(False))) == 1.0, case
+            assert float(broken_flag(others, [torch.tensor(0.3)])) == float(not expected), case
+            assert float(broken_flag(others, [torch.tensor(0.3), torch.tensor(math.nan)])) == 1.0, (
+                case
+            )
 
 
 def test_names_are_those_of_the_broken() -> None:

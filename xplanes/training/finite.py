@@ -1,6 +1,7 @@
 """Whether parameters and gradients are finite, and steps without those that are not."""
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -20,20 +21,19 @@ def usable(gradient: Tensor) -> bool:
     return bool(torch.linalg.vector_norm(gradient).isfinite())
 
 
-def broken_flag(parameters: Iterable[nn.Parameter], finite: Tensor) -> Tensor:
-    """1 if a gradient is not `usable` or the loss was not finite, on its device. float32 []
+def broken_flag(parameters: Iterable[nn.Parameter], losses: Sequence[Tensor]) -> Tensor:
+    """1 if a gradient is not `usable` or a loss is not finite, on its device. float32 []
 
     Args:
         parameters: Parameters, some of which may have no gradient.
-        finite: Whether the loss was finite. bool []
+        losses: Losses of the batches that the gradients are of. [] each
     """
     gradients = [p.grad for p in parameters if p.grad is not None]
-    if finite.device.type == "cpu":
-        sound = bool(finite) and all(usable(gradient) for gradient in gradients)
+    if losses[0].device.type == "cpu":
+        sound = all(math.isfinite(loss) for loss in losses) and all(map(usable, gradients))
         return torch.tensor(float(not sound))
-    if gradients:
-        finite = finite & nn.utils.get_total_norm(gradients).float().square().isfinite()
-    return (~finite).float()
+    norm = nn.utils.get_total_norm([*gradients, *losses])
+    return (~norm.square().isfinite()).float()
 
 
 def leave_out(optimizer: torch.optim.Optimizer, broken: Tensor) -> None:

@@ -1,6 +1,8 @@
 """The LightningModule that trains one field on rays."""
 
+import functools
 import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -93,7 +95,7 @@ class RadianceModule(LightningModule):
         self.tally = Tally()
         self._parts: Parts | None = None
         self._seen: tuple[Rendering, dict[str, Tensor]] | None = None
-        self._finite: Tensor | None = None
+        self._losses: list[Tensor] = []
         self._tag = ""
         self._steps = math.inf
         self._schedules: list[Any] = []
@@ -152,12 +154,13 @@ class RadianceModule(LightningModule):
             raise ConfigError(
                 "a RadianceModule trains with a SceneDataModule: hand one over as datamodule="
             )
-        self.build(
-            data.scene,
-            half_side=data.settings.half_side,
-            device=self.trainer.strategy.root_device,
-            devices=self.trainer.world_size,
-        )
+        with torch.device("cpu"):  # Lightning would make every tensor on the GPU.
+            self.build(
+                data.scene,
+                half_side=data.settings.half_side,
+                device=self.trainer.strategy.root_device,
+                devices=self.trainer.world_size,
+            )
 
     def build(
         self,
@@ -312,9 +315,8 @@ class RadianceModule(LightningModule):
         state = self.state
         rendering = self.sampler.render(self.field, batch, state)
         terms = self.loss_terms(rendering, batch, state)
-        loss = torch.stack(list(terms.values())).sum()
-        finite = loss.detach().isfinite()
-        self._finite = finite if self._finite is None else self._finite & finite
+        loss = functools.reduce(operator.add, terms.values())
+        self._losses.append(loss.detach())
         self._seen = rendering, terms
         self.batches += 1
         self.between_updates = False
@@ -333,9 +335,8 @@ class RadianceModule(LightningModule):
         state = self.state
         self.model.regularise(state)
         self.sampler.regularise()
-        assert self._finite is not None
-        broken = broken_flag(self.parameters(), self._finite)
-        self._finite = None
+        broken = broken_flag(self.parameters(), self._losses)
+        self._losses = []
         if self.trainer.world_size > 1:
             # All processes must leave a step out together, for their planes must stay equal.
             torch.distributed.all_reduce(broken, op=torch.distributed.ReduceOp.MAX)

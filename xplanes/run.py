@@ -16,7 +16,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from xplanes.backend import warm_up
 from xplanes.errors import ConfigError, XPlanesError
-from xplanes.evaluation.findings import camera_findings, opaque_findings
+from xplanes.evaluation.findings import camera_findings, opaque_findings, stray_findings
 from xplanes.evaluation.published import check_published
 from xplanes.evaluation.render import VIDEO_FRAMES, write_orbit
 from xplanes.evaluation.report import closing, header, log_hparams, summary, write_pictures
@@ -177,7 +177,8 @@ def train(
         require_same_views(folder, record.content, views)
     frame = method.model.frame(views, settings.half_side, scene.points)
     if record is not None:
-        for finding in (*camera_findings(scene, frame), *opaque_findings(scene)):
+        findings = *camera_findings(scene, frame), *opaque_findings(scene), *stray_findings(scene)
+        for finding in findings:
             logger.warning("%s", finding.text)
     loaded = time.perf_counter() - warm_up.seconds - began
 

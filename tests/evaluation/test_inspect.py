@@ -247,6 +247,12 @@ def hardly_masked(images):
     return images
 
 
+def stray(images):
+    images[1, 1, 2:4, 3] = 3
+    images[2, -2, -3] = 255
+    return images
+
+
 def inverted(images):
     shown = images[..., 3] > 0
     images = textured(images)
@@ -297,6 +303,12 @@ WRONG = {
     "a mask is missing": (lambda: painted(ball(), some_full), {}, "opaque", "2 of 20 images"),
     "useless masks": (lambda: painted(ball(), hardly_masked), {}, "opaque", "20 of 20 .* less tha"),
     "inverted masks": (lambda: painted(ball(), inverted), {}, "inverted", "of 20 images are opaqu"),
+    "stray pixels": (
+        lambda: painted(ball(), stray),
+        {},
+        "stray",
+        r"4 of 20 images .* 6 in all, in train/001.png \(2\), test/001.png \(2\), ",
+    ),
     "two sizes": (two_sizes, {}, "sizes", r"8 of 16x16 px, 12 of 32x32 px"),
     "coarse planes": (ball, {"texels": 2}, "texels", r"planes with 2 texels.*data\.resolution="),
 }

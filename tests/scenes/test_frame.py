@@ -208,11 +208,13 @@ def test_rays_through_outlines_reach_as_far_as_all():
     assert _reach(beside, torch.zeros(3)) == pytest.approx(4.0, rel=1e-5)
 
 
-def test_one_stray_pixel_widens_the_cube_to_hold_what_it_shows():
-    views = ball_views(12, 0.2, size=32, times=torch.zeros(12))
-    images = views.images.clone()
-    images[3, 2, 16, 3] = 1
-    assert scene_frame(replace(views, images=images)).scale < 0.4 * scene_frame(views).scale
+def test_a_small_thing_aside_widens_the_cube_and_a_stray_pixel_does_not():
+    views = ball_views(12, 0.2, size=64, times=torch.zeros(12))
+    images, usual = views.images.clone(), scene_frame(views).scale
+    images[3, 4, 32, 3] = 255
+    assert scene_frame(replace(views, images=images)).scale == usual
+    images[3, 4:6, 32:34, 3] = 255
+    assert scene_frame(replace(views, images=images)).scale < 0.4 * usual
 
 
 def test_the_frame_is_finite_for_every_kind_of_path():

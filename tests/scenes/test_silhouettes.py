@@ -21,7 +21,7 @@ def silhouette_hull(views, points, *, radius):
 def test_foreground_widens_by_whole_pixels():
     views = ball_views(2, 0.4, size=20)
     alpha = torch.zeros(2, 20, 20, dtype=torch.uint8)
-    alpha[0, 5, 7] = 1
+    alpha[0, 5, 7] = 255
     images = views.images.clone()
     images[..., 3] = alpha
     for margin in (0, 1, 3):

@@ -110,7 +110,9 @@ def test_a_file_says_what_the_alpha_of_cells_and_tiles_shows() -> None:
     image = torch.zeros(70, 130, 4, dtype=torch.uint8)
     image[:, 64:, 3] = 255
     image[0, 64, 3] = 0
-    image[9, 17, 3] = 1
+    image[9:11, 17:19, 3] = 255
+    image[40, 20, 3] = 255  # A speck.
+    image[20, 40, 3] = 2
     images = StoredImages.all_of(TileFile.of([torch.zeros_like(image), image]))
     lit = torch.zeros(9, 17, dtype=torch.bool)
     lit[:, 8:] = lit[1, 2] = True

@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +11,10 @@ from torch import Tensor
 
 from xplanes.rendering.box import ray_box
 from xplanes.scenes.cameras import cast_rays, project
+from xplanes.scenes.entries import some
 from xplanes.scenes.frame import Frame, axes_meet, backwards, optical_centre
+from xplanes.scenes.matte import silhouette_of
+from xplanes.scenes.store import count_in_squares
 from xplanes.scenes.views import Scene, Views
 
 GAP_SPACINGS, GAP_SPAN = 12.0, 0.05
@@ -35,6 +38,9 @@ CUT = 0.02
 PALE_STEPS, PALE = 16, 0.15
 """Opaque pixels at most so far from the background look like it; share that may, at silhouettes."""
 
+HALO = 0.03
+"""Squares in which soft edges fade around silhouettes, as a share of the image's longer side."""
+
 EMPTY = 1e-3
 """Share of opaque pixels below which an image shows next to nothing."""
 
@@ -43,6 +49,9 @@ FULL = 0.98
 
 MOST_VIEWS = 300
 """Views of a split whose pixels are looked at, spread evenly."""
+
+AT_START = 32
+"""The same at the start of a run, whose images may lie on the disk."""
 
 MOST_RAYS = 4096
 """Foreground pixels of an image whose rays are held against the cube."""
@@ -72,6 +81,7 @@ class Look:
         pale_edge: Share of the opaque pixels next to transparent ones that look like the
             background; None where there are too few to say.
         cut: Share of the foreground whose rays miss the cube.
+        stray: Pixels with alpha away from the silhouette.
         digest: Hash of the pixels; None where all are alike.
     """
 
@@ -80,12 +90,13 @@ class Look:
     middle: float
     pale_edge: float | None
     cut: float
+    stray: int
     digest: bytes | None
 
 
-def looked_at(views: Views) -> list[int]:
+def looked_at(views: Views, most: int = MOST_VIEWS) -> list[int]:
     """Numbers of the views whose pixels are looked at."""
-    count = min(len(views), MOST_VIEWS)
+    count = min(len(views), most)
     return [round(i * (len(views) - 1) / max(count - 1, 1)) for i in range(count)]
 
 
@@ -120,6 +131,7 @@ def look(views: Views, index: int, background: Tensor, frame: Frame | None) -> L
         middle=_share(opaque[rows, columns], valid[rows, columns]),
         pale_edge=_share(pale, edge) if int(edge.sum()) >= 0.1 * (height + width) else None,
         cut=0.0 if frame is None else _cut(views, index, opaque, frame),
+        stray=_stray_pixels(alpha),
         digest=None if plain else hashlib.sha256(image.contiguous().numpy().data).digest(),
     )
 
@@ -145,6 +157,14 @@ def _cut(views: Views, index: int, opaque: Tensor, frame: Frame) -> float:
     )
     far = ray_box(*frame.rays(*rays))[1]
     return float((far <= 0).float().mean())
+
+
+def _stray_pixels(alpha: Tensor) -> int:
+    """Pixels with alpha, but away from the silhouette: noise and specks, not soft edges."""
+    side = max(1, round(HALO * max(alpha.shape)))
+    held = count_in_squares(silhouette_of(alpha), side) > 0
+    near = F.max_pool2d(held.float()[None], 3, stride=1, padding=1)[0] > 0
+    return int(count_in_squares(alpha > 0, side)[~near].sum())
 
 
 def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
@@ -175,6 +195,8 @@ def image_findings(scene: Scene, looks: Mapping[str, list[Look]]) -> Iterator[Fi
     masks = list(_masks(scene, looks))
     yield from masks
     yield from _shared_images(scene, looks)
+    named = _named(scene, looks)
+    yield from _stray([(file, each.stray) for file, each in named])
     if masks:
         return  # What silhouettes tell means little then.
     seen = [each for split in looks.values() for each in split]
@@ -200,6 +222,14 @@ def opaque_findings(scene: Scene) -> Iterator[Finding]:
             "the images are opaque and end in the background's colour: a field that is empty there "
             "and one that is filled look the same. Write RGBA images or masks",
         )
+
+
+def stray_findings(scene: Scene) -> Iterator[Finding]:
+    """Whether training images have alpha away from their silhouettes; looks at some of them."""
+    views = scene.splits["train"]
+    if not views.is_opaque:
+        chosen = looked_at(views, AT_START)
+        yield from _stray([(views.files[i], _stray_pixels(views.image(i)[..., 3])) for i in chosen])
 
 
 def texel_findings(per_texel: float, views: Views, resolution: int) -> Iterator[Finding]:
@@ -444,11 +474,7 @@ def _scale(views: Views, frame: Frame) -> Iterator[Finding]:
 
 def _masks(scene: Scene, looks: Mapping[str, list[Look]]) -> Iterator[Finding]:
     """Masks that hide everything, nothing, or the wrong side."""
-    named = [
-        (scene.splits[split].files[index], each)
-        for split, found in looks.items()
-        for index, each in zip(looked_at(scene.splits[split]), found, strict=True)
-    ]
+    named = _named(scene, looks)
     count = len(named)
     empty = [file for file, each in named if each.coverage < EMPTY]
     if len(empty) > 0.05 * count:
@@ -487,6 +513,30 @@ def _masks(scene: Scene, looks: Mapping[str, list[Look]]) -> Iterator[Finding]:
             f"{len(full)} of {count} images are opaque all over, such as {full[0]}, while the "
             f"others hide {1 - _mean([each.coverage for each in masked]):.0%} of their pixels. "
             "Their masks are missing: add them, or leave the images out",
+        )
+
+
+def _named(scene: Scene, looks: Mapping[str, list[Look]]) -> list[tuple[str, Look]]:
+    """Looks at images, with the images' names."""
+    return [
+        (scene.splits[split].files[index], each)
+        for split, found in looks.items()
+        for index, each in zip(looked_at(scene.splits[split]), found, strict=True)
+    ]
+
+
+def _stray(counts: Sequence[tuple[str, int]]) -> Iterator[Finding]:
+    """Images with alpha away from their silhouettes, by their names and the numbers of pixels."""
+    found = sorted([each for each in counts if each[1]], key=lambda each: -each[1])
+    if found:
+        names = some([f"{file} ({count})" for file, count in found])
+        yield Finding(
+            "stray",
+            f"{len(found)} of {len(counts)} images have stray pixels, whose alpha is faint or "
+            f"which stand alone: {sum(count for _, count in found)} in all, in {names}. They are "
+            "trained on, but count as empty space when the cube and the silhouettes are found. "
+            "Clear their alpha; if they show a part of the scene, set data.half_side and "
+            "model.sampler.silhouettes=false",
         )
 
 

@@ -211,10 +211,10 @@ class RayBatches(Batches):
 
     With ``skip_background`` rays far from the silhouettes are drawn at ``background_share`` instead
     of at their share of the pixels. They show nothing but background; a few keep the air clear of
-    floaters. Space far from a silhouette counts as empty shortly before and after, too. Opaque
-    pixels of one colour with all around them, such as those of a white floor, have `PLAIN_SHARE`.
-    Opaque images of fixed cameras have no silhouettes, but pixels that change: the others are drawn
-    at `STILL_SHARE`, at their own times.
+    floaters. Space along those without any alpha counts as empty shortly before and after, too.
+    Opaque pixels of one colour with all around them, such as those of a white floor, have
+    `PLAIN_SHARE`. Opaque images of fixed cameras have no silhouettes, but pixels that change: the
+    others are drawn at `STILL_SHARE`, at their own times.
 
     Of images in a file of tiles each batch takes `PER_TILE` pixels of each of some tiles, so that
     it reads few places of the disk; every pixel is still as likely as any other. Near and far are
@@ -309,7 +309,7 @@ class RayBatches(Batches):
         return {
             "origins": origins,
             "directions": directions,
-            "times": self._times(view, far, move),
+            "times": self._times(view, far & (colour[:, 3] == 0), move),
             "target": colour[:, :3] + (1 - colour[:, 3:]) * background,
             "background": background,
             "alpha": colour[:, 3],
@@ -388,13 +388,13 @@ class RayBatches(Batches):
             self.views.images.prefetch(*place[:, :2].unbind(dim=1))
         self._prefetched = step + AHEAD
 
-    def _times(self, view: Tensor, far: Tensor, move: Tensor | None) -> Tensor:
-        """Times of rays, those far from silhouettes moved. int64 [R], bool [R], [R] -> [R]"""
+    def _times(self, view: Tensor, empty: Tensor, move: Tensor | None) -> Tensor:
+        """Times of rays, those through empty space moved. int64 [R], bool [R], [R] -> [R]"""
         times = self.views.times[view]
         if move is None:
             return times
         move = self.background_jitter * (2 * move - 1)
-        return torch.where(far, (times + move).clamp(0, 1), times)
+        return torch.where(empty, (times + move).clamp(0, 1), times)
 
 
 class DeviceBatches(RayBatches):

@@ -435,7 +435,7 @@ def _warn_of_empty(views: Views, listing: Listing) -> None:
     empty = [file for index, file in enumerate(views.files) if not views.silhouette(index)[0].any()]
     if empty:
         warnings.warn(
-            f"{len(empty)} of {len(views)} images show nothing (alpha is 0 everywhere): "
+            f"{len(empty)} of {len(views)} images show nothing (alpha is next to 0 everywhere): "
             f"{some(empty)} in {listing.paths[0].parent}.",
             stacklevel=4,
         )

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from xplanes.scenes.cameras import ball_extent, project
+from xplanes.scenes.matte import silhouette_of
 from xplanes.scenes.views import Views
 
 WINDOW = 0.06
@@ -21,7 +22,7 @@ MOST_VIEWS = 5
 
 
 def foreground(views: Views, margin: int | Sequence[int]) -> Tensor:
-    """Pixels with alpha above 0, or within ``margin`` pixels of such. bool [V, H, W]
+    """Pixels of the silhouettes, or within ``margin`` pixels of such. bool [V, H, W]
 
     Args:
         views: Images; none of their padding is foreground.
@@ -30,8 +31,8 @@ def foreground(views: Views, margin: int | Sequence[int]) -> Tensor:
     near = torch.zeros(views.images.shape[:3], dtype=torch.bool)
     margins = [margin] * len(views) if isinstance(margin, int) else margin
     for index, reach in enumerate(margins):
-        alpha = views.image(index)[..., 3]
-        near[index, : alpha.shape[0], : alpha.shape[1]] = widened(alpha > 0, reach)
+        shown = silhouette_of(views.image(index)[..., 3])
+        near[index, : shown.shape[0], : shown.shape[1]] = widened(shown, reach)
     return near
 
 

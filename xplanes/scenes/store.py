@@ -1,8 +1,8 @@
 """Decoded images that need not fit in memory: files of tiles, written once and read in pieces.
 
 A file holds the tiles of all images one after the other, each image's row by row, then
-`FLAG_BYTES` a tile that say what its alpha shows: a bit for each of its cells that has any pixel
-above 0, row by row, and a byte that is 1 if all of its pixels are; images without alpha have three
+`FLAG_BYTES` a tile that say what the silhouette holds of it: a bit for each of its cells that has
+any pixel of it, row by row, and a byte that is 1 if all pixels are; images without alpha have three
 channels and no such bytes. Its name is a hash of the sources and of how they were decoded, so it
 needs no header: a file of that name and of the right length is the right one. Its time of change is
 when it was used last.
@@ -40,6 +40,7 @@ from xplanes.files import (
     require_writable,
 )
 from xplanes.locks import if_free, in_turn
+from xplanes.scenes.matte import silhouette_of
 
 IN_MEMORY = 2**30
 """Bytes up to which the decoded images of a split are held in memory."""
@@ -51,10 +52,10 @@ CELL = 8
 """Rows and columns of the cells in which the silhouettes are known."""
 
 FLAG_BYTES = (TILE // CELL) ** 2 // 8 + 1
-"""Bytes that say what a tile's alpha shows."""
+"""Bytes that say what the silhouette holds of a tile."""
 
-VERSION = 2
-"""Version of the files; increase it whenever images are decoded to other bytes."""
+VERSION = 3
+"""Version of the files; increase it whenever images are decoded to other bytes or flags."""
 
 SPARE = 2**28
 """Bytes of the disk that are left free."""
@@ -116,12 +117,12 @@ class StoredImages:
         return self.files[file].image(image)
 
     def lit(self, index: int) -> Tensor:
-        """Which cells of a view have alpha above 0 somewhere. bool [h / CELL, w / CELL] (ceiled)"""
+        """Which cells hold some of a view's silhouette. bool [h / CELL, w / CELL] (ceiled)"""
         file, image = self._of_view[index]
         return self.files[file].lit(image)
 
     def solid(self, index: int) -> Tensor:
-        """Which tiles of a view have alpha above 0 everywhere. bool [rows, columns]"""
+        """Which tiles a view's silhouette holds whole. bool [rows, columns]"""
         file, image = self._of_view[index]
         return self.files[file].solid(image)
 
@@ -170,7 +171,7 @@ class TileFile:
         key: Hash of what the images come from.
         sizes: Height and width of each image.
         channels: 3 for images without alpha, else 4.
-        flags: What the tiles' alpha shows; None for images without. uint8 [tiles, FLAG_BYTES]
+        flags: What the silhouettes hold; None for images without alpha. uint8 [tiles, FLAG_BYTES]
     """
 
     def __init__(
@@ -214,7 +215,7 @@ class TileFile:
         return torch.from_numpy(whole)[:height, :width]
 
     def lit(self, index: int) -> Tensor:
-        """Which cells of an image have alpha above 0 somewhere. bool, as in `StoredImages.lit`"""
+        """Which cells hold some of an image's silhouette. bool, as in `StoredImages.lit`"""
         height, width = self.sizes[index]
         cells = -(-height // CELL), -(-width // CELL)
         if self._flags is None:
@@ -223,7 +224,7 @@ class TileFile:
         return _from_tiles(unpacked(part), _grid(height, width))[: cells[0], : cells[1]]
 
     def solid(self, index: int) -> Tensor:
-        """Which tiles of an image have alpha above 0 everywhere. bool [rows, columns]"""
+        """Which tiles an image's silhouette holds whole. bool [rows, columns]"""
         grid = _grid(*self.sizes[index])
         if self._flags is None:
             return torch.ones(grid, dtype=torch.bool)
@@ -550,8 +551,8 @@ def _from_tiles(cells: Tensor, grid: tuple[int, int]) -> Tensor:
 
 
 def _alpha_flags(pixels: np.ndarray) -> np.ndarray:
-    """What the alpha of an image's tiles shows. uint8 [h, w, 4] -> uint8 [tiles, FLAG_BYTES]"""
-    seen = torch.from_numpy(np.ascontiguousarray(pixels[..., 3] > 0))
+    """What the silhouette holds of the tiles. uint8 [h, w, 4] -> uint8 [tiles, FLAG_BYTES]"""
+    seen = silhouette_of(torch.from_numpy(np.ascontiguousarray(pixels[..., 3])))
     lit = packed(by_tile(count_in_squares(seen, CELL) > 0))
     # The padding of the tiles at the edges is neither lit nor bare.
     solid = (count_in_squares(~seen, TILE) == 0).flatten().byte().numpy()

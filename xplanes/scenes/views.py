@@ -11,6 +11,7 @@ from torch import Tensor
 
 from xplanes.scenes.cameras import cast_rays
 from xplanes.scenes.lenses import Lenses, Sight, sight
+from xplanes.scenes.matte import silhouette_of
 from xplanes.scenes.store import CELL, TILE, StoredImages, TileFile, count_in_squares
 
 PALE_STEPS, PALE_EDGE = 16, 0.9
@@ -240,7 +241,7 @@ class Views:
 
     @cached_property
     def is_opaque(self) -> bool:
-        """Whether no pixel lets the background through whole: alpha says nothing then."""
+        """Whether the silhouettes are the whole images: alpha says nothing then."""
         for index in range(len(self)):
             has_ray = self.intrinsics.has_ray(index)
             if isinstance(self.images, StoredImages):
@@ -248,7 +249,7 @@ class Views:
                 if has_ray is not None:
                     has_ray = count_in_squares(has_ray, TILE) == TILE**2
             else:
-                shown = self.image(index)[..., 3] > 0
+                shown, _ = self.silhouette(index)
             if not (shown if has_ray is None else shown[has_ray]).all():
                 return False
         return True
@@ -311,15 +312,15 @@ class Views:
         return whole
 
     def silhouette(self, index: int) -> tuple[Tensor, int]:
-        """Where image ``index`` has alpha above 0, in square cells.
+        """The silhouette of image ``index``, see `silhouette_of`, in square cells.
 
         Returns:
-            Whether any pixel of a cell has, and the cells' side in pixels: 1, but `CELL` for images
-            in a file of tiles, of which nothing is read. bool [rows, columns]
+            Whether any pixel of a cell belongs to it, and the cells' side in pixels: 1, but `CELL`
+            for images in a file of tiles, of which nothing is read. bool [rows, columns]
         """
         if isinstance(self.images, StoredImages):
             return self.images.lit(index), CELL
-        return self.image(index)[..., 3] > 0, 1
+        return silhouette_of(self.image(index)[..., 3]), 1
 
     def valid(self) -> Tensor:
         """Which pixels show something: no padding, and a ray leads there. bool [V, H, W]"""
@@ -403,10 +404,10 @@ class Views:
         return self.camera(index).rays()
 
     def outline_rays(self, index: int) -> tuple[Tensor, Tensor]:
-        """Rays through the outline of what image ``index`` shows with alpha above 0.
+        """Rays through the outline of the silhouette of image ``index``.
 
-        These are the pixels with such alpha that have a neighbour without, or lie at the image's
-        edge. Of images in a file of tiles, the corners of the tiles that hold such pixels.
+        These are its pixels that have a neighbour outside of it, or lie at the image's edge. Of
+        images in a file of tiles, the corners of the cells that hold pixels of the silhouette.
 
         Returns:
             Origins and unit directions in the world. [N, 3], [N, 3]

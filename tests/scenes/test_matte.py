@@ -1,0 +1,318 @@
+"""Silhouettes of soft mattes: without noise and specks, with what is thin, small or faint."""
+
+import functools
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from tests.synthetic import ball_views
+from xplanes.rendering.carving import carve
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.scenes.batches import RayBatches
+from xplanes.scenes.datamodule import UNIFORM
+from xplanes.scenes.frame import scene_frame
+from xplanes.scenes.matte import FAINT, SMALLER, SPECK, VISIBLE, silhouette_of
+from xplanes.scenes.silhouettes import may_hold
+from xplanes.scenes.store import CELL, StoredImages, TileFile
+
+SIZE, COUNT = 200, 16
+
+RADIUS, WIRE = 0.8, 0.9
+"""Radius of a sphere, and half the length of a wire."""
+
+RAYS = replace(UNIFORM, skip_background=True, background_share=0.4, background_jitter=0.1)
+
+
+def by_hand(mask):
+    """The same mask without specks, region by region."""
+    left, regions = {tuple(place) for place in mask.nonzero().tolist()}, []
+    while left:
+        open_now = [left.pop()]
+        region = list(open_now)
+        while open_now:
+            row, column = open_now.pop()
+            around = {(row + r, column + c) for r in (-1, 0, 1) for c in (-1, 0, 1)} & left
+            left -= around
+            open_now += around
+            region += around
+        regions.append(torch.tensor(region))
+    extents = [int((each.amax(dim=0) - each.amin(dim=0)).max()) + 1 for each in regions]
+    limit = min(max(1, round(SPECK * max(mask.shape))), max(extents) // SMALLER)
+    kept = torch.zeros_like(mask)
+    for region, extent in zip(regions, extents, strict=True):
+        if extent > limit:
+            kept[region[:, 0], region[:, 1]] = True
+    return kept
+
+
+def test_specks_are_the_connected_regions_that_are_small():
+    generator, removed = torch.Generator().manual_seed(0), 0
+    for height, width in ((1, 1), (1, 40), (40, 1), (90, 130), (260, 210)):
+        for density in (0.01, 0.1, 0.3, 0.45, 0.6):
+            mask = torch.rand(height, width, generator=generator) < density
+            mask[height // 2, width // 3 : 1 + 2 * width // 3] = True
+            found = silhouette_of(255 * mask.byte())
+            assert torch.equal(found, by_hand(mask)), (height, width, density)
+            removed += int((mask & ~found).sum())
+    assert removed > 1000
+
+
+def disc(radius, size=SIZE, centre=(0.5, 0.5)):
+    """Alpha of an antialiased disc. [size, size]"""
+    place = torch.arange(size) + 0.5
+    away = torch.hypot(place[:, None] - centre[0] * size, place - centre[1] * size)
+    return (255 * (radius - away + 0.5).clamp(0, 1)).round().byte()
+
+
+def line(angle, width, size=SIZE, *, length=None):
+    """Alpha of an antialiased line through the middle. [size, size]"""
+    place = torch.arange(size) + 0.5 - 0.5 * size
+    turned = math.cos(angle), math.sin(angle)
+    away = (place[:, None] * turned[0] - place * turned[1]).abs()
+    along = (place[:, None] * turned[1] + place * turned[0]).abs()
+    cover = (0.5 * width - away + 0.5).clamp(0, min(1, width))
+    if length is not None:
+        cover *= (0.5 * length - along + 0.5).clamp(0, 1)
+    return (255 * cover).round().byte()
+
+
+def test_faint_alpha_is_no_silhouette_beside_something_opaque():
+    alpha = disc(40)
+    for level in (1, 2, 8, VISIBLE - 1):
+        hazy = torch.maximum(alpha, torch.tensor(level, dtype=torch.uint8))
+        assert torch.equal(silhouette_of(hazy), alpha >= VISIBLE), level
+    assert silhouette_of(torch.full_like(alpha, 255)).all()
+    assert not silhouette_of(torch.zeros_like(alpha)).any()
+    assert not silhouette_of(torch.full_like(alpha, FAINT - 1)).any()
+
+
+def test_opaque_specks_are_left_out_and_what_is_larger_is_not():
+    for size in (100, 200, 400, 800):
+        alpha = disc(0.2 * size, size)
+        for side in range(1, size // 25):
+            speckled = alpha.clone()
+            speckled[3 : 3 + side, 5 : 5 + side] = 255
+            found = silhouette_of(speckled)
+            if side > SPECK * size:
+                assert torch.equal(found, speckled >= VISIBLE), (size, side)
+            else:
+                assert torch.equal(found, alpha >= VISIBLE), (size, side)
+
+
+def test_wires_are_kept_at_every_angle():
+    body = disc(30, centre=(0.25, 0.25))
+    for width in (0.25, 0.5, 1.0, 2.0):
+        for step in range(24):
+            angle = math.pi * step / 24
+            for alpha in (line(angle, width), line(angle, width, length=12)):
+                assert silhouette_of(alpha)[alpha >= VISIBLE].all(), (width, angle)
+                beside = torch.maximum(alpha, body)
+                assert torch.equal(silhouette_of(beside), beside >= VISIBLE), (width, angle)
+
+
+def test_a_small_thing_that_is_far_away_is_kept():
+    # Alone in its image, whatever its size; beside something large from 1% of the image on.
+    for radius in (0.4, 1.0, 2.0, 5.0):
+        for centre in ((0.5, 0.5), (0.1, 0.8)):
+            alpha = disc(radius, 400, centre)
+            assert torch.equal(silhouette_of(alpha), alpha >= FAINT), radius
+    pair = torch.maximum(disc(2.4, 400, (0.1, 0.1)), disc(1.0, 400, (0.2, 0.2)))
+    assert torch.equal(silhouette_of(pair), pair >= FAINT)
+    pair = torch.maximum(disc(80, 400, (0.6, 0.6)), disc(2.4, 400, (0.1, 0.1)))
+    assert torch.equal(silhouette_of(pair), pair >= VISIBLE)
+
+
+def test_what_is_faint_all_over_is_kept_without_its_noise():
+    for peak in (0.03, 0.06, 0.1, 0.2):
+        alpha = (peak * disc(60).float()).round().byte()
+        noise = torch.rand(alpha.shape, generator=torch.Generator().manual_seed(0)) < 0.01
+        noisy = torch.where(noise, torch.maximum(alpha, torch.tensor(2).byte()), alpha)
+        assert torch.equal(silhouette_of(noisy), alpha >= FAINT), peak
+    # A few opaque specks do not make the image opaque.
+    alpha = (0.06 * disc(60).float()).round().byte()
+    speckled = alpha.clone()
+    speckled[[4, 60, 190], [7, 193, 20]] = 255
+    assert torch.equal(silhouette_of(speckled), alpha >= FAINT)
+
+
+@functools.cache
+def clean(*, moving=False):
+    """Antialiased views of a sphere."""
+    views = ball_views(COUNT, RADIUS, size=SIZE)
+    images = torch.zeros_like(views.images)
+    pixel = 4.0 / views.intrinsics.focal[0, 0].float()
+    for index in range(COUNT):
+        origins, directions = views.image_rays(index)
+        along = (origins * directions).sum(dim=-1, keepdim=True)
+        away = (origins - along * directions).norm(dim=-1)
+        cover = ((RADIUS - away) / pixel + 0.5).clamp(0, 1)
+        colour = torch.tensor([200.0, 100.0, 50.0, 255.0])
+        images[index] = (cover[:, None] * colour).round().byte().view(SIZE, SIZE, 4)
+    times = views.times if moving else torch.zeros(COUNT)
+    return replace(views, images=images, times=times)
+
+
+def noisy(share, alpha=2):
+    """Faint alpha on a share of all pixels."""
+
+    def paint(images):
+        generator = torch.Generator().manual_seed(1)
+        chosen = torch.rand(images.shape[:3], generator=generator) < share
+        chosen &= images[..., 3] == 0
+        images[chosen] = torch.tensor([1, 1, 0, alpha], dtype=torch.uint8)
+        return images
+
+    return paint
+
+
+def speckled(images):
+    """Four opaque specks of up to 2 x 2 pixels in each image, near its corners."""
+    for number, image in enumerate(images):
+        for row, column, side in ((4, 9, 1), (15, -7, 2), (-9, -30, 1), (-20, 5, 2)):
+            row, column = row % SIZE - number // 4, column % SIZE - number % 4
+            image[row : row + side, column : column + side] = 255
+    return images
+
+
+def blurred(images):
+    """Mattes with soft edges, of a Gaussian one pixel wide."""
+    kernel = torch.exp(-0.5 * torch.arange(-4.0, 5.0).square())
+    kernel = kernel / kernel.sum()
+    planes = images.permute(0, 3, 1, 2).reshape(-1, 1, SIZE, SIZE).float()
+    planes = F.conv2d(planes, kernel.view(1, 1, 1, 9), padding=(0, 4))
+    planes = F.conv2d(planes, kernel.view(1, 1, 9, 1), padding=(4, 0))
+    return planes.round().byte().view(-1, 4, SIZE, SIZE).permute(0, 2, 3, 1).contiguous()
+
+
+MATTES = {
+    "noise on 0.01%": noisy(1e-4),
+    "noise on 1%": noisy(0.01),
+    "stronger noise on 1%": noisy(0.01, alpha=12),
+    "noise everywhere": noisy(1.0, alpha=8),
+    "specks": speckled,
+    "soft edges": blurred,
+    "all of it": lambda images: noisy(0.01)(speckled(blurred(images))),
+}
+
+
+def painted(views, paint):
+    return replace(views, images=paint(views.images.clone()))
+
+
+def tiled(views):
+    file = TileFile.of(views.image(index) for index in range(len(views)))
+    return replace(views, images=StoredImages.all_of(file))
+
+
+def half_side(views):
+    return 1 / scene_frame(views).scale
+
+
+def occupied_share(views):
+    grid = OccupancyGrid(32, 1, step=0.05)
+    carve(grid, views, scene_frame(views))
+    return float(grid.occupied.float().mean())
+
+
+def near_share(views):
+    batches = RayBatches(views, scene_frame(views), RAYS, seed=0)
+    return len(batches.near) / views.pixels
+
+
+@pytest.mark.parametrize("matte", list(MATTES))
+def test_soft_mattes_leave_cube_grid_and_pools_as_they_are(matte):
+    views = clean()
+    soft = painted(views, MATTES[matte])
+    assert not torch.equal(soft.images, views.images)
+    assert half_side(soft) == pytest.approx(half_side(views), rel=0.02)
+    assert occupied_share(soft) == pytest.approx(occupied_share(views), abs=0.02)
+    assert near_share(soft) == pytest.approx(near_share(views), abs=0.02)
+
+
+@pytest.mark.parametrize("matte", list(MATTES))
+def test_mattes_in_tiles_are_read_as_those_in_memory(matte):
+    views = painted(clean(), MATTES[matte])
+    stored = tiled(views)
+    for index in range(COUNT):
+        mask, side = views.silhouette(index)
+        cells, cell = stored.silhouette(index)
+        assert (side, cell) == (1, CELL)
+        blocks = F.max_pool2d(mask.float()[None], CELL, ceil_mode=True)[0] > 0
+        assert torch.equal(cells, blocks)
+    pixel = 4.0 / float(views.intrinsics.focal[0, 0])
+    assert 0 <= half_side(stored) - half_side(views) < 1.1 * 2**0.5 * CELL * pixel
+    clean_tiles = tiled(clean())
+    assert half_side(stored) == pytest.approx(half_side(clean_tiles), rel=0.03)
+    assert occupied_share(stored) == pytest.approx(occupied_share(clean_tiles), abs=0.02)
+    assert near_share(stored) == pytest.approx(near_share(clean_tiles), abs=0.02)
+
+
+def test_pixels_that_no_silhouette_holds_keep_colour_and_time():
+    views = painted(clean(moving=True), noisy(0.2, alpha=12))
+    batches = RayBatches(views, scene_frame(views), RAYS, seed=0)
+    faint = empty = moved = 0
+    for step in range(40):
+        batch = batches.draw(step)
+        stray = (batch["alpha"] * 255).round() == 12
+        faint += int(stray.sum())
+        expected = torch.tensor([1, 1, 0]) / 255 + (1 - 12 / 255)
+        assert torch.allclose(batch["target"][stray], expected, atol=1e-5)
+        still = torch.isin(batch["times"], views.times)
+        assert still[stray].all()
+        clear = batch["alpha"] == 0
+        empty += int(clear.sum())
+        moved += int((~still)[clear].sum())
+    assert faint > 1000
+    assert moved > 0.5 * empty
+
+
+def wire_views(radius, size=SIZE):
+    """Antialiased views of a wire along z."""
+    views = ball_views(COUNT, 0.1, size=size, times=torch.zeros(COUNT))
+    images = torch.zeros_like(views.images)
+    pixel = 4.0 / views.intrinsics.focal[0, 0].float()
+    for index in range(COUNT):
+        origins, directions = views.image_rays(index)
+        # The point of the wire nearest to each ray: its height follows from two right angles.
+        along, up = (origins * directions).sum(dim=-1), directions[:, 2]
+        height = (origins[:, 2] - along * up) / (1 - up.square()).clamp_min(1e-6)
+        offset = -origins
+        offset[:, 2] += height.clamp(-WIRE, WIRE)
+        distance = (offset * directions).sum(dim=-1)
+        away = (offset.square().sum(dim=-1) - distance.square()).clamp_min(0).sqrt()
+        cover = ((radius - away) / pixel + 0.5).clamp(0, float(min(1.0, 2 * radius / pixel)))
+        images[index, ..., 3] = (255 * cover).round().byte().view(size, size)
+    return replace(views, images=images)
+
+
+@pytest.mark.parametrize("thickness", [0.5, 1.0])
+def test_a_wire_stays_in_the_cube_and_in_the_grid(thickness):
+    pixel = 4.0 / float(ball_views(1, 0.1, size=SIZE).intrinsics.focal[0, 0])
+    views = painted(
+        wire_views(0.5 * thickness * pixel), lambda images: noisy(0.01)(speckled(images))
+    )
+    points = torch.linspace(-WIRE, WIRE, 300)[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    for seen in (views, tiled(views)):
+        frame = scene_frame(seen)
+        assert frame.points(points).abs().max() <= 1
+        assert may_hold(seen, points, radius=0.5 * pixel).all()
+    assert half_side(views) < 1.1 * WIRE
+
+
+def test_a_faint_sphere_is_not_carved_away():
+    for peak in (0.04, 0.1):
+        views = painted(clean(), lambda images, peak=peak: (peak * images.float()).round().byte())
+        assert half_side(views) == pytest.approx(half_side(clean()), rel=0.02)
+        assert occupied_share(views) == pytest.approx(occupied_share(clean()), abs=0.02)
+
+
+def test_images_are_opaque_where_the_silhouette_is_all_of_them():
+    views = ball_views(3, 0.5, size=90)
+    images = torch.full_like(views.images, 255)
+    for part, expected in ((slice(0, 0), True), (slice(0, 9), False)):
+        images[1, part, :, 3] = VISIBLE - 1
+        found = replace(views, images=images)
+        assert found.is_opaque == tiled(found).is_opaque == expected

@@ -1,0 +1,88 @@
+"""The silhouette of an image: what its alpha shows, without the noise and specks of soft mattes."""
+
+import numpy as np
+from torch import Tensor
+
+VISIBLE = 20
+"""Alpha, of 255, from which a pixel shows something: far above the noise of mattes, far below half,
+so that hair, glass and the edges of thin things stay."""
+
+FAINT = 6
+"""The same in an image that shows next to nothing opaque, whose content may be faint."""
+
+OPAQUE, OPAQUE_SHARE = 64, 1e-3
+"""Alpha of opaque content; share of the pixels that has it at least, unless the image is faint."""
+
+SPECK, SMALLER = 0.01, 5
+"""Largest extent of a speck, as a share of the image's longer side; how many times as large the
+largest region is at least. Wires are longer, and what is small and alone is the largest itself."""
+
+
+def silhouette_of(alpha: Tensor) -> Tensor:
+    """The pixels of an image that belong to its silhouette.
+
+    These are the connected regions of visible alpha, without those so small that they are specks.
+    Antialiased and soft edges end where alpha falls below `VISIBLE`.
+
+    Args:
+        alpha: Opacity, from 0 to 255. uint8 [h, w]
+
+    Returns:
+        bool [h, w]
+    """
+    opaque = int((alpha >= OPAQUE).sum())
+    visible = alpha >= (VISIBLE if opaque >= OPAQUE_SHARE * alpha.numel() else FAINT)
+    if visible.any() and not visible.all():
+        _remove_specks(visible.numpy())
+    return visible
+
+
+def _remove_specks(mask: np.ndarray) -> None:
+    """Clear regions that are far smaller than the image and than the largest one. bool [h, w]"""
+    height, width = mask.shape
+    # Rows are two pixels longer here, so that runs of different rows never touch by number.
+    pitch = width + 2
+    padded = np.zeros((height, pitch), np.int8)
+    padded[:, 1:-1] = mask
+    change = np.diff(padded.ravel())
+    first, end = (change == 1).nonzero()[0], (change == -1).nonzero()[0]
+    region = _regions(first, end, pitch)
+    count = len(first)
+    low = np.full((2, count), max(height, width))
+    high = np.zeros((2, count), np.int64)
+    row = first // pitch
+    for axis, (start, stop) in enumerate([(row, row + 1), (first % pitch, end - pitch * row)]):
+        np.minimum.at(low[axis], region, start)
+        np.maximum.at(high[axis], region, stop)
+    extent = (high - low).max(axis=0)
+    limit = min(max(1, round(SPECK * max(height, width))), int(extent.max()) // SMALLER)
+    small = extent[region] <= limit
+    first, end, row = first[small], end[small], row[small]
+    for offset in range(limit):
+        inside = first + offset < end
+        mask[row[inside], first[inside] % pitch + offset] = False
+
+
+def _regions(first: np.ndarray, end: np.ndarray, pitch: int) -> np.ndarray:
+    """Number of the region of each run of pixels; runs touch across corners, too.
+
+    Args:
+        first: Number of each run's first pixel, ascending, if rows are ``pitch`` pixels long. [N]
+        end: Number of the pixel after its last one. [N]
+        pitch: Pixels of a row; the last two are never in a run.
+
+    Returns:
+        int64 [N]
+    """
+    region = np.arange(len(first))
+    # The runs that each touches in the row below lie side by side in the order of runs.
+    begin = np.searchsorted(end, first + pitch)
+    touched = np.searchsorted(first, end + pitch, side="right") - begin
+    above = region.repeat(touched)
+    below = np.arange(len(above)) + (begin - (touched.cumsum() - touched)).repeat(touched)
+    while (region[above] != region[below]).any():
+        least = np.minimum(region[above], region[below])
+        for side in (above, below):
+            np.minimum.at(region, region[side], least)
+        region = region[region]
+    return region

@@ -207,14 +207,17 @@ def train(
         for finding in (*camera_findings(scene, frame), *opaque_findings(scene)):
             logger.warning("%s", finding.text)
     loaded = time.monotonic() - started
+    # Before the initialisation: Lightning holds on to the variables around a new module.
+    module = RadianceModule(experiment.config, experiment.config.get("plugins") or [])
     found = Initialisation(method.model, frame)
     if source is not None:
         place = Place(scene, frame, device, experiment.devices, say, settings.half_side)
         found = source.initialise(method, place)
     del source
     began = time.monotonic() - warm_up.seconds
-    module = RadianceModule(experiment.config, experiment.config.get("plugins") or [])
     module.build(scene, frame, device=device, initialise=lambda *_: found)
+    assert module.initialisation is not None
+    found = module.initialisation  # Without the sparse part.
     loaded += time.monotonic() - warm_up.seconds - began
     if record is not None:
         record.note(

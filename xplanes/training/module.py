@@ -17,7 +17,7 @@ from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, XPlanesError
 from xplanes.fields.base import Representation
 from xplanes.metrics import psnr, ssim
-from xplanes.models.base import Model, ModelSettings, colour_error
+from xplanes.models.base import InitialValues, Model, ModelSettings, colour_error
 from xplanes.models.initialisation import Initialisation, Method, Place
 from xplanes.rendering.base import Renderer, Rendering, leave_empty
 from xplanes.rendering.sampler import Sampler, Site
@@ -85,6 +85,7 @@ class RadianceModule(LightningModule):
         self.sampler: Sampler | None = None
         self.site: Site | None = None
         self.initialisation: Initialisation | None = None
+        """How the field was initialised, without the sparse part, which the model holds."""
         self.batches = 0
         self.rays = 0
         self.counts: dict[str, int] = dict.fromkeys(COUNTS, 0)
@@ -221,11 +222,13 @@ class RadianceModule(LightningModule):
             samples_per_batch=self.ray_settings.most_samples,
             batch_scale=self.ray_settings.most / rays.most if rays.most else 1.0,
         )
+        values = found.values
+        if values is not None:  # The sparse part is large: the model alone holds it.
+            found = replace(found, values=replace(values, sparse=None))
         self.initialisation = found
-        self._assemble(found.model, site)
+        self._assemble(found.model, site, values)
 
-    def _assemble(self, settings: ModelSettings, site: Site) -> None:
-        values = None if self.initialisation is None else self.initialisation.values
+    def _assemble(self, settings: ModelSettings, site: Site, values: InitialValues | None) -> None:
         self.model = settings.build(site, values)
         self.field = require_field(self.model)
         settings.sampler.require_kind(type(self.field))
@@ -625,7 +628,10 @@ class RadianceModule(LightningModule):
         assert stronger is not None
         self.restarts += 1
         site = replace(self.site, seed=self.site.seed + ANOTHER_SEED)
-        self._assemble(stronger, site)
+        values = None if self.initialisation is None else self.initialisation.values
+        if values is not None:
+            values = replace(values, sparse=self._parts[0].sparse)
+        self._assemble(stronger, site, values)
 
     # Scores
 
@@ -717,7 +723,7 @@ class RadianceModule(LightningModule):
             surrounded=content.get("surrounded", False),  # Not in older checkpoints.
             samples_per_batch=self.ray_settings.most_samples,
         )
-        self._assemble(settings, site)
+        self._assemble(settings, site, None)
 
     def _require_frame(self, content: Mapping[str, Any], trained: Frame) -> None:
         """Refuse planes that were trained in another frame than the initialisation lies in now."""

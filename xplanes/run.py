@@ -183,13 +183,14 @@ def train(
     loaded = time.perf_counter() - warm_up.seconds - began
 
     # Initialisation and field
+    # The module comes first: Lightning holds on to the variables around a new one.
+    module = RadianceModule(method)
     found = Initialisation(method.model, frame)
     if source is not None:
         place = Place(scene, frame, device, experiment.devices, say, settings.half_side)
         found = source.initialise(method, place)
     del source
     began = time.perf_counter() - warm_up.seconds
-    module = RadianceModule(method)
     module.build(scene, frame, device=device, initialise=lambda *_: found)
     loaded += time.perf_counter() - warm_up.seconds - began
     found = module.initialisation or found

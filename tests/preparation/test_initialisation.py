@@ -108,7 +108,7 @@ def test_a_rank_one_initialisation_explains_what_moves(finished):
         assert unexplained["before"] == pytest.approx(1, abs=0.05), case
         # With fewer texels and rows than the blob needs, less of it can be held.
         assert unexplained["after"] < (0.3 if resolution >= 16 else 0.8), case
-        again = unexplained_energy(field.time, found.values.sparse, rows=field.rows)
+        again = unexplained_energy(field.time, module.model.sparse, rows=field.rows)
         assert again == pytest.approx(unexplained["after"], rel=1e-5), case
 
 
@@ -156,18 +156,18 @@ def test_reports_and_seconds_are_whole(finished):
 
 
 def test_a_second_initialisation_comes_from_the_cache(finished, monkeypatch):
-    folder, first, _ = finished
+    folder, first, module = finished
 
     def refuse(*_args, **_options):
         raise AssertionError("computed again")
 
     monkeypatch.setattr(stages_module, "decompose", refuse)
     monkeypatch.setattr(stages_module, "time_planes", refuse)
-    again, _ = initialised(folder, SEQUENCE)
+    again, other = initialised(folder, SEQUENCE)
     assert again.report == first.report
     for stage in ("decomposition", "convert"):
         assert again.seconds[stage] == first.seconds[stage]
-    assert torch.equal(again.values.sparse, first.values.sparse)
+    assert torch.equal(other.model.sparse, module.model.sparse)
     assert all(
         torch.equal(again.values.planes[name], plane) for name, plane in first.values.planes.items()
     )
@@ -216,7 +216,7 @@ def test_a_scene_of_one_timestep_uses_the_low_rank_part_only(tmp_path: Path):
     found, module = initialised(tmp_path, SEQUENCE, moving=False)
     assert set(found.values.planes) == {"xy", "xz", "yz"}
     assert module.field.time is None
-    assert (found.values.sparse, module.model.product) == (None, None)
+    assert (module.model.sparse, module.model.product) == (None, None)
     assert "no time planes" in found.words
     assert set(found.report) == {"xy", "xz", "yz"}
 
@@ -229,7 +229,7 @@ def test_one_triplane_is_the_space_planes(tmp_path: Path, caplog):
             found, module = initialised(tmp_path, sequence, "model.resolution=16", moving=moving)
         assert ("is trained as static" in caplog.text) == moving
         assert module.field.time is None
-        assert (found.report, found.pictures, found.values.sparse) == ({}, {}, None)
+        assert (found.report, found.pictures, module.model.sparse) == ({}, {}, None)
         for index, name in enumerate(("xy", "xz", "yz")):
             assert torch.equal(found.values.planes[name], sequence.triplanes[0, index]), name
 
@@ -272,8 +272,8 @@ def test_an_unconverged_decomposition_warns_once_also_from_the_cache(
 
 def test_no_weight_needs_no_sparse_part(finished):
     folder, *_ = finished
-    found, module = initialised(folder, SEQUENCE, "model.loss.sparse_weight=0")
-    assert (found.values.sparse, module.model.product) == (None, None)
+    _, module = initialised(folder, SEQUENCE, "model.loss.sparse_weight=0")
+    assert (module.model.sparse, module.model.product) == (None, None)
     assert module.field.time is not None
 
 

@@ -1,11 +1,15 @@
 """The occupancy grid filled from a field: which cells stay and which are pruned."""
 
+import math
+
+import pytest
 import torch
 
 from tests.rendering.test_carving import allowed_at
 from tests.synthetic import ball_views, inside_ball, swinging
 from xplanes.rendering import filling
 from xplanes.rendering.filling import fill
+from xplanes.rendering.marching import march
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.frame import cube_frame
 
@@ -59,6 +63,43 @@ def test_rays_may_march_in_groups(monkeypatch):
     grouped = filled(views, ball_field(0.3, static))
     assert torch.equal(grouped.occupied, whole.occupied)
     assert torch.equal(grouped.density, whole.density)
+
+
+@pytest.mark.parametrize("shown", [0.42, 0.0])
+def test_few_rays_find_the_cells_that_rays_through_all_pixels_find(monkeypatch, shown):
+    """Of a ball whose rim or whole is missing: thin in the images, or as wide as these."""
+    views = ball_views(8, 0.5, size=160)
+    rays = []
+
+    def counted(origins, *rest, **named):
+        rays.append(len(origins))
+        return march(origins, *rest, **named)
+
+    monkeypatch.setattr(filling, "march", counted)
+    few = filled(views, ball_field(shown, static), resolution=12)
+    spent, rays[:] = sum(rays), []
+    monkeypatch.setattr(filling, "pixels_of_a_cell", lambda *_: 1)
+    every = filled(views, ball_field(shown, static), resolution=12)
+    assert (few.occupied != every.occupied).sum() <= 0.001 * every.occupied.sum()
+    assert spent < 0.5 * sum(rays)
+
+
+def test_a_cell_is_as_wide_as_it_looks_at_the_far_end_of_the_cube():
+    views = ball_views(1, 0.5, size=400, distance=4.0)
+    corner = 4.0 + 1.4 * math.sqrt(3)
+    wide = float(views.intrinsics.focal[0, 0]) * 2.8 / 20 / corner
+    assert filling.pixels_of_a_cell(views, 0, FRAME, 20) == math.floor(wide) > 5
+    assert filling.pixels_of_a_cell(views, 0, FRAME, 2000) == 1
+
+
+@pytest.mark.parametrize("side", [1, 3, 4])
+def test_each_square_of_a_mask_has_one_pixel(side):
+    mask = torch.rand(10, 13, generator=torch.Generator().manual_seed(0)) < 0.2
+    pixels = filling.one_of_each_square(mask, side)
+    assert mask[tuple(pixels.T)].all()
+    squares = {tuple(square) for square in (pixels // side).tolist()}
+    assert len(squares) == len(pixels)
+    assert squares == {tuple(square) for square in (mask.nonzero() // side).tolist()}
 
 
 def test_a_field_that_shows_nothing_leaves_every_foreground_ray_open():

@@ -1,6 +1,7 @@
 """Runs initialised from a triplane file: outputs, resuming, loading."""
 
 import json
+import weakref
 from pathlib import Path
 
 import pytest
@@ -132,9 +133,19 @@ def test_the_sparse_part_is_in_no_checkpoint(trained: Path, place: Path) -> None
     assert state["site"]["initialised"]
 
 
+@pytest.mark.parametrize("fading", [(), ("data.views=3", "model.loss.initial_steps=24")])
 def test_a_resumed_run_equals_an_uninterrupted_one(
-    trained: Path, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    trained: Path,
+    place: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    fading: tuple[str, ...],
 ) -> None:
+    """Whether L_r is still on, or has faded out after eight steps."""
+    config = settings(place, *fading)
+    whole = trained
+    if fading:
+        run(config, whole := tmp_path / "whole", [], resume=False)
     original = TrainingClock.on_train_batch_end
 
     def break_down(self, trainer, module, *rest) -> None:
@@ -145,7 +156,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     folder = tmp_path / "broken"
     monkeypatch.setattr(TrainingClock, "on_train_batch_end", break_down)
     with pytest.raises(OSError, match="power cut"):
-        run(settings(place), folder, [], resume=False)
+        run(config, folder, [], resume=False)
     monkeypatch.undo()
 
     def refuse(*_args, **_options):
@@ -153,12 +164,12 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
 
     # The parts come from the cache.
     monkeypatch.setattr(stages_module, "decompose", refuse)
-    run(settings(place), folder, [], resume=True)
-    ours, theirs = weights(folder), weights(trained)
+    run(config, folder, [], resume=True)
+    ours, theirs = weights(folder), weights(whole)
     assert set(ours) == set(theirs)
     assert all(torch.equal(ours[key], theirs[key]) for key in ours)
     for key in ("test", "views", "step", "skipped", "samples_per_ray", "decomposition"):
-        assert metrics(folder)[key] == metrics(trained)[key]
+        assert metrics(folder)[key] == metrics(whole)[key]
 
 
 def test_planes_are_not_resumed_in_another_frame(empty_place: Path, tmp_path: Path) -> None:
@@ -235,6 +246,39 @@ def test_regularisers_towards_the_initialisation_fade(place: Path) -> None:
     for gradient, all_of_it in zip(left, whole, strict=True):
         torch.testing.assert_close(gradient, 0.75 * all_of_it)
     assert not any(gradient.any() for gradient in gradients(96, "288") + gradients(104, "288"))
+
+
+def test_nothing_keeps_the_sparse_part_once_l_r_has_faded_out(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held: list[weakref.ref[torch.Tensor]] = []
+    alive: dict[int, bool] = {}
+    regularise = XPlanesModel.regularise
+
+    def watched(self: XPlanesModel, state: TrainingState) -> None:
+        if not held:
+            assert self.sparse is not None
+            held.append(weakref.ref(self.sparse))
+        regularise(self, state)
+        alive[state.step] = held[0]() is not None
+
+    monkeypatch.setattr(XPlanesModel, "regularise", watched)
+    fading = ["model.loss.every=1", "data.views=3", "model.loss.initial_steps=18"]
+    run(settings(place, UNSCORED, *fading), tmp_path / "run", [], resume=False)
+    assert all(alive[step] == (step < 6) for step in alive)
+    assert max(alive) > 6
+
+
+def test_a_field_that_begins_anew_keeps_l_r_while_it_is_of_use(place: Path) -> None:
+    module = RadianceModule(config := settings(place, "model.loss.initial_steps=288"))
+    module.build(Experiment.read(config).data.read())
+    sparse = module.model.sparse
+    module._assemble_stronger()
+    assert sparse is not None
+    assert module.model.sparse is sparse
+    module.model.product = None  # As after fading out.
+    module._assemble_stronger()
+    assert module.model.sparse is None
 
 
 def test_total_variation_has_a_weight_for_the_planes_of_space_and_one_for_those_of_time(

@@ -1,5 +1,6 @@
 """The regulariser L_r: products of time planes stay near the sparse part (X-Planes, Eq. 17)."""
 
+import copy
 from collections.abc import Sequence
 
 import torch
@@ -69,8 +70,12 @@ def unexplained_energy(time_planes: Tensor, sparse: Tensor, *, rows: Rows) -> fl
 class SparseProduct:
     """The regulariser L_r, at a few random frames per step or at all of them.
 
+    With |S - b a^T|^2 = |S|^2 - 2 b^T S a + |a|^2 |b|^2, for profiles a and b of two time planes, a
+    gradient takes products of matrices and vectors, and nothing of the size of S is formed.
+    `sparse_product_loss` is the same, written for reading.
+
     It is not a module: the sparse part is large, can be recomputed, and must not be written to
-    checkpoints.
+    checkpoints. Copies share it.
 
     Args:
         sparse: The sparse part of all frames. [T, 3, C, H, W]
@@ -87,8 +92,11 @@ class SparseProduct:
     ) -> None:
         if reduction not in REDUCTIONS:
             raise ValueError(f"reduction is {reduction!r}: allowed are {', '.join(REDUCTIONS)}")
-        self.sparse, self.rows, self.count = sparse, rows, count
+        self.sparse, self.rows, self.count = sparse.contiguous(), rows, count
         self.factor = sparse.numel() if reduction == "sum" else 1
+
+    def __deepcopy__(self, memo: dict[int, object]) -> "SparseProduct":
+        return copy.copy(self)
 
     def add_gradient(
         self, gradient: Tensor, planes: Tensor, weight: float, generator: torch.Generator
@@ -101,24 +109,49 @@ class SparseProduct:
             weight: Weight of the regulariser.
             generator: Generator that draws the frames, on the CPU.
         """
-        frames = torch.arange(len(self.sparse))
+        self._follow(planes)
+        frames, target = torch.arange(len(self.sparse)), self.sparse
         if self.count is not None:
             frames = torch.randint(len(self.sparse), (self.count,), generator=generator)
+            target = self.sparse[frames.to(planes.device, non_blocking=True)]
         with torch.enable_grad():
             leaf = planes.detach().requires_grad_()
-            loss = self._loss(leaf, frames)
-        gradient.add_(torch.autograd.grad(loss, leaf)[0], alpha=weight)
+            loss = self._varying(leaf, target, frames)
+        scale = weight * self.factor / target.numel()
+        gradient.add_(torch.autograd.grad(loss, leaf)[0], alpha=scale)
 
     @torch.no_grad()
     def value(self, planes: Tensor) -> float:
         """The loss, estimated from ``count`` evenly spaced frames; deterministic."""
+        self._follow(planes)
         total = len(self.sparse)
-        return float(self._loss(planes, _spread(self.count or total, total)))
+        frames = _spread(self.count or total, total)
+        # One at a time: their errors have the size of the sparse part.
+        errors = [
+            sparse_product_loss(planes, self.sparse, frame, rows=self.rows)
+            for frame in frames.split(1)
+        ]
+        return self.factor * float(torch.stack(errors).mean())
 
-    def _loss(self, planes: Tensor, frames: Tensor) -> Tensor:
-        if self.sparse.device != planes.device:
-            self.sparse = self.sparse.to(planes.device)
-        return self.factor * sparse_product_loss(planes, self.sparse, frames, rows=self.rows)
+    def _follow(self, planes: Tensor) -> None:
+        """Move the sparse part to where the planes are."""
+        self.sparse = self.sparse.to(planes.device, planes.dtype)
+
+    def _varying(self, planes: Tensor, target: Tensor, frames: Tensor) -> Tensor:
+        """Sum of the squared errors at frames, less the sum of the target's own squares. []"""
+        count, (height, width) = len(self.sparse), target.shape[-2:]
+        wide = frame_profiles(planes, frames, count, width)
+        tall = wide if height == width else frame_profiles(planes, frames, count, height)
+        first, second = zip(*self.rows, strict=True)
+        wide, tall = _per_slice(wide, first), _per_slice(tall, second)
+        met = torch.bmm(target.flatten(0, 2), wide[..., None])[..., 0]
+        products = wide.square().sum(dim=-1) * tall.square().sum(dim=-1)
+        return products.sum() - 2 * (tall * met).sum()
+
+
+def _per_slice(profiles: Tensor, places: Sequence[int]) -> Tensor:
+    """Profiles of some planes in the order of a triplane's slices. [P, B, N, C] -> [B 3 C, N]"""
+    return torch.stack([profiles[place].mT for place in places], dim=1).flatten(0, 2)
 
 
 def _spread(count: int, total: int) -> Tensor:

@@ -118,6 +118,14 @@ class Model(ABC):
         """Further values for the logger, by name."""
         return {}
 
+    @property
+    def sparse(self) -> Tensor | None:
+        """The sparse part of the initial values, while a loss term needs it. [T, 3, C, H, H]
+
+        The model alone holds it, so that it is freed in time.
+        """
+        return None
+
 
 @dataclass(frozen=True, kw_only=True)
 class ModelSettings(Settings, ABC):

@@ -223,6 +223,10 @@ class XPlanesModel(Model):
         return self._field
 
     @property
+    def sparse(self) -> Tensor | None:
+        return None if self.product is None else self.product.sparse
+
+    @property
     def _planes(self) -> list[Tensor]:
         return [p for p in (self._field.space, self._field.time) if p is not None]
 

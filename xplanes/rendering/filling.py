@@ -1,6 +1,10 @@
 """The occupancy grid of a field that already shows something."""
 
+import math
+from collections.abc import Sequence
+
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from xplanes.rendering.box import Field
@@ -28,7 +32,8 @@ def fill(
     """Keep the cells in which a field shows something, and those that must hold what it misses.
 
     A foreground pixel whose ray meets no cell that is left shows that something is missing: the
-    cells along that ray stay as they were.
+    cells along that ray stay as they were. One pixel is looked at of each square that is no wider
+    than a cell in the image, and all pixels of squares beside which others differ.
 
     Args:
         grid: Changed in place; cells that are empty already stay so.
@@ -42,21 +47,74 @@ def fill(
     grid.sweep(field, generator)
     kept = grid.occupied.clone()
     missing = torch.zeros_like(kept)
-    for index in range(len(views)):
-        solid = (views.image(index)[..., 3] >= SOLID).flatten()
-        origins, directions = (ray[solid] for ray in views.image_rays(index))
-        origins, directions = frame.rays(origins, directions)
-        origins, directions = origins.to(kept.device), directions.to(kept.device)
+
+    def look(index: int, pixels: Tensor) -> Tensor:
+        """Which pixels [K, 2] show something that is left; what others show is missing. bool [K]"""
+        chosen, (rows, columns) = torch.full_like(pixels[:, 0], index), pixels.float().unbind(dim=1)
+        rays = frame.rays(*views.pixel_rays(chosen, rows, columns))
         time = views.times[index].to(kept.device)
-        for some, there in zip(origins.split(RAYS), directions.split(RAYS), strict=True):
+        found = [torch.zeros(0, dtype=torch.bool)]
+        for origins, directions in zip(*(part.split(RAYS) for part in rays), strict=True):
+            some, there = origins.to(kept.device), directions.to(kept.device)
             met = torch.zeros(len(some), dtype=torch.bool, device=kept.device)
             met[_samples(grid, some, there, time, step).ray] = True
             grid.occupied.copy_(occupied)
             missing[_samples(grid, some[~met], there[~met], time, step).cells] = True
             grid.occupied.copy_(kept)
+            found.append(met.cpu())
+        return torch.cat(found)
+
+    for index in range(len(views)):
+        solid = views.image(index)[..., 3] >= SOLID
+        side = pixels_of_a_cell(views, index, frame, grid.resolution)
+        pixels = one_of_each_square(solid, side)
+        met = look(index, pixels)
+        if side > 1:
+            squares = torch.zeros([-(-length // side) for length in solid.shape])
+            squares[tuple((pixels // side).T)] = 2 - met.float()
+            look(index, (solid & enlarged(differing(squares), side, solid.shape)).nonzero())
     missing &= ~kept
     grid.density[missing] = density[missing]
     grid.occupied |= missing
+
+
+def pixels_of_a_cell(views: Views, index: int, frame: Frame, resolution: int) -> int:
+    """Pixels along the side of a cell of the grid in image ``index``, where cells look smallest."""
+    away = (views.camera_to_world[index, :3, 3].double() - frame.centre.double()).norm()
+    corner = float(away) + math.sqrt(3) / frame.scale  # Of the cube, behind its centre.
+    focal = float(views.intrinsics.focal[index].min())
+    return max(1, int(focal * 2 / resolution / frame.scale / corner))
+
+
+def one_of_each_square(mask: Tensor, side: int) -> Tensor:
+    """One pixel of a mask, of each square that has any.
+
+    Args:
+        mask: Pixels to choose from. bool [H, W]
+        side: Pixels along a square's side.
+
+    Returns:
+        Rows and columns. int64 [K, 2]
+    """
+    height, width = mask.shape
+    padded = F.pad(mask, (0, -width % side, 0, -height % side))
+    squares = padded.unflatten(1, (-1, side)).unflatten(0, (-1, side)).transpose(1, 2).flatten(2)
+    found, place = squares.byte().max(dim=2)
+    square = found.nonzero()
+    place = place[tuple(square.T)]
+    return side * square + torch.stack([place // side, place % side], dim=1)
+
+
+def differing(values: Tensor) -> Tensor:
+    """Where an image is above 0 and not all of the eight pixels around are equal. bool [H, W]"""
+    most, least = (F.max_pool2d(sign * values[None], 3, 1, 1)[0] * sign for sign in (1, -1))
+    return (values > 0) & (most != least)
+
+
+def enlarged(mask: Tensor, factor: int, size: Sequence[int]) -> Tensor:
+    """A mask with squares in place of pixels, cut to a size. bool [h, w] -> bool [H, W]"""
+    mask = mask.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
+    return mask[: size[0], : size[1]]
 
 
 def _samples(

@@ -30,7 +30,8 @@ class Parts:
         site: What the field was built for.
         model: The model, which has the field.
         sampler: Renders the field.
-        initialisation: Where the initial values came from; None if they were loaded.
+        initialisation: Where the initial values came from, without the sparse part, which the model
+            holds; None if they were loaded.
     """
 
     settings: ModelSettings
@@ -55,6 +56,9 @@ class Parts:
         """
         values = None if initialisation is None else initialisation.values
         model = settings.build(site, values)
+        if initialisation is not None and values is not None:
+            # It is large, and of use for some steps only.
+            initialisation = replace(initialisation, values=replace(values, sparse=None))
         field = require_field(model)
         settings.sampler.require_kind(type(field))
         sampler = settings.sampler.build(field, site)
@@ -65,8 +69,10 @@ class Parts:
         """The same with another seed and the model's settings for a field that shows nothing."""
         settings = self.settings.stronger()
         assert settings is not None
-        site = replace(self.site, seed=self.site.seed + ANOTHER_SEED)
-        return Parts.assemble(settings, site, self.initialisation)
+        site, found = replace(self.site, seed=self.site.seed + ANOTHER_SEED), self.initialisation
+        if found is not None and found.values is not None:
+            found = replace(found, values=replace(found.values, sparse=self.model.sparse))
+        return Parts.assemble(settings, site, found)
 
 
 def build_parts(
@@ -120,8 +126,9 @@ def build_parts(
         batch_scale=settled.most / rays.most if rays.most else 1.0,
     )
     parts = Parts.assemble(found.model, site, found)
+    assert parts.initialisation is not None
     seconds = found.seconds | {"fill": parts.sampler.fill_seconds}
-    return replace(parts, initialisation=replace(found, seconds=seconds))
+    return replace(parts, initialisation=replace(parts.initialisation, seconds=seconds))
 
 
 def precision_of(settings: ModelSettings, device: torch.device) -> str:

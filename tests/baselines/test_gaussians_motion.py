@@ -19,6 +19,8 @@ from xplanes.metrics import ssim
 from xplanes.models.densification import densify
 from xplanes.models.initialisation import Method
 from xplanes.preparation import points
+from xplanes.preparation.reconstruct import LoadedLRM
+from xplanes.preparation.sources import BundledLRMSettings, LRMInitialiser
 from xplanes.rendering.sampler import Site
 from xplanes.scenes.frame import cube_frame
 from xplanes.scenes.views import Scene
@@ -253,6 +255,27 @@ def test_first_points_lie_on_what_a_field_shows(tmp_path, monkeypatch):
     early = RadianceModule(config | {"lrm": config["lrm"] | {"steps": 1}})
     with pytest.raises(ConfigError, match=r"lrm\.steps=1: six_planes shows nothing yet"):
         early.build(scene, frame, say=said.append)
+
+
+def test_points_of_other_weights_are_made_anew(tmp_path, monkeypatch):
+    """The cache knows the LRM by its weights: the same name may stand for new ones."""
+    views, made = ball_views(4, 0.6, size=8), []
+    config = baseline_config(
+        tmp_path, "model=gaussians_spacetime", "lrm=field", "lrm.source=tiny",
+        f"preparation.cache={tmp_path}/cache",
+    )  # fmt: skip
+
+    def train(_field, place, _folder, **_):
+        made.append(key)
+        return SimpleNamespace(frame=place.frame)
+
+    monkeypatch.setattr(points, "trained_field", train)
+    monkeypatch.setattr(points, "surface_points", lambda *_, **__: cloud(8))
+    for key in ("first", "first", "second", "first"):
+        source = LRMInitialiser(None, LoadedLRM(None, key, 0.0))
+        monkeypatch.setattr(BundledLRMSettings, "load", lambda *_, source=source: source)
+        RadianceModule(config).build(Scene("ball", {"train": views}), say=lambda _: None)
+    assert made == ["first", "second"]
 
 
 def test_what_cannot_begin_with_points_or_planes_is_refused(scenes):

@@ -478,6 +478,58 @@ def test_nothing_is_set_beside_other_data(tmp_path: Path) -> None:
     assert "published" not in write_tables(tmp_path)
 
 
+LRMS, TEXELS = ("small", "base", "large", "xlarge"), ("64", "128", "256", "512")
+PRINTED = {
+    ("Table 1", "gaussians_hexplane_published"): {"none": "34.09 0.981 24"},
+    ("Table 1", "gaussians_spacetime_published"): {"none": "36.07 0.984 50"},
+    ("Table 1", ""): {"": "36.13 0.985 50"},
+    ("Table 1", "kplanes"): {"none": "31.71 0.971 52"},
+    ("Table 1", "tensor4d"): {"none": "32.33 0.973 64"},
+    ("Table 1", "tineuvox_b"): {"none": "32.67 0.973 28"},
+    ("Table 1", "nine_planes"): {"xlarge": "33.67 0.980 34"},
+    ("Table 1", "six_planes"): {"xlarge": "33.40 0.979 26"},
+    ("Table 2", "six_planes"): dict(
+        zip(LRMS, ("31.13 0.966", "31.78 0.970", "32.18 0.973", "33.40 0.979"), strict=True)
+    ),
+    ("Table 3", "six_planes"): dict(
+        zip(LRMS, ("31.13 0.969", "31.78 0.971", "32.18 0.972", "33.40 0.978"), strict=True)
+    ),
+    ("Table 3", "nine_planes"): dict(
+        zip(LRMS, ("32.04 0.972", "32.54 0.975", "32.54 0.974", "33.67 0.981"), strict=True)
+    ),
+    ("Table 4", "six_planes"): dict(zip(TEXELS, ("33.40", "33.51", "33.55", "33.55"), strict=True)),
+    ("Table 4", "nine_planes"): dict(
+        zip(TEXELS, ("33.56", "33.65", "33.68", "33.67"), strict=True)
+    ),
+}
+"""PSNR, SSIM and minutes that the paper prints, by LRM; those of Table 4 by texels, PSNR alone."""
+
+
+def test_the_papers_figures_are_those_that_it_prints() -> None:
+    found: dict[tuple[str, str], dict[str, str]] = {}
+    for entry in read_published():
+        if entry["table"].startswith("Table"):
+            column = "resolution" if entry["table"] == "Table 4" else "lrm"
+            words = " ".join(filter(None, (entry[name] for name in ("psnr", "ssim", "minutes"))))
+            row = found.setdefault((entry["table"], entry["model"]), {})
+            assert entry[column] not in row, entry
+            row[entry[column]] = words
+            if entry["method"].startswith("X-Planes"):
+                assert entry["method"] == f"X-Planes ({entry['model'].split('_')[0]})"
+                assert entry["table"] == "Table 4" or entry["resolution"] == "64"
+                assert entry["table"] != "Table 4" or entry["lrm"] == "xlarge"
+    assert found == PRINTED
+
+
+def test_the_page_on_the_paper_quotes_them_where_they_stand() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "paper.md").read_text(encoding="utf-8")
+    six = "Table 2: {}; Table 3: {}, at the same PSNR"
+    rows = (PRINTED[table, "six_planes"] for table in ("Table 2", "Table 3"))
+    assert six.format(*(", ".join(t.split()[1] for t in row.values()) for row in rows)) in page
+    held = [t for (t, m), row in PRINTED.items() if "33.67" in str(row.get("xlarge"))]
+    assert f"33.67 in Tables {' and '.join(t[-1] for t in held)}, 33.56 in Table 4" in page
+
+
 def test_published_figures_name_their_source_and_models_that_exist() -> None:
     models = {path.stem for path in (CONF / "model").glob("*.yaml")}
     for entry in read_published():

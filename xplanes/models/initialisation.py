@@ -84,7 +84,13 @@ class Place:
 
 
 class Initialiser(ABC):
-    """A source that is ready: its files are found, its weights loaded."""
+    """A source that is ready: its files are found, its weights loaded.
+
+    Attributes:
+        key: Hash of the weights, for keys of cached stages; empty if there are none.
+    """
+
+    key: str = ""
 
     @abstractmethod
     def initialise(self, method: "Method", place: Place) -> Initialisation:

@@ -67,8 +67,8 @@ class FieldSettings(InitialiserSettings):
     def load(self, say: Callable[[str], None] = print) -> "FieldInitialiser":
         overrides = [f"model={self.model}", f"lrm={self.source}"]
         method = Method.read(compose_plain("train", overrides))
-        method.lrm.load(say)  # Weights that are not there are told of now.
-        return FieldInitialiser(self, method)
+        source = method.lrm.load(say)  # Weights that are not there are told of now.
+        return FieldInitialiser(self, method, "" if source is None else source.key)
 
 
 class FieldInitialiser(Initialiser):
@@ -77,10 +77,11 @@ class FieldInitialiser(Initialiser):
     Args:
         settings: For how long.
         field: How the field is made.
+        key: Hash of the weights that the field is initialised from; empty for none.
     """
 
-    def __init__(self, settings: FieldSettings, field: Method) -> None:
-        self.settings, self.field = settings, field
+    def __init__(self, settings: FieldSettings, field: Method, key: str) -> None:
+        self.settings, self.field, self.key = settings, field, key
 
     def initialise(self, method: Method, place: Place) -> Initialisation:
         settings, scene = self.settings, place.scene
@@ -100,6 +101,7 @@ class FieldInitialiser(Initialiser):
             intrinsics_key(views.intrinsics),
             frame_content(place.frame),
             field.plain(),
+            self.key,
             [None if more is None else more.identity for more in (scene.cut, scene.video)],
             [settings.steps, settings.seconds, count],
         ]

@@ -100,7 +100,7 @@ class LRMInitialiser(Initialiser):
     """
 
     def __init__(self, settings: ImageLRMSettings, lrm: LoadedLRM) -> None:
-        self.settings, self.lrm = settings, lrm
+        self.settings, self.lrm, self.key = settings, lrm, lrm.key
 
     def initialise(self, method: Method, place: Place) -> Initialisation:
         cache = cache_of(method, place)

@@ -14,6 +14,7 @@ from xplanes.config import CONF, compose_plain, group_options
 from xplanes.evaluation.published import check_published, read_published
 from xplanes.evaluation.sheet import check_what
 from xplanes.experiment import Experiment
+from xplanes.training.losses import loss_terms
 
 PAPER = {
     "table1": (8, 7),
@@ -114,7 +115,7 @@ def does_a_step(cases: list[tuple[str, ...]]) -> None:
         module, batches = built(experiment.config, scene)
         rays, state = batches.draw(0), module.state
         rendering = module.sampler.render(module.field, rays, state)
-        loss = sum(module.loss_terms(rendering, rays, state).values())
+        loss = sum(loss_terms(module.parts, module.method.losses, rendering, rays, state).values())
         assert torch.isfinite(loss), overrides
         loss.backward()
         module.model.regularise(state)

@@ -26,6 +26,7 @@ from xplanes.experiment import Experiment
 from xplanes.run import run
 from xplanes.scenes.errors import SceneError
 from xplanes.training.fit import Trainer
+from xplanes.training.losses import loss_terms
 
 ROOT = Path(__file__).resolve().parents[1]
 CALLBACKS = "lightning.pytorch.callbacks"
@@ -252,7 +253,7 @@ def test_two_halves_of_a_batch_make_the_same_step_as_the_whole(config: dict) -> 
         for part in range(parts):
             rays = {name: value[part::parts] for name, value in batch.items()}
             rendering = module.sampler.render(module.field, rays, module.state)
-            terms = module.loss_terms(rendering, rays, module.state)
+            terms = loss_terms(module.parts, module.method.losses, rendering, rays, module.state)
             (sum(terms.values()) / parts).backward()
         found.append(module.field.space.grad.clone())
     torch.testing.assert_close(found[0], found[1], rtol=1e-3, atol=1e-7)

@@ -18,6 +18,7 @@ from xplanes.rendering.proposal import spaced, unspaced
 from xplanes.scenes.views import Scene
 from xplanes.training.collapse import CollapseWatch
 from xplanes.training.fit import Trainer
+from xplanes.training.losses import loss_terms
 from xplanes.training.scores import render_view
 
 STEPS = 30
@@ -86,8 +87,12 @@ def test_a_plain_background_stays_as_it_was(kind):
         assert torch.equal(value, without.state_dict()[name]), name
     assert [group["name"] for group in with_.model.groups()] == ["space", "time", "decoder"]
     batch = SceneDataModule.of(scene(kind)).batches_for(with_, 0).draw(0)
-    terms = with_.loss_terms(
-        with_.sampler.render(with_.field, batch, with_.state), batch, with_.state
+    terms = loss_terms(
+        with_.parts,
+        with_.method.losses,
+        with_.sampler.render(with_.field, batch, with_.state),
+        batch,
+        with_.state,
     )
     assert "opacity" in terms
 
@@ -107,8 +112,12 @@ def test_a_world_gets_a_background_and_the_planes_are_initialised_as_ever():
     listed = [id(p) for params in groups.values() for p in params]
     assert sorted(listed) == sorted(id(p) for p in with_.parameters())
     batch = SceneDataModule.of(scene("world")).batches_for(with_, 0).draw(0)
-    terms = with_.loss_terms(
-        with_.sampler.render(with_.field, batch, with_.state), batch, with_.state
+    terms = loss_terms(
+        with_.parts,
+        with_.method.losses,
+        with_.sampler.render(with_.field, batch, with_.state),
+        batch,
+        with_.state,
     )
     assert set(terms) == {"colour"}
 
@@ -195,7 +204,9 @@ def test_baselines_see_the_world_in_their_own_way(model):
     module = baseline(model, "world")
     batch = SceneDataModule.of(scene("world")).batches_for(module, 0).draw(0)
     rendering = module.sampler.render(module.field, batch, module.state)
-    sum(module.loss_terms(rendering, batch, module.state).values()).backward()
+    sum(
+        loss_terms(module.parts, module.method.losses, rendering, batch, module.state).values()
+    ).backward()
     module.model.regularise(module.state)
     if model == "tineuvox_s":
         assert "a background" in module.field.outline

@@ -29,6 +29,7 @@ from xplanes.training.collapse import CollapseWatch
 from xplanes.training.evaluation import Evaluation
 from xplanes.training.interrupt import Interrupt
 from xplanes.training.loading import require_whole_floats
+from xplanes.training.losses import loss_terms
 from xplanes.training.module import RadianceModule
 
 
@@ -230,7 +231,7 @@ def rehearse(module: RadianceModule, rays: Batch) -> None:
     model, sampler = copied.model, copied.sampler
     optimizer = model.optimizer([*model.groups(), *sampler.groups()])
     rendering = sampler.render(model.field, rays, state)
-    terms = module.loss_terms(rendering, rays, state, copied)
+    terms = loss_terms(copied, module.method.losses, rendering, rays, state)
     torch.stack(list(terms.values())).sum().backward()
     sampler.observe(rendering)
     model.regularise(state)

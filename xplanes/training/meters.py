@@ -1,10 +1,11 @@
 """What training steps show: sums that a GPU's host reads now and then, and opacities."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
+from lightning import Trainer
 from torch import Tensor
 
 from xplanes.rendering.base import Rendering
@@ -86,13 +87,11 @@ class Tally:
         if broken.device.type == "cpu":
             self._read_updates()
 
-    def read(
-        self, of_all: Callable[[dict[str, float]], dict[str, float]] = dict
-    ) -> tuple[int, int] | None:
-        """Look at what was taken in since the last look.
+    def read(self, trainer: Trainer) -> tuple[int, int] | None:
+        """Look at what was taken in since the last look, by all processes.
 
         Args:
-            of_all: From one process's numbers to the sums of all.
+            trainer: Whose processes they are.
 
         Returns:
             Numbers of rays and of samples; None if there was no batch.
@@ -100,7 +99,7 @@ class Tally:
         self._read_updates()
         if not (found := self._batches.read()):
             return None
-        found = of_all(found)
+        found = _of_all(found, trainer)
         batches, rays = int(found["batches"]), int(found["rays"])
         error = max(found["error"] / batches, 1e-10)
         self.last |= {"loss": found["loss"] / batches, "psnr": -10 * math.log10(error)}
@@ -126,6 +125,28 @@ class Tally:
         """Go on from a state."""
         self.counts = dict.fromkeys(COUNTS, 0) | state["counts"]
         self.skipped, self.last = state["skipped"], dict(state["last"])
+
+
+def _of_all(values: dict[str, float], trainer: Trainer) -> dict[str, float]:
+    """Sums over all processes, so that they go on with the same numbers."""
+    if trainer.world_size == 1:
+        return values
+    device = trainer.strategy.root_device
+    own = torch.tensor(list(values.values()), dtype=torch.float64, device=device)
+    total = torch.as_tensor(trainer.strategy.reduce(own, reduce_op="sum"))
+    return dict(zip(values, total.tolist(), strict=True))
+
+
+def batch_values(rendering: Rendering, rays: Batch, loss: Tensor) -> dict[str, Tensor | float]:
+    """What a `Tally` takes in of a batch."""
+    count, samples = len(rays["times"]), rendering.samples
+    shown: Tensor | None = getattr(samples, "shown", None)
+    values = {name: getattr(samples, name) for name in ("candidates", "empty", "occluded")}
+    values |= {"samples": samples.count, "batches": 1, "all_rays": count, "loss": loss}
+    values["rays"] = count if shown is None else shown.sum()
+    error = (rendering.colour - rays["target"]).square()
+    values["error"] = error.mean() if shown is None else masked_mean(error.mean(dim=1), shown)
+    return values
 
 
 def mean_opacities(rendering: Rendering, rays: Batch) -> dict[str, Tensor]:

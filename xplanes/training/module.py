@@ -7,16 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
-from lightning import LightningModule
 from lightning.pytorch.core.optimizer import LightningOptimizer
-from torch import Tensor
+from torch import Tensor, nn
 
 from xplanes import __version__
 from xplanes.components import plugins
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
-from xplanes.fields.base import Representation
-from xplanes.models.base import Model, colour_error
+from xplanes.models.base import Model
 from xplanes.models.initialisation import Initialisation, Method
 from xplanes.rendering.base import Renderer, Rendering
 from xplanes.rendering.sampler import Sampler, Site
@@ -24,8 +22,7 @@ from xplanes.scenes.batches import Batch, BatchSettings
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene
 from xplanes.streams import TrainingState
-from xplanes.training.building import Initialise, Parts, build_parts
-from xplanes.training.clock import training_seconds
+from xplanes.training.building import Parts, build_parts
 from xplanes.training.diagnosis import TrainingError, diagnosis
 from xplanes.training.finite import broken_flag, leave_out, unusable_gradients
 from xplanes.training.loading import (
@@ -35,20 +32,19 @@ from xplanes.training.loading import (
     require_whole_floats,
     site_content,
 )
-from xplanes.training.meters import Tally, due, masked_mean, mean_opacities
-from xplanes.training.scores import ViewScore, gathered, mean_scores, render_item, score_image
+from xplanes.training.logs import log_terms, logs_now
+from xplanes.training.losses import loss_terms
+from xplanes.training.meters import Tally, batch_values, due, mean_opacities
+from xplanes.training.scoring import ViewScoring
 
 PATIENCE = 20
 """Updates in a row with a loss or gradient that is not finite after which training gives up."""
-
-DROPPED = ("candidates", "empty", "occluded")
-"""Numbers of samples before some are dropped."""
 
 OPACITIES = 5
 """Batches from one look at the rays' opacity to the next."""
 
 
-class RadianceModule(LightningModule):
+class RadianceModule(ViewScoring):
     """Trains a field on rays, supervised by the images' colours.
 
     The field is built in `configure_model`, when the scene is known. An LRM, if configured, runs
@@ -69,8 +65,6 @@ class RadianceModule(LightningModule):
         ConfigError: If a setting is missing or invalid, or a plug-in cannot be imported.
     """
 
-    field: Representation
-
     def __init__(self, config: Mapping[str, Any] | Method, plugins: Sequence[str] = ()) -> None:
         super().__init__()
         read = isinstance(config, Method)
@@ -90,13 +84,11 @@ class RadianceModule(LightningModule):
         """How often the field was initialised again, see `restart`."""
         self.between_updates = True
         """Whether no gradients wait for those of further batches (`accumulate_grad_batches`)."""
-        self.scores: list[ViewScore] = []
-        """Scores of the views of the last validation or test, those of all processes."""
+        self.scores = []
         self.tally = Tally()
         self._parts: Parts | None = None
         self._seen: tuple[Rendering, dict[str, Tensor]] | None = None
         self._losses: list[Tensor] = []
-        self._tag = ""
         self._steps = math.inf
         self._schedules: list[Any] = []
         self._peaks: list[float] = []
@@ -162,38 +154,22 @@ class RadianceModule(LightningModule):
                 devices=self.trainer.world_size,
             )
 
-    def build(
-        self,
-        scene: Scene,
-        frame: Frame | None = None,
-        *,
-        half_side: float | None = None,
-        device: torch.device | None = None,
-        devices: int = 1,
-        initialise: Initialise | None = None,
-        say: Callable[[str], None] = print,
-    ) -> None:
+    def build(self, scene: Scene, frame: Frame | None = None, **options: Any) -> None:
         """Build the field for a scene, with the configured initialisation.
 
-        The arguments are those of `build_parts`.
+        Args:
+            scene: The scene, with a ``train`` split.
+            frame: The field's frame; chosen by the model when None.
+            **options: Further arguments of `build_parts`: ``half_side``, ``device``, ``devices``,
+                ``initialise``, ``say``.
 
         Raises:
             ConfigError, SceneError, LRMError: If settings, scene and initialisation do not fit
                 together.
         """
-        self.ray_settings = self.method.model.rays.on(device or torch.device("cpu"))
-        self._adopt(
-            build_parts(
-                self.method,
-                scene,
-                half_side=half_side,
-                device=device,
-                devices=devices,
-                initialise=initialise,
-                frame=frame,
-                say=say,
-            )
-        )
+        device = options.get("device") or torch.device("cpu")
+        self.ray_settings = self.method.model.rays.on(device)
+        self._adopt(build_parts(self.method, scene, frame=frame, **options))
 
     def _adopt(self, parts: Parts) -> None:
         self._parts = parts
@@ -244,6 +220,10 @@ class RadianceModule(LightningModule):
     def renderer(self) -> Renderer:
         """Renders images of the field."""
         return self.parts.sampler.renderer
+
+    @property
+    def shared_parts(self) -> list[nn.Module]:
+        return list(self.sampler.parts.values())
 
     @property
     def _ddp_params_and_buffers_to_ignore(self) -> list[str]:
@@ -314,14 +294,14 @@ class RadianceModule(LightningModule):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         state = self.state
         rendering = self.sampler.render(self.field, batch, state)
-        terms = self.loss_terms(rendering, batch, state)
+        terms = loss_terms(self.parts, self.method.losses, rendering, batch, state)
         loss = functools.reduce(operator.add, terms.values())
         self._losses.append(loss.detach())
         self._seen = rendering, terms
         self.batches += 1
         self.between_updates = False
         self._count(rendering, batch, loss)
-        self._log_terms(terms, state)
+        log_terms(self, terms, state)
         if self.trainer.world_size > 1:
             # Processes wait for the gradient of every parameter, also of one that no ray met.
             loss = loss + 0 * sum(p.sum() for p in self.parameters() if p.requires_grad)
@@ -365,48 +345,21 @@ class RadianceModule(LightningModule):
     def on_train_end(self) -> None:
         self._read_tally()
 
-    def loss_terms(
-        self, rendering: Rendering, rays: Batch, state: TrainingState, parts: Parts | None = None
-    ) -> dict[str, Tensor]:
-        """All terms of the loss that need the rays, weighted, by name; of a copy, if given. []"""
-        model, sampler = (parts or self.parts).model, (parts or self.parts).sampler
-        device = rendering.colour.device
-        found = model.losses(rendering, rays, state) | sampler.losses(rendering)
-        terms = {name: _number(term, f"loss term {name}", device) for name, term in found.items()}
-        for name, term in self.method.losses.items():
-            if name in found:
-                raise ConfigError(
-                    f"losses.{name}: the loss has a term of this name already; choose another name"
-                )
-            value = term.value(model.field, rendering, rays, state)
-            terms[name] = term.weight * _number(value, f"losses.{name}", device)
-        return terms
-
     def _count(self, rendering: Rendering, rays: Batch, loss: Tensor) -> None:
         """Take in what a batch showed; on a GPU the host looks at it later."""
-        count, samples = len(rays["times"]), rendering.samples
-        shown: Tensor | None = getattr(samples, "shown", None)
-        values = {name: getattr(samples, name) for name in DROPPED}
-        values |= {"samples": samples.count, "batches": 1, "all_rays": count, "loss": loss}
-        values["rays"] = count if shown is None else shown.sum()
-        if shown is None:
-            values["error"] = colour_error(rendering, rays)
-        else:
-            error = (rendering.colour - rays["target"]).square().mean(dim=1)
-            values["error"] = masked_mean(error, shown)
         # Before a background that is learnt, no pixel is known to need opacity or to lack it.
         known = getattr(self.field, "background", None) is None
         if known and self.batches % OPACITIES == 0:
             self.tally.opacities = mean_opacities(rendering, rays)
-        self.tally.add_batch(values)
-        if loss.device.type == "cpu" or due(self.batches) or self._logs_now:
+        self.tally.add_batch(batch_values(rendering, rays, loss))
+        if loss.device.type == "cpu" or due(self.batches) or logs_now(self.trainer):
             self._read_tally()
             if self.tally.skipped_in_a_row >= PATIENCE:
                 self._give_up()
 
     def _read_tally(self) -> None:
         """Look at what the batches since the last look showed, and draw as many rays as fit."""
-        if (found := self.tally.read(self._of_all)) is None:
+        if (found := self.tally.read(self.trainer)) is None:
             return
         rays, samples = found
         # Of batches of as many rays as the next one has.
@@ -414,41 +367,9 @@ class RadianceModule(LightningModule):
         if self.rays:
             self.rays = self.ray_settings.fitting(rays, samples)
 
-    def _of_all(self, values: dict[str, float]) -> dict[str, float]:
-        """Sums over all processes, so that they go on with the same numbers."""
-        if self.trainer.world_size == 1:
-            return values
-        own = torch.tensor(list(values.values()), dtype=torch.float64, device=self.device)
-        total = torch.as_tensor(self.trainer.strategy.reduce(own, reduce_op="sum"))
-        return dict(zip(values, total.tolist(), strict=True))
-
     def _give_up(self, unusable: Sequence[str] = ()) -> None:
         assert self._seen is not None
         raise TrainingError(diagnosis(self, *self._seen, unusable))
-
-    @property
-    def _logs_now(self) -> bool:
-        """Whether the Trainer wants logs of the last batch."""
-        every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
-        # As the Trainer counts, for which a module that was loaded begins again.
-        batch = self.trainer.fit_loop.epoch_loop.total_batch_idx + 1
-        return bool(every and not batch % every and self.trainer.loggers)
-
-    def _log_terms(self, terms: Mapping[str, Tensor], state: TrainingState) -> None:
-        """Log every term of the loss, weighted, where the Trainer wants logs of this step."""
-        if not self._logs_now:
-            return
-        values = {name: float(term.detach()) for name, term in terms.items()}
-        values |= self.model.regularisers(state)
-        entries = {f"train/{name}": value for name, value in values.items()}
-        entries |= {"train/loss": sum(values.values()), "train/psnr": self.last["psnr"]}
-        entries |= {"train/steps_skipped": float(self.unusable), "step": float(state.step)}
-        entries |= {f"lr/{group['name']}": group["lr"] for group in self._optimizer.param_groups}
-        entries["sampler/samples_per_ray"] = self.counts["samples"] / max(1, self.counts["rays"])
-        if seconds := training_seconds(self.trainer):
-            entries["time/rays_per_s"] = self.counts["rays"] / seconds
-            entries["time/train_s"] = seconds
-        self.log_dict(entries | self.sampler.scalars() | self.model.scalars(), batch_size=1)
 
     @property
     def can_restart(self) -> bool:
@@ -469,63 +390,11 @@ class RadianceModule(LightningModule):
             group["params"] = new["params"]
         optimizer.state.clear()
 
-    # Scores
-
-    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Any]:
-        return self._score(batch, batch_idx)
-
-    def test_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Any]:
-        return self._score(batch, batch_idx)
-
-    def predict_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
-        """One view: ``colour`` [H, W, 3], ``opacity`` and ``depth`` [H, W]."""
-        assert self.frame is not None
-        return render_item(self.field, self.renderer, self.frame, batch)
-
-    def _score(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Any]:
-        """The rendered view; its scores wait for those of the others."""
-        image = self.predict_step(batch, batch_idx)
-        self.scores.append(score_image(image, batch))
-        self._tag = batch["tag"]
-        return image
-
-    def on_validation_epoch_start(self) -> None:
-        self._agree()
-        self.scores = []
-
-    def on_test_epoch_start(self) -> None:
-        self._agree()
-        self.scores = []
-
-    def on_validation_epoch_end(self) -> None:
-        self._log_scores()
-
-    def on_test_epoch_end(self) -> None:
-        self._log_scores()
-
-    def _log_scores(self) -> None:
-        self.scores = gathered(self.scores, self.trainer)
-        tag = self.trainer.strategy.broadcast(self._tag)  # A process may have had no view.
-        means = {f"{tag}/{name}": value for name, value in mean_scores(self.scores).items()}
-        self.tally.last |= means
-        self.log_dict(means, batch_size=1)  # All processes have the means of all views.
-
     # Checkpoints
-
-    def _agree(self) -> None:
-        """Go on with the first process's sampler, for each has seen the samples of its own rays.
-
-        What is scored, or goes into a checkpoint, is one field.
-        """
-        if self._trainer is None or self._trainer.world_size == 1:
-            return
-        for part in self.sampler.parts.values():
-            for buffer in part.buffers():
-                torch.distributed.broadcast(buffer, src=0)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self._read_tally()
-        self._agree()
+        self.agree()
         own = {"batches": self.batches, "rays": self.rays, "restarts": self.restarts}
         checkpoint["xplanes"] = __version__
         checkpoint["progress"] = own | self.tally.state_dict()
@@ -577,19 +446,3 @@ def _read(config: Mapping[str, Any], modules: Sequence[str]) -> Method:
             return Method.read(config)
         except KeyError as error:
             raise ConfigError(f"the configuration lacks the group {error}") from error
-
-
-def _number(term: Any, name: str, device: torch.device) -> Tensor:
-    """A term of the loss as a tensor without dimensions. []
-
-    Raises:
-        TrainingError: If it is not one number.
-    """
-    if isinstance(term, int | float):
-        return torch.tensor(float(term), device=device)
-    if isinstance(term, Tensor) and term.numel() == 1:
-        return term.reshape(()) if term.ndim else term
-    shape = f"a tensor of shape {list(term.shape)}" if isinstance(term, Tensor) else None
-    raise TrainingError(
-        f"{name}: returned {shape or type(term).__name__}; return one number, such as its mean"
-    )

@@ -1,0 +1,46 @@
+"""What a training step tells the loggers."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from lightning import Trainer
+from torch import Tensor
+
+from xplanes.streams import TrainingState
+from xplanes.training.clock import training_seconds
+
+if TYPE_CHECKING:
+    from xplanes.training.module import RadianceModule
+
+
+def logs_now(trainer: Trainer) -> bool:
+    """Whether a Trainer wants logs of the last batch."""
+    every = trainer.log_every_n_steps  # type: ignore[attr-defined]
+    # As the Trainer counts, for which a module that was loaded begins again.
+    batch = trainer.fit_loop.epoch_loop.total_batch_idx + 1
+    return bool(every and not batch % every and trainer.loggers)
+
+
+def log_terms(module: "RadianceModule", terms: Mapping[str, Tensor], state: TrainingState) -> None:
+    """Log every term of the loss, weighted, where the Trainer wants logs of this step.
+
+    Args:
+        module: What is trained.
+        terms: The terms that need rays, by name. [] each
+        state: How far training is.
+    """
+    if not logs_now(module.trainer):
+        return
+    values = {name: float(term.detach()) for name, term in terms.items()}
+    values |= module.model.regularisers(state)
+    entries = {f"train/{name}": value for name, value in values.items()}
+    entries |= {"train/loss": sum(values.values()), "train/psnr": module.last["psnr"]}
+    entries |= {"train/steps_skipped": float(module.unusable), "step": float(state.step)}
+    for group in module.trainer.optimizers[0].param_groups:
+        entries[f"lr/{group['name']}"] = group["lr"]
+    counts = module.counts
+    entries["sampler/samples_per_ray"] = counts["samples"] / max(1, counts["rays"])
+    if seconds := training_seconds(module.trainer):
+        entries["time/rays_per_s"] = counts["rays"] / seconds
+        entries["time/train_s"] = seconds
+    module.log_dict(entries | module.sampler.scalars() | module.model.scalars(), batch_size=1)

@@ -155,3 +155,13 @@ def test_the_view_ends_with_ctrl_c(trained_run: Path, monkeypatch, capsys):
     printed = capsys.readouterr().out
     assert "http://localhost:18090" in printed
     assert "ssh -L 18090:localhost:18090" in printed
+
+
+def test_resume_is_a_verb_for_the_override(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[list[str]] = []
+    monkeypatch.setattr("xplanes.launch.train", lambda words, *_: given.append(list(words)))
+    assert main(["resume", "runs/my run", "trainer.max_steps=9"]) == 0
+    assert main(["resume", "outputs/a"]) == 0
+    assert given == [["resume='runs/my run'", "trainer.max_steps=9"], ["resume=outputs/a"]]
+    with pytest.raises(SystemExit):
+        main(["resume"])

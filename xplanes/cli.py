@@ -29,6 +29,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     os.environ.update(defaults(os.environ))  # before torch is loaded
     words = sys.argv[1:] if arguments is None else list(arguments)
+    if words[:1] == ["resume"] and len(words) > 1 and words[1] not in ("-h", "--help"):
+        from xplanes.config import quoted
+
+        words = ["train", f"resume={quoted(words[1])}", *words[2:]]
+        sys.argv[1:] = words if arguments is None else sys.argv[1:]
     if words[:1] == ["train"]:
         from xplanes.launch import train
 
@@ -61,6 +66,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"xplanes {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     commands.add_parser("train", help="train a field: key=value ..., and the options of Hydra")
+    resume = commands.add_parser("resume", help="continue a run: RUN key=value ...")
+    resume.add_argument("run", help="the run directory, then what changes, as for train")
     verbs = (_add_download, _add_inspect, _add_triplanes, _add_evaluate, _add_render, _add_view)
     for add in (*verbs, _add_export, _add_table, _add_sheet, _add_pretrain, _add_score):
         add(commands)

@@ -19,7 +19,7 @@ from xplanes.errors import ConfigError, XPlanesError
 from xplanes.evaluation.findings import camera_findings, opaque_findings, stray_findings
 from xplanes.evaluation.published import check_published
 from xplanes.evaluation.render import VIDEO_FRAMES, write_orbit
-from xplanes.evaluation.report import closing, header, log_hparams, summary, write_pictures
+from xplanes.evaluation.report import closing, header, log_hparams, rest, summary, write_pictures
 from xplanes.evaluation.sheet import check_what
 from xplanes.experiment import Experiment
 from xplanes.files import StorageError, clear_unfinished, storage_error, write_json
@@ -44,7 +44,6 @@ from xplanes.training.record import (
     require_same_run,
     require_same_views,
 )
-from xplanes.training.scores import ViewScore
 
 logger = logging.getLogger(__name__)
 
@@ -213,7 +212,7 @@ def train(
 
     # Scores
     began = time.perf_counter()
-    scores = _final_scores(trainer, module, data)
+    scores = trainer.final_scores(module, data)
     if record is None:
         return {}
     evaluation = find_callback(trainer, Evaluation)
@@ -234,36 +233,13 @@ def train(
     if experiment.media:
         say(f"rendering {VIDEO_FRAMES} frames of the orbit video ...")
         metrics["media"] = str(write_orbit(module, scene, folder).relative_to(folder))
-    seconds |= _rest(seconds, record.total_seconds)
+    seconds |= rest(seconds, record.total_seconds)
     write_json(folder / "metrics.json", metrics)
     log_hparams(trainer, experiment, metrics)
     text = closing(folder, experiment, metrics)
     logger.info("\n%s", text)
     say(text)
     return metrics
-
-
-def _final_scores(
-    trainer: Trainer, module: RadianceModule, data: SceneDataModule
-) -> list[ViewScore]:
-    """Scores of all views of the split to test, those of the last evaluation if it had them."""
-    views = data.scene.splits[data.test_split]
-    evaluation = find_callback(trainer, Evaluation)
-    same = data.test_split == (data.validation_split or data.test_split)
-    scored = evaluation is not None and evaluation.step == trainer.global_step
-    if not (same and scored and len(module.scores) == len(views)):
-        with trainer.interrupt.exits():
-            trainer.test(module, data, verbose=False)
-    by_file = {score.file: score for score in module.scores}
-    return [by_file[file] for file in views.files if file in by_file]
-
-
-def _rest(seconds: dict[str, Any], total: float) -> dict[str, float]:
-    """``other``, what a run did besides the stages of ``seconds``, and ``total``."""
-    # Stages from the cache count with what they took to make: they may exceed the run's own time.
-    named = sum(seconds["prepare"].values())
-    named += sum(value for name, value in seconds.items() if name != "prepare")
-    return {"other": max(0.0, total - named), "total": total}
 
 
 def say(text: str) -> None:

@@ -147,6 +147,14 @@ def summary(
     }
 
 
+def rest(seconds: dict[str, Any], total: float) -> dict[str, float]:
+    """``other``, what a run did besides the stages of ``seconds``, and ``total``."""
+    # Stages from the cache count with what they took to make: they may exceed the run's own time.
+    named = sum(seconds["prepare"].values())
+    named += sum(value for name, value in seconds.items() if name != "prepare")
+    return {"other": max(0.0, total - named), "total": total}
+
+
 def write_pictures(trainer: Trainer, pictures: Mapping[str, Tensor], *, log: bool) -> None:
     """Write the images of what happened before training, if anything did.
 

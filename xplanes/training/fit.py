@@ -31,6 +31,7 @@ from xplanes.training.interrupt import Interrupt
 from xplanes.training.loading import require_whole_floats
 from xplanes.training.losses import loss_terms
 from xplanes.training.module import RadianceModule
+from xplanes.training.scores import ViewScore
 
 
 class Trainer(lightning.Trainer):
@@ -138,6 +139,18 @@ class Trainer(lightning.Trainer):
                 # Lightning trains nothing where no step is left, though the end was not scored yet.
                 self.validate(module, data, verbose=False)
         module.to(device)  # Lightning leaves it on the CPU.
+
+    def final_scores(self, module: RadianceModule, data: SceneDataModule) -> list[ViewScore]:
+        """Scores of all views of the split to test, those of the last evaluation if it had them."""
+        views = data.scene.splits[data.test_split]
+        evaluation = find_callback(self, Evaluation)
+        same = data.test_split == (data.validation_split or data.test_split)
+        scored = evaluation is not None and evaluation.step == self.global_step
+        if not (same and scored and len(module.scores) == len(views)):
+            with self.interrupt.exits():
+                self.test(module, data, verbose=False)
+        by_file = {score.file: score for score in module.scores}
+        return [by_file[file] for file in views.files if file in by_file]
 
 
 def _refuse_callbacks(callbacks: Sequence[Callback]) -> None:

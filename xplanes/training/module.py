@@ -92,6 +92,8 @@ class RadianceModule(LightningModule):
         self.unusable_in_a_row = 0
         self.restarts = 0
         """How often the field has begun anew, see `restart`."""
+        self.advice: str | None = None
+        """What to change when the loss is not finite; the model's own advice when None."""
         self.last: dict[str, float] = {}
         """Loss and PSNR of the last batch, mean opacities, and the last scores of views."""
         self._meters = Meters()
@@ -586,6 +588,8 @@ class RadianceModule(LightningModule):
         precision = "" if self.field.precision == "32" else ", or set model.precision=32"
         if begun:
             more = f", or omit {' and '.join(added)}" if added else ""
+            if self.advice is not None:
+                return f"{self.advice}{resume}"
             return f"{self._parts[0].advice}{more}{precision}{resume}"
         initialised = self.site is not None and self.site.initialised
         if initialised and not added and not (rendered and broken):

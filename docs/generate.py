@@ -290,6 +290,9 @@ ENVIRONMENT = {
     "OMP_NUM_THREADS": "Maximum number of threads of torch and the compiled loops.",
     "OMP_WAIT_POLICY, GOMP_SPINCOUNT": "How threads wait; defaults apply if neither is set.",
     "ONEDNN_PRIMITIVE_CACHE_CAPACITY": "Compiled bfloat16 products that are kept; 256 unless set.",
+    "NUMBA_CACHE_DIR": "Folder that keeps the compiled loops of the CPU; without one that can be "
+    "written they are compiled at every start.",
+    "TRITON_CACHE_DIR": "The same for the kernels of a GPU.",
     "XPLANES_CPU_LOOPS=0": "Plain torch instead of compiled loops on the CPU.",
     "XPLANES_GPU_KERNELS=0": "Plain torch instead of Triton kernels on a GPU.",
 }

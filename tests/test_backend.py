@@ -1,6 +1,8 @@
 """The compiled loops agree with torch on the number of threads, and may be absent."""
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 import time
@@ -8,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from xplanes.backend import WarmUp
+from tests.training.runs import SMALL
+from xplanes import backend
+from xplanes.backend import COMPILING, WarmUp
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -90,3 +94,104 @@ def test_warming_up_inside_warming_up_counts_once() -> None:
     with clock.timed():
         time.sleep(0.01)
     assert clock.seconds >= 0.06
+
+
+SEALED = """
+import importlib, sys
+from pathlib import Path
+import torch
+import xplanes
+from xplanes import backend
+from xplanes.rendering.compositing import composite
+assert Path(xplanes.__file__).parent == Path(sys.argv[1])
+nothing = torch.zeros(4, dtype=torch.long)
+total, _ = composite(torch.rand(4), torch.rand(4, 3), torch.rand(4), nothing, nothing[:1])
+assert total.isfinite().all()
+print(backend.name(torch.device("cpu")))
+for name in ("fields.cpu", "rendering.cpu", "rendering.gaussians.cpu", "pretraining.cpu"):
+    importlib.import_module(f"xplanes.{name}")
+"""
+
+
+@pytest.fixture
+def sealed(tmp_path: Path) -> tuple[Path, dict[str, str]]:
+    """A package that numba can keep nothing in, and an environment without a folder to write to."""
+    package = tmp_path / "site" / "xplanes"
+    shutil.copytree(ROOT / "xplanes", package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "conf", package.parent / "conf")
+    for folder in (package, *(path for path in package.rglob("*") if path.is_dir())):
+        (folder / "__pycache__").write_text("a file")
+    file = tmp_path / "file"
+    file.write_text("")
+    # Permissions do not stop root: nothing can be created below a file, whoever asks.
+    names = ("HOME", "NUMBA_CACHE_DIR", "TRITON_CACHE_DIR", "MPLCONFIGDIR", "XDG_CACHE_HOME")
+    others = {"PYTHONPATH": str(package.parent), "PYTHONDONTWRITEBYTECODE": "1"}
+    return package, os.environ | {name: f"{file}/{name}" for name in names} | others
+
+
+def test_loops_run_where_numba_can_keep_nothing(sealed, tmp_path: Path) -> None:
+    package, environment = sealed
+    command = [sys.executable, "-c", SEALED, str(package)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "compiled loops\n"
+    said = [line for line in done.stderr.splitlines() if "numba" in line]
+    assert len(said) == 1, done.stderr
+    assert f"compiled anew at every start, which takes about {COMPILING} s" in said[0]
+    assert "NUMBA_CACHE_DIR=FOLDER" in said[0]
+
+
+@pytest.mark.slow
+def test_a_run_needs_no_folder_but_its_own(sealed, tmp_path: Path) -> None:
+    environment = sealed[1]
+    place, data = tmp_path / "place", tmp_path / "data"
+    place.mkdir()
+    given = [*SMALL, "lrm=tiny", f"data.root={data}", f"preparation.cache={tmp_path}/file/cache"]
+    command = [sys.executable, "-m", "xplanes", "train", *given, "hydra.run.dir=run"]
+    before = set(tmp_path.rglob("*"))
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=place, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "NUMBA_CACHE_DIR=FOLDER" in (place / "run" / "train.log").read_text()
+    for path in set(tmp_path.rglob("*")) - before:
+        assert path.is_relative_to(place / "run") or path.is_relative_to(data), path
+
+
+def test_loops_are_kept_where_they_can_be(sealed, tmp_path: Path) -> None:
+    package, environment = sealed
+    environment |= {"NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+    command = [sys.executable, "-c", SEALED, str(package)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    assert "numba" not in done.stderr
+    assert list((tmp_path / "kept").rglob("*.nbi"))
+
+
+def test_triton_gets_a_folder_where_it_has_none(tmp_path: Path, monkeypatch, caplog) -> None:
+    own, file, removed = tmp_path / "own", tmp_path / "file", []
+    file.write_text("")
+    monkeypatch.setattr(backend.atexit, "register", lambda _, path, **__: removed.append(path))
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(own))
+    backend._settle_triton.__wrapped__()
+    assert os.environ["TRITON_CACHE_DIR"] == str(own)
+    assert not caplog.records
+    for name, place in (
+        ("TRITON_CACHE_DIR", f"{file}/cache"),
+        ("TRITON_HOME", f"{file}/.triton/cache"),
+        ("HOME", "~/.triton/cache"),
+    ):
+        for other in ("TRITON_CACHE_DIR", "TRITON_HOME"):
+            monkeypatch.delenv(other, raising=False)
+        monkeypatch.setenv(name, place.removesuffix("/.triton/cache").replace("~", str(file)))
+        caplog.clear()
+        backend._settle_triton.__wrapped__()
+        assert Path(os.environ["TRITON_CACHE_DIR"]).is_dir()
+        assert os.environ["TRITON_CACHE_DIR"] == removed[-1]
+        assert f"triton cannot write to {place}: " in caplog.text
+        shutil.rmtree(removed[-1])

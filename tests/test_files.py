@@ -10,6 +10,8 @@ import pytest
 from xplanes.files import (
     StorageError,
     clear_unfinished,
+    existing,
+    is_there,
     read_json,
     replacing,
     require_writable,
@@ -99,3 +101,19 @@ def test_only_unfinished_files_are_cleared(tmp_path: Path) -> None:
     assert not left.exists()
     assert kept.read_text() == "whole"
     assert hidden.exists()
+
+
+def test_what_lies_in_a_folder_that_cannot_be_entered_is_missing(tmp_path, monkeypatch):
+    inner = tmp_path / "locked" / "cache"
+    exists = Path.exists
+
+    def refuse(path, **options):
+        if "locked" in path.parts[:-1]:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return exists(path, **options)
+
+    (tmp_path / "locked").mkdir()
+    monkeypatch.setattr(Path, "exists", refuse)
+    assert existing(inner) == tmp_path / "locked"
+    require_writable(inner)
+    assert not is_there(inner)

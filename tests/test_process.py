@@ -1,4 +1,4 @@
-"""What the environment tells OpenMP and oneDNN."""
+"""What the environment tells OpenMP, oneDNN, and libraries that look for a home."""
 
 import os
 import subprocess
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from xplanes.process import KEEP, WAIT, defaults
+from xplanes.process import KEEP, NOWHERE, WAIT, defaults
 
 ROOT = Path(__file__).parents[1]
 
@@ -17,6 +17,16 @@ def test_a_users_own_setting_stands_alone(own):
     assert defaults({"HOME": "/", **own}) == KEEP
     assert defaults({"HOME": "/"}) == WAIT | KEEP
     assert defaults(dict.fromkeys(KEEP, "7")) == WAIT
+
+
+def test_who_has_no_home_gets_one_that_takes_no_folders(monkeypatch):
+    def homeless():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", homeless)
+    assert defaults({}) == WAIT | KEEP | NOWHERE
+    with pytest.raises(OSError, match=NOWHERE["HOME"]):
+        Path(NOWHERE["HOME"], ".cache").mkdir(parents=True)
 
 
 @pytest.mark.parametrize(

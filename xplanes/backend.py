@@ -1,24 +1,32 @@
 """Which implementation of the inner loops a tensor gets."""
 
+import atexit
 import functools
 import importlib
 import importlib.util
 import logging
 import math
 import os
+import shutil
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from xplanes.errors import DeviceError
+from xplanes.files import require_writable
 
 logger = logging.getLogger(__name__)
+
+COMPILING = 15
+"""Seconds that numba takes to compile the loops of training and rendering."""
 
 
 @dataclass
@@ -87,11 +95,30 @@ def cpu_loops(tensor: Tensor) -> bool:
 
 def triton_found() -> bool:
     """Whether triton is installed; says so once where it is not."""
+    _settle_triton()
     return _found(
         "triton",
         "the GPU takes the plain torch path, which is slower. "
         "`pip install --upgrade triton` brings it (torch for CUDA on Linux comes with it).",
     )
+
+
+@functools.cache
+def _settle_triton() -> None:
+    """Give triton a folder of this process for what it compiles, where it could write to none."""
+    home = os.environ.get("TRITON_HOME") or "~"
+    folder = os.environ.get("TRITON_CACHE_DIR") or f"{home}/.triton/cache"
+    try:
+        require_writable(Path(folder).expanduser())
+    except (OSError, RuntimeError):  # The latter where the user has no home.
+        own = tempfile.mkdtemp(prefix="xplanes_triton_")
+        atexit.register(shutil.rmtree, own, ignore_errors=True)
+        os.environ["TRITON_CACHE_DIR"] = own
+        logger.warning(
+            "triton cannot write to %s: the GPU's kernels are compiled anew at every start, which "
+            "takes some seconds each. TRITON_CACHE_DIR=FOLDER keeps them in FOLDER",
+            folder,
+        )
 
 
 def gpu_kernels(tensor: Tensor) -> bool:
@@ -189,6 +216,33 @@ def fast_bf16(device: torch.device) -> bool:
     if device.type == "cpu":
         return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
     return False
+
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """`numba.njit` that keeps what it compiles, wherever it finds a folder for that.
+
+    Args:
+        options: As for `numba.njit`; ``cache`` is settled here.
+    """
+    numba = importlib.import_module("numba")
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        try:
+            return numba.njit(cache=True, **options)(function)
+        except RuntimeError:  # A container may leave no folder that can be written.
+            _say_not_kept()
+            return numba.njit(**options)(function)
+
+    return decorate
+
+
+@functools.cache
+def _say_not_kept() -> None:
+    logger.warning(
+        "numba finds no folder that it can write to: the inner loops are compiled anew at every "
+        "start, which takes about %d s. NUMBA_CACHE_DIR=FOLDER keeps them in FOLDER",
+        COMPILING,
+    )
 
 
 def compiled(module: str) -> Any:

@@ -75,7 +75,15 @@ def natural(name: str) -> list[str | int]:
 
 def existing(path: Path) -> Path:
     """The path itself or the nearest folder above it that exists."""
-    return next((p for p in (path, *path.absolute().parents) if p.exists()), Path("/"))
+    return next((p for p in (path, *path.absolute().parents) if is_there(p)), Path("/"))
+
+
+def is_there(path: Path) -> bool:
+    """Whether a path exists; what lies in a folder that cannot be entered is as good as missing."""
+    try:
+        return path.exists()
+    except PermissionError:
+        return False
 
 
 def require_writable(folder: Path) -> None:

@@ -1,8 +1,9 @@
-"""This process: how OpenMP's threads wait, what oneDNN keeps, and the command that started it.
+"""This process: OpenMP's threads, what oneDNN keeps, the user's home, and the command line.
 
 Must stay quick: its caller has yet to import torch, whose libraries read the environment once.
 """
 
+import os
 import shlex
 import sys
 from collections.abc import Mapping
@@ -20,11 +21,23 @@ of eleven 400 px images; from 64 on training is as fast.
 """
 
 
+NOWHERE = {"HOME": os.devnull}
+"""A home in which no library can make a folder, for users who have none, as in containers.
+
+Without it some fail, and others write into a folder called ``~`` of the working directory.
+"""
+
+
 def defaults(environment: Mapping[str, str]) -> dict[str, str]:
     """The variables to add. Of `WAIT` none where one is set, since they only work together."""
+    try:
+        Path.home()
+        groups = [WAIT, KEEP]
+    except RuntimeError:
+        groups = [WAIT, KEEP, NOWHERE]
     return {
         name: value
-        for group in (WAIT, KEEP)
+        for group in groups
         if not group.keys() & environment.keys()
         for name, value in group.items()
     }

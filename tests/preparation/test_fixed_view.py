@@ -11,8 +11,9 @@ import torch
 
 from tests.baselines.runs import KPLANES, PROPOSAL
 from tests.refusals import assert_refused
-from tests.synthetic import ball_scene, ball_views, inside_ball, swinging
+from tests.synthetic import ball_scene, ball_views, inside_ball, surrounding, swinging
 from tests.training.runs import small_config
+from tests.training.test_health import spoil_gradient
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.lrm.alignment import align
@@ -22,9 +23,11 @@ from xplanes.preparation import fixed_view as module
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.fixed_view import canonical_pose, fixed_view, pick_frames, rendering_method
 from xplanes.rendering.base import RayRenderer
+from xplanes.rendering.sampler import Site
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, scene_frame
 from xplanes.scenes.views import Scene
+from xplanes.training.module import TrainingError
 
 SMALL_FIELD = (
     "model.resolution=24",
@@ -64,7 +67,7 @@ def video_of(method, scene, folder, size=24):
 
 def test_the_field_that_renders_has_its_models_default_settings(tmp_path: Path):
     changed = ("model=nine_planes", "model.sampler.samples=16", "model.precision=bf16")
-    rendering = rendering_method(settings(tmp_path, *changed, "seed=3"))
+    rendering = rendering_method(settings(tmp_path, *changed, "seed=3"), ball_views(6, 0.6), 0.9)
     default = default_settings().model
     # Images for a model of few pixels need no more samples than training.
     sampler = replace(default.sampler, render_samples=default.sampler.samples)
@@ -113,8 +116,73 @@ def test_it_leaves_the_run_as_deterministic_as_it_was(tmp_path: Path, small_fiel
 def test_kplanes_render_as_published(tmp_path: Path):
     own = settings(tmp_path, "preparation.fixed_view_model=kplanes")
     published = default_settings("model=kplanes").model
-    assert rendering_method(own).model == replace(published, precision=own.model.precision)
+    found = rendering_method(own, ball_views(6, 0.6), None).model
+    assert found == replace(published, precision=own.model.precision)
     assert not published.rays.skip_background
+
+
+def elsewhere(scale=1.0, shift=(0.0, 0.0, 0.0), *, distance=4.0, count=6, size=16):
+    """A ball of 0.6 at the origin, seen from ``distance``; then all of it scaled and shifted."""
+    shift = torch.tensor(shift)
+    poses = surrounding(count, distance * scale, 0)
+    poses[:, :3, 3] += shift
+    return ball_views(count, 0.6 * scale, size=size, centre=lambda _: shift, poses=poses)
+
+
+AWAY = (3.6, -2.8, 2.0)
+PLACES = {
+    "three times as far": ({"scale": 3.0}, None),
+    "a tenth": ({"scale": 0.1}, None),
+    "off centre": ({"shift": AWAY}, None),
+    "a long lens": ({"distance": 9.0}, None),
+    "the user's cube": ({}, 1.2),
+    "the user's cube, off centre": ({"shift": AWAY}, 1.2),
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_published_bounds_give_way_where_they_do_not_fit(tmp_path: Path, place):
+    moved, half_side = PLACES[place]
+    views = elsewhere(**moved)
+    cube = scene_frame(views, half_side)
+    for name in ("kplanes", "kplanes_explicit", "tineuvox_s"):
+        method = settings(tmp_path, f"preparation.fixed_view_model={name}")
+        model = rendering_method(method, views, half_side).model
+        frame, bounds = model.frame(views, half_side), model.bounds(views)
+        site = Site(frame, views.times, 0, "32", views=views, bounds=bounds)
+        if name == "tineuvox_s":
+            # Its box is that of what the cameras see, which holds the scene from side to side.
+            assert (bounds[0] < cube.centre - 0.99 / cube.scale).all(), name
+            assert (bounds[1] > cube.centre + 0.99 / cube.scale).all(), name
+        else:
+            assert frame.scale == pytest.approx(cube.scale), name
+            torch.testing.assert_close(frame.centre, cube.centre, msg=name)
+            assert model.sampler.near is model.sampler.far is None, name
+        model = replace(model, **TINY_FIELDS[name])
+        model.sampler.build(model.build(site).field, site)
+
+
+TINY_FIELDS = {
+    "kplanes": {"resolution": 4, "scales": [1]},
+    "kplanes_explicit": {"resolution": 4, "scales": [1]},
+    "tineuvox_s": {"resolution": 8, "grow_at": []},
+}
+
+
+def test_published_bounds_stay_where_they_fit(tmp_path: Path):
+    for name in ("kplanes", "kplanes_explicit", "tineuvox_s", "tineuvox_b"):
+        method = settings(tmp_path, f"preparation.fixed_view_model={name}")
+        published = default_settings(f"model={name}").model
+        for views in (elsewhere(), elsewhere(scale=1.3, distance=4.0311 / 1.3)):
+            found = rendering_method(method, views, None).model
+            assert found == replace(published, precision=method.model.precision), name
+
+
+def test_a_field_that_breaks_names_settings_that_the_user_has(tmp_path, small_fields, monkeypatch):
+    spoil_gradient(monkeypatch, math.nan, range(3, 1000))
+    with pytest.raises(TrainingError, match=r"preparation\.fixed_view_model to another") as caught:
+        video_of(settings(tmp_path), ball_scene(), tmp_path / "cache", size=4)
+    assert "plane_lr" not in str(caught.value)
 
 
 def test_a_model_that_is_not_there_cannot_render(tmp_path: Path):
@@ -216,11 +284,11 @@ def test_the_field_that_renders_has_the_users_cube(tmp_path: Path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_kplanes_render_in_their_own_cube(tmp_path: Path, small_fields):
+@pytest.mark.parametrize("place", [{}, {"scale": 3.0}, {"scale": 0.1}, {"shift": AWAY}])
+def test_kplanes_render_in_their_own_cube_or_the_scenes(tmp_path: Path, small_fields, place):
     options = ("preparation.fixed_view_model=kplanes", "preparation.fixed_view_steps=200")
-    made, _ = video_of(
-        settings(tmp_path, *options), ball_scene(count=12, size=24), tmp_path / "cache"
-    )
+    scene = Scene("ball", {"train": elsewhere(count=12, size=24, **place)})
+    made, _ = video_of(settings(tmp_path, *options), scene, tmp_path / "cache")
     alpha = made.views.images[..., 3].float() / 255
     # Coarse planes blur it.
     assert alpha[:, 9:15, 9:15].mean() > 1.5 * alpha[:, :3, :3].mean() > 0

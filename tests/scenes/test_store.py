@@ -523,3 +523,19 @@ def test_tiles_on_a_read_only_disk_are_read(tmp_path: Path, small, monkeypatch) 
     assert isinstance(again, StoredImages)
     assert isinstance(first, StoredImages)
     assert torch.equal(again.image(1), first.image(1))
+
+
+def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path, small, monkeypatch) -> None:
+    paths = pictures(tmp_path / "scene", [(65, 65)] * 2, alpha=False)
+    file = tmp_path / "file"
+    file.write_text("")
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    for home in (lambda: file, homeless):
+        monkeypatch.setattr(Path, "home", home)
+        with pytest.raises(StorageError, match=r"cannot be written: .*data\.cache names the one"):
+            read_images(paths, None)
+    assert read_images(paths, None, cache=tmp_path / "cache")[0].image(0).shape == (65, 65, 4)
+
+
+def homeless() -> Path:
+    raise RuntimeError("Could not determine home directory.")

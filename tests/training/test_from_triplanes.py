@@ -273,12 +273,11 @@ def test_a_field_that_begins_anew_keeps_l_r_while_it_is_of_use(place: Path) -> N
     module = RadianceModule(config := settings(place, "model.loss.initial_steps=288"))
     module.build(Experiment.read(config).data.read())
     sparse = module.model.sparse
-    module._assemble_stronger()
+    again = module.parts.stronger()
     assert sparse is not None
-    assert module.model.sparse is sparse
-    module.model.product = None  # As after fading out.
-    module._assemble_stronger()
-    assert module.model.sparse is None
+    assert again.model.sparse is sparse
+    again.model.product = None  # As after fading out.
+    assert again.stronger().model.sparse is None
 
 
 def test_total_variation_has_a_weight_for_the_planes_of_space_and_one_for_those_of_time(

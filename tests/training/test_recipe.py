@@ -2,13 +2,15 @@
 
 import csv
 import itertools
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from tests.baselines.runs import PROPOSAL
+from tests.baselines.runs import KPLANES, PROPOSAL
 from tests.preparation.sequences import moving_sequence
 from tests.synthetic import ball_scene
 from tests.training.runs import SMALL, changed
@@ -23,7 +25,7 @@ from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 from xplanes.models.base import InitialValues
 from xplanes.models.initialisation import Initialisation
 from xplanes.models.tensor4d import FeatureSmoothness
-from xplanes.preparation import TriplaneSequence, save_triplanes
+from xplanes.preparation import TriplaneSequence, fixed_view, save_triplanes
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.stages import convert_stage, decompose_stage
 from xplanes.run import run
@@ -312,6 +314,61 @@ def test_a_run_logs_every_term_in_its_loss(model: str, scenes: Path, tmp_path: P
         .sum()
         .item()
     )
+
+
+SCENES = {
+    "ordinary": (),
+    "the user's cube": ("data.half_side=1.2",),
+    "off centre": ("data=suite", "data.scene=off_centre"),
+    "ten times as large": ("data=suite", "data.scene=scale"),
+}
+NAMED = tuple(text for text in TINY if text != "lrm=none")
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_it_runs_on_scenes_unlike_those_of_d_nerf(scenes, tmp_path, reduced, scene) -> None:
+    config = changed(("recipe=paper", *NAMED), "lrm=tiny", f"data.root={scenes}", *SCENES[scene])
+    check_runs(config, tmp_path)
+
+
+def test_it_runs_on_a_scene_of_d_nerf_three_times_as_large(scenes, tmp_path, reduced) -> None:
+    ordinary = Experiment.read(small(f"data.root={scenes}")).data
+    enlarge(ordinary.folder, tmp_path / "large", 3.0)
+    others = tuple(text for text in NAMED if not text.startswith("data."))
+    given = "lrm=tiny", "data=dnerf", f"data.root={tmp_path}", "data.scene=large"
+    check_runs(changed(("recipe=paper", *others), *given, "data.resolution=null"), tmp_path)
+
+
+@pytest.fixture
+def reduced(monkeypatch) -> None:
+    """Small K-Planes render the fixed view."""
+
+    def composed(name, lines):
+        return compose_plain(name, [*lines, *KPLANES, *PROPOSAL])
+
+    monkeypatch.setattr(fixed_view, "compose_plain", composed)
+
+
+def check_runs(config: dict, folder: Path) -> None:
+    """A few steps of the recipe, of the field that renders the fixed view too."""
+    config["preparation"] |= {"cache": str(folder / "cache"), "frames": 3, "fixed_view_steps": 2}
+    config["trainer"]["max_steps"] = 2
+    run(config, folder / "run", [], resume=False)
+    metrics = json.loads((folder / "run" / "metrics.json").read_text())
+    assert metrics["lrm"]["fixed_view"] == "3 frames rendered by kplanes trained for 2 steps"
+    assert metrics["step"] == 2
+    assert 0 < metrics["test"]["psnr"] < 60
+
+
+def enlarge(folder: Path, target: Path, factor: float) -> None:
+    """Copy a scene of D-NeRF's format with all distances times a factor."""
+    shutil.copytree(folder, target)
+    for path in target.glob("transforms_*.json"):
+        content = json.loads(path.read_text())
+        for frame in content["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] *= factor
+        path.write_text(json.dumps(content))
 
 
 def test_half_the_timesteps_are_rows_whatever_the_lrm_has() -> None:

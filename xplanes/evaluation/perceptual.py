@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from xplanes.files import is_there
 from xplanes.optional import require
 
 WEIGHTS = {
@@ -49,12 +50,12 @@ def lpips(network: str, side: int, device: str, *, download: bool) -> Metric:
     name, size = WEIGHTS[network]
     url = getattr(models, name).DEFAULT.url
     file = Path(torch.hub.get_dir()) / "checkpoints" / Path(url).name
-    if not file.is_file() and not download:
+    if not is_there(file) and not download:
         raise UnavailableError(f"{file} is missing: --lpips {network} downloads its {size}")
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     try:
-        if file.is_file():
+        if is_there(file):
             # torchvision would read the file as a pickle, which may run code.
             torch.load(file, map_location="cpu", weights_only=True)
         metric = LearnedPerceptualImagePatchSimilarity(

@@ -7,9 +7,11 @@ registers. Imported only when needed, since numba takes a second to load.
 # ruff: noqa: D103 (the callers in lookup.py document these loops)
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
-COMPILE = {"cache": True, "nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
+from xplanes.backend import njit
+
+COMPILE = {"nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
 
 
 @njit(inline="always", **COMPILE)

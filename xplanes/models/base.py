@@ -177,6 +177,20 @@ class ModelSettings(Settings, ABC):
         """
         return scene_cube(views, half_side, points)
 
+    def for_scene(
+        self, views: Views, half_side: float | None, points: Tensor | None = None
+    ) -> "ModelSettings":
+        """The same with the scene's cube, near and far where published ones do not fit the scene.
+
+        Unchanged by default, for models whose field and sampler take them from the scene anyway.
+
+        Args:
+            views: Training views.
+            half_side: As for `frame`; given, it replaces a published cube that would fit.
+            points: As for `frame`.
+        """
+        return self
+
     def bounds(self, views: Views) -> Tensor | None:
         """Least and largest corner of the field's box in the world, if it needs one. [2, 3]"""
         return None

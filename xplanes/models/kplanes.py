@@ -1,6 +1,6 @@
 """K-Planes (Fridovich-Keil et al., CVPR 2023), hybrid and explicit, as in the released code."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import torch
@@ -11,7 +11,14 @@ from xplanes.fields.kplanes import ExplicitDecoder, HybridDecoder, KPlanes
 from xplanes.fields.products import PlaneProducts
 from xplanes.fields.regularisers import PlaneTerms, Variation
 from xplanes.models.base import InitialValues, Model, ModelSettings, warm_cosine
-from xplanes.rendering.sampler import Group, Site, origin_cube, scene_cube
+from xplanes.rendering.sampler import (
+    Group,
+    Site,
+    fits_origin_cube,
+    origin_cube,
+    scene_cube,
+    seen_range,
+)
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Positive, Settings, Steps, Weight
@@ -62,6 +69,16 @@ class KPlanesSettings(ModelSettings):
         if self.half_side is None:
             return scene_cube(views, half_side, points)
         return origin_cube(self.half_side, views, half_side)
+
+    def for_scene(
+        self, views: Views, half_side: float | None, points: Tensor | None = None
+    ) -> "KPlanesSettings":
+        cube = scene_cube(views, half_side, points)
+        near, far = seen_range(views, cube)
+        fits = self.half_side is None or fits_origin_cube(self.half_side, cube)
+        if half_side is None and fits and self.sampler.holds(near, far):
+            return self
+        return replace(self, half_side=None, sampler=self.sampler.bounded(near, far))
 
     def build(self, site: Site, initial: InitialValues | None = None) -> "KPlanesModel":
         decoder = {"hybrid": HybridDecoder, "explicit": ExplicitDecoder}[self.variant]

@@ -1,7 +1,7 @@
 """TiNeuVox (Fang et al., SIGGRAPH Asia 2022), small and base, as in the released code."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -13,7 +13,7 @@ from xplanes.models.background import BackgroundSettings
 from xplanes.models.base import InitialValues, Model, ModelSettings, colour_error
 from xplanes.rendering.base import Rendering
 from xplanes.rendering.fixed_step import FixedStepRendering
-from xplanes.rendering.sampler import Group, Site, origin_cube
+from xplanes.rendering.sampler import Group, Site, origin_cube, scene_cube, seen_range
 from xplanes.scenes.batches import Batch
 from xplanes.scenes.frame import Frame, cube_frame
 from xplanes.scenes.views import Views
@@ -73,6 +73,16 @@ class TiNeuVoxSettings(ModelSettings):
         if self.half_side is not None:
             return origin_cube(self.half_side, views, half_side)
         return cube_frame(float(self.bounds(views).abs().max()), torch.zeros(3))
+
+    def for_scene(
+        self, views: Views, half_side: float | None, points: Tensor | None = None
+    ) -> "TiNeuVoxSettings":
+        near, far = seen_range(views, scene_cube(views, half_side, points))
+        seen = self.near <= near and far <= self.far and self.sampler.holds(near, far)
+        if half_side is None and seen:
+            return self
+        sampler = self.sampler.bounded(near, far)
+        return replace(self, near=near, far=far, half_side=None, sampler=sampler)
 
     def build(self, site: Site, initial: InitialValues | None = None) -> "TiNeuVoxModel":
         assert site.bounds is not None

@@ -37,11 +37,19 @@ CHECKPOINT_EVERY = 250
 """Steps between checkpoints of the field that renders the fixed-view video."""
 
 
-def rendering_method(method: Method) -> Method:
+def rendering_method(
+    method: Method, views: Views, half_side: float | None, points: Tensor | None = None
+) -> Method:
     """Settings of the field that renders the fixed-view video: the defaults of its model.
 
     The run's own model is not used, because ablations of it would also change the video. Images are
     rendered with the number of samples of training steps: the LRM sees images of few pixels.
+
+    Args:
+        method: The run's settings.
+        views: Training views; the model's published cube, near and far stay if they fit these.
+        half_side: Half the side of the scene's cube in world units; estimated when None.
+        points: Surface points in the world, if known. [N, 3]
     """
     name = method.preparation.fixed_view_model
     found = Method.read(compose_plain("train", [f"model={name}", "lrm=none"]))
@@ -50,9 +58,8 @@ def rendering_method(method: Method) -> Method:
             f"preparation.fixed_view_model={name}: its renderer takes no single rays; name a model "
             "of a radiance field, such as six_planes"
         )
-    model = replace(
-        found.model, sampler=found.model.sampler.for_video(), precision=method.model.precision
-    )
+    model = found.model.for_scene(views, half_side, points)
+    model = replace(model, sampler=model.sampler.for_video(), precision=method.model.precision)
     return replace(found, seed=method.seed, model=model)
 
 
@@ -220,7 +227,7 @@ def _rendered(
     pose = canonical_pose(train, frame, view, azimuth=options.azimuth, elevation=options.elevation)
     side = min(size, max(train.height, train.width))
     focal = view.focal * side
-    rendering = rendering_method(method)
+    rendering = rendering_method(method, train, place.half_side, scene.points)
     own_frame = rendering.model.frame(train, place.half_side, scene.points)
     # Samplers may have a fixed near bound. The LRM's camera is closer than the training cameras, so
     # its ray origins are moved back.
@@ -249,6 +256,8 @@ def _rendered(
                 folder,
                 steps=options.fixed_view_steps,
                 seconds=options.fixed_view_seconds,
+                advice=f"It belongs to {options.fixed_view_model}, which was to render the fixed "
+                "view: set preparation.fixed_view_model to another model, or lrm=none",
             )
             return {"images": _render(module, own_frame, pose, focal, side, count, back)}
 
@@ -279,7 +288,13 @@ def intrinsics_key(intrinsics: Intrinsics) -> list[Tensor]:
 
 
 def trained_field(
-    method: Method, place: Place, folder: Path, *, steps: int, seconds: float | None
+    method: Method,
+    place: Place,
+    folder: Path,
+    *,
+    steps: int,
+    seconds: float | None,
+    advice: str,
 ) -> RadianceModule:
     """Train a field for a short time; an interrupted training is resumed.
 
@@ -289,9 +304,15 @@ def trained_field(
         folder: Where its checkpoints lie.
         steps: Training steps at most.
         seconds: Seconds of training at most; None for no limit.
+        advice: What to change when the loss is not finite: the settings of ``method`` are not the
+            user's.
+
+    Raises:
+        TrainingError: If the loss is not finite.
     """
     module = RadianceModule(method)
     module.build(place.scene, place.frame, device=place.device, say=place.say)
+    module.advice = advice
     fit_quietly(
         module,
         place.scene,

@@ -109,8 +109,15 @@ class FieldInitialiser(Initialiser):
         def make() -> dict[str, Any]:
             place.say(f"points: training {settings.model} for {self._budget}")
             with cache.workshop("points", inputs) as folder:
-                budget = {"steps": settings.steps, "seconds": settings.seconds}
-                module = trained_field(field, place, folder, **budget)
+                module = trained_field(
+                    field,
+                    place,
+                    folder,
+                    steps=settings.steps,
+                    seconds=settings.seconds,
+                    advice=f"It belongs to {settings.model}, whose surfaces were to give points: "
+                    "set lrm.model to another model, or lrm=none",
+                )
                 found = surface_points(module, views, count, seed=method.seed)
             if not len(found.points):
                 raise ConfigError(

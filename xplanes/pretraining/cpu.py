@@ -8,9 +8,10 @@ Imported only when needed, since numba takes a second to load.
 import math
 
 import numpy as np
-from numba import njit
 
-COMPILE = {"cache": True, "nogil": True, "error_model": "numpy"}
+from xplanes.backend import njit
+
+COMPILE = {"nogil": True, "error_model": "numpy"}
 
 INF = math.inf
 INWARD = 0.998

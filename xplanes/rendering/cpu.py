@@ -6,9 +6,11 @@ Imported only when needed, since numba takes a second to load.
 # ruff: noqa: D103 (the callers document these loops)
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
-COMPILE = {"cache": True, "nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
+from xplanes.backend import njit
+
+COMPILE = {"nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
 
 EXACT = {**COMPILE, "fastmath": False}
 """For loops that must come to the same numbers twice: a fused product may round otherwise."""

@@ -1,6 +1,6 @@
 """Rays through a field's box at equal steps; colour only where it counts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any
 
@@ -159,6 +159,12 @@ class FixedStepSettings(SamplerSettings):
                 f"model.sampler.name={self.name}: needs a field of cells, as TiNeuVox's; set "
                 "model/sampler=occupancy or proposal"
             )
+
+    def holds(self, near: float, far: float) -> bool:
+        return self.near <= near and far <= self.far
+
+    def bounded(self, near: float, far: float) -> "FixedStepSettings":
+        return replace(self, near=near, far=far)
 
     def build(self, field: RadianceField, site: Site) -> "FixedStepSampler":
         self.require(field)

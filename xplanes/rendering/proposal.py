@@ -1,7 +1,7 @@
 """Samples where small density fields, trained along, expect something."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -277,6 +277,12 @@ class ProposalSettings(SamplerSettings):
             raise ConfigError(
                 f"space_low={self.space_low}: must not be above space_high={self.space_high}"
             )
+
+    def holds(self, near: float, far: float) -> bool:
+        return self.near is None or self.far is None or (self.near <= near and far <= self.far)
+
+    def bounded(self, near: float, far: float) -> "ProposalSettings":
+        return replace(self, near=None, far=None)
 
     def build(self, field: RadianceField, site: Site) -> "ProposalSampler":
         bounds: dict[str, float] = {}

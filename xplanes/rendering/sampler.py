@@ -215,6 +215,24 @@ class SamplerSettings(Settings, ABC):
         """Settings for the low-resolution fixed-view video of an LRM; unchanged by default."""
         return self
 
+    def holds(self, near: float, far: float) -> bool:
+        """Whether samples reach a scene; true by default, for samplers without bounds of their own.
+
+        Args:
+            near: Least distance of the scene from a camera, in world units.
+            far: Its largest distance.
+        """
+        return True
+
+    def bounded(self, near: float, far: float) -> "SamplerSettings":
+        """The same with bounds for a scene; unchanged by default.
+
+        Args:
+            near: As for `holds`.
+            far: As for `holds`.
+        """
+        return self
+
 
 def scene_cube(views: Views, half_side: float | None, points: Tensor | None = None) -> Frame:
     """The scene's own cube; ``half_side`` in world units, found when None, see `scene_frame`."""
@@ -241,31 +259,57 @@ def origin_cube(half_side: float, views: Views, given: float | None = None) -> F
         scene = scene_frame(views, None)
     except SceneError:
         return cube_frame(half_side, torch.zeros(3), "model.half_side")
-    reach = 1 / scene.scale + float(scene.centre.norm())
-    # A scene that fills the cube's corners reaches sqrt(3) times as far as its sides.
-    if not half_side / 4 < reach < half_side * 3**0.5:
+    if not fits_origin_cube(half_side, scene):
         logger.warning(
             "model.half_side=%g: the scene reaches %.3g world units from the origin; set it to "
             "about that, or to null for the scene's own cube",
             half_side,
-            reach,
+            _reach(scene),
         )
     return cube_frame(half_side, torch.zeros(3), "model.half_side")
 
 
+def fits_origin_cube(half_side: float, scene: Frame) -> bool:
+    """Whether a cube around the world's origin is of about the size of a scene.
+
+    Args:
+        half_side: Half the side of the cube, in world units.
+        scene: The scene's cube.
+    """
+    # A scene that fills the cube's corners reaches sqrt(3) times as far as its sides.
+    return half_side / 4 < _reach(scene) < half_side * 3**0.5
+
+
+def _reach(scene: Frame) -> float:
+    """How far a scene reaches from the world's origin."""
+    return 1 / scene.scale + float(scene.centre.norm())
+
+
+def seen_range(views: Views, scene: Frame) -> tuple[float, float]:
+    """Least and largest distance of a scene from its cameras, in world units.
+
+    Args:
+        views: Training views.
+        scene: The scene's cube, whose inscribed ball holds its content.
+    """
+    away = (views.camera_to_world[:, :3, 3] - scene.centre).norm(dim=-1)
+    return max(float(away.min()) - 1 / scene.scale, 0.0), float(away.max()) + 1 / scene.scale
+
+
 def check_range(site: Site, near: float, far: float) -> None:
-    """Refuse distances between which the cameras do not see the centre of the field's cube.
+    """Refuse distances between which the cameras do not see the centre of the field's box.
 
     Raises:
         ConfigError: With the cameras' distances.
     """
     if site.views is None:
         return
-    away = (site.views.camera_to_world[:, :3, 3] - site.frame.centre).norm(dim=-1)
+    centre = site.frame.centre if site.bounds is None else site.bounds.mean(dim=0)
+    away = (site.views.camera_to_world[:, :3, 3] - centre).norm(dim=-1)
     nearest, farthest = float(away.min()), float(away.max())
     if nearest <= near or farthest >= far:
         raise ConfigError(
             f"model.sampler.near={near} with model.sampler.far={far}: the cameras stand "
-            f"{nearest:.3g} to {farthest:.3g} world units from the centre of the field's cube; set "
+            f"{nearest:.3g} to {farthest:.3g} world units from the centre of the field's box; set "
             "both to numbers around these"
         )

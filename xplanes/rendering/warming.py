@@ -7,7 +7,7 @@ from functools import cache
 
 import torch
 
-from xplanes.backend import warm_up
+from xplanes.backend import COMPILING, warm_up
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.box import Field
 
@@ -18,7 +18,7 @@ PATIENCE = 3.0
 @cache
 def say_why() -> None:
     """Once in a process, though loops are warmed up at several places."""
-    print("compiling the inner loops, once after installation: about 20 s ...", flush=True)
+    print(f"compiling the inner loops: about {COMPILING} s ...", flush=True)
 
 
 @contextmanager

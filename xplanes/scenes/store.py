@@ -268,7 +268,10 @@ class TileFile:
 
 def default_cache() -> Path:
     """The folder of decoded images in the user's cache directory."""
-    home = Path.home()
+    try:
+        home = Path.home()
+    except RuntimeError:  # The user has none, as in containers: no folder can be made in a file.
+        home = Path(os.devnull)
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local"
     elif sys.platform == "darwin":
@@ -347,12 +350,15 @@ def decoded(
             with suppress(OSError):  # The cache may be another user's, or on a read-only disk.
                 os.utime(path)
             return StoredImages.all_of(TileFile(path, key, sizes, channels))
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError, PermissionError):
             return None
 
     if (ready := found()) is not None:
         return ready
-    require_writable(folder)
+    try:
+        require_writable(folder)
+    except StorageError as problem:
+        raise StorageError(f"{problem}: data.cache names the one for decoded images") from problem
     with in_turn(path.with_suffix(".lock")):
         if (ready := found()) is not None:
             return ready

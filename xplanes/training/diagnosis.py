@@ -86,6 +86,8 @@ def _way_out(
         return f"The rendering is finite: correct {' and '.join(culprits)} or omit it{resume}"
     precision = "" if module.field.precision == "32" else ", or set model.precision=32"
     if begun:
+        if module.advice is not None:
+            return f"{module.advice}{resume}"
         more = f", or omit {' and '.join(added)}" if added else ""
         return f"{module.model.advice}{more}{precision}{resume}"
     if module.site.initialised and not added and not (rendered and broken):

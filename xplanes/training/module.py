@@ -82,6 +82,8 @@ class RadianceModule(ViewScoring):
         """Rays of the next batch; 0 for whole views."""
         self.restarts = 0
         """How often the field was initialised again, see `restart`."""
+        self.advice: str | None = None
+        """What to change when the loss is not finite; the model's own advice when None."""
         self.between_updates = True
         """Whether no gradients wait for those of further batches (`accumulate_grad_batches`)."""
         self.scores = []

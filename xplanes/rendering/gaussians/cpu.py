@@ -9,8 +9,9 @@ to load.
 # ruff: noqa: D103 (rasteriser.py documents these loops)
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from xplanes.backend import njit
 from xplanes.rendering.gaussians.reference import (
     LEAST_ALPHA,
     LEAST_QUATERNION,
@@ -19,7 +20,7 @@ from xplanes.rendering.gaussians.reference import (
     MOST_ALPHA,
 )
 
-EXACT = {"cache": True, "nogil": True, "fastmath": False, "error_model": "numpy"}
+EXACT = {"nogil": True, "fastmath": False, "error_model": "numpy"}
 COMPILE = {**EXACT, "fastmath": {"contract"}}
 SUMS = {**EXACT, "fastmath": {"contract", "reassoc"}}
 """For loops whose sums may take vector registers, in an order that is the same each time."""

@@ -67,7 +67,10 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     commands.add_parser("train", help="train a field: key=value ..., and the options of Hydra")
     resume = commands.add_parser("resume", help="continue a run: RUN key=value ...")
-    resume.add_argument("run", help="the run directory, then what changes, as for train")
+    resume.add_argument("run", metavar="RUN", help="the run directory")
+    resume.add_argument(
+        "overrides", nargs="*", metavar="KEY=VALUE", help="what changes, and options of Hydra"
+    )
     verbs = (_add_download, _add_inspect, _add_triplanes, _add_evaluate, _add_render, _add_view)
     for add in (*verbs, _add_export, _add_table, _add_sheet, _add_pretrain, _add_score):
         add(commands)

@@ -19,7 +19,7 @@ from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.scenes.errors import SceneError
-from xplanes.training import module
+from xplanes.training import scoring
 from xplanes.training.checkpoints import AtomicCheckpointIO
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import KEPT, RunRecord, require_same_settings
@@ -110,14 +110,14 @@ def test_the_best_is_chosen_by_the_same_views_throughout(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One view is scored on the way, and the others are harder by 10 dB."""
-    original = module.score_image
+    original = scoring.score_image
     improved: list[tuple[str, dict]] = []
 
     def score(image, item):
         found = original(image, item)
         return replace(found, psnr=found.psnr - 10 * (item["index"] != 0))
 
-    monkeypatch.setattr(module, "score_image", score)
+    monkeypatch.setattr(scoring, "score_image", score)
     note_checkpoints(improved, monkeypatch)
     few = (
         "trainer.limit_val_batches=1",

@@ -49,6 +49,8 @@ class Stream(IntEnum):
     """Noise on the times at which Gaussians are deformed."""
     SIGHT = 1_000_381
     """Rays along which points of a field are looked for."""
+    SPARSITY = 1_000_403
+    """Points at which the sparsity prior is taken; processes add their rank."""
 
 
 def step_generator(seed: int, step: int, stream: int = 0) -> torch.Generator:

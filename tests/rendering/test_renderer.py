@@ -6,11 +6,15 @@ import math
 import pytest
 import torch
 
+from xplanes.config import compose_plain
 from xplanes.rendering.grid_renderer import (
     DIAGONAL,
     GridRenderer,
+    OccupancySampler,
+    OccupancySettings,
 )
 from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.streams import TrainingState
 
 COLOUR = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
 WHITE = torch.ones(3, dtype=torch.float64)
@@ -218,3 +222,42 @@ def test_jitter_moves_samples_within_their_steps():
     first = samples.distances[samples.starts]
     expected = 2 * math.sqrt(3) + jitter * renderer.step
     torch.testing.assert_close(first, expected)
+
+
+class Fog(torch.nn.Module):
+    """One density everywhere."""
+
+    def __init__(self, density: float) -> None:
+        super().__init__()
+        self.density = torch.nn.Parameter(torch.tensor(density, dtype=torch.float64))
+
+    def forward(self, points, times):
+        return COLOUR.expand(len(points), 3), self.density.expand(len(points))
+
+
+def test_random_points_of_occupied_cells_pay_for_their_opacity():
+    renderer = renderer_of(64, 6)
+    options = compose_plain("train", [])["model"]["sampler"]
+    known = {key: value for key, value in options.items() if key != "_target_"}
+    settings = OccupancySettings(**known | {"sparsity": 0.5, "update_every": 4})
+    sampler, field = OccupancySampler(renderer, settings), Fog(0.7)
+    sampler.regularise(field, TrainingState(0, 3, 3, 0))
+    assert field.density.grad is None
+    sampler.regularise(field, TrainingState(0, 4, 4, 0))
+    step = DIAGONAL / 64
+    expected = 0.5 * 4 * step * math.exp(-0.7 * step)
+    assert float(field.density.grad) == pytest.approx(expected, rel=1e-6)
+    sampler.regularise(field, TrainingState(0, 8, 8, 0))
+    assert float(field.density.grad) == pytest.approx(2 * expected, rel=1e-6)
+    renderer.grid.occupied.zero_()
+    sampler.regularise(field, TrainingState(0, 12, 12, 0))
+    assert float(field.density.grad) == pytest.approx(2 * expected, rel=1e-6)
+
+
+def test_points_of_occupied_cells_lie_in_all_of_them_and_in_no_others():
+    grid = OccupancyGrid(5, 3, step=0.1)
+    chosen = torch.rand(len(grid.occupied), generator=torch.Generator().manual_seed(0)) < 0.2
+    grid.occupied.copy_(chosen)
+    uniform = torch.rand(4000, 5, generator=torch.Generator().manual_seed(1))
+    cells = grid.cells(*grid.occupied_points(uniform))
+    assert torch.equal(cells.unique(), chosen.nonzero()[:, 0])

@@ -22,7 +22,7 @@ from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
 from xplanes.rendering.warming import render_one_ray
 from xplanes.scenes.batches import Batch
-from xplanes.settings import Count, Range, Share
+from xplanes.settings import Count, Range, Share, Weight
 from xplanes.streams import Stream, TrainingState, counted_uniform, step_generator
 
 SPARE = 1.25
@@ -30,6 +30,9 @@ SPARE = 1.25
 
 STEP_OF_ROOM = 1024
 """Their number is a multiple of this."""
+
+SPARSE_POINTS = 2048
+"""Points at which the sparsity prior is taken."""
 
 DIAGONAL = 2 * math.sqrt(3)
 """Longest way through the field's cube."""
@@ -139,6 +142,9 @@ class OccupancySettings(SamplerSettings):
     occlusion: Annotated[float, Range(0, 1)]  # Transmittance below which samples are occluded.
     silhouettes: bool  # Prune cells outside the silhouettes (alpha).
     fill: bool  # Prune empty cells of an initialised field.
+    # Weight of the mean opacity of random points in occupied cells, one step long. It empties what
+    # no training ray sees, such as the space below a ground plate.
+    sparsity: Weight
     sweep_at: list[int]  # Steps at which all occupied cells are updated.
     sweep_every: Count  # Steps between updates of all occupied cells afterwards.
     update_every: Count  # Steps between updates of random cells.
@@ -265,6 +271,37 @@ class OccupancySampler(Sampler):
     def observe(self, rendering: Rendering) -> None:
         samples = rendering.samples
         self.grid.observe(samples.cells, rendering.density, samples.live)
+
+    def regularise(self, field: Any, state: TrainingState) -> None:
+        settings, device = self.settings, self.device
+        if not settings.sparsity or state.step % settings.update_every:
+            return
+        stream = Stream.SPARSITY + state.rank
+        uniform = counted_uniform(state.seed, state.step, stream, (SPARSE_POINTS, 5), device)
+        points, times = self.grid.occupied_points(uniform.float())
+        if not len(points):
+            return
+        with torch.enable_grad():
+            density = field(points, times)[1]
+            opacity = -torch.expm1(-self._training.step * density)
+            loss = settings.sparsity * settings.update_every * opacity.mean()
+        parameters = [p for p in field.parameters() if p.requires_grad]
+        gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            if gradient is None:
+                continue
+            if distributed.is_available() and distributed.is_initialized():
+                distributed.all_reduce(gradient)  # Each process has points of its own.
+                gradient /= distributed.get_world_size()
+            if parameter.grad is None:
+                parameter.grad = gradient
+            else:
+                parameter.grad += gradient
+
+    @property
+    def device(self) -> torch.device:
+        """Where the grid is."""
+        return self.grid.density.device
 
     def update(self, field: Any, state: TrainingState) -> None:
         step, settings = state.step, self.settings

@@ -197,6 +197,27 @@ class OccupancyGrid(nn.Module):
         points, times = self.draw(cells, uniform[:, 4:].float())
         self.observe(cells, field(points, times)[1], looked_at)
 
+    def occupied_points(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
+        """Points and times in random occupied cells, by numbers from 0 to 1; none if all are empty.
+
+        Off the CPU nothing waits for the number of these cells.
+
+        Args:
+            uniform: The cell, the place in it along each axis, and the time. [N, 5]
+
+        Returns:
+            [N, 3], [N]
+        """
+        if uniform.device.type == "cpu":
+            cells = self.occupied.nonzero()[:, 0]
+            if len(cells):
+                cells = cells[(uniform[:, 0] * len(cells)).long().clamp_(max=len(cells) - 1)]
+            return self.draw(cells, uniform[: len(cells), 1:])
+        running = self.occupied.cumsum(0)
+        number = (uniform[:, 0] * running[-1]).long() + 1
+        cells = torch.searchsorted(running, number).clamp_max_(self.density.numel() - 1)
+        return self.draw(cells, uniform[:, 1:])
+
     def _near_occupied(self, count: int, generator: torch.Generator) -> Tensor:
         """Random cells of the same time within one step of an occupied one, along each axis."""
         device = self.density.device

@@ -387,7 +387,7 @@ class ProposalSampler(Sampler):
             return {}
         return {"histogram": self.settings.histogram * histogram_loss(rendering.levels)}
 
-    def regularise(self) -> None:
+    def regularise(self, field: Any, state: TrainingState) -> None:
         for proposal in self._renderer.proposals:
             assert isinstance(proposal, DensityField)
             self.terms.add_gradients(proposal.products)

@@ -140,8 +140,13 @@ class Sampler(ABC):
         """Weighted loss terms of the sampler, by name. [] each"""
         return {}
 
-    def regularise(self) -> None:
-        """Add the gradients of loss terms that need no rays to the sampler's parameters."""
+    def regularise(self, field: Any, state: TrainingState) -> None:
+        """Add the gradients of loss terms that need no rays to parameters, once an update.
+
+        Args:
+            field: The field.
+            state: Seed and progress of training.
+        """
         return
 
     def observe(self, rendering: Any) -> None:

@@ -248,7 +248,7 @@ def rehearse(module: RadianceModule, rays: Batch) -> None:
     torch.stack(list(terms.values())).sum().backward()
     sampler.observe(rendering)
     model.regularise(state)
-    sampler.regularise()
+    sampler.regularise(model.field, state)
     optimizer.step()
     sampler.update(model.field, state)
 

@@ -316,7 +316,7 @@ class RadianceModule(ViewScoring):
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         state = self.state
         self.model.regularise(state)
-        self.sampler.regularise()
+        self.sampler.regularise(self.field, state)
         broken = broken_flag(self.parameters(), self._losses)
         self._losses = []
         if self.trainer.world_size > 1:

@@ -275,6 +275,7 @@ def test_a_masked_field_is_the_field_where_it_is_kept():
     assert torch.equal(masked(points, times)[0], colour)
     assert torch.equal(masked(points, times)[1], torch.where(kept, density, 0))
     assert masked.outline == "balls"
+    assert torch.equal(masked.snapshot(0.0)(points, times)[1], masked(points, times)[1])
     assert (density > 0).sum() > (density[kept] > 0).sum() > 0
 
 

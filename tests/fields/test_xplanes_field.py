@@ -127,6 +127,31 @@ def test_the_time_planes_may_have_another_resolution_than_space():
     assert field(*scattered(5))[1].isfinite().all()
 
 
+@pytest.mark.parametrize("plane_set", SETS)
+@pytest.mark.parametrize("time_rows", [1, 3])
+def test_a_snapshot_shows_the_field_at_its_time(plane_set, time_rows):
+    field = field_of(plane_set, torch.float64, time_resolution=time_rows)
+    points, _ = scattered(300, torch.float64)
+    points = 1.3 * points  # Beyond the cube the planes fade to zero.
+    for time in (0.0, 0.25, 0.6, 1.0, 1.5):
+        still = field.snapshot(time)
+        assert not still.moves
+        times = torch.full((300,), time, dtype=torch.float64)
+        for found, expected in zip(still(points, 1 - times), field(points, times), strict=True):
+            torch.testing.assert_close(found, expected, atol=1e-12, rtol=1e-12)
+
+
+def test_a_snapshot_is_the_field_itself_where_it_would_show_something_else():
+    class Other(XPlanes):
+        pass
+
+    planes = planes_of("six")
+    other = Other(planes=planes, decoder=Decoder(4), plane_set="six")
+    finer = {**planes, **{name: torch.randn(4, 9, 11) for name in TIME_PLANES["six"]}}
+    for field in (other, XPlanes(planes=finer, decoder=Decoder(4), plane_set="six")):
+        assert field.snapshot(0.3) is field
+
+
 def test_planes_that_do_not_fit_are_refused_with_a_message():
     for change, words in [
         ({"yz": None}, "needs xy, xz, yz, xt, yt, zt"),

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from xplanes.config import compose_plain
+from xplanes.rendering import front_to_back
 from xplanes.rendering.grid_renderer import (
     DIAGONAL,
     GridRenderer,
@@ -196,12 +197,85 @@ def test_an_image_does_not_depend_on_its_chunks():
 
     whole = renderer.image(field, origins, directions, 0.3, WHITE.float())
     parts = renderer.image(field, origins, directions, 0.3, WHITE.float(), chunk=7)
-    times = torch.full((100,), 0.3)
-    same = renderer.render(field, origins, directions, times, WHITE.float())
     for name, value in whole.items():
         assert torch.equal(value, parts[name]), name
-        assert torch.equal(value, getattr(same, name)), name
         assert not value.requires_grad
+
+
+def clouds(points, times):
+    """From air to what stops all light within a few samples."""
+    return points.abs(), (40 * points.prod(dim=-1)).exp()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_image_is_what_training_renders_but_for_what_surfaces_hide(dtype):
+    origins, directions, _ = rays_of(200, dtype)
+    times, white = torch.full((200,), 0.3, dtype=dtype), WHITE.to(dtype)
+    for occlusion, allowed in ((0.0, 1e-5), (1e-3, 1e-3), (0.1, 0.1)):
+        renderer = renderer_of(128, occlusion=occlusion)
+        whole = renderer.render(clouds, origins, directions, times, white)
+        image = renderer.image(clouds, origins, directions, 0.3, white)
+        for name in ("colour", "opacity"):
+            apart = (image[name] - getattr(whole, name)).abs()
+            assert (apart <= allowed).all(), (name, occlusion)
+        assert image["colour"].dtype == dtype
+
+
+def test_an_image_does_not_depend_on_how_many_samples_are_taken_at_a_time(monkeypatch):
+    rays = rays_of(50, torch.float32)[:2]
+    for renderer in (renderer_of(128), renderer_of(128, occlusion=0.0)):
+        expected = renderer.image(clouds, *rays, 0.3, WHITE.float())
+        for samples in (1, 130):
+            monkeypatch.setattr(front_to_back, "AT_ONCE", samples)
+            image = renderer.image(clouds, *rays, 0.3, WHITE.float())
+            for name, value in image.items():
+                assert torch.equal(value, expected[name]), (name, samples)
+
+
+def test_an_image_does_not_ask_for_what_surfaces_hide(monkeypatch):
+    monkeypatch.setattr(front_to_back, "AT_ONCE", 64)
+    asked = []
+
+    def wall(points, times):
+        asked.append(len(points))
+        return points.abs(), torch.where(points[:, 2] < 0, 1e4, 0.0)
+
+    origins = torch.zeros(64, 3).index_fill_(1, torch.tensor(2), 3)
+    directions = torch.tensor([0.0, 0, -1]).expand(64, 3)
+    for occlusion, share in ((1e-3, 0.5), (0.0, 1.0)):
+        asked.clear()
+        renderer = renderer_of(1024, occlusion=occlusion)
+        renderer.image(wall, origins, directions, 0.0, WHITE.float())
+        along = 64 * 2 / renderer.step
+        assert sum(asked) == pytest.approx(share * along, rel=0.01)
+
+
+def test_images_of_fields_in_low_precision_and_with_a_nan():
+    origins, directions, _ = diagonal_rays(torch.float32)
+
+    def half(points, times):
+        bad = (points * directions[1]).sum(dim=-1).abs() > 1.5
+        density = torch.where(bad, math.nan, 2.0)
+        return points.abs().bfloat16(), density.bfloat16()
+
+    image = renderer_of().image(half, origins, directions, 0.0, WHITE.float())
+    assert image["colour"].dtype == torch.float32
+    assert image["opacity"].isnan().tolist() == [False, True, False, False]
+    assert image["opacity"][0] == pytest.approx(1 - math.exp(-2 * DIAGONAL), abs=1e-3)
+
+
+def test_an_image_takes_a_snapshot_of_the_field_at_its_time():
+    taken = []
+
+    class Clock:
+        def snapshot(self, time):
+            taken.append(time)
+            return fog(9.0)
+
+    origins, directions, _ = rays_of(20, torch.float32)
+    image = renderer_of().image(Clock(), origins, directions, 0.3, WHITE.float(), chunk=7)
+    assert taken == [0.3]
+    assert (image["opacity"] > 0).any()
 
 
 def test_an_image_without_rays_is_empty():

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from xplanes.fields.gaussians import PosedGaussians
 from xplanes.rendering.base import RayRenderer, Renderer
+from xplanes.rendering.box import snapshot
 from xplanes.rendering.grid_renderer import GridRenderer
 from xplanes.rendering.pictures import depth_picture
 from xplanes.scenes.frame import Frame
@@ -112,6 +113,10 @@ class Masked:
         distance, *others = self._field.distance_and_slope(points, times)
         return torch.where(self._keep(points), distance, OUTSIDE), *others
 
+    def snapshot(self, time: float) -> "Masked":
+        """As `RadianceField.snapshot`."""
+        return Masked(snapshot(self._field, time), self._keep)
+
     def at(self, time: float) -> PosedGaussians:
         """As `Gaussians.at`; a Gaussian is where its mean is."""
         posed = self._field.at(time)
@@ -145,6 +150,7 @@ def draw(
         The picture on the CPU; None once ``stop`` says so.
     """
     device, box = renderer.device, shot.box
+    field = snapshot(field, shot.time)
     background = background.to(device)
     shown, solid = field, renderer
     if box is not None or shot.mode == "floaters":

@@ -57,6 +57,17 @@ class RadianceField(Representation):
 
     view_dependent = False
 
+    def snapshot(self, time: float) -> "RadianceField":
+        """The field at one time, for images; this field itself where that saves nothing.
+
+        Args:
+            time: From 0 to 1.
+
+        Returns:
+            A field that takes the same arguments and ignores the times, without gradients.
+        """
+        return self
+
 
 class ViewDependentField(RadianceField):
     """A field in two stages, so that samples can be dropped before their colour is computed."""

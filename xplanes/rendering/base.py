@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from xplanes.rendering.box import snapshot
 from xplanes.rendering.marching import Samples
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import PosedCamera
@@ -111,6 +112,16 @@ class RayRenderer(Renderer):
             One value per ray; gradients reach the field.
         """
 
+    def pixels(
+        self, field: Any, origins: Tensor, directions: Tensor, times: Tensor, background: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Colour, opacity and depth of rays without gradients. [R, 3], [R], [R]
+
+        A renderer overrides this where an image can be had for less than what training needs.
+        """
+        seen = self.render(field, origins, directions, times, background)
+        return seen.colour, seen.opacity, seen.depth
+
     @torch.no_grad()
     def image(
         self,
@@ -127,12 +138,11 @@ class RayRenderer(Renderer):
         Returns:
             ``colour`` [R, 3], ``opacity`` [R] and ``depth`` [R], on the rays' device.
         """
-        parts = []
+        field, parts = snapshot(field, time), []
         chunk = chunk or self.rays_at_once * (1 if self.device.type == "cpu" else 2)
         for start in range(0, max(len(origins), 1), chunk):
             rays = origins[start : start + chunk], directions[start : start + chunk]
             times = torch.full_like(rays[0][:, 0], time)
-            part = self.render(field, *rays, times, background)
-            parts.append((part.colour, part.opacity, part.depth))
+            parts.append(self.pixels(field, *rays, times, background))
         colour, opacity, depth = (torch.cat(part) for part in zip(*parts, strict=True))
         return {"colour": colour, "opacity": opacity, "depth": depth}

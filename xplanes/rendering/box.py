@@ -33,6 +33,12 @@ def ray_box(origins: Tensor, directions: Tensor, half: float = 1.0) -> tuple[Ten
     return torch.where(hit, near, 0), torch.where(hit, far, 0)
 
 
+def snapshot(field: Any, time: float) -> Any:
+    """A field for one time alone: its own `RadianceField.snapshot` if it has one, else itself."""
+    taken = getattr(field, "snapshot", None)
+    return field if taken is None else taken(time)
+
+
 def shade(
     field: Any, points: Tensor, times: Tensor, directions: Tensor, ray: Tensor
 ) -> tuple[Tensor, Tensor]:

@@ -125,6 +125,44 @@ def composite(optical_depth, colour, distances, starts, opaque, weights, total):
         total[r, 3], total[r, 4] = opacity, far
 
 
+@njit(parallel=True, **EXACT)
+def take_samples(rays, first, starts, points, distances, taken):
+    """Lay the next samples of some rays side by side."""
+    ray_taken, points_taken, distances_taken = taken
+    for i in prange(len(rays)):
+        end = starts[i + 1] if i + 1 < len(rays) else len(ray_taken)
+        for n in range(starts[i], end):
+            source = first[rays[i]] + n - starts[i]
+            ray_taken[n], distances_taken[n] = rays[i], distances[source]
+            for axis in range(3):
+                points_taken[n, axis] = points[source, axis]
+
+
+@njit(parallel=True, **COMPILE)
+def composite_on(optical_depth, colour, distances, rays, starts, opaque, limit, before, total):
+    """Go on with `composite` on rays that stopped on the way, as far as a limit of depth."""
+    for i in prange(len(rays)):
+        r = rays[i]
+        end = starts[i + 1] if i + 1 < len(rays) else len(optical_depth)
+        passed, opacity, far = before[r], total[r, 3], total[r, 4]
+        red, green, blue = total[r, 0], total[r, 1], total[r, 2]
+        for n in range(starts[i], end):
+            if passed >= limit:
+                break
+            depth = max(min(np.float64(optical_depth[n]), opaque), 0.0)
+            if np.isnan(optical_depth[n]):
+                depth = np.nan
+            weight = np.exp(-passed) * -np.expm1(-depth)
+            passed += depth
+            red += weight * colour[n, 0]
+            green += weight * colour[n, 1]
+            blue += weight * colour[n, 2]
+            far += weight * distances[n]
+            opacity += weight
+        before[r], total[r, 3], total[r, 4] = passed, opacity, far
+        total[r, 0], total[r, 1], total[r, 2] = red, green, blue
+
+
 @njit(parallel=True, **COMPILE)
 def composite_backward(
     optical_depth, colour, distances, starts, opaque, weights, gradient, d_depth, d_colour

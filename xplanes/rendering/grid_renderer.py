@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, distributed, nn
 
-from xplanes.backend import warm_up
+from xplanes.backend import cpu_loops, warm_up
 from xplanes.errors import ConfigError
 from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
@@ -17,6 +17,7 @@ from xplanes.rendering.box import Field, shade
 from xplanes.rendering.carving import carve
 from xplanes.rendering.compositing import composite
 from xplanes.rendering.filling import fill
+from xplanes.rendering.front_to_back import front_to_back
 from xplanes.rendering.marching import march
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
@@ -46,7 +47,8 @@ class GridRenderer(RayRenderer):
         grid: Which cells hold something, and when.
         samples: Steps along the diagonal of the field's cube.
         skip_empty: Skip samples in empty cells.
-        occlusion: Skip samples behind surfaces that leave less light than this; 0 skips none.
+        occlusion: Skip samples behind surfaces that leave less light than this; 0 skips none. The
+            grid tells; in images on the CPU the field itself does.
         room: Places for samples where nothing may wait for their number, see `march`.
     """
 
@@ -109,18 +111,40 @@ class GridRenderer(RayRenderer):
             samples.starts,
             samples.number,
         )
-        opacity = total[:, 3]
-        background = behind(field, origins, directions, opacity, background, jitter)
+        background = behind(field, origins, directions, total[:, 3], background, jitter)
         if samples.shown is not None:
             # A ray without room sees nothing but the background, which must not learn from it.
             background = torch.where(samples.shown[:, None], background, background.detach())
-        return Rendering(
-            colour=total[:, :3] + (1 - opacity)[:, None] * background,
-            opacity=opacity,
-            depth=(total[:, 4] / opacity.clamp_min(1e-6)).detach(),
-            density=density.detach(),
-            samples=samples,
+        colour, opacity, depth = _pixels(total, background)
+        return Rendering(colour, opacity, depth.detach(), density.detach(), samples)
+
+    def pixels(
+        self, field: Any, origins: Tensor, directions: Tensor, times: Tensor, background: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """As `render`, without gradients; on the CPU front to back, until rays are opaque."""
+        if not cpu_loops(origins):
+            return super().pixels(field, origins, directions, times, background)
+        samples = march(
+            origins,
+            directions,
+            times,
+            torch.full_like(times, 0.5),
+            self.grid,
+            step=self.step,
+            skip_empty=self.skip_empty,
         )
+        total = front_to_back(
+            field, samples, times, directions, step=self.step, occlusion=self.occlusion
+        )
+        background = behind(field, origins, directions, total[:, 3], background)
+        return _pixels(total, background)
+
+
+def _pixels(total: Tensor, background: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Colour, opacity and depth from a ray's sums and what is behind it. [R, 5], [R, 3]"""
+    opacity = total[:, 3]
+    colour = total[:, :3] + (1 - opacity)[:, None] * background
+    return colour, opacity, total[:, 4] / opacity.clamp_min(1e-6)
 
 
 Fraction = Annotated[float, Range(0, 1, open=True)]

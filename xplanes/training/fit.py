@@ -236,6 +236,9 @@ def warm_up(module: RadianceModule, data: SceneDataModule, device: torch.device)
         rendering = module.sampler.render(module.field, rays, module.state)
         rendering.colour.sum().backward()
         module.zero_grad(set_to_none=True)
+        if isinstance(module.renderer, RayRenderer):
+            ends = rays["origins"], rays["directions"]
+            module.renderer.image(module.field, *ends, 0.0, data.scene.background)
 
 
 def rehearse(module: RadianceModule, rays: Batch) -> None:

@@ -237,7 +237,7 @@ def test_first_points_lie_on_what_a_field_shows(tmp_path, monkeypatch):
     places = frame.to_world(field.means.detach())
     centres = torch.stack([path(time) for time in field.centres.tolist()])
     error = ((places - centres).norm(dim=1) - radius).abs()
-    assert error.median() < 0.1
+    assert error.median() < 0.12
     assert torch.corrcoef(torch.stack([places[:, 0], centres[:, 0]]))[0, 1] > 0.5
     assert len(places.unique(dim=0)) == 300
     colours = field.base.detach()[:, 0] * 0.28209479177387814 + 0.5

@@ -86,7 +86,11 @@ def test_kplanes_regularises_its_planes_and_those_of_the_density_fields(tmp_path
     assert len(proposals) == 2
     for proposal in proposals:
         module.zero_grad()
-        check_planes(proposal.products, (0.5, 0.1, 0.4), module.sampler.regularise)
+        check_planes(
+            proposal.products,
+            (0.5, 0.1, 0.4),
+            lambda: module.sampler.regularise(module.field, FIRST),
+        )
 
 
 def test_density_fields_learn_by_the_weighted_histogram_term(tmp_path):

@@ -331,7 +331,7 @@ def test_a_final_evaluation_that_was_interrupted_is_made_up_for(
         )
         assert ours["global_step"] == theirs["global_step"], name
         for key, value in theirs["state_dict"].items():
-            assert torch.equal(ours["state_dict"][key], value), (name, key)
+            torch.testing.assert_close(ours["state_dict"][key], value, msg=f"{name}, {key}")
 
 
 def test_an_evaluation_waits_for_the_update_of_its_batches(

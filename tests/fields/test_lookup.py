@@ -1,8 +1,10 @@
 """Plane lookup: compiled loops, readable twin and NumPy oracle come to the same numbers."""
 
 import itertools
+import os
+import subprocess
+import sys
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.oracles import plane_features as oracle
+from xplanes.fields import cpu
 from xplanes.fields.lookup import plane_features, plane_features_reference, time_plane_axes
 from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES
 
@@ -284,21 +287,44 @@ def test_half_precision_planes_take_the_torch_path():
     torch.testing.assert_close(value.float(), full, atol=0.4, rtol=0.1)
 
 
-def test_results_are_bit_identical_for_any_number_of_threads():
-    space, time = stacks("nine", torch.float32, size=16, channels=8)
+MANY_THREADS = """
+import torch
+from tests.fields.test_lookup import both, scattered, stacks
+from xplanes.backend import threads
+from xplanes.fields import cpu
+
+shared = set()
+for plane_set in ("three", "six", "nine"):
+    space, time = stacks(plane_set, torch.float32, size=16, time_rows=5, channels=8)
     points, times = scattered(5000, torch.float32)
-    usual = both("nine", space, time, points, times)[0]
-    for threads in [1, 2]:
-        before, torch_before = numba.get_num_threads(), torch.get_num_threads()
-        try:
-            numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-            torch.set_num_threads(threads)
-            again = both("nine", space, time, points, times)[0]
-        finally:
-            numba.set_num_threads(before)
-            torch.set_num_threads(torch_before)
-        for a, b in zip(usual, again, strict=True):
-            assert torch.equal(a, b), threads
+    found = {}
+    for count in (1, 2, 4, 8):
+        with threads(count):
+            found[count], _ = both(plane_set, space, time, points, times)
+            shared |= {cpu.tasks_a_plane(3), cpu.tasks_a_plane(6)}
+    for count, values in found.items():
+        assert all(map(torch.equal, values, found[1])), (plane_set, count)
+print(sorted(shared))
+"""
+
+
+def test_results_are_bit_identical_for_any_number_of_threads():
+    """Fewer threads than planes, and more, which share the rows of a plane."""
+    environment = os.environ | {"NUMBA_NUM_THREADS": "8"}
+    call = [sys.executable, "-c", MANY_THREADS]
+    done = subprocess.run(call, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[1, 2, 4]"
+
+
+@pytest.mark.parametrize("tasks", [1, 2, 4, 32])
+def test_tasks_that_share_a_plane_add_up_all_of_it(monkeypatch, tasks):
+    monkeypatch.setattr(cpu, "tasks_a_plane", lambda planes: tasks)
+    for plane_set in SETS:
+        space, time = stacks(plane_set, time_rows=5)
+        loops, twin = both(plane_set, space, time, *scattered(300))
+        for a, b in zip(loops, twin, strict=True):
+            torch.testing.assert_close(a, b, atol=1e-12, rtol=1e-10)
 
 
 def test_axes_of_time_planes_are_those_of_their_names():

@@ -127,12 +127,14 @@ class _Features(torch.autograd.Function):
         space = time = None
         if ctx.needs_input_grad[0]:
             space = gradient.new_zeros(ctx.shapes[0])
-            cpu.scatter_space(*_arrays(points, gradient, space))
+            tasks = cpu.tasks_a_plane(len(space))
+            cpu.scatter_space(*_arrays(points, gradient), tasks, *_arrays(space))
         if ctx.needs_input_grad[1]:
             time = gradient.new_zeros(ctx.shapes[1])
             spread = torch.empty_like(factors)
             cpu.product_gradients(*_arrays(pairs, gradient, factors, spread))
-            cpu.scatter_time(*_arrays(points, times, axes, spread, time))
+            tasks = cpu.tasks_a_plane(len(time))
+            cpu.scatter_time(*_arrays(points, times, axes, spread), tasks, *_arrays(time))
         return space, time, None, None, None
 
 

@@ -301,15 +301,15 @@ def test_background_and_near_rays_are_shares_of_what_is_no_padding():
     views = mixed(6)
     frame = cube_frame(1.4, torch.zeros(3))
     batches = RayBatches(views, frame, RAYS, seed=0)
-    assert len(batches.near) + len(batches.far) == views.pixels
+    assert batches.near_pixels + batches.far_pixels == views.pixels
     alone = [RayBatches(views.subset(torch.tensor([i])), frame, RAYS, seed=0) for i in range(6)]
-    for pool in ("near", "far"):
-        count = sum(len(getattr(one, pool)) for one in alone)
-        assert len(getattr(batches, pool)) == count, pool
-    natural = len(batches.far) / views.pixels
+    for pixels in ("near_pixels", "far_pixels"):
+        count = sum(getattr(one, pixels) for one in alone)
+        assert getattr(batches, pixels) == count, pixels
+    natural = batches.far_pixels / views.pixels
     assert batches.skipped == pytest.approx(natural - 0.1)
     # Images of nothing but padding and content have no background.
-    assert len(RayBatches(opaque(views), frame, RAYS, seed=0).far) == 0
+    assert RayBatches(opaque(views), frame, RAYS, seed=0).far_pixels == 0
 
 
 # What is seen in them

@@ -205,7 +205,7 @@ def test_fisheye_corners_have_no_rays_and_are_left_out():
     assert directions.isfinite().all()
     assert directions.norm(dim=1).sub(1).abs().max() < 1e-5
     batches = RayBatches(views, cube_frame(1.0, torch.zeros(3)), UNIFORM, seed=0)
-    assert len(batches.near) + len(batches.far) == int(views.valid().sum())
+    assert batches.near_pixels + batches.far_pixels == int(views.valid().sum())
     assert (batches.draw(0)["alpha"] == 1).all()
 
 

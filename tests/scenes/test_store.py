@@ -24,7 +24,7 @@ from xplanes.scenes.frame import cube_frame, scene_frame
 from xplanes.scenes.images import final_sizes, native_sizes
 from xplanes.scenes.images import read_images as read_sized
 from xplanes.scenes.lenses import Lenses, LensModel
-from xplanes.scenes.silhouettes import may_hold, plain
+from xplanes.scenes.silhouettes import foreground, may_hold, plain
 from xplanes.scenes.store import TILE, StoredImages, TileFile
 from xplanes.scenes.views import Views, joined
 from xplanes.streams import step_generator
@@ -130,8 +130,8 @@ def test_pixels_are_drawn_from_their_cells_alone() -> None:
     batches = RayBatches(stored(views), FRAME, settings, seed=0)
     exact = RayBatches(views, FRAME, settings, seed=0)
     # The margin of 8 pixels is rounded up to a cell, and so are the silhouettes.
-    assert len(exact.near) < len(batches.near) < 1.6 * len(exact.near)
-    shown = float((views.images[..., 3] > 0).sum()) / len(batches.near)
+    assert exact.near_pixels < batches.near_pixels < 1.6 * exact.near_pixels
+    shown = float((views.images[..., 3] > 0).sum()) / batches.near_pixels
     lit = sum(float((batches.draw(step)["alpha"] > 0).float().mean()) for step in range(20)) / 20
     assert lit == pytest.approx(shown, rel=0.1)
 
@@ -235,7 +235,7 @@ def test_no_pixel_is_drawn_that_a_fisheye_lens_leaves_dark() -> None:
     views = replace(views, images=tiles, intrinsics=intrinsics)
     assert views.is_opaque
     batches = RayBatches(views, FRAME, replace(RAYS, per_batch=4000), seed=0)
-    assert len(batches.near) + len(batches.far) == 2 * int(shown.sum())
+    assert batches.near_pixels + batches.far_pixels == 2 * int(shown.sum())
     drawn = torch.zeros(150, 150)
     for step in range(60):
         batch = batches.draw(step)
@@ -257,8 +257,8 @@ def test_tiles_far_from_silhouettes_get_the_asked_share() -> None:
             RAYS, skip_background=True, background_share=share, background_jitter=0.2
         )
         batches = RayBatches(views, FRAME, settings, seed=0)
-        assert len(batches.near) + len(batches.far) == views.pixels
-        natural = len(batches.far) / views.pixels
+        assert batches.near_pixels + batches.far_pixels == views.pixels
+        natural = batches.far_pixels / views.pixels
         assert batches.skipped == pytest.approx(natural - share)
         moved = lit = 0.0
         for step in range(30):
@@ -325,9 +325,10 @@ def test_draws_from_memory_are_those_of_scattered_pixels() -> None:
         uniform = torch.rand(
             1000, 3, generator=step_generator(7, 11, 2), dtype=torch.float64
         ).numpy()
-        far, near = batches.far.pixels.numpy(), batches.near.pixels.numpy()
-        count = int(plain(views, [1] * 5).sum()) if skip else 0
-        even, rest = near[:count] if count else near, near[count:]
+        near = foreground(views, [1] * 5).numpy().ravel()
+        even = plain(views, [1] * 5).numpy().ravel() & near & skip
+        far, even, rest = (np.flatnonzero(kind) for kind in (~near, even, near & ~even))
+        even = even if len(even) else rest  # Whose share is 0 then.
         ends = np.cumsum([batches.far_share, batches.plain_share])
         pixel = np.select(
             [uniform[:, 0] < ends[0], uniform[:, 0] < ends[1]],

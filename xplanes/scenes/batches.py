@@ -10,7 +10,7 @@ from torch import Tensor
 from xplanes.backend import memory_left
 from xplanes.scenes.changes import changing
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.pools import PixelPool, PixelPools, in_cells, tile_pools
+from xplanes.scenes.pools import PixelPools, TilePool, in_cells, pixels_of, tile_pools
 from xplanes.scenes.silhouettes import foreground, plain
 from xplanes.scenes.store import CELL, TILE, StoredImages, unpacked
 from xplanes.scenes.views import Views
@@ -237,34 +237,34 @@ class RayBatches(Batches):
         widths = views.intrinsics.size[:, 1].tolist()
         margins = [max(1, round(NEAR_SILHOUETTE * width)) for width in widths]
         changes = None
-        plain_pixels = 0
+        self.pools: PixelPools | None = None
+        self.tiles: tuple[TilePool, TilePool] | None = None
         if isinstance(views.images, StoredImages):
-            self.near, self.far = tile_pools(views, views.images, margins)
+            near, far = self.tiles = tile_pools(views, views.images, margins)
+            self.far_pixels, plain_pixels, others = len(far), 0, len(near)
         else:
             if settings.skip_background and views.is_opaque:
                 changes = changing(views, margins)  # Large captures are drawn from evenly.
-            near = foreground(views, margins) if changes is None else changes
-            far = ~near
-            if views.is_cut:
-                valid = views.valid()
-                near, far = near & valid, far & valid
-            self.near, self.far = (PixelPool(pool) for pool in (near, far))
-            if settings.skip_background and changes is None:
-                plain_pixels = self.near.put_first(plain(views, margins))
+            skips_plain = settings.skip_background and changes is None
+            self.pools = PixelPools(
+                foreground(views, margins) if changes is None else changes,
+                plain(views, margins) if skips_plain else None,
+                views.valid() if views.is_cut else None,
+            )
+            self.far_pixels, plain_pixels, others = self.pools.sizes
         self._prefetched = -1
-        pixels = len(self.near) + len(self.far)
-        natural, plain_natural = len(self.far) / pixels, plain_pixels / pixels
-        skip = settings.skip_background and len(self.near) > 0
+        self.near_pixels = plain_pixels + others
+        pixels = self.near_pixels + self.far_pixels
+        natural, plain_natural = self.far_pixels / pixels, plain_pixels / pixels
+        skip = settings.skip_background and self.near_pixels > 0
         share = settings.background_share if changes is None else STILL_SHARE
         self.far_share = min(share, natural) if skip else natural
         self.plain_share = min(PLAIN_SHARE, plain_natural) if skip else plain_natural
         jitter = skip and natural > 0 and not views.is_static and changes is None
         self.background_jitter = settings.background_jitter if jitter else 0.0
         self.skipped = natural + plain_natural - self.far_share - self.plain_share
-        self.pools = None
-        if isinstance(self.near, PixelPool) and isinstance(self.far, PixelPool):
-            shares = (self.far_share, self.plain_share)
-            self.pools = PixelPools(self.far, self.near, plain_pixels, shares)
+        if self.pools is not None:
+            self.pools.share(self.far_share, self.plain_share)
 
     def draw(self, step: int, rays: int | None = None) -> Batch:
         """The batch of a step.
@@ -318,10 +318,11 @@ class RayBatches(Batches):
 
     def _choose(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Which choices are far from silhouettes, and the place of each. [K, 3] -> [K], [K, 2]"""
-        far = uniform[:, 0] < self.far_share
-        if not (len(self.near) and len(self.far)):
-            return far, (self.near if len(self.near) else self.far).pick(uniform[:, 1])
-        near_place, far_place = self.near.pick(uniform[:, 1]), self.far.pick(uniform[:, 1])
+        assert self.tiles is not None
+        far, (near_tiles, far_tiles) = uniform[:, 0] < self.far_share, self.tiles
+        if not (len(near_tiles) and len(far_tiles)):
+            return far, (near_tiles if len(near_tiles) else far_tiles).pick(uniform[:, 1])
+        near_place, far_place = near_tiles.pick(uniform[:, 1]), far_tiles.pick(uniform[:, 1])
         return far, torch.where(far[:, None], far_place, near_place)
 
     def _from_memory(self, images: Tensor, uniform: Tensor) -> tuple[Tensor, ...]:
@@ -372,7 +373,7 @@ class RayBatches(Batches):
             if shown is not None:
                 shown = shown[row : row + TILE, column : column + TILE]
                 chosen[: shown.shape[0], : shown.shape[1]] = shown
-            found.append(PixelPool(chosen & tile).pick(uniform)[:, 0])
+            found.append(pixels_of(chosen & tile, uniform))
         pixel = torch.stack(found)
         return pixel // TILE, pixel % TILE
 

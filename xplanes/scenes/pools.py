@@ -1,6 +1,7 @@
 """Pixels that rays are drawn through: those near silhouettes and far from them."""
 
 import copy
+import itertools
 
 import torch
 import torch.nn.functional as F
@@ -9,76 +10,66 @@ from torch import Tensor
 from xplanes.scenes.store import CELL, TILE, StoredImages, by_tile, count_in_squares, packed
 from xplanes.scenes.views import Views
 
+FAR, OTHER, PLAIN, NOTHING = range(4)
+"""Kinds of pixels, as numbers."""
 
-class PixelPool:
-    """Pixels to draw from.
+ORDER = (FAR, PLAIN, OTHER)
+"""Kinds as they are listed."""
 
-    Args:
-        chosen: Which pixels of some images or of a tile. bool, of any shape
-    """
-
-    def __init__(self, chosen: Tensor) -> None:
-        self.count = int(chosen.sum())
-        self.pixels = None
-        """Their numbers; None where all are chosen, which takes no memory."""
-        if self.count < chosen.numel():
-            kind = torch.int32 if chosen.numel() < 2**31 else torch.int64
-            self.pixels = chosen.flatten().nonzero()[:, 0].to(kind)
-
-    def __len__(self) -> int:
-        return self.count
-
-    def put_first(self, some: Tensor) -> int:
-        """Reorder: some of the images' pixels first. Says how many; none if there are no others."""
-        if not self.count or not some.any():
-            return 0
-        pixels = (
-            torch.arange(some.numel(), dtype=torch.int32) if self.pixels is None else self.pixels
-        )
-        first = some.flatten()[pixels]
-        found = int(first.sum())
-        if not 0 < found < self.count:
-            return 0
-        self.pixels = torch.cat([pixels[first], pixels[~first]])
-        return found
-
-    def pick(self, uniform: Tensor) -> Tensor:
-        """Pixels at places given by numbers from 0 to 1. [K] -> [K, 1]"""
-        place = (uniform * len(self)).long().clamp_(max=len(self) - 1)[:, None]
-        return place if self.pixels is None else self.pixels[place].long()
+BLOCK = 2**16
+"""Pixels that the same 16 bits tell apart."""
 
 
 class PixelPools:
     """Pixels of three kinds, each of which has a share of its own: far, plain and all others.
 
+    Pixels are listed kind by kind, by the lower 16 bits of their numbers: whole numbers would take
+    as much memory as the images.
+
     Args:
-        far: Those far from silhouettes.
-        near: All others, the plain ones first.
-        plain: How many of these are plain.
-        shares: Of far and of plain pixels.
+        near: Pixels near silhouettes; all others are far. Overwritten. bool [V, H, W]
+        plain: Which pixels have one colour with all around them; None for none. bool [V, H, W]
+        valid: Which pixels show something; None for all. bool [V, H, W]
+
+    Attributes:
+        sizes: Numbers of far, plain and other pixels; none are plain where no others would be left.
     """
 
     def __init__(
-        self, far: PixelPool, near: PixelPool, plain: int, shares: tuple[float, float]
+        self, near: Tensor, plain: Tensor | None = None, valid: Tensor | None = None
     ) -> None:
-        self.order = None
-        """Numbers of all pixels, kind by kind; None where they are of one kind, in order."""
-        if far.pixels is not None and near.pixels is not None:
-            self.order = torch.cat([far.pixels, near.pixels])
-            # No second copy: they are millions.
-            far.pixels, near.pixels = self.order[: len(far)], self.order[len(far) :]
-        elif near.pixels is not None or far.pixels is not None:
-            self.order = near.pixels if len(near) else far.pixels
-        counts = torch.tensor([len(far), plain, len(near) - plain], dtype=torch.float64)
-        self.counts, self.starts = counts, counts.cumsum(dim=0) - counts
-        self.bounds = torch.tensor(shares, dtype=torch.float64).cumsum(dim=0)
-        self.most = len(far) + len(near) - 1
+        kinds = near.view(torch.uint8)
+        if plain is not None and (near & ~plain).any():
+            kinds.add_(near & plain)
+        if valid is not None:
+            kinds.masked_fill_(~valid, NOTHING)
+        blocks = kinds.flatten().split(BLOCK)
+        counts = torch.tensor([[int((part == kind).sum()) for part in blocks] for kind in ORDER])
+        sizes = counts.sum(dim=1)
+        self.sizes: tuple[int, ...] = tuple(sizes.tolist())
+        self.total = sum(self.sizes)
+        self.counts = sizes.double()
+        self.starts = self.counts.cumsum(dim=0) - self.counts
+        self.bounds = torch.zeros(2, dtype=torch.float64)
+        self.before = F.pad(counts.flatten().cumsum(dim=0), (1, 0))
+        """Listed pixels before those of each kind and block, kind by kind. int64 [3 B + 1]"""
+        self.listed = None
+        """Lower bits of all pixels' numbers; None where all are of one kind. int16 [N]"""
+        if max(self.sizes) < near.numel():
+            self.listed = torch.empty(self.total, dtype=torch.int16)
+            places = iter(self.listed.split(counts.flatten().tolist()))
+            for kind, part in itertools.product(ORDER, blocks):
+                next(places).copy_((part == kind).nonzero()[:, 0])
+
+    def share(self, far: float, plain: float) -> None:
+        """Settle the shares of far and of plain pixels."""
+        self.bounds = torch.tensor([far, plain], dtype=torch.float64).cumsum(dim=0)
 
     def to(self, device: torch.device) -> "PixelPools":
         """The same on another device."""
         moved = copy.copy(self)
-        moved.order = None if self.order is None else self.order.to(device)
-        for name in ("counts", "starts", "bounds"):
+        moved.listed = None if self.listed is None else self.listed.to(device)
+        for name in ("counts", "starts", "bounds", "before"):
             setattr(moved, name, getattr(self, name).to(device))
         return moved
 
@@ -86,8 +77,22 @@ class PixelPools:
         """Pixels, and which of them are far, by numbers from 0 to 1. [R] -> bool [R], int64 [R]"""
         kind = torch.bucketize(kind.contiguous(), self.bounds, right=True)
         place = torch.addcmul(self.starts[kind], where, self.counts[kind]).long()
-        place.clamp_(max=self.most)
-        return kind == 0, place if self.order is None else self.order[place].long()
+        place.clamp_(max=self.total - 1)
+        return kind == 0, self.numbers(place)
+
+    def numbers(self, place: Tensor) -> Tensor:
+        """Pixels at places in the list. int64 [R] -> int64 [R]"""
+        if self.listed is None:
+            return place
+        block = torch.searchsorted(self.before, place, right=True) - 1
+        block %= len(self.before) // len(ORDER)
+        return BLOCK * block + (self.listed[place].long() & (BLOCK - 1))
+
+
+def pixels_of(chosen: Tensor, uniform: Tensor) -> Tensor:
+    """Some of the chosen pixels of a tile, by numbers from 0 to 1. bool [H, W], [K] -> int64 [K]"""
+    pixels = chosen.flatten().nonzero()[:, 0]
+    return pixels[(uniform * len(pixels)).long().clamp_(max=len(pixels) - 1)]
 
 
 class TilePool:

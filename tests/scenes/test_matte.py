@@ -219,7 +219,7 @@ def occupied_share(views):
 
 def near_share(views):
     batches = RayBatches(views, scene_frame(views), RAYS, seed=0)
-    return len(batches.near) / views.pixels
+    return batches.near_pixels / views.pixels
 
 
 @pytest.mark.parametrize("matte", list(MATTES))

@@ -19,6 +19,9 @@ ORDER = (FAR, PLAIN, OTHER)
 BLOCK = 2**16
 """Pixels that the same 16 bits tell apart."""
 
+PART = 2**22
+"""Pixels whose numbers are put together at a time."""
+
 
 class PixelPools:
     """Pixels of three kinds, each of which has a share of its own: far, plain and all others.
@@ -53,6 +56,8 @@ class PixelPools:
         self.bounds = torch.zeros(2, dtype=torch.float64)
         self.before = F.pad(counts.flatten().cumsum(dim=0), (1, 0))
         """Listed pixels before those of each kind and block, kind by kind. int64 [3 B + 1]"""
+        self.whole: Tensor | None = None
+        """Numbers of all pixels, on a GPU. [N]"""
         self.listed = None
         """Lower bits of all pixels' numbers; None where all are of one kind. int16 [N]"""
         if max(self.sizes) < near.numel():
@@ -68,8 +73,14 @@ class PixelPools:
     def to(self, device: torch.device) -> "PixelPools":
         """The same on another device."""
         moved = copy.copy(self)
-        moved.listed = None if self.listed is None else self.listed.to(device)
-        for name in ("counts", "starts", "bounds", "before"):
+        if self.listed is not None:
+            # A GPU has room for whole numbers, and a draw there is a few operations shorter.
+            kind = torch.int32 if len(self.before) // len(ORDER) * BLOCK < 2**31 else torch.int64
+            steps = range(0, self.total, PART)
+            parts = (torch.arange(n, min(n + PART, self.total)) for n in steps)
+            whole = torch.cat([self.numbers(part).to(kind) for part in parts])
+            moved.whole = whole.to(device)
+        for name in ("counts", "starts", "bounds"):
             setattr(moved, name, getattr(self, name).to(device))
         return moved
 
@@ -82,6 +93,8 @@ class PixelPools:
 
     def numbers(self, place: Tensor) -> Tensor:
         """Pixels at places in the list. int64 [R] -> int64 [R]"""
+        if self.whole is not None:
+            return self.whole[place].long()
         if self.listed is None:
             return place
         block = torch.searchsorted(self.before, place, right=True) - 1

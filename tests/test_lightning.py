@@ -73,7 +73,7 @@ def test_fit_logs_every_term_of_the_loss_validates_and_keeps_the_best(fitted: tu
     folder, module, _, used = fitted
     values = logged(folder)
     terms = {"colour", "opacity", "floaters", "total_variation", "time_variation"}
-    terms |= {"time_smoothness", "time_magnitude"}
+    terms |= {"time_smoothness", "time_magnitude", "sparsity"}
     assert terms <= {name.removeprefix("train/") for name in values}
     total = sum(values[f"train/{name}"][-1] for name in terms)
     assert values["train/loss"][-1] == pytest.approx(total, rel=1e-5)

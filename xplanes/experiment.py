@@ -1,7 +1,6 @@
 """A whole run: its method, data, trainer, callbacks and logger, from a configuration."""
 
 import inspect
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -95,19 +94,6 @@ class Experiment:
         """Processes that share the run."""
         devices = self.trainer.get("devices", 1)
         return devices if isinstance(devices, int) and devices > 0 else 1
-
-    def check_trainer(self, run: Path) -> None:
-        """Refuse a Trainer, callbacks or loggers that cannot be built; nothing is written.
-
-        Args:
-            run: The run directory, which need not exist.
-
-        Raises:
-            ConfigError: If one of them refuses its arguments.
-        """
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # They are repeated where the Trainer is built to run.
-            self.build_trainer(run)
 
     def build_trainer(self, run: Path) -> Trainer:
         """The Trainer, with callbacks and loggers, for a run directory.

@@ -212,6 +212,37 @@ def test_resets_and_large_ones():
     assert optimizer.state[field.means]["exp_avg"].all()
 
 
+def test_large_ones_are_split_before_they_are_removed():
+    """As released: halves whose size is within bounds stay, whatever they came from."""
+    field = gaussians(9)
+    with torch.no_grad():
+        # A tenth of the extent is 0.2; halves of 0.3 are smaller, those of 0.35 are not.
+        field.log_scales[:6] = math.log(0.3)
+        field.log_scales[6:] = math.log(0.35)
+    field.seen.fill_(1)
+    field.slopes[3:].fill_(1)
+    densify(field, stepped(field, 0), control(), torch.Generator(), remove_large=True)
+    expected = torch.full((6, 3), 0.3 / 1.6)
+    torch.testing.assert_close(field.scales.detach(), expected)
+
+
+@pytest.mark.parametrize("accumulate", [1, 2])
+def test_a_view_counts_whole_beside_others_of_its_step(accumulate):
+    model = settings("count=10").build(Site(FRAME, torch.tensor([0.0, 1.0]), 0, "32"))
+    field = model.field
+    field.deforms.fill_(True)
+    optimizer = torch.optim.Adam([field.means])
+    field.seen.fill_(1)
+    # Of the mean of the losses of a step's views, as training differentiates it.
+    field.slopes.fill_(1.2 * model.settings.densify.threshold / accumulate)
+    model.before_step(TrainingState(0, 300, 300 * accumulate, 0, 0.3), optimizer)
+    assert len(field) == 2
+    field.seen.fill_(1)
+    field.slopes.fill_(0.8 * model.settings.densify.threshold / accumulate)
+    model.before_step(TrainingState(0, 400, 400 * accumulate, 0, 0.4), optimizer)
+    assert len(field) == 2
+
+
 def test_nothing_left_and_numbers_that_are_not_finite_are_named():
     field = gaussians(10)
     with torch.no_grad():

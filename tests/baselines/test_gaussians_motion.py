@@ -14,9 +14,10 @@ from tests.synthetic import ball_scene, ball_views, swinging
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.evaluation.export import write_gaussians
-from xplanes.fields.gaussians import DeformedGaussians, PointCloud, SpacetimeGaussians
+from xplanes.fields.gaussians import BASE, DeformedGaussians, PointCloud, SpacetimeGaussians
 from xplanes.metrics import ssim
 from xplanes.models.densification import densify
+from xplanes.models.gaussians import camera_extent
 from xplanes.models.initialisation import Method
 from xplanes.preparation import points
 from xplanes.preparation.reconstruct import LoadedLRM
@@ -76,11 +77,10 @@ def test_spacetime_gaussians_follow_their_polynomials(time):
         mean = values["means"][row] + sum(
             values["motion"][row, power - 1] * since**power for power in (1, 2, 3)
         )
-        unit = values["quaternions"][row] / np.linalg.norm(values["quaternions"][row])
         width = math.exp(values["log_widths"][row])
         opacity = math.exp(-((since / width) ** 2)) / (1 + math.exp(-values["logits"][row]))
         found = (posed.means[row], posed.quaternions[row], posed.opacities[row], posed.scales[row])
-        turned = unit + since * values["spin"][row]
+        turned = values["quaternions"][row] + since * values["spin"][row]
         for mine, theirs in zip(
             found, (mean, turned, opacity, np.exp(values["log_scales"][row])), strict=True
         ):
@@ -160,8 +160,9 @@ def test_published_learning_rates():
     site = Site(FRAME, torch.tensor([0.0, 1.0]), 0, "32")
     model = settings("gaussians_deform_published", "count=10").build(site)
     peaks = {group["name"]: group["lr"] for group in model.groups()}
-    # 5 times 0.00016 in D-NeRF's world, whose cameras' extent is 4.4.
-    assert 4.4 * peaks["means"] == pytest.approx(0.0008, rel=0.02)
+    # 5 times 0.00016 in D-NeRF's world, whose cameras' extent is 5.1.
+    assert 5.1 * peaks["means"] == pytest.approx(0.0008, rel=0.03)
+    assert peaks["log_scales"] == pytest.approx(0.005)
     assert peaks["network"] == pytest.approx(0.0008)
     steps = 40_000
     assert peaks["network"] * model.rate_of("network", steps, 1.0) == pytest.approx(1.6e-6)
@@ -173,8 +174,29 @@ def test_published_learning_rates():
     model = settings("gaussians_spacetime_published", "count=10").build(site)
     peaks = {group["name"]: group["lr"] for group in model.groups()}
     assert peaks["motion"] == pytest.approx(1.75 * peaks["means"])
+    # Of colours themselves; what is trained is multiplied by the harmonic.
+    assert BASE * peaks["base"] == pytest.approx(0.0025, rel=0.01)
     assert set(peaks) == set(SpacetimeGaussians.PARAMETERS)
     assert model.settings.densify.until * 30_000 == 9000
+    model = settings("gaussians_hexplane_published", "count=10").build(site)
+    peaks = {group["name"]: group["lr"] for group in model.groups()}
+    assert peaks["planes"] / 5.1 == pytest.approx(0.0016, rel=0.03)
+    assert peaks["network"] / 5.1 == pytest.approx(0.00016, rel=0.03)
+
+
+def test_extent_and_time_rows_are_those_of_dnerf():
+    """Cameras on the upper hemisphere, 4.03 from the origin; a view at each of 150 times."""
+    directions = torch.randn(150, 3, generator=torch.Generator().manual_seed(0))
+    directions[:, 2].abs_()
+    poses = torch.eye(4).repeat(150, 1, 1)
+    poses[:, :3, 3] = 4.03 * torch.nn.functional.normalize(directions, dim=1)
+    views = replace(ball_views(1, 0.6).subset(torch.zeros(150, dtype=torch.long)))
+    views = replace(views, camera_to_world=poses, times=torch.linspace(0, 1, 150))
+    world = replace(FRAME, scale=1.0)
+    site = Site(world, views.times, 0, "32", views=views)
+    assert camera_extent(site) == pytest.approx(5.1, abs=0.2)
+    model = settings("gaussians_hexplane_published", "count=10").build(site)
+    assert model.field.planes["xt"].shape[1] == 75
 
 
 def test_loss_is_a_mixture_of_absolute_and_structural_errors():

@@ -373,7 +373,7 @@ class SpacetimeGaussians(Gaussians):
         return replace(
             still,
             means=still.means + (powers[..., None] * self.motion).sum(dim=1),
-            quaternions=F.normalize(still.quaternions, dim=1) + since * self.spin,
+            quaternions=still.quaternions + since * self.spin,
             opacities=still.opacities * life,
         )
 

@@ -43,6 +43,7 @@ def densify(
     generator: torch.Generator,
     *,
     remove_large: bool,
+    views: int = 1,
 ) -> None:
     """Double Gaussians whose projected means have large gradients, and remove faint ones.
 
@@ -54,28 +55,32 @@ def densify(
         optimizer: Of its parameters; changed in place.
         settings: Thresholds.
         generator: Draws the places of halves.
-        remove_large: Whether Gaussians larger than `LARGEST` are removed, too.
+        remove_large: Whether Gaussians larger than `LARGEST` are removed, too, once halves are
+            smaller.
+        views: Views whose losses a step averages: the statistics hold that share of each gradient.
 
     Raises:
         GaussianError: If none would be left.
     """
-    slopes = field.slopes / field.seen.clamp(min=1)
+    slopes = views * field.slopes / field.seen.clamp(min=1)
     size, extent = field.scales.amax(dim=1), float(field.extent)
     keep = field.opacities >= settings.least_opacity
+    steep, large = slopes >= settings.threshold, size > settings.large * extent
     if remove_large:
-        keep &= size <= LARGEST * extent
+        # A split comes before: halves that are small enough stay.
+        keep &= torch.where(steep & large, size / SHRINK, size) <= LARGEST * extent
     if not keep.any():
         raise GaussianError(
             f"all {len(field)} Gaussians are fainter than model.densify.least_opacity="
             f"{settings.least_opacity}, or too large: nothing would be left to train. Lower it, or "
             "the learning rates of opacity and scales; resume= continues from the last checkpoint"
         )
-    double = keep & (slopes >= settings.threshold)
+    double = keep & steep
     room = max(0, settings.most - int(keep.sum()))
     if int(double.sum()) > room:
         chosen = torch.where(double, slopes, -1).topk(room).indices
         double = torch.zeros_like(double).index_fill_(0, chosen, True)
-    split = double & (size > settings.large * extent)
+    split = double & large
     stay, clones, halves = (
         (mask).nonzero()[:, 0] for mask in (keep & ~split, double & ~split, split)
     )

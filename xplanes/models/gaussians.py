@@ -131,7 +131,8 @@ class GaussiansModel(Model):
         if step > control.first and step % control.every == 0:
             generator = state.generator(torch.device("cpu"), Stream.SPLITTING)
             late = reset is not None and step > reset
-            densify(field, optimizer, control, generator, remove_large=late)
+            views = max(1, round(state.batch / step))
+            densify(field, optimizer, control, generator, remove_large=late, views=views)
         if reset is not None and step % reset == 0:
             reset_opacity(field, optimizer)
 

@@ -297,19 +297,12 @@ class OccupancySampler(Sampler):
         self.grid.observe(samples.cells, rendering.density, samples.live)
 
     def regularise(self, field: Any, state: TrainingState) -> None:
-        settings, device = self.settings, self.device
+        settings = self.settings
         if not settings.sparsity or state.step % settings.update_every:
             return
-        stream = Stream.SPARSITY + state.rank
-        uniform = counted_uniform(state.seed, state.step, stream, (SPARSE_POINTS, 5), device)
-        points, times = self.grid.occupied_points(uniform.float())
-        if not len(points):
-            return
-        with torch.enable_grad():
-            density = field(points, times)[1]
-            opacity = -torch.expm1(-self._training.step * density)
-            loss = settings.sparsity * settings.update_every * opacity.mean()
         parameters = [p for p in field.parameters() if p.requires_grad]
+        with torch.enable_grad():
+            loss = settings.update_every * self._sparsity(field, state)
         gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             if gradient is None:
@@ -321,6 +314,20 @@ class OccupancySampler(Sampler):
                 parameter.grad = gradient
             else:
                 parameter.grad += gradient
+
+    @torch.no_grad()
+    def regularisers(self, field: Any, state: TrainingState) -> dict[str, float]:
+        return {"sparsity": float(self._sparsity(field, state))} if self.settings.sparsity else {}
+
+    def _sparsity(self, field: Any, state: TrainingState) -> Tensor:
+        """Mean opacity of random points in occupied cells over a training step, weighted. []"""
+        stream, device = Stream.SPARSITY + state.rank, self.device
+        uniform = counted_uniform(state.seed, state.step, stream, (SPARSE_POINTS, 5), device)
+        points, times = self.grid.occupied_points(uniform.float())
+        density = field(points, times)[1]
+        opacity = -torch.expm1(-self._training.step * density)
+        # No cell may be occupied; other processes wait for the gradients all the same.
+        return self.settings.sparsity * opacity.sum() / SPARSE_POINTS
 
     @property
     def device(self) -> torch.device:

@@ -392,6 +392,16 @@ class ProposalSampler(Sampler):
             assert isinstance(proposal, DensityField)
             self.terms.add_gradients(proposal.products)
 
+    @torch.no_grad()
+    def regularisers(self, field: Any, state: TrainingState) -> dict[str, float]:
+        totals: dict[str, float] = {}
+        for proposal in self._renderer.proposals:
+            assert isinstance(proposal, DensityField)
+            for name, value in self.terms.values(proposal.products).items():
+                key = f"proposal_{name}"
+                totals[key] = totals.get(key, 0.0) + getattr(self.terms, name) * float(value)
+        return totals
+
 
 class UpdateSchedule:
     """In which steps density fields learn: all at first, then rarer, a function of the step alone.

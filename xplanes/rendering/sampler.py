@@ -149,6 +149,10 @@ class Sampler(ABC):
         """
         return
 
+    def regularisers(self, field: Any, state: TrainingState) -> dict[str, float]:
+        """Weighted values of the terms in `regularise`, by name, for the logger."""
+        return {}
+
     def observe(self, rendering: Any) -> None:
         """Update the sampler from the rendering of a batch, before the optimiser step."""
         return

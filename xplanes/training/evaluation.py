@@ -16,7 +16,6 @@ from xplanes.errors import ConfigError
 from xplanes.files import read_rows, write_rows
 from xplanes.rendering.pictures import plane_sheet, strip, write_png
 from xplanes.training.clock import off_clock, training_seconds
-from xplanes.training.interrupt import check_interrupt
 from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore, mean
 
@@ -124,8 +123,6 @@ class Evaluation(Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        if trainer.world_size == 1:  # Else all processes must stop together, after a step.
-            check_interrupt(trainer)
         if batch_idx < SHOWN and trainer.is_global_zero:
             parts = (outputs[name].float() for name in ("colour", "depth", "opacity"))
             colour, depth, opacity = parts

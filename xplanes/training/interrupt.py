@@ -10,7 +10,7 @@ from typing import Any
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
-from xplanes.training.clock import agreeing, find_callback
+from xplanes.training.clock import agreeing
 
 
 class Stopped(KeyboardInterrupt):
@@ -54,8 +54,10 @@ class Interrupt(Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        if trainer.world_size == 1:
+        if trainer.world_size == 1:  # Else all processes must stop together, after a step.
             self.check()
+
+    on_validation_batch_end = on_test_batch_end
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         self._listen()
@@ -95,9 +97,3 @@ class Interrupt(Callback):
         if self.asked:
             raise KeyboardInterrupt
         self.asked = True
-
-
-def check_interrupt(trainer: Trainer) -> None:
-    """Stop here if a signal asked the trainer's `Interrupt` to; the state must be whole."""
-    if (interrupt := find_callback(trainer, Interrupt)) is not None:
-        interrupt.check()

@@ -33,6 +33,7 @@ def log_terms(module: "RadianceModule", terms: Mapping[str, Tensor], state: Trai
         return
     values = {name: float(term.detach()) for name, term in terms.items()}
     values |= module.model.regularisers(state)
+    values |= module.sampler.regularisers(module.field, state)
     entries = {f"train/{name}": value for name, value in values.items()}
     entries |= {"train/loss": sum(values.values()), "train/psnr": module.last["psnr"]}
     entries |= {"train/steps_skipped": float(module.unusable), "step": float(state.step)}

@@ -139,7 +139,7 @@ def test_loops_run_where_numba_can_keep_nothing(sealed, tmp_path: Path) -> None:
     assert done.stdout == "compiled loops\n"
     said = [line for line in done.stderr.splitlines() if "numba" in line]
     assert len(said) == 1, done.stderr
-    assert f"compiled anew at every start, which takes about {COMPILING} s" in said[0]
+    assert f"compiled again at every start, which takes about {COMPILING} s" in said[0]
     assert "NUMBA_CACHE_DIR=FOLDER" in said[0]
 
 

@@ -210,7 +210,7 @@ def test_without_checkpoints_the_last_lines_offer_none(
 def test_a_run_of_an_earlier_version_is_refused_with_its_version(tmp_path: Path) -> None:
     (tmp_path / "overrides.txt").write_text("loss.every=4\n")
     (tmp_path / "run.json").write_text(json.dumps({"xplanes": "0.1.0", "status": "interrupted"}))
-    with pytest.raises(ConfigError, match=r"made by xplanes 0\.1\.0.*train anew"):
+    with pytest.raises(ConfigError, match=r"made by xplanes 0\.1\.0.*start a new run"):
         prepare([f"resume={tmp_path}"])
 
 

@@ -115,7 +115,7 @@ def _settle_triton() -> None:
         atexit.register(shutil.rmtree, own, ignore_errors=True)
         os.environ["TRITON_CACHE_DIR"] = own
         logger.warning(
-            "triton cannot write to %s: the GPU's kernels are compiled anew at every start, which "
+            "triton cannot write to %s: the GPU's kernels are compiled again at every start, which "
             "takes some seconds each. TRITON_CACHE_DIR=FOLDER keeps them in FOLDER",
             folder,
         )
@@ -239,7 +239,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 @functools.cache
 def _say_not_kept() -> None:
     logger.warning(
-        "numba finds no folder that it can write to: the inner loops are compiled anew at every "
+        "numba finds no folder that it can write to: the inner loops are compiled again at every "
         "start, which takes about %d s. NUMBA_CACHE_DIR=FOLDER keeps them in FOLDER",
         COMPILING,
     )
@@ -278,7 +278,7 @@ def use_threads(count: int) -> None:
     """Let torch and the compiled loops, if they are loaded, share work among so many threads."""
     if numba := sys.modules.get("numba"):
         numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
-    if torch.get_num_threads() != count:  # Setting it, torch makes a pool of threads anew.
+    if torch.get_num_threads() != count:  # Setting it, torch makes a pool of threads again.
         torch.set_num_threads(count)
 
 

@@ -165,7 +165,7 @@ def _require_same_job(folder: Path, overrides: Iterable[str]) -> None:
     try:
         kept = (folder / "overrides.txt").read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):
-        return  # Damaged: it is written anew.
+        return  # Damaged: it is written again.
     before, now = ({t for t in each if not _may_differ(t)} for each in (kept, overrides))
     if before != now:
         raise ConfigError(
@@ -261,7 +261,7 @@ def _require_version(run: Path) -> None:
     if version.split(".")[:2] != __version__.split(".")[:2]:
         raise ConfigError(
             f"resume={run}: it was made by xplanes {version}, whose settings are not those of "
-            f"{__version__}; continue it with that version, or train anew in another folder"
+            f"{__version__}; continue it with that version, or start a new run in another folder"
         )
 
 

@@ -49,7 +49,7 @@ def test_products_of_planes_equal_loops_inside_and_outside_the_cube(monkeypatch)
 @pytest.mark.parametrize(
     ("dtype", "time"),
     [
-        (torch.float32, 3),  # As in training. The others are compiled anew, for seconds.
+        (torch.float32, 3),  # As in training. The others are compiled again, for seconds.
         pytest.param(torch.float32, None, marks=pytest.mark.slow),
         pytest.param(torch.float64, 3, marks=pytest.mark.slow),
         pytest.param(torch.float64, None, marks=pytest.mark.slow),

@@ -88,7 +88,7 @@ def test_all_checkpoints(tally, nursery, shared, half, tmp_path: Path) -> None:
         cut(folder / "checkpoints" / f"{name}.ckpt", 0.5)
     child = nursery.start(config_of(shared, "none", None), folder, resume=True)
     assert child.finish() == 1
-    tally.said(child.output().split("error: ")[-1], "cannot be read", "delete", "begin anew")
+    tally.said(child.output().split("error: ")[-1], "cannot be read", "delete", "start again")
     tally.content["cases"] += 1
 
 
@@ -118,7 +118,7 @@ def test_preparation_cache(tally, nursery, shared, whole, tmp_path: Path, change
     for path in entries:
         change(path, 0.6)
     child = nursery.run(config, tmp_path / "second", resume=False)
-    assert child.output().count("making it anew") >= len(entries) - 1
+    assert child.output().count("making it again") >= len(entries) - 1
     tally.said(child.output(), "damaged")
     assert outcome(tmp_path / "second") == whole["tiny"]
     tally.recovered()

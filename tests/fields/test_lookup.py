@@ -248,7 +248,7 @@ def strided(space, time, points, times):
 
 @pytest.mark.parametrize(
     "planes_too",
-    [False, pytest.param(True, marks=pytest.mark.slow)],  # The loops are compiled for them anew.
+    [False, pytest.param(True, marks=pytest.mark.slow)],  # The loops are compiled for them again.
 )
 def test_points_and_planes_need_not_be_contiguous(planes_too):
     given = *stacks("six"), *scattered(50)

@@ -1,4 +1,4 @@
-"""Ray hits, normals and insides of the solids against implicit functions written anew."""
+"""Ray hits, normals and insides of the solids against implicit functions written again."""
 
 import math
 from itertools import product

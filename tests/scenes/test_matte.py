@@ -1,4 +1,4 @@
-"""Silhouettes of soft mattes: without noise and specks, with what is thin, small or faint."""
+"""Silhouettes of soft mattes: without noise, with what is thin, small or faint."""
 
 import functools
 import math
@@ -14,7 +14,7 @@ from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.batches import RayBatches
 from xplanes.scenes.datamodule import UNIFORM
 from xplanes.scenes.frame import scene_frame
-from xplanes.scenes.matte import FAINT, SMALLER, SPECK, VISIBLE, silhouette_of
+from xplanes.scenes.matte import FAINT, NOISE, SMALLER, VISIBLE, silhouette_of
 from xplanes.scenes.silhouettes import may_hold
 from xplanes.scenes.store import CELL, StoredImages, TileFile
 
@@ -27,7 +27,7 @@ RAYS = replace(UNIFORM, skip_background=True, background_share=0.4, background_j
 
 
 def by_hand(mask):
-    """The same mask without specks, region by region."""
+    """The same mask without noise, region by region."""
     left, regions = {tuple(place) for place in mask.nonzero().tolist()}, []
     while left:
         open_now = [left.pop()]
@@ -40,7 +40,7 @@ def by_hand(mask):
             region += around
         regions.append(torch.tensor(region))
     extents = [int((each.amax(dim=0) - each.amin(dim=0)).max()) + 1 for each in regions]
-    limit = min(max(1, round(SPECK * max(mask.shape))), max(extents) // SMALLER)
+    limit = min(max(1, round(NOISE * max(mask.shape))), max(extents) // SMALLER)
     kept = torch.zeros_like(mask)
     for region, extent in zip(regions, extents, strict=True):
         if extent > limit:
@@ -96,7 +96,7 @@ def test_opaque_specks_are_left_out_and_what_is_larger_is_not():
             speckled = alpha.clone()
             speckled[3 : 3 + side, 5 : 5 + side] = 255
             found = silhouette_of(speckled)
-            if side > SPECK * size:
+            if side > NOISE * size:
                 assert torch.equal(found, speckled >= VISIBLE), (size, side)
             else:
                 assert torch.equal(found, alpha >= VISIBLE), (size, side)

@@ -469,7 +469,7 @@ def test_what_no_run_has_used_for_a_month_is_removed(
         read_images(paths[1:3], None)
     assert [path for path in [old, *kept, *gone] if path.exists()] == [old, *kept]
     assert "removed 0.0 GB of decoded images" in capsys.readouterr().out
-    # A reader keeps what it has opened; the next one decodes it anew.
+    # A reader keeps what it has opened; the next one decodes it again.
     aged(old, 31)
     expected = images.image(0).clone()
     read_images(paths[3:], None)

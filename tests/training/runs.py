@@ -61,7 +61,7 @@ def _parsed(override: str) -> Any:
 def changed(base: tuple[str, ...], *overrides: str) -> dict[str, Any]:
     """What ``base`` and these overrides compose to, as plain builtins.
 
-    Options of groups are composed anew; keys are set in what was composed before, where their
+    Options of groups are composed again; keys are set in what was composed before, where their
     types are checked as Hydra checks them.
     """
     values = [

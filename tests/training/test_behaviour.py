@@ -12,9 +12,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tests.training.runs import small_config
 from xplanes.errors import ConfigError
+from xplanes.files import read_rows
 from xplanes.models.initialisation import STAGES
 from xplanes.rendering import warming
 from xplanes.rendering.grid_renderer import OccupancySampler
@@ -92,7 +94,11 @@ def test_run_directory_holds_what_it_promises(trained: Path) -> None:
         "checkpoints/last.ckpt checkpoints/best.ckpt media/planes.png"
     ).split():
         assert (trained / name).is_file(), name
-    assert list((trained / "tb").glob("events.*"))
+    events = EventAccumulator(str(trained / "tb"))
+    events.Reload()
+    scored = [(str(e.step), f"{e.value:.4f}") for e in events.Scalars("val/psnr")]
+    rows = read_rows(trained / "curve.csv")
+    assert scored == [(row["step"], row["psnr"]) for row in rows]
     content = metrics(trained)
     assert content["split"] == "test"
     assert len(content["views"]) == 3
@@ -182,7 +188,7 @@ def test_a_run_resumed_in_a_later_epoch_equals_an_uninterrupted_one(
 def test_a_resumed_run_on_images_from_disk_equals_an_uninterrupted_one(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After the second failure the decoded images are gone, and are decoded anew."""
+    """After the second failure the decoded images are gone, and are decoded again."""
     monkeypatch.setattr(store, "IN_MEMORY", 0)
     cache = tmp_path / "cache"
     config = small_config(scenes, f"data.cache={cache}", "trainer.max_steps=30")

@@ -1,4 +1,4 @@
-"""A field that shows nothing is noticed, said and begun anew; opacity is supervised."""
+"""A field that shows nothing is noticed, said and started again; opacity is supervised."""
 
 import csv
 import json
@@ -85,7 +85,7 @@ def dead(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(collapse, "NOTHING", 2.0)
 
 
-def test_a_dead_field_begins_anew_once_and_then_a_warning_is_enough(
+def test_a_dead_field_starts_again_once_and_then_a_warning_is_enough(
     scenes: Path, tmp_path: Path, dead: None, caplog: pytest.LogCaptureFixture
 ) -> None:
     fields = []
@@ -104,7 +104,7 @@ def test_a_dead_field_begins_anew_once_and_then_a_warning_is_enough(
         run(small_config(scenes, *QUICK), tmp_path / "run", [], resume=False)
     assert len(fields) == 1
     words = [r.getMessage() for r in caplog.records if "field shows nothing" in r.getMessage()]
-    assert ["anew" in line for line in words] == [True, False]
+    assert ["again" in line for line in words] == [True, False]
     assert "at step 10" in words[0]
     assert "data.half_side" in words[1]
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
@@ -118,11 +118,11 @@ def test_a_baseline_is_left_as_published(
     config = baseline_config(scenes, "model=kplanes", *KPLANES, *PROPOSAL, "trainer.max_steps=11")
     run(config, tmp_path / "run", [], resume=False)
     words = [r.getMessage() for r in caplog.records if "field shows nothing" in r.getMessage()]
-    assert ["anew" in line for line in words] == [False]
+    assert ["again" in line for line in words] == [False]
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["restarts"] == 0
 
 
-def test_a_run_that_began_anew_resumes_to_the_same_numbers(
+def test_a_run_that_began_again_resumes_to_the_same_numbers(
     scenes: Path, tmp_path: Path, dead: None
 ) -> None:
     config = small_config(scenes, *QUICK, "trainer.deterministic=true")

@@ -269,7 +269,7 @@ def test_nothing_keeps_the_sparse_part_once_l_r_has_faded_out(
     assert max(alive) > 6
 
 
-def test_a_field_that_begins_anew_keeps_l_r_while_it_is_of_use(place: Path) -> None:
+def test_a_field_that_starts_again_keeps_l_r_while_it_is_of_use(place: Path) -> None:
     module = RadianceModule(config := settings(place, "model.loss.initial_steps=288"))
     module.build(Experiment.read(config).data.read())
     sparse = module.model.sparse

@@ -283,7 +283,7 @@ def test_damaged_checkpoints_alone_are_refused_with_a_message(tmp_path: Path) ->
     assert find_resumable(tmp_path) is None
     for name in ("last.ckpt", "best.ckpt"):
         (tmp_path / name).write_bytes(b"half")
-        with pytest.raises(ConfigError, match=r"last\.ckpt cannot be read.*delete .*begin anew"):
+        with pytest.raises(ConfigError, match=r"last\.ckpt cannot be read.*delete .*start again"):
             find_resumable(tmp_path)
 
 
@@ -304,6 +304,6 @@ def test_a_damaged_record_does_not_end_a_run(scenes, folder, caplog) -> None:
     with pytest.raises(ConfigError, match=r"holds a run already \(damaged\)"):
         run(small_config(scenes, *SCORED), folder, [], resume=False)
     run(small_config(scenes, *SCORED), folder, [], resume=True)
-    assert "record of this run begins anew" in caplog.text
+    assert "record of this run starts again" in caplog.text
     record = json.loads((folder / "run.json").read_text())
     assert (record["status"], record["resumed"]) == ("finished", 1)

@@ -200,10 +200,10 @@ def test_another_start_in_a_folder_begins_its_own_record(tmp_path: Path) -> None
     again = RunRecord(tmp_path, 0, resume=True)
     assert (again.content["started"], again.content["resumed"]) == ("long ago", 1)
     assert again.content["files"] == {"train": ["a.png"]}
-    anew = RunRecord(tmp_path, 0, resume=False)
-    assert anew.content["started"] != "long ago"
-    assert (anew.content["resumed"], anew.content["total_seconds"]) == (0, 0.0)
-    assert "files" not in anew.content
+    again = RunRecord(tmp_path, 0, resume=False)
+    assert again.content["started"] != "long ago"
+    assert (again.content["resumed"], again.content["total_seconds"]) == (0, 0.0)
+    assert "files" not in again.content
 
 
 def test_a_scene_of_training_views_alone_is_scored_on_views_held_out(

@@ -160,7 +160,7 @@ def _cut(views: Views, index: int, opaque: Tensor, frame: Frame) -> float:
 
 
 def _stray_pixels(alpha: Tensor) -> int:
-    """Pixels with alpha, but away from the silhouette: noise and specks, not soft edges."""
+    """Pixels with alpha, but away from the silhouette: noise, not soft edges."""
     side = max(1, round(HALO * max(alpha.shape)))
     held = count_in_squares(silhouette_of(alpha), side) > 0
     near = F.max_pool2d(held.float()[None], 3, stride=1, padding=1)[0] > 0

@@ -173,7 +173,7 @@ def read_experiment(run: Path, plugins: Sequence[str] = ()) -> Experiment:
         if isinstance(version, str) and version != __version__:
             raise ConfigError(
                 f"{run} was made by xplanes {version}, this is {__version__}, which cannot read "
-                f"its settings ({error}): install that version to use it, or train anew"
+                f"its settings ({error}): install that version to use it, or start a new run"
             ) from error
         if isinstance(error, ConfigError) and not isinstance(error.__cause__, KeyError):
             raise ConfigError(f"{run}/config.yaml: {error}") from error

@@ -36,7 +36,7 @@ MOVING_SECONDS = 0.08
 FEWEST = 16
 """Rows of a picture at least."""
 REFRESH_SECONDS, SHARE = 0.5, 3
-"""A picture at rest is drawn anew, of a field that trains, when so many seconds and so many times
+"""A picture at rest is drawn again, of a field that trains, when so many seconds and so many times
 its own duration have passed since it was begun."""
 AWAY = 1.4
 """The first camera's distance from the scene, as a share of the training cameras'."""
@@ -118,7 +118,7 @@ class Viewer:
 
     Attributes:
         patience: Seconds that a picture at rest may take; larger ones become smaller.
-        step: Training step of the field; pictures are drawn anew once it changes.
+        step: Training step of the field; pictures are drawn again once it changes.
         paused: Whether someone paused training.
 
     Raises:
@@ -343,7 +343,7 @@ class _Browser:
         step: Training step of its picture.
         sharp: Whether its picture is as large as it can be.
         began: When its picture was begun.
-        again: When its picture is to be drawn anew, if the field has changed.
+        again: When its picture is to be drawn again, if the field has changed.
         rate: Pixels that are drawn in a second.
     """
 

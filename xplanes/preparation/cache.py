@@ -139,7 +139,7 @@ def _find(path: Path | None, key: str) -> Stage | None:
     try:
         content, seconds = _read(path, key)
     except _UnusableError as reason:
-        logger.warning("%s is %s: making it anew", path, reason)
+        logger.warning("%s is %s: making it again", path, reason)
         return None
     return Stage(content, seconds, True, key)
 

@@ -128,7 +128,7 @@ def _pretrain(plain: dict, config: PretrainingSettings, announce: Callable[[str]
             load_checkpoint(last)
         except ConfigError as problem:
             raise ConfigError(
-                f"{last} is damaged: delete it to begin anew, or name another run"
+                f"{last} is damaged: delete it to start again, or name another run"
             ) from problem
     module, data, look = assemble(config, announce)
     if last.is_file():

@@ -157,7 +157,7 @@ class SceneDataModule(LightningDataModule):
     def setup(self, stage: str) -> None:
         """Read the splits that a stage needs: ``fit``, ``validate``, ``test`` or ``predict``."""
         if stage == "fit" and self.trainer is not None:
-            # Where this data trained another module before, the next begins anew.
+            # Where this data trained another module before, the next starts again.
             self.first = getattr(self.trainer.lightning_module, "batches", self.first)
         scores = self.trainer is None or self.trainer.limit_val_batches
         if stage in ("fit", "validate") and scores:

@@ -1,4 +1,4 @@
-"""The silhouette of an image: what its alpha shows, without the noise and specks of soft mattes."""
+"""The silhouette of an image: what its alpha shows, without the noise of soft mattes."""
 
 import numpy as np
 from torch import Tensor
@@ -13,15 +13,16 @@ FAINT = 6
 OPAQUE, OPAQUE_SHARE = 64, 1e-3
 """Alpha of opaque content; share of the pixels that has it at least, unless the image is faint."""
 
-SPECK, SMALLER = 0.01, 5
-"""Largest extent of a speck, as a share of the image's longer side; how many times as large the
-largest region is at least. Wires are longer, and what is small and alone is the largest itself."""
+NOISE, SMALLER = 0.01, 5
+"""Largest extent of a region that is noise, as a share of the image's longer side; how many times
+as large the largest region is at least. Wires are longer, and what is small and alone is the
+largest itself."""
 
 
 def silhouette_of(alpha: Tensor) -> Tensor:
     """The pixels of an image that belong to its silhouette.
 
-    These are the connected regions of visible alpha, without those so small that they are specks.
+    These are the connected regions of visible alpha, without those so small that they are noise.
     Antialiased and soft edges end where alpha falls below `VISIBLE`.
 
     Args:
@@ -55,7 +56,7 @@ def _remove_specks(mask: np.ndarray) -> None:
         np.minimum.at(low[axis], region, start)
         np.maximum.at(high[axis], region, stop)
     extent = (high - low).max(axis=0)
-    limit = min(max(1, round(SPECK * max(height, width))), int(extent.max()) // SMALLER)
+    limit = min(max(1, round(NOISE * max(height, width))), int(extent.max()) // SMALLER)
     small = extent[region] <= limit
     first, end, row = first[small], end[small], row[small]
     for offset in range(limit):

@@ -254,7 +254,7 @@ class TileFile:
         if len(content) < length:
             raise StorageError(
                 f"{self.source} ends too early: it was cut off while in use. Delete it and start "
-                "again; it is decoded anew"
+                "again; it is decoded again"
             )
         return content
 

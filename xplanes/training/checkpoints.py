@@ -174,7 +174,7 @@ def find_resumable(folder: Path) -> Path | None:
         try:
             step = load_checkpoint(best)["global_step"]
         except (ConfigError, KeyError, TypeError):
-            raise ConfigError(f"{problem}; or delete {last} to begin anew") from problem
+            raise ConfigError(f"{problem}; or delete {last} to start again") from problem
         logger.warning("%s. Continuing from %s, step %d", problem, best, step)
         with replacing(last) as temporary:
             shutil.copyfile(best, temporary)

@@ -1,4 +1,4 @@
-"""Fields that show nothing, or fog: noticed within seconds, and trained anew once."""
+"""Fields that show nothing, or fog: noticed within seconds, and trained again once."""
 
 import logging
 import math
@@ -65,8 +65,8 @@ class CollapseWatch(Callback):
         alone = trainer.world_size == 1
         if len(self.restarted) < self.restarts and alone and pl_module.can_restart:
             logger.warning(
-                "%s at step %d: it is initialised anew, with another seed and stronger supervision "
-                "of opacity",
+                "%s at step %d: it is initialised again, with another seed and stronger "
+                "supervision of opacity",
                 found,
                 trainer.global_step,
             )

@@ -71,7 +71,7 @@ class Trainer(lightning.Trainer):
             raise ConfigError(f"max_seconds={max_seconds}: must be above 0, or null for no limit")
         if others.get("overfit_batches", 0) != 0:
             raise ConfigError(
-                f"overfit_batches={others['overfit_batches']}: rays are drawn anew at each step; "
+                f"overfit_batches={others['overfit_batches']}: rays are drawn again at each step; "
                 "leave it out, and set data.views for a field of few images"
             )
         require_whole_floats(str(others.get("precision") or "32-true"))

@@ -32,7 +32,7 @@ def require_version(path: Any) -> None:
     if made.split(".")[:2] != __version__.split(".")[:2]:
         raise ConfigError(
             f"{path} was made by xplanes {made}, whose settings are not those of {__version__}: "
-            "load it with that version, or train again"
+            "load it with that version, or start a new run"
         )
 
 
@@ -94,7 +94,8 @@ def require_frame(parts: Parts, content: Mapping[str, Any]) -> None:
             raise ConfigError(
                 f"the initialisation was computed again, and its frame is not the checkpoint's "
                 f"({name} {before.tolist()}, now {torch.as_tensor(now).tolist()}): what "
-                "preparation.cache kept is gone. Bring it back, or train anew in another folder"
+                "preparation.cache kept is gone. Bring it back, or start a new run "
+                "in another folder"
             )
 
 

@@ -438,7 +438,7 @@ class RadianceModule(ViewScoring):
             problem = str(error).splitlines()[-1].strip().rstrip(".")
             raise ConfigError(
                 f"the checkpoint does not fit these settings ({problem}): continue with those that "
-                "the run began with, or train anew in another folder"
+                "the run began with, or start a new run in another folder"
             ) from error
 
 

@@ -50,7 +50,7 @@ def require_same_settings(run: Path, before: Mapping[str, Any], now: Mapping[str
             was, wanted = ("null" if value is None else value for value in (was, wanted))
             raise ConfigError(
                 f"resume={run} with {key}={wanted}: its checkpoint was trained with {key}={was}. "
-                "Leave it out, or train anew in another folder"
+                "Leave it out, or start a new run in another folder"
             )
 
 
@@ -192,7 +192,7 @@ def _earlier(path: Path) -> dict[str, Any]:
     try:
         return read_json(path)
     except ValueError as problem:
-        logger.warning("%s: the record of this run begins anew", problem)
+        logger.warning("%s: the record of this run starts again", problem)
         return {"resumed": 0}
 
 

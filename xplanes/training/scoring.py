@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 from lightning import LightningModule
+from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor, nn
 
 from xplanes.fields.base import Representation
@@ -81,7 +82,11 @@ class ViewScoring(LightningModule):
         tag = self.trainer.strategy.broadcast(self._tag)  # A process may have had no view.
         means = {f"{tag}/{name}": value for name, value in mean_scores(self.scores).items()}
         self.tally.last |= means
-        self.log_dict(means, batch_size=1)  # All processes have the means of all views.
+        if self.trainer.state.fn == TrainerFn.FITTING:
+            # Lightning's own count is one less, and not that of a run that goes on.
+            means["step"] = float(self.trainer.global_step)
+        # All processes have the means of all views; Lightning warns where it need not.
+        self.log_dict(means, batch_size=1, sync_dist=self.trainer.world_size > 1)
 
     def agree(self) -> None:
         """Go on with the first process's sampler, for each has seen the samples of its own rays.

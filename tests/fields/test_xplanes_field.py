@@ -8,20 +8,24 @@ import torch
 from tests.oracles import plane_features as oracle
 from tests.refusals import assert_refused
 from xplanes.fields import Decoder, XPlanes
-from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES, random_planes
+from xplanes.fields.xplanes import FINE_PLANES, PLANE_SETS, TIME_PLANES, random_planes
 
 SETS = tuple(PLANE_SETS)
 
 
-def planes_of(plane_set, seed=0, **changes):
+def planes_of(plane_set, seed=0, fine=False, **changes):
     sizes = {"channels": 4, "resolution": 6, "time_resolution": 3}
-    return random_planes(
+    planes = random_planes(
         plane_set,
         **{**sizes, **changes},
         space_scale=0.3,
         time_scale=0.5,
         generator=torch.Generator().manual_seed(seed),
     )
+    if fine:
+        generator = torch.Generator().manual_seed(seed + 1)
+        planes |= {name: torch.randn(3, 13, 13, generator=generator) for name in FINE_PLANES}
+    return planes
 
 
 def field_of(plane_set, dtype=torch.float32, **changes):
@@ -53,11 +57,32 @@ def test_features_come_from_the_planes_of_their_names():
         )
 
 
+def test_fine_planes_are_added_to_the_first_channels_of_the_space_planes():
+    field = field_of("six", torch.float64, fine=True)
+    points, times = scattered(20, torch.float64)
+    planes = {name: plane.detach().numpy() for name, plane in field.planes.items()}
+    fine = {name.removesuffix("_fine"): planes.pop(name) for name in FINE_PLANES}
+    expected = torch.from_numpy(oracle(planes, "six", points, times))
+    expected[..., :3] += torch.from_numpy(oracle(fine, "three", points, times))
+    found = field.features(points, times)
+    torch.testing.assert_close(found, expected.flatten(1), atol=1e-12, rtol=0)
+    field.is_fine = False
+    with torch.no_grad():
+        left_out = field.features(points, times)
+        field.is_fine = True
+        field.fine.zero_()
+        assert torch.equal(field.features(points, times), left_out)
+    wide = {**planes_of("six"), **dict.fromkeys(FINE_PLANES, torch.zeros(5, 8, 8))}
+    with pytest.raises(ValueError, match="5 channels, more than the space planes' 4"):
+        XPlanes(planes=wide, decoder=Decoder(4))
+
+
 def test_planes_come_back_as_they_were_given():
     for plane_set in SETS:
-        given = planes_of(plane_set)
+        given = planes_of(plane_set, fine=True)
         field = XPlanes(planes=given, decoder=Decoder(4), plane_set=plane_set)
-        assert list(field.planes) == ["xy", "xz", "yz", *TIME_PLANES[plane_set]], plane_set
+        names = ["xy", "xz", "yz", *TIME_PLANES[plane_set], *FINE_PLANES]
+        assert list(field.planes) == names, plane_set
         for name, plane in field.planes.items():
             assert torch.equal(plane, given[name]), (plane_set, name)
 
@@ -72,14 +97,14 @@ def test_planes_are_views_of_the_parameters():
 
 def test_gradients_reach_every_parameter():
     for plane_set in SETS:
-        field = field_of(plane_set)
+        field = field_of(plane_set, fine=True)
         colour, density = field(*scattered(200))
         (colour.sum() + density.sum()).backward()
         for name, parameter in field.named_parameters():
             case = plane_set, name
             assert parameter.grad is not None, case
             assert parameter.grad.isfinite().all(), case
-            if name in ("space", "time"):
+            if name in ("space", "time", "fine"):
                 assert (parameter.grad.flatten(1).abs().amax(dim=1) > 0).all(), case
             else:
                 assert parameter.grad.abs().max() > 0, case
@@ -103,7 +128,7 @@ def test_no_points_give_no_colours():
 
 
 def test_state_goes_round_through_a_state_dict():
-    first, second = field_of("nine"), field_of("nine", seed=9)
+    first, second = field_of("nine", fine=True), field_of("nine", fine=True, seed=9)
     points, times = scattered(10)
     assert not torch.equal(first(points, times)[1], second(points, times)[1])
     second.load_state_dict(first.state_dict())
@@ -128,9 +153,9 @@ def test_the_time_planes_may_have_another_resolution_than_space():
 
 
 @pytest.mark.parametrize("plane_set", SETS)
-@pytest.mark.parametrize("time_rows", [1, 3])
-def test_a_snapshot_shows_the_field_at_its_time(plane_set, time_rows):
-    field = field_of(plane_set, torch.float64, time_resolution=time_rows)
+@pytest.mark.parametrize(("time_rows", "fine"), [(1, False), (3, True)])
+def test_a_snapshot_shows_the_field_at_its_time(plane_set, time_rows, fine):
+    field = field_of(plane_set, torch.float64, time_resolution=time_rows, fine=fine)
     points, _ = scattered(300, torch.float64)
     points = 1.3 * points  # Beyond the cube the planes fade to zero.
     for time in (0.0, 0.25, 0.6, 1.0, 1.5):

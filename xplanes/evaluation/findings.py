@@ -236,7 +236,7 @@ def texel_findings(per_texel: float, views: Views, resolution: int) -> Iterator[
     """Whether the images show far more than planes resolve.
 
     Args:
-        per_texel: Image pixels that a texel of the planes covers, see `pixels_per_texel`.
+        per_texel: Image pixels that a texel of the planes covers, see `pixels_across`.
         views: Training views.
         resolution: Texels along an axis of the planes.
     """
@@ -247,21 +247,8 @@ def texel_findings(per_texel: float, views: Views, resolution: int) -> Iterator[
             "texels",
             f"a texel of planes with {resolution} texels a side covers {per_texel:.0f} pixels of "
             f"images {views.width} pixels wide. Set data.resolution={width}, which costs nothing "
-            f"that the planes could show, or model.resolution={finer}",
+            f"that the planes could show, or give the planes {finer}",
         )
-
-
-def pixels_per_texel(views: Views, frame: Frame, resolution: int) -> float:
-    """Image pixels, along a side, that a texel covers at the centre of the cube; the median view.
-
-    Args:
-        views: Training views.
-        frame: The field's frame.
-        resolution: Texels along an axis of the planes.
-    """
-    distance = (views.camera_to_world[:, :3, 3] - frame.centre).double().norm(dim=-1)
-    pixel = distance / views.intrinsics.pinhole.amax(dim=1)
-    return float((2 / frame.scale / resolution / pixel).median())
 
 
 def time_steps(views: Views) -> Tensor:

@@ -20,7 +20,6 @@ from xplanes.evaluation.findings import (
     image_findings,
     look,
     looked_at,
-    pixels_per_texel,
     texel_findings,
     time_gaps,
     time_steps,
@@ -30,7 +29,7 @@ from xplanes.models.base import ModelSettings
 from xplanes.process import train_command
 from xplanes.scenes.cameras import cast_rays, image_plane
 from xplanes.scenes.errors import SceneError
-from xplanes.scenes.frame import Frame
+from xplanes.scenes.frame import Frame, pixels_across
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
@@ -186,11 +185,12 @@ def inspect(choice: Choice) -> Capture:
         split: [look(views, index, scene.background, frame) for index in looked_at(views)]
         for split, views in scene.splits.items()
     }
-    texels = getattr(model, "resolution", None)
-    texels = texels if isinstance(texels, int) else None
     findings = [*camera_findings(scene, frame), *image_findings(scene, looks)]
-    if frame is not None and texels is not None:
-        findings += texel_findings(pixels_per_texel(train, frame, texels), train, texels)
+    texels = None
+    if frame is not None:
+        pixels = pixels_across(train, frame)
+        if (texels := model.texels(pixels)) is not None:
+            findings += texel_findings(pixels / texels, train, texels)
     follows = {kind for each in findings for kind in CONSEQUENCES.get(each.kind, ())}
     findings = [each for each in findings if each.kind not in follows]
     return Capture(choice, scene, frame, problem, looks, tuple(findings), texels)
@@ -323,7 +323,7 @@ def facts(capture: Capture) -> dict[str, Any]:
             "camera_distance": [float(away.min()), float(away.median()), float(away.max())],
         }
         if capture.texels is not None:
-            content["pixels_per_texel"] = pixels_per_texel(train, frame, capture.texels)
+            content["pixels_per_texel"] = pixels_across(train, frame) / capture.texels
     return content
 
 
@@ -394,7 +394,7 @@ def table(capture: Capture) -> str:
         )
     if known["pixels_per_texel"] is not None:
         text.append(
-            f"texels  {known['texels']} a side (model.resolution): each covers "
+            f"texels  {known['texels']} a side of the finest planes: each covers "
             f"{known['pixels_per_texel']:.1f} image pixels at the centre of the cube"
         )
     warned = [f"warning ({each.kind})  {each.text}" for each in capture.findings]

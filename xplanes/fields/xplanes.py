@@ -23,6 +23,8 @@ that stands still.
 
 SPACE_PLANES = ("xy", "xz", "yz")
 
+FINE_PLANES = ("xy_fine", "xz_fine", "yz_fine")
+
 TIME_PLANES: dict[str, tuple[str, ...]] = {
     "three": (),
     "six": ("xt", "yt", "zt"),
@@ -39,7 +41,8 @@ class XPlanes(RadianceField):
     Args:
         planes: Initial values by name: space planes xy, xz, yz [C, H, H] and the plane set's time
             planes [C, T, H'] with time along the rows. Axis "a" of plane "ab" runs along the
-            columns.
+            columns. Fine planes xy_fine, xz_fine, yz_fine [C', F, F] may be among them, C' <= C:
+            they are added to the first C' channels of the space planes' features.
         decoder: Maps features [N, 3 C] to colour [N, 3] and density [N].
         plane_set: "six" (as in K-Planes), "nine" (as in Tensor4D) or "three" (no time planes).
         background: Model of what lies behind the cube; None for the renderer's plain colour.
@@ -65,19 +68,28 @@ class XPlanes(RadianceField):
         self.plane_set = plane_set
         self.rows = PLANE_SETS[plane_set]
         names = TIME_PLANES[plane_set]
-        if set(planes) != {*SPACE_PLANES, *names}:
+        if set(planes) - set(FINE_PLANES) != {*SPACE_PLANES, *names}:
             raise ValueError(
                 f"planes are {', '.join(sorted(planes))}: plane_set={plane_set!r} needs "
-                f"{', '.join((*SPACE_PLANES, *names))}"
+                f"{', '.join((*SPACE_PLANES, *names))}, and takes {', '.join(FINE_PLANES)}"
             )
         self.space = nn.Parameter(_stack(planes, SPACE_PLANES))
         self.time = nn.Parameter(_stack(planes, names)) if names else None
+        fine = FINE_PLANES[0] in planes
+        self.fine = nn.Parameter(_stack(planes, FINE_PLANES)) if fine else None
+        self.is_fine = True
+        """Whether fine planes are read: while they are zero, nothing changes if they are not."""
         if self.space.shape[1] != self.space.shape[2]:
             raise ValueError(f"space planes are {list(planes['xy'].shape)}: must be [C, H, H]")
         if self.time is not None and self.time.shape[3] != self.space.shape[3]:
             raise ValueError(
                 f"time planes have {self.time.shape[3]} channels, space planes "
                 f"{self.space.shape[3]}: must be equal"
+            )
+        if self.fine is not None and self.fine.shape[3] > self.space.shape[3]:
+            raise ValueError(
+                f"fine planes have {self.fine.shape[3]} channels, more than the space planes' "
+                f"{self.space.shape[3]}"
             )
         self.decoder = decoder
         self.background = background
@@ -88,6 +100,8 @@ class XPlanes(RadianceField):
         stacks: list[tuple[tuple[str, ...], Tensor]] = [(SPACE_PLANES, self.space)]
         if self.time is not None:
             stacks.append((TIME_PLANES[self.plane_set], self.time))
+        if self.fine is not None:
+            stacks.append((FINE_PLANES, self.fine))
         return {
             name: plane.permute(2, 0, 1)
             for names, stack in stacks
@@ -105,7 +119,11 @@ class XPlanes(RadianceField):
     @property
     def outline(self) -> str:
         behind = "" if self.background is None else " · a background"
-        return f"({' '.join(self.planes)}) · {self.space.shape[3]} channels{behind}"
+        coarse = (*SPACE_PLANES, *TIME_PLANES[self.plane_set])
+        sizes = f"{self.space.shape[2]} texels"
+        if self.fine is not None:
+            sizes += f" and {self.fine.shape[2]}"
+        return f"({' '.join(coarse)}) · {sizes} · {self.space.shape[3]} channels{behind}"
 
     def snapshot(self, time: float) -> RadianceField:
         """The field at one time as three space planes, equal up to rounding and faster to read.
@@ -135,13 +153,17 @@ class XPlanes(RadianceField):
                 SPACE_PLANES, self.space.detach(), self.rows, strict=True
             )
         }
+        planes |= {name: plane for name, plane in self.planes.items() if name in FINE_PLANES}
         return XPlanes(
             planes=planes, decoder=self.decoder, plane_set="three", background=self.background
         )
 
     def features(self, points: Tensor, times: Tensor) -> Tensor:
         """Features that the decoder sees. [N, 3], [N] -> [N, 3 C]"""
-        return plane_features(self.space, self.time, points, times, self.rows).flatten(1)
+        found = plane_features(self.space, self.time, points, times, self.rows)
+        if self.fine is not None and self.is_fine:
+            found[..., : self.fine.shape[3]] += plane_features(self.fine, None, points, times, ())
+        return found.flatten(1)
 
     def forward(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
         """Colour and density at points and times.
@@ -174,6 +196,7 @@ def random_planes(
     channels: int,
     resolution: int,
     time_resolution: int,
+    time_texels: int | None = None,
     space_scale: float,
     time_scale: float,
     generator: torch.Generator,
@@ -187,6 +210,7 @@ def random_planes(
         channels: Channels C of each plane.
         resolution: Texels along each space axis.
         time_resolution: Rows of the time planes.
+        time_texels: Texels of the time planes along space; ``resolution`` when None.
         space_scale: Standard deviation of the space planes.
         time_scale: Standard deviation of the time planes.
         generator: Source of randomness.
@@ -196,7 +220,7 @@ def random_planes(
     """
     square = (channels, resolution, resolution)
     planes = {name: space_scale * torch.randn(square, generator=generator) for name in SPACE_PLANES}
-    strip = (channels, time_resolution, resolution)
+    strip = (channels, time_resolution, time_texels or resolution)
     for name in TIME_PLANES[plane_set]:
         planes[name] = time_scale * torch.randn(strip, generator=generator)
     return planes

@@ -164,6 +164,15 @@ class ModelSettings(Settings, ABC):
         """
         return None
 
+    def texels(self, pixels: float) -> int | None:
+        """Texels of the finest planes along each space axis; None for fields without planes.
+
+        Args:
+            pixels: Image pixels that a side of the field's cube covers.
+        """
+        texels = getattr(self, "resolution", None)
+        return texels if isinstance(texels, int) else None
+
     def frame(self, views: Views, half_side: float | None, points: Tensor | None = None) -> Frame:
         """The field's frame: the scene's cube, unless the model defines another.
 

@@ -23,7 +23,7 @@ from xplanes.fields.regularisers import (
     time_smoothness,
     total_variation,
 )
-from xplanes.fields.xplanes import XPlanes, random_planes
+from xplanes.fields.xplanes import FINE_PLANES, XPlanes, random_planes
 from xplanes.models.background import BackgroundSettings
 from xplanes.models.base import (
     InitialValues,
@@ -39,6 +39,15 @@ from xplanes.rendering.sampler import Group, Site, time_rows
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
 from xplanes.streams import Stream, TrainingState, step_generator
+
+FINE_WARMUP = 100
+"""Steps over which the learning rate of fine planes rises."""
+
+TEXELS_PER_PIXEL, TEXEL_STEP, MOST_TEXELS = 0.66, 32, 256
+"""Texels of fine planes where settings leave them open: how many, rounded to what, at most."""
+
+FINER = 1.5
+"""Times as many texels as the space planes have that fine planes need to be worth their time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +68,19 @@ class DecoderSettings(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class FineSettings(Settings):
+    """Fine space planes, zero at first, that are added to some channels of the space planes."""
+
+    # Texels along each space axis. auto: from the image pixels that the field's cube covers.
+    texels: Count | Literal["auto"]
+    channels: Count  # Channels of each plane.
+    start: Steps  # Step from which they are trained.
+    total_variation: Weight  # Weight of their total variation.
+    coarse_variation: Weight  # Replaces `model.loss.total_variation` where there are fine planes.
+    lr: Positive  # Learning rate.
+
+
+@dataclass(frozen=True, kw_only=True)
 class XPlanesLoss(Settings):
     """Weights of the terms of the loss beyond the colour's mean squared error."""
 
@@ -69,6 +91,8 @@ class XPlanesLoss(Settings):
     variation: Literal["mean", "coded"]
     total_variation: Weight  # Weight of the space planes' total variation.
     world_variation: Weight  # Replaces `model.loss.total_variation` if a background is learnt.
+    # Factor on the time planes' weights of smoothness and magnitude if a background is learnt.
+    world_smoothness: Weight
     time_variation: Weight  # Weight of the time planes' total variation.
     time_smoothness: Weight  # Weight of time smoothness (squared second differences).
     time_magnitude: Weight  # Weight of the time planes' mean square.
@@ -81,6 +105,17 @@ class XPlanesLoss(Settings):
     # of training views; null: never.
     initial_steps: Count | None
     every: Count  # Steps between evaluations of the regularisers; weights are scaled to match.
+
+    def before_world(self) -> "XPlanesLoss":
+        """The same with the weights before a background that is learnt."""
+        factor = self.world_smoothness
+        return replace(
+            self,
+            total_variation=self.world_variation,
+            time_variation=factor * self.time_variation,
+            time_smoothness=factor * self.time_smoothness,
+            time_magnitude=factor * self.time_magnitude,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +131,10 @@ class XPlanesSettings(ModelSettings):
     # Rows along time. half: half the distinct times, as in K-Planes, or all if four or more views
     # show each; null: the same, but at least the LRM's timesteps.
     time_resolution: Count | Literal["half"] | None
+    # Texels of the time planes along space; null: as many as the space planes.
+    time_texels: Count | None
     channels: Count  # Channels of each plane.
+    fine: FineSettings | None  # Fine space planes; null: none.
     space_scale: Weight  # Standard deviation of randomly initialised space planes.
     time_scale: Weight  # Standard deviation of randomly initialised time planes.
     decoder: DecoderSettings
@@ -106,6 +144,7 @@ class XPlanesSettings(ModelSettings):
     plane_lr: Positive  # Learning rate of the space planes.
     time_lr: Positive  # Learning rate of the time planes.
     decoder_lr: Positive  # Learning rate of the decoder.
+    world_rate: Positive  # Factor on the learning rates of the planes if a background is learnt.
     warmup_steps: Steps  # Warm-up steps of the learning rates.
     final_lr: Share  # Final learning rate relative to the initial one.
 
@@ -117,6 +156,25 @@ class XPlanesSettings(ModelSettings):
         loss = replace(self.loss, opacity=10 * max(self.loss.opacity, 0.1))
         decoder = replace(self.decoder, colour_bias=max(self.decoder.colour_bias, 2.0))
         return replace(self, loss=loss, decoder=decoder)
+
+    @property
+    def texels_of_time(self) -> int:
+        """Texels of the time planes along space."""
+        return self.time_texels or self.resolution
+
+    def texels(self, pixels: float) -> int:
+        return max(self.resolution, self.fine_texels(pixels))
+
+    def fine_texels(self, pixels: float) -> int:
+        """Texels of the fine planes along each space axis; 0 for none.
+
+        Args:
+            pixels: Image pixels that a side of the field's cube covers; 0 if not known.
+        """
+        if self.fine is None or self.fine.texels != "auto":
+            return 0 if self.fine is None else int(self.fine.texels)
+        texels = TEXEL_STEP * round(TEXELS_PER_PIXEL * pixels / TEXEL_STEP)
+        return 0 if texels < FINER * self.resolution else min(texels, MOST_TEXELS)
 
     def rows_of_time(self, times: Tensor, frames: int = 0) -> int:
         """Rows of the time planes.
@@ -146,10 +204,14 @@ class XPlanesSettings(ModelSettings):
                 channels=self.channels,
                 resolution=self.resolution,
                 time_resolution=self.rows_of_time(site.times),
+                time_texels=self.texels_of_time,
                 space_scale=self.space_scale,
                 time_scale=self.time_scale,
                 generator=generator,
             )
+        if self.fine is not None and (texels := self.fine_texels(site.pixels)):
+            zeros = torch.zeros(self.fine.channels, texels, texels)
+            planes = {**planes, **dict.fromkeys(FINE_PLANES, zeros)}
         options = self.decoder
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(generator.initial_seed())
@@ -192,14 +254,21 @@ class XPlanesModel(Model):
         initial: InitialValues | None = None,
     ) -> None:
         self._field, self.settings, self.weights = field, settings, settings.loss
+        self.plane_rate = 1.0
+        fine = None if field.fine is None else settings.fine
+        if fine is not None:
+            self.weights = replace(self.weights, total_variation=fine.coarse_variation)
+        if field.background is not None:
+            self.weights = self.weights.before_world()
+            self.plane_rate = settings.world_rate
+        self.fine = fine
         views = len(site.times)
         steps = self.weights.initial_steps
         self.fade = None if steps is None else steps / views / site.batch_scale
         self.warmup = site.steps(settings.warmup_steps)
+        self.fine_start = 0 if settings.fine is None else site.steps(settings.fine.start)
+        self.fine_warmup = site.steps(FINE_WARMUP)
         self.opacity = self.weights.opacity
-        self.total_variation = self.weights.total_variation
-        if field.background is not None:
-            self.total_variation = self.weights.world_variation
         self._opaque = site.views is not None and site.views.is_opaque
         self.product: SparseProduct | None = None
         self.initial_weight, self._initial = 0.0, []
@@ -232,9 +301,14 @@ class XPlanesModel(Model):
 
     def groups(self) -> list[Group]:
         field, settings = self._field, self.settings
-        groups: list[Group] = [{"params": [field.space], "lr": settings.plane_lr, "name": "space"}]
+        rate = self.plane_rate
+        groups: list[Group] = [
+            {"params": [field.space], "lr": rate * settings.plane_lr, "name": "space"}
+        ]
         if field.time is not None:
-            groups.append({"params": [field.time], "lr": settings.time_lr, "name": "time"})
+            groups.append({"params": [field.time], "lr": rate * settings.time_lr, "name": "time"})
+        if field.fine is not None and self.fine is not None:
+            groups.append({"params": [field.fine], "lr": rate * self.fine.lr, "name": "fine"})
         decoder = [p for p in field.decoder.parameters() if p.requires_grad]
         if decoder:
             groups.append({"params": decoder, "lr": settings.decoder_lr, "name": "decoder"})
@@ -255,6 +329,15 @@ class XPlanesModel(Model):
 
     def rate(self, step: int, progress: float) -> float:
         return warm_cosine(step, progress, warmup=self.warmup, final=self.settings.final_lr)
+
+    def rate_of(self, group: str, step: int, progress: float) -> float:
+        if group != "fine":
+            return self.rate(step, progress)
+        since = max(0, step - self.fine_start)
+        return warm_cosine(since, progress, warmup=self.fine_warmup, final=self.settings.final_lr)
+
+    def before_step(self, state: TrainingState, optimizer: torch.optim.Optimizer) -> None:
+        self._field.is_fine = state.step >= self.fine_start
 
     def regularise(self, state: TrainingState) -> None:
         every, field, weights = self.weights.every, self._field, self.weights
@@ -316,13 +399,15 @@ class XPlanesModel(Model):
         space, time = self._field.space, self._field.time
         coded = self.weights.variation == "coded"
         # Coded: twice the sum over planes, in which space planes count twice (as `PlaneTerms`).
-        weight = self.total_variation * (4 * len(space) if coded else 1)
+        weight = self.weights.total_variation * (4 * len(space) if coded else 1)
         found: dict[str, tuple[Tensor, tuple[int, ...], float]] = {
             "total_variation": (space, (1, 2), weight)
         }
         if time is not None:
             weight = self.weights.time_variation * (2 * len(time) if coded else 1)
             found["time_variation"] = (time, (1, 2) if coded else (2,), weight)
+        if (fine := self._field.fine) is not None and (options := self.fine):
+            found["fine_variation"] = (fine, (1, 2), options.total_variation)
         return found
 
     def _distance(self) -> float:

@@ -226,7 +226,7 @@ def convert_stage(
             moved,
             plane_set=model.plane_set,
             dynamic=dynamic,
-            resolution=model.resolution,
+            resolution=model.texels_of_time,
             time_resolution=rows,
             noise=config.noise,
             generator=step_generator(seed, 0, Stream.NOISE),
@@ -246,14 +246,9 @@ def convert_stage(
             }
         return content
 
-    inputs = [
-        parts.key,
-        config.static,
-        model.resolution,
-        [config.dynamic, config.noise, model.plane_set, model.time_resolution, seed]
-        if moving
-        else [],
-    ]
+    of_time = [config.dynamic, config.noise, model.plane_set, model.time_resolution]
+    of_time += [model.texels_of_time, seed]
+    inputs = [parts.key, config.static, model.resolution, of_time if moving else []]
     stage = cache.stage("planes", inputs, make)
     planes = _named(stage.content["space"], SPACE_PLANES)
     if stage.content["time"] is not None:

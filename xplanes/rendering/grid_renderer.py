@@ -3,7 +3,7 @@
 import math
 import time
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor, distributed, nn
@@ -31,6 +31,9 @@ SPARE = 1.25
 
 STEP_OF_ROOM = 1024
 """Their number is a multiple of this."""
+
+FEWEST_SAMPLES, SAMPLES_PER_PIXEL = 128, 0.5
+"""Samples along the diagonal, of which a step covers 3.5 pixels."""
 
 SPARSE_POINTS = 2048
 """Points at which the sparsity prior is taken."""
@@ -154,7 +157,9 @@ Fraction = Annotated[float, Range(0, 1, open=True)]
 class OccupancySettings(SamplerSettings):
     """Equal steps along rays; samples that cannot contribute are skipped."""
 
-    samples: Count  # Samples along the diagonal of the cube in training.
+    # Samples along the diagonal of the cube in training. auto: half as many as a side of it covers
+    # image pixels, from 128 to 256.
+    samples: Count | Literal["auto"]
     render_samples: Count  # Samples along the diagonal in evaluation and videos.
     grid_resolution: Count  # Cells of the occupancy grid along each side.
     time_bins: Count  # Bins of the occupancy grid along time.
@@ -187,17 +192,22 @@ class OccupancySettings(SamplerSettings):
             )
 
     def build(self, field: RadianceField, site: Site) -> "OccupancySampler":
+        if self.samples == "auto":
+            least, most = FEWEST_SAMPLES, 2 * FEWEST_SAMPLES
+            samples = min(max(round(SAMPLES_PER_PIXEL * site.pixels), least), most)
+            return replace(self, samples=samples).build(field, site)
+        along = self.samples
         plain = getattr(field, "background", None) is None
         grid = OccupancyGrid(
             self.grid_resolution,
             self.time_bins if site.moves else 1,
-            step=DIAGONAL / self.samples,
+            step=DIAGONAL / along,
             threshold=self.threshold if plain else self.world_threshold,
             decay=self.decay,
         )
         renderer = GridRenderer(
             grid,
-            self.samples,
+            along,
             skip_empty=self.skip_empty,
             occlusion=self.occlusion if self.skip_occluded else 0.0,
         )
@@ -222,7 +232,8 @@ class OccupancySettings(SamplerSettings):
         )
 
     def for_video(self) -> "OccupancySettings":
-        return replace(self, render_samples=self.samples)
+        samples = FEWEST_SAMPLES if self.samples == "auto" else self.samples
+        return replace(self, samples=samples, render_samples=samples)
 
 
 def _fill(renderer: GridRenderer, field: RadianceField, site: Site) -> float:
@@ -263,6 +274,7 @@ class OccupancySampler(Sampler):
     ) -> None:
         self.settings, self.grid, self.samples = settings, renderer.grid, samples
         self.fill_seconds = fill_seconds
+        self._along = renderer.samples
         room = None if samples is None else self._room(samples)
         self._training = replace(renderer, room=room)
         self._images = replace(renderer, samples=settings.render_samples)
@@ -364,9 +376,7 @@ class OccupancySampler(Sampler):
     def _room(self, samples: float) -> int:
         """Places for batches of so many samples on average: some hold more."""
         # A ray must find room, and few sizes let memory be used again.
-        return STEP_OF_ROOM * math.ceil(
-            max(SPARE * samples, 2 * self.settings.samples) / STEP_OF_ROOM
-        )
+        return STEP_OF_ROOM * math.ceil(max(SPARE * samples, 2 * self._along) / STEP_OF_ROOM)
 
     def scalars(self) -> dict[str, float]:
         return {"sampler/occupied": self.grid.occupied_fraction}

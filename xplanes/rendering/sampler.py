@@ -41,6 +41,8 @@ class Site:
             none. [2, 3]
         views: Training views; None if a checkpoint is loaded without its data.
         initialised: Whether the initial field already shows the scene.
+        pixels: Image pixels that a side of the field's cube covers, see `pixels_across`; 0 if not
+            known.
         surrounded: Whether the training images show surroundings, which lie behind the field's
             cube.
         device: Device on which the field will be trained; the CPU when None.
@@ -55,6 +57,7 @@ class Site:
     bounds: Tensor | None = None
     views: Views | None = None
     initialised: bool = False
+    pixels: float = 0.0
     surrounded: bool = False
     device: torch.device | None = None
     samples_per_batch: int | None = None

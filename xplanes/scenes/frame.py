@@ -200,6 +200,18 @@ def scene_frame(
     return cube_frame(min(half, reach), centre, source)
 
 
+def pixels_across(views: Views, frame: Frame) -> float:
+    """Image pixels that a side of the cube covers at its centre; the median view.
+
+    Args:
+        views: Training views.
+        frame: The field's frame.
+    """
+    distance = (views.camera_to_world[:, :3, 3] - frame.centre).double().norm(dim=-1)
+    pixel = distance / views.intrinsics.pinhole.amax(dim=1)
+    return float((2 / frame.scale / pixel).median())
+
+
 def _middle_box(views: Views, points: Tensor, centre: Tensor) -> Tensor | None:
     """The box of the points that most cameras see in the middle of their images, with some room.
 

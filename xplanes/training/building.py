@@ -12,7 +12,7 @@ from xplanes.fields.base import Representation
 from xplanes.models.base import Model, ModelSettings
 from xplanes.models.initialisation import Initialisation, Method, Place
 from xplanes.rendering.sampler import Sampler, Site
-from xplanes.scenes.frame import Frame
+from xplanes.scenes.frame import Frame, pixels_across
 from xplanes.scenes.views import Scene
 
 ANOTHER_SEED = 1_000_003
@@ -110,7 +110,7 @@ def build_parts(
     found = Initialisation(method.model, frame)
     if initialise is not None:
         found = initialise(method, Place(scene, frame, device, devices, say, half_side))
-    settled = rays.on(device)
+    settled = rays.on(device, scene.is_surrounded)
     site = Site(
         frame=found.frame,
         # In a field without time planes all views are of one timestep.
@@ -120,6 +120,7 @@ def build_parts(
         bounds=found.model.bounds(views),
         views=views,
         initialised=found.values is not None,
+        pixels=pixels_across(views, found.frame),
         surrounded=scene.is_surrounded,
         device=device,
         samples_per_batch=settled.most_samples,

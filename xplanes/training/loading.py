@@ -45,6 +45,7 @@ def site_content(parts: Parts) -> dict[str, Any]:
         "times": site.times,
         "bounds": site.bounds,
         "initialised": site.initialised,
+        "pixels": site.pixels,
         "surrounded": site.surrounded,
     }
 
@@ -73,6 +74,7 @@ def parts_from(
         seed=method.seed,
         precision=precision_of(settings, torch.device("cpu")),
         bounds=content["bounds"],
+        pixels=content["pixels"],
         surrounded=content["surrounded"],
         samples_per_batch=samples,
     )

@@ -1,0 +1,63 @@
+"""Fine planes: as many texels as the images show, trained from their first step on, resumed."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.training.runs import small_config
+from xplanes.config import compose_plain
+from xplanes.models.initialisation import Method
+from xplanes.run import run
+from xplanes.training.module import RadianceModule
+
+FINE = ("model.fine.texels=40", "model.fine.start=8", "model.fine.channels=3")
+
+
+def settings(*overrides: str):
+    return Method.read(small_config(Path("none"), *overrides)).model
+
+
+@pytest.mark.parametrize(
+    ("pixels", "texels"), [(0, 0), (100, 0), (140, 96), (200, 128), (400, 256), (4000, 256)]
+)
+def test_fine_planes_have_the_texels_that_the_images_show(pixels, texels):
+    model = settings("model.resolution=64")
+    assert model.fine_texels(pixels) == texels
+    assert model.texels(pixels) == max(64, texels)
+
+
+def test_they_may_be_given_or_left_out():
+    assert settings("model.fine.texels=100").fine_texels(0) == 100
+    assert settings("model.fine=null").fine_texels(4000) == 0
+    assert compose_plain("train", ["recipe=paper"])["model"]["fine"] is None
+
+
+def state_of(folder: Path) -> dict:
+    return torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+
+
+def test_they_are_zero_until_their_first_step_and_go_on_exactly(scenes: Path, tmp_path: Path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    for steps in (8, 9, 12):
+        # A limit in steps is no schedule: the rates depend on the share of it that is done.
+        config = small_config(scenes, *FINE, "model.final_lr=1.0", f"trainer.max_steps={steps}")
+        run(config, parts, [], resume=steps > 8)
+        fine = state_of(parts)["state_dict"]["field.fine"]
+        assert fine.shape == (3, 40, 40, 3)
+        assert bool(fine.any()) == (steps > 8)
+    run(config, whole, [], resume=False)
+    first, second = state_of(whole), state_of(parts)
+    for name, value in first["state_dict"].items():
+        assert torch.equal(value, second["state_dict"][name]), name
+    groups = first["optimizer_states"][0]["param_groups"]
+    assert [group["name"] for group in groups] == ["space", "time", "fine", "decoder"]
+
+
+def test_a_checkpoint_knows_how_many_texels_the_images_asked_for(scenes: Path, tmp_path: Path):
+    config = small_config(scenes, "model.resolution=16", "trainer.max_steps=2")
+    config["data"]["resolution"] = 64
+    run(config, tmp_path, [], resume=False)
+    module = RadianceModule.load_from_checkpoint(tmp_path / "checkpoints" / "last.ckpt")
+    texels = module.method.model.fine_texels(module.site.pixels)
+    assert texels == module.field.fine.shape[1] == 32

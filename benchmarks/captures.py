@@ -35,7 +35,7 @@ VARIANTS = {
     "cut_tiny": ["lrm=tiny", "data.mask_use=lrm"],
     "masks_tiny": ["lrm=tiny", "data.mask_use=alpha"],
     "rough_world": ["lrm=none", "model.background.total_variation=0"],
-    "rough_field": ["lrm=none", "model.loss.world_variation=0", "model.loss.world_smoothness=0"],
+    "rough_field": ["lrm=none", "model.loss.world_variation=0", "model.loss.time_variation=0"],
     "thin_fog": ["lrm=none", "model.sampler.world_threshold=0.001"],
     "even_rays": ["lrm=none", "model.rays.skip_background=false"],
     "kplanes": [

@@ -95,6 +95,7 @@ COMPOSITIONS = [
     ["data=nerfies", "model=kplanes_explicit"],
     ["recipe=paper", "preparation=paper"],
     ["recipe=fair", "scale=demo"],
+    ["recipe=capture"],
     ["model=tineuvox_b"],
     ["model=gaussians_hexplane", "model/sampler=rasteriser"],
     ["model=gaussians_hexplane_published", "entry=gaussians_hexplane_published"],

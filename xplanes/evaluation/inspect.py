@@ -189,7 +189,8 @@ def inspect(choice: Choice) -> Capture:
     texels = None
     if frame is not None:
         pixels = pixels_across(train, frame)
-        if (texels := model.texels(pixels)) is not None:
+        texels = model.texels(0.0 if scene.is_surrounded else pixels)
+        if texels is not None:
             findings += texel_findings(pixels / texels, train, texels)
     follows = {kind for each in findings for kind in CONSEQUENCES.get(each.kind, ())}
     findings = [each for each in findings if each.kind not in follows]

@@ -91,8 +91,6 @@ class XPlanesLoss(Settings):
     variation: Literal["mean", "coded"]
     total_variation: Weight  # Weight of the space planes' total variation.
     world_variation: Weight  # Replaces `model.loss.total_variation` if a background is learnt.
-    # Factor on the time planes' weights of smoothness and magnitude if a background is learnt.
-    world_smoothness: Weight
     time_variation: Weight  # Weight of the time planes' total variation.
     time_smoothness: Weight  # Weight of time smoothness (squared second differences).
     time_magnitude: Weight  # Weight of the time planes' mean square.
@@ -105,17 +103,6 @@ class XPlanesLoss(Settings):
     # of training views; null: never.
     initial_steps: Count | None
     every: Count  # Steps between evaluations of the regularisers; weights are scaled to match.
-
-    def before_world(self) -> "XPlanesLoss":
-        """The same with the weights before a background that is learnt."""
-        factor = self.world_smoothness
-        return replace(
-            self,
-            total_variation=self.world_variation,
-            time_variation=factor * self.time_variation,
-            time_smoothness=factor * self.time_smoothness,
-            time_magnitude=factor * self.time_magnitude,
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,7 +131,6 @@ class XPlanesSettings(ModelSettings):
     plane_lr: Positive  # Learning rate of the space planes.
     time_lr: Positive  # Learning rate of the time planes.
     decoder_lr: Positive  # Learning rate of the decoder.
-    world_rate: Positive  # Factor on the learning rates of the planes if a background is learnt.
     warmup_steps: Steps  # Warm-up steps of the learning rates.
     final_lr: Share  # Final learning rate relative to the initial one.
 
@@ -254,14 +240,12 @@ class XPlanesModel(Model):
         initial: InitialValues | None = None,
     ) -> None:
         self._field, self.settings, self.weights = field, settings, settings.loss
-        self.plane_rate = 1.0
-        fine = None if field.fine is None else settings.fine
-        if fine is not None:
-            self.weights = replace(self.weights, total_variation=fine.coarse_variation)
+        self.fine = None if field.fine is None else settings.fine
+        self.total_variation = self.weights.total_variation
         if field.background is not None:
-            self.weights = self.weights.before_world()
-            self.plane_rate = settings.world_rate
-        self.fine = fine
+            self.total_variation = self.weights.world_variation
+        elif self.fine is not None:
+            self.total_variation = self.fine.coarse_variation
         views = len(site.times)
         steps = self.weights.initial_steps
         self.fade = None if steps is None else steps / views / site.batch_scale
@@ -301,14 +285,11 @@ class XPlanesModel(Model):
 
     def groups(self) -> list[Group]:
         field, settings = self._field, self.settings
-        rate = self.plane_rate
-        groups: list[Group] = [
-            {"params": [field.space], "lr": rate * settings.plane_lr, "name": "space"}
-        ]
+        groups: list[Group] = [{"params": [field.space], "lr": settings.plane_lr, "name": "space"}]
         if field.time is not None:
-            groups.append({"params": [field.time], "lr": rate * settings.time_lr, "name": "time"})
+            groups.append({"params": [field.time], "lr": settings.time_lr, "name": "time"})
         if field.fine is not None and self.fine is not None:
-            groups.append({"params": [field.fine], "lr": rate * self.fine.lr, "name": "fine"})
+            groups.append({"params": [field.fine], "lr": self.fine.lr, "name": "fine"})
         decoder = [p for p in field.decoder.parameters() if p.requires_grad]
         if decoder:
             groups.append({"params": decoder, "lr": settings.decoder_lr, "name": "decoder"})
@@ -399,7 +380,7 @@ class XPlanesModel(Model):
         space, time = self._field.space, self._field.time
         coded = self.weights.variation == "coded"
         # Coded: twice the sum over planes, in which space planes count twice (as `PlaneTerms`).
-        weight = self.weights.total_variation * (4 * len(space) if coded else 1)
+        weight = self.total_variation * (4 * len(space) if coded else 1)
         found: dict[str, tuple[Tensor, tuple[int, ...], float]] = {
             "total_variation": (space, (1, 2), weight)
         }

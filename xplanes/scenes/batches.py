@@ -41,7 +41,7 @@ LARGEST_SHARE = 0.25
 AHEAD = 8
 """Batches whose tiles the system is told to read in advance."""
 
-CPU_RAYS, CPU_SAMPLES, SURROUNDED_SAMPLES = 1365, 8192, 24576
+CPU_RAYS, CPU_SAMPLES = 1365, 8192
 """Largest batch on the CPU where the settings leave it open; schedules in steps are made for it."""
 
 GPU_RAYS, GPU_SAMPLES = 2**15, 2**19
@@ -75,13 +75,8 @@ class Batches(ABC):
 class BatchSettings(Settings, ABC):
     """What a training step gets to see."""
 
-    def on(self, device: torch.device, surrounded: bool = False) -> "BatchSettings":
-        """The same with sizes that suit a device and images, where these are open.
-
-        Args:
-            device: Where training takes place.
-            surrounded: Whether the training images show surroundings.
-        """
+    def on(self, device: torch.device) -> "BatchSettings":
+        """The same with sizes that suit a device, where these are open."""
         return self
 
     @property
@@ -117,8 +112,7 @@ class RaySettings(BatchSettings):
     # Maximum rays per batch. auto: 1365 on the CPU; 32768 on a GPU, with the schedules of X-Planes
     # and of the occupancy grid shortened to 1/24.
     per_batch: Count | Literal["auto"]
-    # Maximum samples per batch, on average. auto: 8192 on the CPU, 24576 if images show
-    # surroundings; 524288 on a GPU.
+    # Maximum samples per batch, on average. auto: 8192 on the CPU, 524288 on a GPU.
     samples_per_batch: Count | Literal["auto"]
     # Background colour. random: drawn per ray; one: drawn per batch.
     background: Literal["white", "random", "one"]
@@ -126,10 +120,9 @@ class RaySettings(BatchSettings):
     background_share: Share  # Share of rays far from silhouettes.
     background_jitter: Share  # Maximum random time offset of these rays.
 
-    def on(self, device: torch.device, surrounded: bool = False) -> "RaySettings":
+    def on(self, device: torch.device) -> "RaySettings":
         if device.type == "cpu":
-            more = surrounded and self.samples_per_batch == "auto"
-            return replace(self, samples_per_batch=SURROUNDED_SAMPLES) if more else self
+            return self
         rays = GPU_RAYS if self.per_batch == "auto" else self.per_batch
         samples = GPU_SAMPLES if self.samples_per_batch == "auto" else self.samples_per_batch
         return replace(self, per_batch=rays, samples_per_batch=samples)

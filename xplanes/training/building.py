@@ -110,7 +110,7 @@ def build_parts(
     found = Initialisation(method.model, frame)
     if initialise is not None:
         found = initialise(method, Place(scene, frame, device, devices, say, half_side))
-    settled = rays.on(device, scene.is_surrounded)
+    settled = rays.on(device)
     site = Site(
         frame=found.frame,
         # In a field without time planes all views are of one timestep.
@@ -120,7 +120,7 @@ def build_parts(
         bounds=found.model.bounds(views),
         views=views,
         initialised=found.values is not None,
-        pixels=pixels_across(views, found.frame),
+        pixels=0.0 if scene.is_surrounded else pixels_across(views, found.frame),
         surrounded=scene.is_surrounded,
         device=device,
         samples_per_batch=settled.most_samples,

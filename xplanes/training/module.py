@@ -170,7 +170,7 @@ class RadianceModule(ViewScoring):
                 together.
         """
         device = options.get("device") or torch.device("cpu")
-        self.ray_settings = self.method.model.rays.on(device, scene.is_surrounded)
+        self.ray_settings = self.method.model.rays.on(device)
         self._adopt(build_parts(self.method, scene, frame=frame, **options))
 
     def _adopt(self, parts: Parts) -> None:

@@ -314,7 +314,7 @@ class OccupancySampler(Sampler):
             return
         parameters = [p for p in field.parameters() if p.requires_grad]
         with torch.enable_grad():
-            loss = settings.update_every * self._sparsity(field, state)
+            loss = self._sparsity(field, state, settings.update_every)
         gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             if gradient is None:
@@ -331,15 +331,15 @@ class OccupancySampler(Sampler):
     def regularisers(self, field: Any, state: TrainingState) -> dict[str, float]:
         return {"sparsity": float(self._sparsity(field, state))} if self.settings.sparsity else {}
 
-    def _sparsity(self, field: Any, state: TrainingState) -> Tensor:
-        """Mean opacity of random points in occupied cells over a training step, weighted. []"""
+    def _sparsity(self, field: Any, state: TrainingState, steps: int = 1) -> Tensor:
+        """Mean opacity of random points in occupied cells, weighted for so many steps. []"""
         stream, device = Stream.SPARSITY + state.rank, self.device
         uniform = counted_uniform(state.seed, state.step, stream, (SPARSE_POINTS, 5), device)
         points, times = self.grid.occupied_points(uniform.float())
         density = field(points, times)[1]
         opacity = -torch.expm1(-self._training.step * density)
         # No cell may be occupied; other processes wait for the gradients all the same.
-        return self.settings.sparsity * opacity.sum() / SPARSE_POINTS
+        return steps * self.settings.sparsity / SPARSE_POINTS * opacity.sum()
 
     @property
     def device(self) -> torch.device:

@@ -288,11 +288,11 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
         synchronize(device)
         seconds.append(time.perf_counter() - began)
     views, renderer = data.scene.splits[data.test_split], module.renderer
-    moment, background = float(views.times[0]), data.scene.background.to(device)
+    shown_at, background = float(views.times[0]), data.scene.background.to(device)
     camera = views.camera(0)
     if not isinstance(renderer, RayRenderer):
         began = time.perf_counter()
-        renderer.view(module.field, module.frame, camera, moment, background)
+        renderer.view(module.field, module.frame, camera, shown_at, background)
         pixels = camera.height * camera.width
         return Estimate(min(seconds), pixels / (time.perf_counter() - began))
     ends = module.frame.rays(*camera.rays())
@@ -301,7 +301,7 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
     spent = []
     for _ in range(1 if device.type == "cpu" else 2):  # On a GPU the first compiles kernels.
         began = time.perf_counter()
-        renderer.image(module.field, origins, directions, moment, background)
+        renderer.image(module.field, origins, directions, shown_at, background)
         synchronize(device)
         spent.append(time.perf_counter() - began)
     return Estimate(min(seconds), len(chosen) / min(spent))

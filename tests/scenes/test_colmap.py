@@ -295,6 +295,10 @@ def test_times_are_the_last_numbers_in_names(tmp_path, caplog):
     capture.refused(
         r"c1_020\.png has no number where data\.time_pattern=f\(", time_pattern=r"f(\d+)"
     )
+    stamps = ["1305031102.175304.png", "1305031102.975304.png", "1305031103.175304.png"]
+    assert Capture(tmp_path / "stamps", stamps).views().times.tolist() == pytest.approx([0, 0.8, 1])
+    ends = ["034_cam0.png", "036cam1.png", "044-Camera_2.png"]
+    assert Capture(tmp_path / "ends", ends).views().times.tolist() == pytest.approx([0, 0.2, 1])
     bare = Capture(tmp_path / "bare", ["a.png", "b.png"])
     bare.refused(r"a\.png has no number\. Set data\.time_pattern.*data\.times.*data\.static=true")
     assert bare.views(static=True).times.tolist() == [0, 0]

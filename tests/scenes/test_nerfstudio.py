@@ -87,6 +87,7 @@ def test_a_capture_equals_what_it_was_written_from(capture):
         ({"camera_model": "FULL_OPENCV", "k1": 0.3, "k4": 0.2, "k5": 0.02}, None),
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.03, "k2": 0.005, "k4": 1e-4}, "fisheye"),
         ({"is_fisheye": True, "k1": 0.03}, "fisheye"),
+        ({"distortion_params": [0.15, 0.02, 0.0, 0.0, 0.001, -0.002]}, None),
     ],
 )
 def test_a_distorted_lens_gives_its_rays(tmp_path, keys, model):
@@ -94,7 +95,9 @@ def test_a_distorted_lens_gives_its_rays(tmp_path, keys, model):
     capture = Capture(tmp_path, 4, **shared)
     # One frame tells a lens of its own.
     capture.frames[2] |= {"fl_x": 25.0, "k1": 0.02}
-    numbers_of = {key: value for key, value in keys.items() if key[0] in "kp"}
+    listed = keys.get("distortion_params", [0.0] * 6)
+    numbers_of = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), listed, strict=True))
+    numbers_of |= {key: value for key, value in keys.items() if key[0] in "kp"}
     for resolution, scale in ((None, 1), (8, 1 / 3)):
         views = capture.read(resolution=resolution, eval_every=10).splits["train"]
         side = views.width
@@ -270,6 +273,25 @@ def test_names_without_ending_find_upper_case_files(capture):
         path.rename(path.with_suffix(".PNG"))
         frame["file_path"] = frame["file_path"].removesuffix(".png")
     assert len(capture.read(eval_every=100).splits["train"]) == 10
+
+
+def test_a_mark_at_the_start_and_a_missing_last_row_are_read(tmp_path):
+    capture = Capture(tmp_path, 4)
+    expected = capture.read(eval_every=10).splits["train"].camera_to_world
+    path = tmp_path / "transforms.json"
+    content = json.loads(path.read_text())
+    for frame in content["frames"]:
+        frame["transform_matrix"] = frame["transform_matrix"][:3]
+    path.write_text(json.dumps(content), encoding="utf-8-sig")
+    found = read_capture(tmp_path, resolution=None, splits=["train"], eval_every=10)
+    assert torch.equal(found.splits["train"].camera_to_world, expected)
+    path.write_text('{"frames": [] // none yet\n}')
+    with pytest.raises(SceneError, match="JSON has no comments: take those that begin with //"):
+        read_capture(tmp_path, resolution=None, splits=["train"])
+    content["distortion_params"] = [0.1, 0.0, 0.0, 0.0]
+    path.write_text(json.dumps(content))
+    with pytest.raises(SceneError, match="a list of the 6 numbers k1, k2, k3, k4, p1, p2"):
+        read_capture(tmp_path, resolution=None, splits=["train"])
 
 
 def test_keys_of_other_programs_change_nothing(capture):

@@ -1,5 +1,6 @@
 """Camera paths from and to JSON files: nerfstudio's, and those of transforms files."""
 
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,6 +14,11 @@ from torch import Tensor
 from xplanes.scenes.entries import checked_pose, is_number, is_positive, read_object, short
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.views import Views
+
+logger = logging.getLogger(__name__)
+
+OVERSHOOT = 0.25
+"""How far times may lie beyond 0 and 1: splines through key frames overshoot."""
 
 
 @dataclass(frozen=True)
@@ -214,12 +220,20 @@ def _times(path: Path, entries: Entries, keys: tuple[str, ...]) -> Tensor:
     if all(time is None for time in found):
         return torch.linspace(0, 1, len(entries))
     for label, time in zip(entries, found, strict=True):
-        if not is_number(time) or not 0 <= time <= 1:
+        if not is_number(time) or not -OVERSHOOT <= time <= 1 + OVERSHOOT:
             raise SceneError(
                 f"{label}: {keys[0]} is {short(time)}; it must be a number from 0 to 1 in every "
                 f"camera of {path.name}, or in none"
             )
-    return torch.tensor(found, dtype=torch.float32)
+    times = torch.tensor(found, dtype=torch.float32)
+    within = times.clamp(0, 1)
+    if beyond := int((within != times).sum()):
+        logger.warning(
+            "%s: %d of %d times lie a little below 0 or above 1, as splines overshoot; 0 or 1 "
+            "takes their place",
+            *(path, beyond, len(times)),
+        )
+    return within
 
 
 def _count(path: Path, content: Mapping[str, Any], key: str) -> int | None:

@@ -58,7 +58,7 @@ class ColmapSettings(SceneSettings):
     # camera's folder; null: the numbers in the file names.
     times: str | None
     # Regular expression whose group is the number in a file name, such as frame_(\d+); null: the
-    # last number.
+    # last number that is not a camera's, as in 034_cam1; all of a name such as 1305031102.175304.
     time_pattern: str | None
     test_cameras: list[str]  # Subfolders of the image folder that form the test split.
     # Hold out every n-th image as val, in order of time and file name; never the first or last.
@@ -267,12 +267,23 @@ def _number(text: str) -> float | None:
     return None
 
 
+def _time_in(stem: str) -> str | None:
+    """The number in a name that tells its time: the whole name, or the last one in it.
+
+    A number of the camera at the end is none of time, as in 034_cam1.
+    """
+    if re.fullmatch(r"\d+\.\d+", stem):
+        return stem
+    without = re.sub(r"(?i)[_\-. ]*(cam|camera)[_\- ]*\d+$", "", stem)
+    return (re.findall(r"\d+", without) or re.findall(r"\d+", stem) or [None])[-1]
+
+
 def _numbers(names: Sequence[str], labels: Sequence[str], pattern: str | None) -> list[float]:
     """The number in each name."""
     found: list[float] = []
     for name, label in zip(names, labels, strict=True):
         if pattern is None:
-            text = (re.findall(r"\d+", PurePosixPath(name).stem) or [None])[-1]
+            text = _time_in(PurePosixPath(name).stem)
             wanted = "no number"
         else:
             match = re.search(pattern, name)

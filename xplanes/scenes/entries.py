@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PureWindowsPath
@@ -127,11 +128,13 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
         SceneError: If it cannot be read, or is none.
     """
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_bytes()
+        found = json.loads(text.decode("utf-8-sig"))  # Some editors begin files with a mark.
     except (OSError, ValueError, RecursionError) as problem:
-        raise SceneError(
-            f"{path} cannot be read as JSON ({problem}). Export or download it again."
-        ) from problem
+        way_out = "Export or download it again"
+        if isinstance(problem, json.JSONDecodeError) and re.search(r"(?m)//.*$", problem.doc):
+            way_out = "JSON has no comments: take those that begin with // out of it"
+        raise SceneError(f"{path} cannot be read as JSON ({problem}). {way_out}.") from problem
     if not isinstance(found, dict):
         raise SceneError(f"{path} must hold a JSON object with {content}, not {short(found)}.")
     return found
@@ -142,7 +145,7 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
 
     Args:
         label: The file and frame that hold it, for messages.
-        matrix: 4 rows of 4 numbers.
+        matrix: 4 rows of 4 numbers; the last may be missing.
         key: What it is called there.
 
     Returns:
@@ -155,6 +158,8 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
         pose = np.asarray(matrix, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         pose = np.empty(0)
+    if pose.shape == (3, 4):  # Some programs leave the last row out.
+        pose = np.vstack([pose, [0, 0, 0, 1]])
     if pose.shape != (4, 4):
         raise SceneError(f"{label}: {key} must be 4 rows of 4 numbers, not {short(matrix)}.")
     if not np.isfinite(pose).all():

@@ -39,6 +39,9 @@ OTHER_MODELS = ("FISHEYE", "EQUIRECTANGULAR", "ORTHO", "OMNI", "VR180", "DIVISIO
 OTHER_LENSES = ("equirectangular", "latlong", "orthographic", "ftheta_p0")
 """Keys with which instant-ngp tells of further lenses."""
 
+DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""Order of the list of coefficients that nerfstudio writes and reads."""
+
 SYNONYMS = {"sx1": "s1", "sy1": "s3"}
 """What COLMAP calls the prism coefficients of a fisheye lens."""
 
@@ -219,6 +222,7 @@ def _lens(
             model = _model(source, name)
         if keys.get("is_fisheye"):
             model = LensModel.FISHEYE
+        keys = _listed_distortion(source, keys)
         for key in (*COEFFICIENTS, *SYNONYMS, "omega"):
             value = keys.get(key)
             if value is None:
@@ -245,6 +249,20 @@ def _lens(
         )
     distortion = tuple(found.get(key, 0.0) for key in COEFFICIENTS)
     return model, distortion if any(distortion) else ()
+
+
+def _listed_distortion(source: str, keys: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The keys with nerfstudio's list of coefficients taken apart; single ones count more."""
+    listed = keys.get("distortion_params")
+    if listed is None:
+        return keys
+    if not isinstance(listed, list) or len(listed) != len(DISTORTION_PARAMS):
+        raise SceneError(
+            f"{source}: distortion_params is {short(listed)}; it must be a list of the "
+            f"{len(DISTORTION_PARAMS)} numbers {', '.join(DISTORTION_PARAMS)}. Give them as keys "
+            "of these names."
+        )
+    return dict(zip(DISTORTION_PARAMS, listed, strict=True)) | dict(keys)
 
 
 def _model(source: str, name: str) -> LensModel:

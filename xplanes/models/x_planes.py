@@ -46,7 +46,7 @@ FINE_WARMUP = 100
 TEXELS_PER_PIXEL, TEXEL_STEP, MOST_TEXELS = 0.66, 32, 256
 """Texels of fine planes where settings leave them open: how many, rounded to what, at most."""
 
-FINER = 1.5
+FINER = 2.0
 """Times as many texels as the space planes have that fine planes need to be worth their time."""
 
 

@@ -67,7 +67,7 @@ def check(tally, module, names, state) -> None:
     rendering = module.sampler.render(module.field, rays, state)
     terms = module.model.losses(rendering, rays, state) | module.sampler.losses(rendering)
     sum(terms.values()).backward()
-    module.sampler.pass_on(rendering, state)
+    module.sampler.observe(rendering)
     gradients = [p.grad for p in module.parameters() if p.grad is not None]
     assert gradients or len(names) == 1, "the rays together must reach the parameters"
     tally.finite(rendering.colour, rendering.opacity, rendering.depth, *terms.values(), *gradients)

@@ -80,7 +80,7 @@ def _way_out(
         rendered: Whether parameters and rendering are finite nevertheless.
     """
     added = [f"losses.{name}" for name in module.method.losses] if rendered else []
-    begun = module.global_step > module.tally.skipped
+    begun = module.tally.done > 0
     resume = "; resume= continues from the last checkpoint" if begun else ""
     if culprits := [name for name in added if name in broken]:
         return f"The rendering is finite: correct {' and '.join(culprits)} or omit it{resume}"

@@ -65,6 +65,7 @@ class Tally:
     Attributes:
         counts: Numbers since the start of the run, by the names in `COUNTS`.
         last: Loss and PSNR of the last batches, mean opacities, and the last scores of views.
+        done: Updates that were not left out.
         skipped: Updates that were left out.
         skipped_in_a_row: The same, since the last one that was not.
         opacities: Mean opacities of a recent batch, on its device.
@@ -73,7 +74,7 @@ class Tally:
     def __init__(self) -> None:
         self.counts: dict[str, int] = dict.fromkeys(COUNTS, 0)
         self.last: dict[str, float] = {}
-        self.skipped = self.skipped_in_a_row = 0
+        self.done = self.skipped = self.skipped_in_a_row = 0
         self.opacities: dict[str, Tensor] = {}
         self._batches, self._updates = Meters(), Meters()
 
@@ -114,17 +115,24 @@ class Tally:
         if found := self._updates.read():
             skipped = int(found["skipped"])
             self.skipped += skipped
+            self.done += int(found["updates"]) - skipped
             all_of_them = skipped == int(found["updates"])
             self.skipped_in_a_row = self.skipped_in_a_row + skipped if all_of_them else 0
 
     def state_dict(self) -> dict[str, Any]:
         """Counts and last values."""
-        return {"counts": dict(self.counts), "skipped": self.skipped, "last": dict(self.last)}
+        return {
+            "counts": dict(self.counts),
+            "done": self.done,
+            "skipped": self.skipped,
+            "last": dict(self.last),
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from a state."""
         self.counts = dict.fromkeys(COUNTS, 0) | state["counts"]
-        self.skipped, self.last = state["skipped"], dict(state["last"])
+        self.done, self.skipped = state["done"], state["skipped"]
+        self.last = dict(state["last"])
 
 
 def _of_all(values: dict[str, float], trainer: Trainer) -> dict[str, float]:

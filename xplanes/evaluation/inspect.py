@@ -89,7 +89,7 @@ class CameraGroup:
     Attributes:
         name: Their folder where it tells cameras apart, or a number.
         indices: Numbers of the views.
-        fixed: Whether it stands still.
+        fixed: Whether it is static.
     """
 
     name: str

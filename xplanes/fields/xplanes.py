@@ -17,8 +17,8 @@ PLANE_SETS: dict[str, Rows] = {
 }
 """Which two time planes each of xy, xz, yz multiplies.
 
-six: xt, yt, zt, each shared by two rows. nine: xt, yt | xt', zt | yt', zt'. three: none, a scene
-that stands still.
+six: xt, yt, zt, each shared by two rows. nine: xt, yt | xt', zt | yt', zt'. three: none, a static
+scene.
 """
 
 SPACE_PLANES = ("xy", "xz", "yz")
@@ -78,7 +78,7 @@ class XPlanes(RadianceField):
         fine = FINE_PLANES[0] in planes
         self.fine = nn.Parameter(_stack(planes, FINE_PLANES)) if fine else None
         self.is_fine = True
-        """Whether fine planes are read: while they are zero, nothing changes if they are not."""
+        """Whether fine planes are read; not needed while they are zero."""
         if self.space.shape[1] != self.space.shape[2]:
             raise ValueError(f"space planes are {list(planes['xy'].shape)}: must be [C, H, H]")
         if self.time is not None and self.time.shape[3] != self.space.shape[3]:

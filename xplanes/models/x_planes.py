@@ -71,7 +71,8 @@ class DecoderSettings(Settings):
 class FineSettings(Settings):
     """Fine space planes, zero at first, that are added to some channels of the space planes."""
 
-    # Texels along each space axis. auto: from the image pixels that the field's cube covers.
+    # Texels along each space axis. auto: two for three image pixels that the field's cube covers;
+    # none in scenes with surroundings.
     texels: Count | Literal["auto"]
     channels: Count  # Channels of each plane.
     start: Steps  # Step from which they are trained.

@@ -158,7 +158,7 @@ class OccupancySettings(SamplerSettings):
     """Equal steps along rays; samples that cannot contribute are skipped."""
 
     # Samples along the diagonal of the cube in training. auto: half as many as a side of it covers
-    # image pixels, from 128 to 256.
+    # image pixels, from 128 to 256; 128 in scenes with surroundings.
     samples: Count | Literal["auto"]
     render_samples: Count  # Samples along the diagonal in evaluation and videos.
     grid_resolution: Count  # Cells of the occupancy grid along each side.

@@ -9,7 +9,7 @@ from xplanes.scenes.silhouettes import widened
 from xplanes.scenes.views import Views
 
 LEAST_FRAMES = 3
-"""Images that a camera must have taken for their median to show what stands still."""
+"""Images that a camera must have taken for their median to show what is static."""
 
 CHANGE = 20
 """Difference from the median, of 255 in any channel, from which a pixel has changed."""

@@ -128,11 +128,11 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
         SceneError: If it cannot be read, or is none.
     """
     try:
-        text = path.read_bytes()
-        found = json.loads(text.decode("utf-8-sig"))  # Some editors begin files with a mark.
+        # Some editors begin files with a byte order mark.
+        found = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as problem:
         way_out = "Export or download it again"
-        if isinstance(problem, json.JSONDecodeError) and re.search(r"(?m)//.*$", problem.doc):
+        if isinstance(problem, json.JSONDecodeError) and re.search(r"(?m)(^|[\s,])//", problem.doc):
             way_out = "JSON has no comments: take those that begin with // out of it"
         raise SceneError(f"{path} cannot be read as JSON ({problem}). {way_out}.") from problem
     if not isinstance(found, dict):

@@ -34,11 +34,11 @@ def silhouette_of(alpha: Tensor) -> Tensor:
     opaque = int((alpha >= OPAQUE).sum())
     visible = alpha >= (VISIBLE if opaque >= OPAQUE_SHARE * alpha.numel() else FAINT)
     if visible.any() and not visible.all():
-        _remove_specks(visible.numpy())
+        _remove_noise(visible.numpy())
     return visible
 
 
-def _remove_specks(mask: np.ndarray) -> None:
+def _remove_noise(mask: np.ndarray) -> None:
     """Clear regions that are far smaller than the image and than the largest one. bool [h, w]"""
     height, width = mask.shape
     # Rows are two pixels longer here, so that runs of different rows never touch by number.

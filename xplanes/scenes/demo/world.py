@@ -17,7 +17,7 @@ CLOUDS = 0.06
 
 @dataclass(frozen=True)
 class World:
-    """A world around a thing; all of it stands still.
+    """A world around a thing, all of it static.
 
     Attributes:
         parts: What stands there, the ground included.

@@ -86,6 +86,30 @@ def is_there(path: Path) -> bool:
         return False
 
 
+def stand_in(path: Path) -> str | None:
+    """What lies in the place of a file that was not fetched, and the way out; None if nothing does.
+
+    Args:
+        path: A file that cannot be read as what it should be.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(256)
+    except OSError:
+        return None
+    start = head.lstrip().lower()
+    if re.match(rb"version https?://(git-lfs|hawser|git-media)", start):
+        return (
+            "is a pointer of Git LFS, not the file itself: run git lfs pull in its repository, or "
+            "download the file"
+        )
+    if b"/annex/objects/" in start:
+        return "is a pointer of git-annex, not the file itself: run git annex get on it"
+    if start.startswith((b"<!doctype html", b"<html")):
+        return "is a web page, not the file itself: download it again, from its direct address"
+    return None
+
+
 def require_writable(folder: Path) -> None:
     """Try whether a folder, which need not exist yet, can take a small file.
 

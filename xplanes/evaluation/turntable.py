@@ -23,12 +23,11 @@ from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.cameras import camera_around
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import cube_frame
-from xplanes.scenes.images import load_images
+from xplanes.scenes.images import ENDINGS, is_image, load_images
 from xplanes.streams import Stream, step_generator
 
 FRAMES, FPS, SIDE = 48, 16, 224
 SAMPLES, CELLS = 192, 64
-KINDS = (".png", ".jpg", ".jpeg")
 
 
 def write_triplanes(
@@ -98,11 +97,9 @@ def find_pictures(paths: Sequence[Path]) -> list[Path]:
     found: list[Path] = []
     for path in paths:
         if path.is_dir():
-            inside = [p for p in path.iterdir() if p.suffix.lower() in KINDS]
-            inside = [p for p in inside if not p.name.startswith(".")]
-            inside.sort(key=lambda p: natural(p.name))
+            inside = sorted(filter(is_image, path.iterdir()), key=lambda p: natural(p.name))
             if not inside:
-                raise SceneError(f"{path} holds no pictures ({', '.join(KINDS)})")
+                raise SceneError(f"{path} holds no pictures ({', '.join(ENDINGS)})")
             found += inside
         elif path.is_file():
             found.append(path)

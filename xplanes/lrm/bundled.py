@@ -3,6 +3,7 @@
 import hashlib
 from pathlib import Path
 
+from xplanes.files import stand_in
 from xplanes.lrm.checkpoint import load
 from xplanes.lrm.errors import LRMError
 from xplanes.lrm.model import LRM
@@ -36,6 +37,8 @@ def load_bundled(name: str, folder: Path = FOLDER) -> tuple[LRM, Path]:
     if not path.is_file() or not described.is_file():
         known = ", ".join(bundled_models(folder)) or "none"
         raise LRMError(f"{path} and {described.name}: no such model; {folder} contains {known}")
+    if (other := stand_in(path)) is not None:
+        raise LRMError(f"{path} {other}")
     config = read_config(described)
     expected = config.pop(CHECKSUM, None)
     found = hashlib.sha256(path.read_bytes()).hexdigest()

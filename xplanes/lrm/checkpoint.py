@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from xplanes.files import stand_in
 from xplanes.lrm.config import PUBLISHED, LRMConfig, parse_config, published_config
 from xplanes.lrm.errors import LRMError
 from xplanes.lrm.keys import translator
@@ -153,6 +154,8 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """
     if not path.is_file():
         raise LRMError(f"{path} is not a file: give the downloaded weights")
+    if (other := stand_in(path)) is not None:
+        raise LRMError(f"{path} {other}")
     content = _read_safetensors(path) if path.suffix == ".safetensors" else _read_pickle(path)
     carried: Any = {}
     if isinstance(content, dict) and "weights" in content:

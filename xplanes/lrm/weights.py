@@ -13,6 +13,7 @@ from urllib.request import getproxies, proxy_bypass
 
 import yaml
 
+from xplanes.files import stand_in
 from xplanes.lrm.checkpoint import MismatchError, load
 from xplanes.lrm.errors import LRMError
 from xplanes.lrm.model import LRM
@@ -170,6 +171,8 @@ def read_config(path: Path) -> dict[str, Any]:
     Raises:
         LRMError: If it cannot be read.
     """
+    if (other := stand_in(path)) is not None:
+        raise LRMError(f"{path} {other}")
     try:
         text = path.read_text(encoding="utf-8")
         content = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from xplanes.errors import ConfigError
 from xplanes.fields import Decoder
-from xplanes.files import replacing
+from xplanes.files import replacing, stand_in
 from xplanes.scenes.frame import Frame, check_frame, frame_content, read_frame
 
 MARK = "xplanes"
@@ -129,6 +129,8 @@ def load_triplanes(path: Path) -> TriplaneSequence:
     """
     if not path.is_file():
         raise ConfigError(f"{path}: there is no such file; save_triplanes writes one")
+    if (other := stand_in(path)) is not None:
+        raise ConfigError(f"{path} {other}")
     try:
         content = read_content(path)
     except Exception as error:  # A damaged file raises many kinds of errors.

@@ -212,17 +212,17 @@ def look_at(position: Tensor, target: Tensor | None = None) -> Tensor:
     return pose
 
 
-def upright(camera_to_world: Tensor) -> Tensor | None:
+def upright(up_vectors: Tensor) -> Tensor | None:
     """A rotation of the world after which the cameras' mean up vector is its z axis.
 
     Args:
-        camera_to_world: Poses of all cameras. [V, 4, 4]
+        up_vectors: Unit vectors, one for each camera. [V, 3]
 
     Returns:
         The rotation, in double precision, [3, 3]; None where the cameras agree on no up vector, as
         where they look down on the scene from all headings.
     """
-    up = camera_to_world[:, :3, 1].double().mean(dim=0)
+    up = up_vectors.double().mean(dim=0)
     length = up.norm()
     if length < 0.1:
         return None

@@ -25,6 +25,7 @@ from xplanes.scenes.entries import (
     unit_times,
 )
 from xplanes.scenes.errors import MissingSplitError, SceneError
+from xplanes.scenes.images import is_image
 from xplanes.scenes.listing import (
     Listing,
     MaskUse,
@@ -40,8 +41,6 @@ from xplanes.scenes.views import Scene
 from xplanes.settings import Count
 
 logger = logging.getLogger(__name__)
-
-KINDS = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,13 +129,13 @@ class ColmapSettings(SceneSettings):
         present = {
             path.relative_to(root).as_posix()
             for path in root.rglob("*")
-            if path.suffix.lower() in KINDS and path.is_file() and path.name[0] != "."
+            if is_image(path) and path.is_file()
         }
         _warn_of_unregistered(sorted(present - set(model.names)), len(present), images)
         times = self._times(model.names, labels, present)
         poses, points = model.camera_to_world, model.points
         if self.orient:
-            poses, points = oriented(poses, points)
+            poses, points = oriented(poses, points, paths)
         require_precision(model.source, poses[:, :3, 3])
         refuse_repeats(labels, paths, poses, times)
         folders = [_camera(name) for name in model.names]

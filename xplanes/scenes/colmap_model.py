@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from xplanes.scenes.entries import short
+from xplanes.scenes.entries import require_fetched, short
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
 from xplanes.scenes.listing import Calibration
@@ -183,6 +183,7 @@ _AGAIN = "Copy it again, or export the model again with colmap model_converter."
 
 
 def _read_binary(path: Path, parse: Callable[[_Binary], Parsed]) -> Parsed:
+    require_fetched(path)
     try:
         with path.open("rb") as file:
             if not os.fstat(file.fileno()).st_size:
@@ -239,6 +240,7 @@ def _binary_points(path: Path) -> np.ndarray:
 
 def _text_lines(path: Path) -> Iterator[tuple[str, str]]:
     """Lines that are no comments, each with its label."""
+    require_fetched(path)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as problem:

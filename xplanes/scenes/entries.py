@@ -1,6 +1,7 @@
 """Names, poses, numbers and times in files of cameras, read and checked."""
 
 import json
+import logging
 import math
 import re
 import warnings
@@ -11,10 +12,14 @@ from typing import Any, TypeGuard
 import numpy as np
 import torch
 
+from xplanes.files import stand_in
 from xplanes.scenes.cameras import upright
 from xplanes.scenes.errors import SceneError
+from xplanes.scenes.images import ENDINGS, orientation
 
-SUFFIXES = ("", ".png", ".jpg", ".jpeg")
+logger = logging.getLogger(__name__)
+
+SUFFIXES = ("", *ENDINGS)
 RIGID_TOLERANCE = 1e-3
 
 FARTHEST = 1e15
@@ -43,7 +48,7 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         if image.is_file():
             return image
     raise SceneError(
-        f"{label}: no image {folder / name}, nor with {', '.join(SUFFIXES[1:])} added. "
+        f"{label}: no image {folder / name}, nor with {', '.join(SUFFIXES[1:4])}, ... added. "
         f"Add the file or take the frame out of the list."
     )
 
@@ -127,6 +132,7 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
     Raises:
         SceneError: If it cannot be read, or is none.
     """
+    require_fetched(path)
     try:
         # Some editors begin files with a byte order mark.
         found = json.loads(path.read_text(encoding="utf-8-sig"))
@@ -138,6 +144,16 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise SceneError(f"{path} must hold a JSON object with {content}, not {short(found)}.")
     return found
+
+
+def require_fetched(path: Path) -> None:
+    """Refuse what stands for a file that was not fetched, such as a pointer of Git LFS.
+
+    Raises:
+        SceneError: Saying what it is and how to fetch the file.
+    """
+    if (other := stand_in(path)) is not None:
+        raise SceneError(f"{path} {other}.")
 
 
 def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.ndarray:
@@ -184,16 +200,32 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
     return pose
 
 
-def oriented(poses: np.ndarray, points: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+UP = {3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
+"""What is up in the stored pixels, to the right and upward, by EXIF's orientation; (0, 1) else."""
+
+
+def oriented(
+    poses: np.ndarray, points: np.ndarray | None, paths: Sequence[Path]
+) -> tuple[np.ndarray, np.ndarray | None]:
     """A capture whose world is turned so that the cameras' mean up vector is its z axis.
 
-    It stays as it is, and a warning says so, where the cameras agree on no up vector.
+    Up is where EXIF says that it is in an image; pixels and cameras stay as they are. The world
+    stays as it is, and a warning says so, where the cameras agree on no up vector.
 
     Args:
         poses: Cameras. float64 [V, 4, 4]
         points: Points in the same world. float64 [N, 3]
+        paths: The images. [V]
     """
-    rotation = upright(torch.from_numpy(poses))
+    tags = [orientation(path) for path in paths]
+    if turned_photos := sum(tag in UP for tag in tags):
+        logger.info(
+            "%d of %d images are to be shown turned, as their EXIF orientation says: pixels are "
+            "read as they are stored, and up vectors follow EXIF",
+            *(turned_photos, len(paths)),
+        )
+    right, upward = np.array([UP.get(tag, (0, 1)) for tag in tags], np.float64).T[..., None]
+    rotation = upright(torch.from_numpy(poses[:, :3, 0] * right + poses[:, :3, 1] * upward))
     if rotation is None:
         warnings.warn(
             "The up vectors of the cameras cancel out, so the world keeps the axes that the files "

@@ -1,5 +1,7 @@
 """Errors in scene data."""
 
+from collections.abc import Sequence
+
 from xplanes.errors import XPlanesError
 
 
@@ -9,3 +11,19 @@ class SceneError(XPlanesError, ValueError):
 
 class MissingSplitError(SceneError):
     """A scene has no split of a name."""
+
+
+SHOWN = 5
+"""Problems of a capture that are shown in full."""
+
+
+def refuse_all(problems: Sequence[str]) -> None:
+    """Refuse a capture with all that is wrong with it at once; nothing if nothing is.
+
+    Raises:
+        SceneError: With the first of many problems, and their number.
+    """
+    if problems:
+        more = len(problems) - SHOWN
+        rest = [f"... and {more} more problems like these."] * (more > 0)
+        raise SceneError("\n".join([*problems[:SHOWN], *rest]))

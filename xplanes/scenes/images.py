@@ -1,21 +1,54 @@
 """Image files decoded, multiplied by alpha and reduced to the working resolution."""
 
 import hashlib
+import re
 import struct
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 from torch import Tensor
 
+from xplanes.files import stand_in
 from xplanes.scenes import store
-from xplanes.scenes.errors import SceneError
+from xplanes.scenes.errors import SceneError, refuse_all
 
 Size = tuple[int, int]
 """Height and width."""
 
-FORMATS = ("PNG", "JPEG")
+FORMATS = """PNG JPEG MPO WEBP TIFF BMP AVIF JPEG2000 PPM TGA GIF QOI""".split()
+"""Formats of Pillow that are read; it runs other programs for some of the others."""
+
+ENDINGS = """.png .jpg .jpeg .jpe .jfif .webp .tif .tiff .bmp .avif .jp2 .ppm .pgm .tga .gif
+.qoi""".split()
+"""Endings of their files."""
+
+RAW = ".dng .nef .cr2 .cr3 .arw .raf .orf .rw2 .pef .srw".split()
+"""Endings of cameras' raw files, in which Pillow would find a thumbnail."""
+
+OTHERS = [*RAW, *".heic .heif .jxl .exr .hdr .psd".split()]
+"""Endings of image files that are not read, but named for what they are."""
+
+KINDS = {
+    r".{4}ftyp(hei|hev|mif1|msf1)": "HEIC",
+    r".{4}ftypavi[fs]": "AVIF",
+    r"\xff\n|.{4}JXL ": "JPEG XL",
+    r"v/1\x01": "OpenEXR",
+    r"#\?RADIANCE": "Radiance HDR",
+    r"8BPS": "Photoshop",
+    r".{4}ftypcrx|FUJIFILMCCD": "a camera's raw format",
+    r".{4}ftyp": "MP4",
+    r"\x93NUMPY": "NumPy's format",
+    r"%PDF": "PDF",
+}
+"""How files of other formats begin."""
+
+ORIENTATION = 0x0112
+"""EXIF's tag of how an image is to be turned when it is shown."""
+
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "P", "PA", "1")
 SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I")
 LABELS = 15
@@ -23,6 +56,14 @@ LABELS = 15
 
 COLOURED = 16
 """Difference of channels above which a mask is coloured; what JPEG makes of grey stays below."""
+
+UNTURN = {
+    5: "-transpose",
+    6: "-rotate 270",
+    7: "-transverse",
+    8: "-rotate 90",
+}
+"""How ImageMagick turns back what was turned as an EXIF orientation says."""
 
 MASKS = 2
 """Version of what masks mean; increase it whenever decoded images change."""
@@ -41,7 +82,7 @@ def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
     """Decode images of one size and reduce them to a width.
 
     Args:
-        paths: Image files, PNG or JPEG, at least one. [V]
+        paths: Image files, at least one. [V]
         resolution: Width in pixels; None keeps the size of the files.
 
     Returns:
@@ -55,13 +96,26 @@ def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
     return store.in_memory(sizes, _jobs(paths, sizes))
 
 
+def is_image(path: Path) -> bool:
+    """Whether a file's name is that of an image, be it of a format that is read or not."""
+    return path.suffix.lower() in (*ENDINGS, *OTHERS) and not path.name.startswith(".")
+
+
 def native_sizes(paths: Sequence[Path]) -> list[Size]:
     """Heights and widths of image files, read from their headers alone.
 
     Raises:
-        SceneError: If a file is no image.
+        SceneError: If files are no images; it names all of them.
     """
-    return [read_header(path)[0] for path in paths]
+    sizes: list[Size] = []
+    problems: list[str] = []
+    for path in paths:
+        try:
+            sizes.append(read_header(path)[0])
+        except SceneError as problem:
+            problems.append(str(problem))
+    refuse_all(problems)
+    return sizes
 
 
 def final_sizes(
@@ -96,7 +150,7 @@ def read_images(
     Images that take more than `store.IN_MEMORY` bytes are decoded once to a file of the cache.
 
     Args:
-        paths: Image files, PNG or JPEG, at least one. [V]
+        paths: Image files, at least one. [V]
         sizes: Height and width of each image after that. [V]
         masks: Files that alpha is multiplied by; none where it is empty. [V]
         has_ray: Pixels of the reduced images that show anything, of each image bool [h, w], or None
@@ -171,16 +225,33 @@ def _read_mask(path: Path, image: Path, size: tuple[int, ...]) -> np.ndarray:
     all but 0 or black belong to the mask.
     """
     try:
-        with Image.open(path, formats=FORMATS) as picture:
+        with _opened(path) as picture:
             values = _mask_values(picture)
     except UNREADABLE as problem:
         raise _unreadable(path, problem) from problem
     if values.shape != size:
-        raise SceneError(
-            f"{path} has {values.shape[1]}x{values.shape[0]} pixels, but {image}, whose mask it "
-            f"is, has {size[1]}x{size[0]}. Export the mask at the size of the image."
-        )
+        raise SceneError(mask_misfit(path, values.shape, image, size))
     return values
+
+
+def mask_misfit(mask: Path, size: tuple[int, ...], image: Path, wanted: tuple[int, ...]) -> str:
+    """What to do about a mask that has another height and width than its image."""
+    text = (
+        f"{mask} has {size[1]}x{size[0]} pixels, but {image}, whose mask it is, has "
+        f"{wanted[1]}x{wanted[0]}."
+    )
+    if size == wanted[::-1] and (turn := UNTURN.get(orientation(image))):
+        return (
+            f"{text} The image's EXIF orientation says that it is shown turned, and the mask was "
+            "made of the turned image. Images are read as they are stored: turn the masks back "
+            f"(magick mogrify {turn} {mask.parent}/*)."
+        )
+    if size == wanted[::-1]:
+        return (
+            f"{text} Its sides are swapped: it was perhaps made of an image that was shown turned, "
+            "as an EXIF orientation says. Make it of the image's pixels as they are stored."
+        )
+    return f"{text} Export the mask at the size of the image."
 
 
 def _mask_values(picture: Image.Image) -> np.ndarray:
@@ -231,7 +302,7 @@ def check_resolution(path: Path, width: int, height: int, resolution: int) -> No
 def load_premultiplied(path: Path) -> np.ndarray:
     """Decode one image to colour times alpha and alpha, from 0 to 255. float32 [4, H, W]"""
     try:
-        with Image.open(path, formats=FORMATS) as picture:
+        with _opened(path) as picture:
             picture.load()
             channels = _straight_channels(path, picture)
     except SceneError:
@@ -297,15 +368,56 @@ def _straight_channels(path: Path, picture: Image.Image) -> np.ndarray:
 def read_header(path: Path) -> tuple[Size, bool]:
     """Height and width of an image file, and whether it may have alpha."""
     try:
-        with Image.open(path, formats=FORMATS) as picture:
+        with _opened(path) as picture:
             alpha = "A" in picture.getbands() or "transparency" in picture.info
             return (picture.height, picture.width), alpha
     except UNREADABLE as problem:
         raise _unreadable(path, problem) from problem
 
 
+def orientation(path: Path) -> int:
+    """How EXIF says that an image is to be turned when it is shown, from 1 (not at all) to 8.
+
+    Pixels are read as they are stored, whatever it says.
+    """
+    try:
+        with _opened(path) as picture:
+            # Of a PNG without it, Pillow would decode all pixels to look for it.
+            if picture.format != "TIFF" and not {"exif", "Raw profile type exif"} & {*picture.info}:
+                return 1
+            found = picture.getexif().get(ORIENTATION, 1)
+    except UNREADABLE:
+        return 1
+    return found if found in range(1, 9) else 1
+
+
+@cache
+def _formats() -> tuple[str, ...]:
+    """Those of `FORMATS` that this Pillow knows."""
+    Image.init()
+    return tuple(name for name in FORMATS if name in Image.OPEN)
+
+
+def _opened(path: Path) -> Image.Image:
+    """An image file, its header read."""
+    if path.suffix.lower() in RAW:
+        raise OSError("it holds what the sensor measured")
+    return Image.open(path, formats=_formats())
+
+
 def _unreadable(path: Path, problem: BaseException) -> SceneError:
+    if (other := stand_in(path)) is not None:
+        return SceneError(f"{path} {other}.")
+    kind = "a camera's raw format" if path.suffix.lower() in RAW else None
+    with suppress(OSError), path.open("rb") as file:
+        start = file.read(16).decode("latin-1")
+        kind = kind or next((KINDS[text] for text in KINDS if re.match(text, start, re.S)), None)
+    if kind is not None:
+        return SceneError(
+            f"{path} is in {kind}, which is not read. Convert all such files to PNG and name "
+            f"these where the capture lists them: magick mogrify -format png *{path.suffix}"
+        )
     return SceneError(
-        f"{path} cannot be decoded as PNG or JPEG ({problem}). It is probably truncated or "
-        f"damaged: export or download it again."
+        f"{path} cannot be decoded as an image ({problem}). It is probably truncated or damaged: "
+        "export or download it again."
     )

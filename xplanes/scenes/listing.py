@@ -11,8 +11,16 @@ import torch
 from torch import Tensor
 
 from xplanes.scenes.entries import some
-from xplanes.scenes.errors import MissingSplitError, SceneError
-from xplanes.scenes.images import Size, final_sizes, native_sizes, read_images
+from xplanes.scenes.errors import MissingSplitError, SceneError, refuse_all
+from xplanes.scenes.images import (
+    UNTURN,
+    Size,
+    final_sizes,
+    mask_misfit,
+    native_sizes,
+    orientation,
+    read_images,
+)
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.views import Intrinsics, Views
 
@@ -307,42 +315,60 @@ def read_splits(
 
 
 def require_shapes(listing: Listing) -> None:
-    """Refuse images that cannot be those that their cameras were calibrated for.
+    """Refuse images that cannot be those that their cameras were calibrated for, and other masks.
 
     Args:
         listing: The images.
 
     Raises:
-        SceneError: If an aspect ratio is another.
+        SceneError: If an aspect ratio is another, or a mask has another size than its image. It
+            names all such files.
     """
     sizes = native_sizes(listing.paths)
-    for path, size, camera in zip(listing.paths, sizes, listing.calibrations, strict=True):
-        require_shape(path, size, camera)
+    shapes = map(misshapen, listing.paths, sizes, listing.calibrations)
+    problems = [problem for problem in shapes if problem is not None]
+    masked = [
+        (mask, path, size)
+        for mask, path, size in zip(listing.masks, listing.paths, sizes, strict=False)
+        if mask is not None
+    ]
+    for mask_size, (mask, path, size) in zip(
+        native_sizes([mask for mask, _, _ in masked]), masked, strict=True
+    ):
+        if mask_size != size:
+            problems.append(mask_misfit(mask, mask_size, path, size))
+    refuse_all(problems)
 
 
-def require_shape(path: Path, size: Size, camera: Calibration) -> None:
-    """Refuse an image or a video that cannot be what its camera was calibrated for.
+def misshapen(path: Path, size: Size, camera: Calibration) -> str | None:
+    """Why an image or a video cannot be what its camera was calibrated for; None if it can.
 
     Args:
-        path: The file, for messages.
+        path: The file.
         size: Its height and width.
-        camera: Its calibration.
-
-    Raises:
-        SceneError: If the calibration tells width and height, of another aspect ratio.
+        camera: Its calibration; it may tell width and height, of another aspect ratio.
     """
     if camera.w is None or camera.h is None:
-        return
+        return None
     height, width = size
     # Images that were made smaller have rounded sizes.
     off = abs(width * camera.h - height * camera.w)
-    if off > max(1.5 * max(camera.w, camera.h), SHAPE_TOLERANCE * width * camera.h):
-        raise SceneError(
-            f"{path} has {width}x{height} pixels, but its camera was calibrated for images of "
-            f"{camera.w:g}x{camera.h:g}, of another aspect ratio. Perhaps the image was cut, "
-            "or turned (orientations in EXIF are not followed): take the one that the camera was "
-            "calibrated with."
+    if off <= max(1.5 * max(camera.w, camera.h), SHAPE_TOLERANCE * width * camera.h):
+        return None
+    text = (
+        f"{path} has {width}x{height} pixels, but its camera was calibrated for images of "
+        f"{camera.w:g}x{camera.h:g}, of another aspect ratio."
+    )
+    if (height > width) != (camera.h > camera.w) and orientation(path) in UNTURN:
+        return (
+            f"{text} Its EXIF orientation says that it is to be shown turned, and the camera was "
+            "calibrated with the turned image. Pixels are read as they are stored: turn those of "
+            f"copies of the images (magick mogrify -auto-orient *{path.suffix})."
         )
+    return (
+        f"{text} Perhaps the image was cut or turned: take the one that the camera was calibrated "
+        "with."
+    )
 
 
 def final_intrinsics(

@@ -23,19 +23,21 @@ from xplanes.files import natural
 from xplanes.scenes import store, videos
 from xplanes.scenes.colmap_model import MODELS, find_model, read_model
 from xplanes.scenes.entries import (
-    SUFFIXES,
     checked_pose,
     is_positive,
     paths_inside,
+    require_fetched,
     require_precision,
     some,
 )
-from xplanes.scenes.errors import MissingSplitError, SceneError
+from xplanes.scenes.errors import MissingSplitError, SceneError, refuse_all
 from xplanes.scenes.images import (
+    ENDINGS,
     Size,
     cleared,
     digests,
     final_sizes,
+    is_image,
     native_sizes,
     read_header,
     read_image,
@@ -45,8 +47,8 @@ from xplanes.scenes.listing import (
     Calibration,
     Listing,
     final_intrinsics,
+    misshapen,
     require_rays,
-    require_shape,
     thinned,
 )
 from xplanes.scenes.source import SceneSettings
@@ -258,6 +260,7 @@ def _is_recording(path: Path) -> bool:
 def _from_poses_bounds(folder: Path) -> list[Camera]:
     """Cameras of poses_bounds.npy, whose rows belong to the videos or folders cam* by name."""
     path = folder / POSES
+    require_fetched(path)
     try:
         rows = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as problem:
@@ -440,16 +443,12 @@ def _recording(camera: Camera) -> Recording:
         rate = None if video.rate is None else float(video.rate)
         return Recording(camera, video.size, video.count, rate)
     images = sorted(
-        (
-            path
-            for path in camera.source.iterdir()
-            if path.suffix.lower() in SUFFIXES[1:] and not path.name.startswith(".")
-        ),
+        (path for path in camera.source.iterdir() if is_image(path)),
         key=lambda path: natural(path.name),
     )
     if not images:
         raise SceneError(
-            f"{camera.source} holds no images ({', '.join(SUFFIXES[1:])}). Add the frames of the "
+            f"{camera.source} holds no images ({', '.join(ENDINGS)}). Add the frames of the "
             f"camera, or take it out of the calibration ({camera.label})."
         )
     sizes = native_sizes(images)
@@ -541,8 +540,8 @@ def _read_views(
     sources = [recording.camera.source for recording in recordings]
     sizes = final_sizes(sources, native, resolution)
     calibrations = [recording.camera.calibration for recording in recordings]
-    for source, size, calibration in zip(sources, native, calibrations, strict=True):
-        require_shape(source, size, calibration)
+    shapes = map(misshapen, sources, native, calibrations)
+    refuse_all([problem for problem in shapes if problem is not None])
     labels = [recording.camera.label for recording in recordings]
     intrinsics = final_intrinsics(labels, calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(recordings))]

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from xplanes.scenes.entries import (
+    SUFFIXES,
     checked_pose,
     image_path,
     is_number,
@@ -19,6 +20,7 @@ from xplanes.scenes.entries import (
     oriented,
     read_object,
     refuse_repeats,
+    require_fetched,
     require_precision,
     short,
     some,
@@ -44,8 +46,6 @@ logger = logging.getLogger(__name__)
 
 TIMES = ("time_id", "warp_id", "appearance_id")
 """Keys of metadata.json that count timesteps; the first that all images have is taken."""
-
-IMAGES = (".png", ".jpg", ".jpeg")
 
 DOWNLOAD = "Download or unpack the capture again."
 
@@ -106,14 +106,14 @@ class NerfiesSettings(SceneSettings):
         points = _points(folder / "points.npy")
         if points is not None:
             points = (points - centre) * scale
-        if self.orient:
-            poses, points = oriented(poses, points)
         pictures = _picture_folder(folder, names, self.resolution)
         labels = [f"{folder / 'dataset.json'}: {name}" for name in names]
         paths = [
             image_path(label, root, f"rgb/{pictures}/{name}", "ids")
             for label, name in zip(labels, names, strict=True)
         ]
+        if self.orient:
+            poses, points = oriented(poses, points, paths)
         times, takers = self._metadata(names)
         require_precision(folder, poses[:, :3, 3])
         refuse_repeats(labels, paths, poses, times)
@@ -322,7 +322,7 @@ def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) 
     """
     widths = {}
     for path in (folder / "rgb").glob("*x"):
-        first = [path / f"{names[0]}{end}" for end in IMAGES]
+        first = [path / f"{names[0]}{end}" for end in SUFFIXES[1:]]
         if path.name[:-1].isdecimal() and any(file.is_file() for file in first):
             widths[path.name] = native_sizes([file for file in first if file.is_file()])[0][1]
     if not widths:
@@ -332,7 +332,7 @@ def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) 
         )
     enough = {name: width for name, width in widths.items() if width >= (resolution or math.inf)}
     chosen = min(enough, key=enough.__getitem__) if enough else max(widths, key=widths.__getitem__)
-    _require_files(folder / "rgb" / chosen, names, IMAGES)
+    _require_files(folder / "rgb" / chosen, names, SUFFIXES[1:])
     return chosen
 
 
@@ -351,6 +351,7 @@ def _points(path: Path) -> np.ndarray | None:
     """Points of the background, before they are centred and scaled. float64 [N, 3]"""
     if not path.is_file():
         return None
+    require_fetched(path)
     try:
         points = np.array(np.load(path, mmap_mode="r", allow_pickle=False), dtype=np.float64)
     except (OSError, ValueError, EOFError) as problem:

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from xplanes.files import stand_in
 from xplanes.optional import require
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.images import Size
 
-SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+SUFFIXES = """.mp4 .mov .m4v .mkv .webm .avi .mpg .mpeg .ts .mts .m2ts .3gp .wmv""".split()
 """Suffixes of files that are taken for videos."""
 
 
@@ -97,6 +98,8 @@ def _stream(path: Path, container: Any) -> Any:
 
 
 def _unreadable(path: Path, problem: Exception) -> SceneError:
+    if (other := stand_in(path)) is not None:
+        return SceneError(f"{path} {other}.")
     return SceneError(
         f"{path} cannot be decoded as a video ({problem}). It is probably truncated or damaged: "
         "export or download it again."

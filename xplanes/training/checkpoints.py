@@ -16,7 +16,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from xplanes.errors import ConfigError
-from xplanes.files import replacing
+from xplanes.files import replacing, stand_in
 from xplanes.training.clock import off_clock
 from xplanes.training.diagnosis import require_finite
 from xplanes.training.interrupt import Stopped
@@ -192,6 +192,8 @@ def load_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
             f"{path} does not exist: the run stopped before its first checkpoint "
             "(callbacks.checkpoints.every)"
         )
+    if (other := stand_in(path)) is not None:
+        raise ConfigError(f"{path} {other}")
     try:
         # torch reads changed bytes silently, though it keeps their checksums.
         with zipfile.ZipFile(path) as archive:

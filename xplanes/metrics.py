@@ -8,33 +8,49 @@ import torch
 from torch import Tensor
 
 
-def psnr(prediction: Tensor, truth: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of one image in [0, 1], at most 100. [H, W, 3]"""
-    error = (prediction.clamp(0, 1).double() - truth.double()).square().mean()
+def psnr(prediction: Tensor, truth: Tensor, shown: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB of one image in [0, 1], at most 100.
+
+    Args:
+        prediction: The image. [H, W, 3]
+        truth: What it should be. [H, W, 3]
+        shown: Pixels that count; all when None. bool [H, W]
+    """
+    squares = (prediction.clamp(0, 1).double() - truth.double()).square()
+    error = (squares if shown is None else squares[shown]).mean()
     return float(-10 * torch.log10(error.clamp_min(1e-10)))
 
 
-def ssim(prediction: Tensor, truth: Tensor) -> float:
-    """Structural similarity of one image in [0, 1], Gaussian window of 11 with sigma 1.5. [H, W, 3]
+def ssim(prediction: Tensor, truth: Tensor, shown: Tensor | None = None) -> float:
+    """Structural similarity of one image in [0, 1], Gaussian window of 11 with sigma 1.5.
 
     Images below 11 pixels a side have no window to slide and score NaN.
+
+    Args:
+        prediction: The image. [H, W, 3]
+        truth: What it should be. [H, W, 3]
+        shown: Pixels that count; all when None. bool [H, W]
     """
     if min(truth.shape[:2]) < 11:
         return float("nan")
-    return float(_similarity(prediction.clamp(0, 1), truth.clamp(0, 1)))
+    similarity = _similarity(prediction.clamp(0, 1), truth.clamp(0, 1))
+    return float(similarity.mean() if shown is None else similarity[shown].mean())
 
 
 def dissimilarity(prediction: Tensor, truth: Tensor) -> Tensor:
     """1 - SSIM as a term of a loss, differentiable; 0 for images below 11 pixels a side. []"""
     if min(truth.shape[:2]) < 11:
         return prediction.new_zeros(())
-    return 1 - _similarity(prediction, truth)
+    return 1 - _similarity(prediction, truth).mean()
 
 
 def _similarity(prediction: Tensor, truth: Tensor) -> Tensor:
+    """Similarity of the window around each pixel, the mean over channels. [H, W]"""
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     first, second = (t.float().permute(2, 0, 1)[None] for t in (prediction, truth))
-    score = structural_similarity_index_measure(first, second, data_range=1.0)
-    assert isinstance(score, Tensor)
-    return score
+    _, whole = structural_similarity_index_measure(
+        first, second, data_range=1.0, return_full_image=True
+    )
+    assert isinstance(whole, Tensor)
+    return whole[0].mean(dim=0)

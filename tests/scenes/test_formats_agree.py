@@ -215,7 +215,7 @@ def test_masks_for_lrms_leave_the_images_whole(name: str, tmp_path: Path) -> Non
 def test_masks_that_are_not_there_are_not_for_lrms(tmp_path: Path) -> None:
     made = replace(colmap(tmp_path, text=False), mask_use="lrm", masks=None)
     assert_refused(
-        SceneError, r"data\.mask_use=lrm: no image has a mask file.*alpha", made.read, made
+        SceneError, r"data\.mask_use=lrm: no image has a mask file.*auto", made.read, made
     )
 
 

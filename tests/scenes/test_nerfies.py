@@ -170,7 +170,7 @@ def test_masks_are_used_when_they_are_named(capture):
     for name in capture.ids:
         save(capture.path / "masks" / "1x" / f"{name}.png", mask)
     assert read(capture).splits["train"].image(0)[..., 3].min() == 255
-    image = read(capture, masks="masks").splits["val"].image(1)
+    image = read(capture, masks="masks", mask_use="alpha").splits["val"].image(1)
     assert not image[:, :10].any()
     assert np.array_equal(image[:, 10:, :3], picture(3)[:, 10:])
     refused(capture, r"data\.masks: .*other does not exist", masks="other")

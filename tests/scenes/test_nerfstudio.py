@@ -200,7 +200,7 @@ def test_images_of_several_sizes_and_widths(capture):
         path = capture.path / capture.frames[index]["file_path"]
         with Image.open(path) as picture:
             picture.resize((48, 36)).save(path)
-    assert "another aspect ratio" in capture.refused("EXIF", resolution=12)
+    assert "another aspect ratio" in capture.refused("cut or turned", resolution=12)
     for index in (1, 4):
         capture.frames[index] |= {"h": 18, "cy": 9.0}
     views = capture.read(resolution=12, eval_every=100).splits["train"]
@@ -213,7 +213,7 @@ def test_masks_bound_the_scene(capture):
     mask.save(capture.path / "mask.png")
     for frame in capture.frames:
         frame["mask_path"] = "mask.png"
-    views = capture.read(eval_every=100).splits["train"]
+    views = capture.read(eval_every=100, mask_use="alpha").splits["train"]
     for index in range(10):
         expected = capture.views.image(index) * torch.ones(SIZE, SIZE).tril()[..., None]
         assert torch.equal(views.image(index), expected.byte())
@@ -245,7 +245,7 @@ def test_masks_of_labels_colours_and_alpha_mean_what_they_show(capture, kind):
     label_masks()[kind].save(capture.path / "mask.png")
     for frame in capture.frames:
         frame["mask_path"] = "mask.png"
-    views = capture.read(eval_every=100).splits["train"]
+    views = capture.read(eval_every=100, mask_use="alpha").splits["train"]
     expected = capture.views.image(0) * torch.ones(SIZE, SIZE).tril()[..., None]
     assert torch.equal(views.image(0), expected.byte())
 
@@ -255,9 +255,103 @@ def test_soft_masks_stay_soft(capture):
     Image.fromarray(values).convert("RGB").save(capture.path / "mask.jpg", quality=100)
     for frame in capture.frames:
         frame["mask_path"] = "mask.jpg"
-    alpha = capture.read(eval_every=100).splits["train"].image(0)[..., 3].float()
+    read = capture.read(eval_every=100, mask_use="alpha").splits["train"]
+    alpha = read.image(0)[..., 3].float()
     expected = torch.from_numpy(values) * (capture.views.image(0)[..., 3] > 0)
-    assert float((alpha - expected).abs().max()) <= 3
+    off = (alpha - expected).abs()
+    # Nearly black and white are black and white in a lossy format.
+    assert float(off.max()) <= 11
+    assert float(off[(expected > 11) & (expected < 244)].max()) <= 3
+
+
+def masked(capture, values, ending="png", of=lambda index: True, **options):
+    """Give frames a mask of grey values; the others get a black one."""
+    for index, frame in enumerate(capture.frames):
+        frame["mask_path"] = f"masks/{index}.{ending}"
+        path = capture.path / frame["mask_path"]
+        path.parent.mkdir(exist_ok=True)
+        Image.fromarray(values if of(index) else 0 * values).save(path, **options)
+
+
+def band(rows=SIZE // 4):
+    """A mask of the car bonnet that a camera sees at the bottom of every image."""
+    values = np.full((SIZE, SIZE), 255, np.uint8)
+    values[SIZE - rows :] = 0
+    return values
+
+
+def disc():
+    """The silhouette of a thing in the middle."""
+    row, column = np.mgrid[:SIZE, :SIZE] - (SIZE - 1) / 2
+    return np.where(row**2 + column**2 < (0.4 * SIZE) ** 2, 255, 0).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("ending", "value"), [("png", 255), ("png", 1), ("jpg", 255)])
+def test_pixels_that_masks_leave_out_are_neither_drawn_nor_scored(capture, caplog, ending, value):
+    masked(capture, band() // 255 * value, ending, quality=95)
+    with caplog.at_level("INFO"):
+        scene = capture.read(eval_every=5)
+    assert "masks leave out 25.0% of the pixels. They are taken for pixels to ignore" in caplog.text
+    train = scene.splits["train"]
+    shown = torch.from_numpy(band() > 0)
+    assert torch.equal(train.image(0), capture.views.image(0)), "colours stay as they are"
+    assert all(torch.equal(train.shown(index), shown) for index in range(len(train)))
+    assert torch.equal(train.valid()[1], shown)
+    assert torch.equal(train.subset(torch.tensor([2])).shown(0), shown)
+    module = built(scene)
+    batches = SceneDataModule.of(scene).batches_for(module, 0)
+    rows = torch.cat([batches.draw(step)["row"] for step in range(3)])
+    assert len(rows) > 100
+    assert int(rows.max()) < SIZE - SIZE // 4
+
+
+def test_scores_leave_ignored_pixels_out(capture):
+    masked(capture, band())
+    views = capture.read(eval_every=5).splits["val"]
+    item = whole_view(views, 0, torch.ones(3))
+    image = {"colour": item["target"].clone(), "opacity": torch.ones(SIZE, SIZE)}
+    image["colour"][-SIZE // 4 :] = 0.5
+    found = score_image(image, item)
+    assert found.psnr == 100
+    assert found.ssim > 0.8, "only windows beside the ignored pixels see them"
+    image["colour"][0, 0] += 0.1
+    assert score_image(image, item).psnr < 60
+
+
+def test_masks_that_look_like_silhouettes_bound_the_scene(capture, caplog):
+    masked(capture, disc())
+    with caplog.at_level("INFO"):
+        views = capture.read(eval_every=100).splits["train"]
+    assert "They are taken for silhouettes" in caplog.text
+    assert views.ignored is None
+    assert not views.image(0)[0, 0, 3]
+    ignoring = capture.read(eval_every=100, mask_use="ignore").splits["train"]
+    assert torch.equal(ignoring.shown(0), torch.from_numpy(disc() > 0))
+
+
+def test_masks_that_may_mean_either_are_asked_about(capture):
+    masked(capture, band(5 * SIZE // 12))
+    with pytest.warns(UserWarning, match=r"Both readings are possible.*data\.mask_use=alpha"):
+        capture.read(eval_every=100)
+
+
+def test_all_masks_of_a_capture_have_one_scale(capture):
+    # In a frame without the thing, a lossy format makes values next to 0 of black.
+    masked(capture, disc(), "jpg", of=lambda index: index != 3, quality=60)
+    nearly = np.random.default_rng(0).integers(0, 3, (SIZE, SIZE)).astype(np.uint8)
+    Image.fromarray(nearly).save(capture.path / "masks/3.jpg", quality=100)
+    with pytest.warns(UserWarning, match="1 of 10 images show nothing"):
+        views = capture.read(eval_every=100).splits["train"]
+    assert not views.image(3).any()
+    assert views.image(0)[SIZE // 2, SIZE // 2, 3] == 255
+
+
+def test_numbers_of_many_things_are_labels(capture):
+    values = disc() // 255 * np.arange(1, SIZE + 1, dtype=np.uint8)
+    masked(capture, values)
+    views = capture.read(eval_every=100).splits["train"]
+    solid = capture.views.image(0)[..., 3] > 0
+    assert torch.equal(views.image(0)[..., 3] > 0, solid & torch.from_numpy(disc() > 0))
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -22,8 +22,9 @@ from xplanes.rendering.grid_renderer import DIAGONAL, GridRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.cameras import camera_around
 from xplanes.scenes.errors import SceneError
+from xplanes.scenes.formats import ENDINGS, is_image
 from xplanes.scenes.frame import cube_frame
-from xplanes.scenes.images import ENDINGS, is_image, load_images
+from xplanes.scenes.images import load_images
 from xplanes.streams import Stream, step_generator
 
 FRAMES, FPS, SIDE = 48, 16, 224

@@ -369,7 +369,7 @@ class RayBatches(Batches):
             height, width = self.views.size(index)
             chosen = torch.zeros(TILE, TILE, dtype=torch.bool)
             chosen[: height - row, : width - column] = True
-            shown = self.views.intrinsics.has_ray(index)
+            shown = self.views.shown(index)
             if shown is not None:
                 shown = shown[row : row + TILE, column : column + TILE]
                 chosen[: shown.shape[0], : shown.shape[1]] = shown

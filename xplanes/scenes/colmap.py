@@ -25,16 +25,16 @@ from xplanes.scenes.entries import (
     unit_times,
 )
 from xplanes.scenes.errors import MissingSplitError, SceneError
-from xplanes.scenes.images import is_image
+from xplanes.scenes.formats import is_image
 from xplanes.scenes.listing import (
     Listing,
-    MaskUse,
     held_out,
     picked,
     read_splits,
     require_shapes,
     thinned,
 )
+from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.multicamera import recordings_of_cameras
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene
@@ -52,7 +52,9 @@ class ColmapSettings(SceneSettings):
     # Folder of masks: NAME.png for each image NAME, black outside the foreground; null for none.
     # Masks that hid moving objects from COLMAP would hide them here, too.
     masks: str | None
-    mask_use: MaskUse  # alpha: masks become alpha; lrm: they only cut out the LRM's input.
+    # What masks leave out. alpha: is empty; ignore: is neither trained on nor scored; auto: alpha
+    # where they look like silhouettes, else ignore; lrm: is cut from the LRM's input alone.
+    mask_use: MaskUse
     # Times of the images: a CSV file with the columns file and time; rank: the order within each
     # camera's folder; null: the numbers in the file names.
     times: str | None

@@ -15,7 +15,7 @@ import torch
 from xplanes.files import stand_in
 from xplanes.scenes.cameras import upright
 from xplanes.scenes.errors import SceneError
-from xplanes.scenes.images import ENDINGS, orientation
+from xplanes.scenes.formats import ENDINGS, orientation
 
 logger = logging.getLogger(__name__)
 

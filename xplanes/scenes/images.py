@@ -1,81 +1,25 @@
 """Image files decoded, multiplied by alpha and reduced to the working resolution."""
 
 import hashlib
-import re
-import struct
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from xplanes.files import stand_in
 from xplanes.scenes import store
 from xplanes.scenes.errors import SceneError, refuse_all
+from xplanes.scenes.formats import SIXTEEN_BIT_MODES, UNREADABLE, open_image, unreadable
+from xplanes.scenes.masks import read_mask
 
 Size = tuple[int, int]
 """Height and width."""
 
-FORMATS = """PNG JPEG MPO WEBP TIFF BMP AVIF JPEG2000 PPM TGA GIF QOI""".split()
-"""Formats of Pillow that are read; it runs other programs for some of the others."""
-
-ENDINGS = """.png .jpg .jpeg .jpe .jfif .webp .tif .tiff .bmp .avif .jp2 .ppm .pgm .tga .gif
-.qoi""".split()
-"""Endings of their files."""
-
-RAW = ".dng .nef .cr2 .cr3 .arw .raf .orf .rw2 .pef .srw".split()
-"""Endings of cameras' raw files, in which Pillow would find a thumbnail."""
-
-OTHERS = [*RAW, *".heic .heif .jxl .exr .hdr .psd".split()]
-"""Endings of image files that are not read, but named for what they are."""
-
-KINDS = {
-    r".{4}ftyp(hei|hev|mif1|msf1)": "HEIC",
-    r".{4}ftypavi[fs]": "AVIF",
-    r"\xff\n|.{4}JXL ": "JPEG XL",
-    r"v/1\x01": "OpenEXR",
-    r"#\?RADIANCE": "Radiance HDR",
-    r"8BPS": "Photoshop",
-    r".{4}ftypcrx|FUJIFILMCCD": "a camera's raw format",
-    r".{4}ftyp": "MP4",
-    r"\x93NUMPY": "NumPy's format",
-    r"%PDF": "PDF",
-}
-"""How files of other formats begin."""
-
-ORIENTATION = 0x0112
-"""EXIF's tag of how an image is to be turned when it is shown."""
-
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "P", "PA", "1")
-SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I")
-LABELS = 15
-"""Largest value of masks that number things; brighter ones go from black to white."""
 
-COLOURED = 16
-"""Difference of channels above which a mask is coloured; what JPEG makes of grey stays below."""
-
-UNTURN = {
-    5: "-transpose",
-    6: "-rotate 270",
-    7: "-transverse",
-    8: "-rotate 90",
-}
-"""How ImageMagick turns back what was turned as an EXIF orientation says."""
-
-MASKS = 2
+MASKS = 3
 """Version of what masks mean; increase it whenever decoded images change."""
-
-UNREADABLE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    struct.error,
-    Image.DecompressionBombError,
-)
 
 
 def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
@@ -94,11 +38,6 @@ def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
     common_size(paths)
     sizes = final_sizes(paths, native_sizes(paths), resolution)
     return store.in_memory(sizes, _jobs(paths, sizes))
-
-
-def is_image(path: Path) -> bool:
-    """Whether a file's name is that of an image, be it of a format that is read or not."""
-    return path.suffix.lower() in (*ENDINGS, *OTHERS) and not path.name.startswith(".")
 
 
 def native_sizes(paths: Sequence[Path]) -> list[Size]:
@@ -144,6 +83,7 @@ def read_images(
     masks: Sequence[Path | None] = (),
     has_ray: Sequence[Tensor | None] = (),
     cache: Path | None = None,
+    labels: bool = False,
 ) -> Tensor | store.StoredImages:
     """Decode images of any sizes and reduce them.
 
@@ -156,6 +96,7 @@ def read_images(
         has_ray: Pixels of the reduced images that show anything, of each image bool [h, w], or None
             for all; all of all images where it is empty. [V]
         cache: Folder of decoded images; that of the user when None.
+        labels: Whether masks hold numbers of things, see `masks.read_mask`.
 
     Returns:
         Colour, multiplied by alpha before it was averaged, and alpha, smaller images padded with
@@ -165,13 +106,13 @@ def read_images(
         SceneError: A file cannot be decoded, or a mask does not fit its image.
         StorageError: The cache cannot be written.
     """
-    jobs = _jobs(paths, sizes, masks, has_ray)
+    jobs = _jobs(paths, sizes, masks, has_ray, labels)
     if not store.is_needed(sizes):
         return store.in_memory(sizes, jobs)
     cut = any(masks) or any(shown is not None for shown in has_ray)
     channels = 4 if cut or any(read_header(path)[1] for path in paths) else 3
     sources = [*paths, *(mask for mask in masks if mask is not None)]
-    recipe = ["images", MASKS, [mask is not None for mask in masks], digests(has_ray)]
+    recipe = ["images", MASKS, labels, [mask is not None for mask in masks], digests(has_ray)]
     return store.decoded(sources, recipe, sizes, channels, jobs, cache)
 
 
@@ -180,12 +121,14 @@ def _jobs(
     sizes: Sequence[Size],
     masks: Sequence[Path | None] = (),
     has_ray: Sequence[Tensor | None] = (),
+    labels: bool = False,
 ) -> list[store.Job]:
     """What decodes the images, one each."""
 
     def job(index: int) -> store.Job:
         def decode() -> Iterator[tuple[int, np.ndarray]]:
-            pixels = read_image(paths[index], sizes[index], masks[index] if masks else None)
+            mask = masks[index] if masks else None
+            pixels = read_image(paths[index], sizes[index], mask, labels)
             yield index, cleared(pixels, has_ray[index] if has_ray else None)
 
         return decode
@@ -209,65 +152,15 @@ def digests(masks: Sequence[Tensor | None]) -> list[str]:
     return [known[id(mask)] for mask in masks]
 
 
-def read_image(path: Path, size: Size, mask: Path | None = None) -> np.ndarray:
+def read_image(
+    path: Path, size: Size, mask: Path | None = None, labels: bool = False
+) -> np.ndarray:
     """Decode one image, multiply it by its mask, and reduce it. uint8 [H, W, 4]"""
     channels = load_premultiplied(path)
     if mask is not None:
-        channels *= _read_mask(mask, path, channels.shape[1:])
+        channels *= read_mask(mask, labels, path)
     height, width = size
     return shrink(channels, width, height)
-
-
-def _read_mask(path: Path, image: Path, size: tuple[int, ...]) -> np.ndarray:
-    """A mask as factors from 0, where it is black, to 1. float32 [H, W]
-
-    Transparent masks count by their alpha. Colours and small numbers are labels of things, of which
-    all but 0 or black belong to the mask.
-    """
-    try:
-        with _opened(path) as picture:
-            values = _mask_values(picture)
-    except UNREADABLE as problem:
-        raise _unreadable(path, problem) from problem
-    if values.shape != size:
-        raise SceneError(mask_misfit(path, values.shape, image, size))
-    return values
-
-
-def mask_misfit(mask: Path, size: tuple[int, ...], image: Path, wanted: tuple[int, ...]) -> str:
-    """What to do about a mask that has another height and width than its image."""
-    text = (
-        f"{mask} has {size[1]}x{size[0]} pixels, but {image}, whose mask it is, has "
-        f"{wanted[1]}x{wanted[0]}."
-    )
-    if size == wanted[::-1] and (turn := UNTURN.get(orientation(image))):
-        return (
-            f"{text} The image's EXIF orientation says that it is shown turned, and the mask was "
-            "made of the turned image. Images are read as they are stored: turn the masks back "
-            f"(magick mogrify {turn} {mask.parent}/*)."
-        )
-    if size == wanted[::-1]:
-        return (
-            f"{text} Its sides are swapped: it was perhaps made of an image that was shown turned, "
-            "as an EXIF orientation says. Make it of the image's pixels as they are stored."
-        )
-    return f"{text} Export the mask at the size of the image."
-
-
-def _mask_values(picture: Image.Image) -> np.ndarray:
-    if picture.mode in SIXTEEN_BIT_MODES:
-        values, white = np.asarray(picture, np.float32), 65535
-    else:
-        colours = np.asarray(picture.convert("RGBA"))
-        if colours[..., 3].min() < 255:
-            return np.asarray(colours[..., 3], np.float32) / 255
-        channels = colours[..., :3].astype(np.int16)
-        if np.ptp(channels, axis=-1).max() > COLOURED:
-            return np.asarray(channels.any(axis=-1), np.float32)
-        values, white = np.asarray(picture.convert("L"), np.float32), 255
-    if values.max() <= LABELS:
-        return (values > 0).astype(np.float32)
-    return values / white
 
 
 def common_size(paths: Sequence[Path]) -> tuple[int, int]:
@@ -302,13 +195,13 @@ def check_resolution(path: Path, width: int, height: int, resolution: int) -> No
 def load_premultiplied(path: Path) -> np.ndarray:
     """Decode one image to colour times alpha and alpha, from 0 to 255. float32 [4, H, W]"""
     try:
-        with _opened(path) as picture:
+        with open_image(path) as picture:
             picture.load()
             channels = _straight_channels(path, picture)
     except SceneError:
         raise
     except UNREADABLE as problem:
-        raise _unreadable(path, problem) from problem
+        raise unreadable(path, problem) from problem
     channels[:3] *= channels[3] * np.float32(1 / 255)
     return channels
 
@@ -368,56 +261,8 @@ def _straight_channels(path: Path, picture: Image.Image) -> np.ndarray:
 def read_header(path: Path) -> tuple[Size, bool]:
     """Height and width of an image file, and whether it may have alpha."""
     try:
-        with _opened(path) as picture:
+        with open_image(path) as picture:
             alpha = "A" in picture.getbands() or "transparency" in picture.info
             return (picture.height, picture.width), alpha
     except UNREADABLE as problem:
-        raise _unreadable(path, problem) from problem
-
-
-def orientation(path: Path) -> int:
-    """How EXIF says that an image is to be turned when it is shown, from 1 (not at all) to 8.
-
-    Pixels are read as they are stored, whatever it says.
-    """
-    try:
-        with _opened(path) as picture:
-            # Of a PNG without it, Pillow would decode all pixels to look for it.
-            if picture.format != "TIFF" and not {"exif", "Raw profile type exif"} & {*picture.info}:
-                return 1
-            found = picture.getexif().get(ORIENTATION, 1)
-    except UNREADABLE:
-        return 1
-    return found if found in range(1, 9) else 1
-
-
-@cache
-def _formats() -> tuple[str, ...]:
-    """Those of `FORMATS` that this Pillow knows."""
-    Image.init()
-    return tuple(name for name in FORMATS if name in Image.OPEN)
-
-
-def _opened(path: Path) -> Image.Image:
-    """An image file, its header read."""
-    if path.suffix.lower() in RAW:
-        raise OSError("it holds what the sensor measured")
-    return Image.open(path, formats=_formats())
-
-
-def _unreadable(path: Path, problem: BaseException) -> SceneError:
-    if (other := stand_in(path)) is not None:
-        return SceneError(f"{path} {other}.")
-    kind = "a camera's raw format" if path.suffix.lower() in RAW else None
-    with suppress(OSError), path.open("rb") as file:
-        start = file.read(16).decode("latin-1")
-        kind = kind or next((KINDS[text] for text in KINDS if re.match(text, start, re.S)), None)
-    if kind is not None:
-        return SceneError(
-            f"{path} is in {kind}, which is not read. Convert all such files to PNG and name "
-            f"these where the capture lists them: magick mogrify -format png *{path.suffix}"
-        )
-    return SceneError(
-        f"{path} cannot be decoded as an image ({problem}). It is probably truncated or damaged: "
-        "export or download it again."
-    )
+        raise unreadable(path, problem) from problem

@@ -5,23 +5,21 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from xplanes.scenes.entries import some
 from xplanes.scenes.errors import MissingSplitError, SceneError, refuse_all
+from xplanes.scenes.formats import UNTURN, mask_misfit, orientation
 from xplanes.scenes.images import (
-    UNTURN,
     Size,
     final_sizes,
-    mask_misfit,
     native_sizes,
-    orientation,
     read_images,
 )
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
+from xplanes.scenes.masks import MaskUse, chosen_use, ignored_pixels, survey
 from xplanes.scenes.views import Intrinsics, Views
 
 SHORTEST, LONGEST = 1e-3, 1e5
@@ -32,9 +30,6 @@ FARTHEST_ASIDE, STRONGEST = 1e3, 1e6
 
 SHAPE_TOLERANCE = 0.02
 """By how much the aspect ratio of an image may differ from that of its camera."""
-
-MaskUse = Literal["alpha", "lrm"]
-"""What mask files are for: alpha of the images, or `Scene.cut` alone."""
 
 
 @dataclass(frozen=True)
@@ -253,7 +248,13 @@ def thinned(
     return found
 
 
-def read_views(listing: Listing, resolution: int | None, cache: Path | None = None) -> Views:
+def read_views(
+    listing: Listing,
+    resolution: int | None,
+    cache: Path | None = None,
+    ignore: bool = False,
+    labels: bool | None = None,
+) -> Views:
     """Read the images of a listing, with their masks, and reduce them to a width.
 
     Pixels to which a fisheye or FOV lens maps no direction, as outside of a fisheye's circle, get
@@ -263,6 +264,8 @@ def read_views(listing: Listing, resolution: int | None, cache: Path | None = No
         listing: At least one image.
         resolution: Width in pixels; None keeps the sizes of the files.
         cache: Folder of images that are too large for memory; that of the user when None.
+        ignore: Whether pixels that masks leave out are ignored; they get alpha 0 otherwise.
+        labels: Whether masks hold numbers of things; None finds out.
 
     Raises:
         SceneError: If a file cannot be decoded, the resolution cannot be met, or a perspective
@@ -270,14 +273,26 @@ def read_views(listing: Listing, resolution: int | None, cache: Path | None = No
     """
     native = native_sizes(listing.paths)
     sizes = final_sizes(listing.paths, native, resolution)
-    labels = [str(path) for path in listing.paths]
-    intrinsics = final_intrinsics(labels, listing.calibrations, native, sizes)
+    names = [str(path) for path in listing.paths]
+    intrinsics = final_intrinsics(names, listing.calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(listing))]
     for index, shown in enumerate(has_ray):
         if shown is not None:
-            require_rays(labels[index], listing.calibrations[index], shown)
-    images = read_images(listing.paths, sizes, listing.masks, has_ray, cache)
-    views = Views(images, listing.camera_to_world, listing.times, intrinsics, listing.files)
+            require_rays(names[index], listing.calibrations[index], shown)
+    masked = any(listing.masks)
+    if labels is None:
+        labels = masked and survey(listing.masks).labels
+    masks = () if ignore else listing.masks
+    images = read_images(listing.paths, sizes, masks, has_ray, cache, labels)
+    ignored = ignored_pixels(listing.masks, listing.paths, sizes, labels) if ignore else None
+    views = Views(
+        images,
+        listing.camera_to_world,
+        listing.times,
+        intrinsics,
+        listing.files,
+        ignored=ignored if masked else None,
+    )
     _warn_of_empty(views, listing)
     return views
 
@@ -294,7 +309,7 @@ def read_splits(
         parts: The images of each split.
         resolution: As for `read_views`.
         cache: As for `read_views`.
-        mask_use: Whether masks become alpha, or are for LRMs alone.
+        mask_use: What the black parts of masks are.
 
     Returns:
         The views of each split, and `Scene.cut`.
@@ -306,12 +321,21 @@ def read_splits(
     if mask_use == "lrm":
         if not any(part.masks for part in parts.values()):
             raise SceneError(
-                "data.mask_use=lrm: no image has a mask file. Add masks, or set it to alpha."
+                "data.mask_use=lrm: no image has a mask file. Add masks, or set it to auto."
             )
         if "train" in parts:
             cut = read_views(parts["train"], resolution, cache)
         parts = {split: replace(part, masks=()) for split, part in parts.items()}
-    return {split: read_views(part, resolution, cache) for split, part in parts.items()}, cut
+    masks = [mask for part in parts.values() for mask in part.masks]
+    if not any(masks):
+        return {split: read_views(part, resolution, cache) for split, part in parts.items()}, cut
+    kind = survey(masks)
+    use = chosen_use(mask_use, kind, str(next(iter(parts.values())).paths[0].parent))
+    read = {
+        split: read_views(part, resolution, cache, use == "ignore", kind.labels)
+        for split, part in parts.items()
+    }
+    return read, cut
 
 
 def require_shapes(listing: Listing) -> None:

@@ -31,13 +31,12 @@ from xplanes.scenes.entries import (
     some,
 )
 from xplanes.scenes.errors import MissingSplitError, SceneError, refuse_all
+from xplanes.scenes.formats import ENDINGS, is_image
 from xplanes.scenes.images import (
-    ENDINGS,
     Size,
     cleared,
     digests,
     final_sizes,
-    is_image,
     native_sizes,
     read_header,
     read_image,

@@ -31,13 +31,13 @@ from xplanes.scenes.images import native_sizes
 from xplanes.scenes.listing import (
     Calibration,
     Listing,
-    MaskUse,
     held_out,
     picked,
     read_splits,
     require_shapes,
     thinned,
 )
+from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene
 from xplanes.settings import Count
@@ -60,7 +60,9 @@ class NerfiesSettings(SceneSettings):
     # Folder of masks, with the subfolders and file names of rgb, black outside the foreground; null
     # for none. DyCheck's co-visibility masks are unsuitable: they do not mark the foreground.
     masks: str | None
-    mask_use: MaskUse  # alpha: masks become alpha; lrm: they only cut out the LRM's input.
+    # What masks leave out. alpha: is empty; ignore: is neither trained on nor scored; auto: alpha
+    # where they look like silhouettes, else ignore; lrm: is cut from the LRM's input alone.
+    mask_use: MaskUse
     # Without listed val images: hold out every n-th image as val, in order of time and name.
     eval_every: Count
     orient: bool  # Rotate the world so that the cameras' mean up vector becomes its z axis.

@@ -7,7 +7,8 @@ from typing import Any
 
 from xplanes.scenes.entries import image_path, short
 from xplanes.scenes.errors import MissingSplitError, SceneError
-from xplanes.scenes.listing import Listing, MaskUse, held_out, read_splits, thinned
+from xplanes.scenes.listing import Listing, held_out, read_splits, thinned
+from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.transforms import listing_of, read_frames
 from xplanes.scenes.views import Scene
@@ -26,7 +27,8 @@ class NerfstudioSettings(SceneSettings):
     # Hold out every n-th frame as val, in order of time and file name; never the first or last.
     # Splits listed in the capture (train_filenames, ...) take precedence.
     eval_every: Count
-    # alpha: masks of mask_path become alpha; lrm: they only cut out the LRM's input.
+    # What masks leave out. alpha: is empty; ignore: is neither trained on nor scored; auto: alpha
+    # where they look like silhouettes, else ignore; lrm: is cut from the LRM's input alone.
     mask_use: MaskUse
 
     @classmethod
@@ -52,7 +54,7 @@ def read_capture(
     resolution: int | None,
     splits: Sequence[str],
     eval_every: int = 8,
-    mask_use: MaskUse = "alpha",
+    mask_use: MaskUse = "auto",
     views: int | None = None,
     eval_views: int | None = None,
     cache: Path | None = None,
@@ -68,7 +70,7 @@ def read_capture(
         resolution: Width of the images in pixels; None keeps the native sizes.
         splits: Names of the splits to read: train, val, test.
         eval_every: Where the file lists no splits, one frame in so many goes to val.
-        mask_use: Whether the masks of ``mask_path`` become alpha, or are for LRMs alone.
+        mask_use: What the black parts of masks are.
         views: Number of views to keep of the train split, spread evenly over time;
             None keeps all.
         eval_views: The same for every other split, at most.

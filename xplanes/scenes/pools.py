@@ -150,7 +150,7 @@ def tile_pools(views: Views, images: StoredImages, margins: list[int]) -> tuple[
             reach = -(-margin // CELL)
             around = F.max_pool2d(lit.float()[None], 2 * reach + 1, stride=1, padding=reach)
             near = around[0] > 0
-        shown = views.intrinsics.has_ray(index)
+        shown = views.shown(index)
         if shown is None:
             height, width = (_lengths(side) for side in size)
             count = height[:, None] * width

@@ -180,9 +180,10 @@ class Views:
         files: Name of each image, relative to the scene's folder. [V]
         thing: Share of each pixel that the foreground object covers, from 0 to 255; used only for
             scores. None if unknown. uint8 [V, H, W]
+        ignored: Pixels that are neither trained on nor scored; None for none. bool [V, H, W]
 
     Raises:
-        ValueError: If the shapes of ``images``, ``intrinsics`` and ``thing`` disagree.
+        ValueError: If the shapes of ``images``, ``intrinsics``, ``thing`` and ``ignored`` disagree.
     """
 
     images: Tensor | StoredImages
@@ -191,6 +192,7 @@ class Views:
     intrinsics: Intrinsics
     files: tuple[str, ...]
     thing: Tensor | None = None
+    ignored: Tensor | None = None
 
     def __post_init__(self) -> None:
         count, height, width = self.images.shape[:3]
@@ -204,11 +206,13 @@ class Views:
                 f"{len(size)} images of at most {size.amax(dim=0).tolist() if len(size) else 0} "
                 "pixels, as views.intrinsics says"
             )
-        if self.thing is not None and self.thing.shape != (count, height, width):
-            raise ValueError(
-                f"views.thing is {list(self.thing.shape)}, but views.images are "
-                f"{[count, height, width]}"
-            )
+        for name in ("thing", "ignored"):
+            pixels: Tensor | None = getattr(self, name)
+            if pixels is not None and pixels.shape != (count, height, width):
+                raise ValueError(
+                    f"views.{name} is {list(pixels.shape)}, but views.images are "
+                    f"{[count, height, width]}"
+                )
 
     def __len__(self) -> int:
         return len(self.files)
@@ -235,15 +239,19 @@ class Views:
 
     @property
     def is_cut(self) -> bool:
-        """Whether some pixels show nothing: padding, or corners that a fisheye lens leaves dark."""
+        """Whether some pixels are left out: padding, those without a ray, and ignored ones."""
         sights = self.intrinsics.sights or []
-        return self.is_padded or any(each.has_ray is not None for each in sights)
+        return (
+            self.is_padded
+            or self.ignored is not None
+            or any(each.has_ray is not None for each in sights)
+        )
 
     @cached_property
     def is_opaque(self) -> bool:
         """Whether the silhouettes are the whole images: alpha says nothing then."""
         for index in range(len(self)):
-            has_ray = self.intrinsics.has_ray(index)
+            has_ray = self.shown(index)
             if isinstance(self.images, StoredImages):
                 shown = self.images.solid(index)
                 if has_ray is not None:
@@ -291,6 +299,18 @@ class Views:
         height, width = self.size(index)
         return self.images[index, :height, :width]
 
+    def shown(self, index: int) -> Tensor | None:
+        """Pixels of image ``index`` that are trained on and scored; None for all. bool [h, w]
+
+        The others are ignored, or the lens maps no direction to them.
+        """
+        has_ray = self.intrinsics.has_ray(index)
+        if self.ignored is None:
+            return has_ray
+        height, width = self.size(index)
+        shown = ~self.ignored[index, :height, :width]
+        return shown if has_ray is None else shown & has_ray
+
     def thing_in(self, index: int) -> Tensor | None:
         """Share of each pixel of image ``index`` that shows the foreground object. uint8 [h, w]
 
@@ -329,7 +349,7 @@ class Views:
         columns = torch.arange(self.width) < width[:, None]
         found = rows[:, :, None] & columns[:, None, :]
         for index in range(len(self)):
-            if (has_ray := self.intrinsics.has_ray(index)) is not None:
+            if (has_ray := self.shown(index)) is not None:
                 found[index, : has_ray.shape[0], : has_ray.shape[1]] &= has_ray
         return found
 
@@ -371,6 +391,7 @@ class Views:
             intrinsics,
             tuple(self.files[i] for i in indices.tolist()),
             None if self.thing is None else self.thing[indices, :height, :width],
+            None if self.ignored is None else self.ignored[indices, :height, :width],
         )
 
     def composite(self, index: int, background: Tensor) -> Tensor:
@@ -380,7 +401,7 @@ class Views:
 
     def edge_share_of(self, index: int, colour: Tensor) -> float:
         """Share of the pixels at the edge of image ``index`` that look like a colour. [3]"""
-        image, has_ray = self.image(index), self.intrinsics.has_ray(index)
+        image, has_ray = self.image(index), self.shown(index)
         pale = (image[..., :3].short() - (255 * colour).short()).abs().amax(dim=-1) < PALE_STEPS
         edge = torch.ones_like(pale) if has_ray is None else has_ray.clone()
         height, width = pale.shape

@@ -109,12 +109,17 @@ def score_image(image: Mapping[str, Tensor], item: Mapping[str, Any]) -> ViewSco
     """
     truth = item["target"].cpu()
     colour = image["colour"].float().clamp(0, 1)
+    opacity, alpha = image["opacity"].float(), item["alpha"].cpu()
+    if (shown := item.get("shown")) is not None:
+        shown = shown.cpu()
+        truth = torch.where(shown[..., None], truth, item["background"].cpu())
+        opacity, alpha = opacity[shown], alpha[shown]
     return ViewScore(
         file=item["file"],
         time=float(item["time"]),
-        psnr=psnr(colour, truth),
-        ssim=ssim(colour, truth),
-        floaters=floaters(image["opacity"].float(), item["alpha"].cpu()),
+        psnr=psnr(colour, truth, shown),
+        ssim=ssim(colour, truth, shown),
+        floaters=floaters(opacity, alpha),
         psnr_thing=psnr_thing(colour, truth, item.get("thing")),
     )
 
@@ -163,7 +168,7 @@ def psnr_thing(colour: Tensor, truth: Tensor, thing: Tensor | None) -> float:
 
 
 def floaters(opacity: Tensor, alpha: Tensor) -> float:
-    """Share of pixels with alpha 0 whose rendered opacity is above `VISIBLE`. [H, W], uint8 [H, W]
+    """Share of pixels with alpha 0 whose rendered opacity is above `VISIBLE`. [N], uint8 [N]
 
     NaN without such pixels.
     """

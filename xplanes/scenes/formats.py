@@ -1,0 +1,143 @@
+"""Image files: formats that are read, and what to say of those that are not."""
+
+import re
+import struct
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+from PIL import Image
+
+from xplanes.files import stand_in
+from xplanes.scenes.errors import SceneError
+
+FORMATS = """PNG JPEG MPO WEBP TIFF BMP AVIF JPEG2000 PPM TGA GIF QOI""".split()
+"""Formats of Pillow that are read; it runs other programs for some of the others."""
+
+ENDINGS = """.png .jpg .jpeg .jpe .jfif .webp .tif .tiff .bmp .avif .jp2 .ppm .pgm .tga .gif
+.qoi""".split()
+"""Endings of their files."""
+
+RAW = ".dng .nef .cr2 .cr3 .arw .raf .orf .rw2 .pef .srw".split()
+"""Endings of cameras' raw files, in which Pillow would find a thumbnail."""
+
+OTHERS = [*RAW, *".heic .heif .jxl .exr .hdr .psd".split()]
+"""Endings of image files that are not read, but named for what they are."""
+
+KINDS = {
+    r".{4}ftyp(hei|hev|mif1|msf1)": "HEIC",
+    r".{4}ftypavi[fs]": "AVIF",
+    r"\xff\n|.{4}JXL ": "JPEG XL",
+    r"v/1\x01": "OpenEXR",
+    r"#\?RADIANCE": "Radiance HDR",
+    r"8BPS": "Photoshop",
+    r".{4}ftypcrx|FUJIFILMCCD": "a camera's raw format",
+    r".{4}ftyp": "MP4",
+    r"\x93NUMPY": "NumPy's format",
+    r"%PDF": "PDF",
+}
+"""How files of other formats begin."""
+
+ORIENTATION = 0x0112
+"""EXIF's tag of how an image is to be turned when it is shown."""
+
+SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I")
+UNTURN = {
+    5: "-transpose",
+    6: "-rotate 270",
+    7: "-transverse",
+    8: "-rotate 90",
+}
+"""How ImageMagick turns back what was turned as an EXIF orientation says."""
+
+UNREADABLE = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    struct.error,
+    Image.DecompressionBombError,
+)
+
+
+def is_image(path: Path) -> bool:
+    """Whether a file's name is that of an image, be it of a format that is read or not."""
+    return path.suffix.lower() in (*ENDINGS, *OTHERS) and not path.name.startswith(".")
+
+
+def orientation(path: Path) -> int:
+    """How EXIF says that an image is to be turned when it is shown, from 1 (not at all) to 8.
+
+    Pixels are read as they are stored, whatever it says.
+    """
+    try:
+        with open_image(path) as picture:
+            # Of a PNG without it, Pillow would decode all pixels to look for it.
+            if picture.format != "TIFF" and not {"exif", "Raw profile type exif"} & {*picture.info}:
+                return 1
+            found = picture.getexif().get(ORIENTATION, 1)
+    except UNREADABLE:
+        return 1
+    return found if found in range(1, 9) else 1
+
+
+def mask_misfit(mask: Path, size: tuple[int, ...], image: Path, wanted: tuple[int, ...]) -> str:
+    """What to do about a mask that has another height and width than its image."""
+    text = (
+        f"{mask} has {size[1]}x{size[0]} pixels, but {image}, whose mask it is, has "
+        f"{wanted[1]}x{wanted[0]}."
+    )
+    if size == wanted[::-1] and (turn := UNTURN.get(orientation(image))):
+        return (
+            f"{text} The image's EXIF orientation says that it is shown turned, and the mask was "
+            "made of the turned image. Images are read as they are stored: turn the masks back "
+            f"(magick mogrify {turn} {mask.parent}/*)."
+        )
+    if size == wanted[::-1]:
+        return (
+            f"{text} Its sides are swapped: it was perhaps made of an image that was shown turned, "
+            "as an EXIF orientation says. Make it of the image's pixels as they are stored."
+        )
+    return f"{text} Export the mask at the size of the image."
+
+
+@cache
+def _formats() -> tuple[str, ...]:
+    """Those of `FORMATS` that this Pillow knows."""
+    Image.init()
+    return tuple(name for name in FORMATS if name in Image.OPEN)
+
+
+def open_image(path: Path) -> Image.Image:
+    """An image file, its header read.
+
+    Raises:
+        OSError: If it is none, and others of `UNREADABLE`.
+    """
+    if path.suffix.lower() in RAW:
+        raise OSError("it holds what the sensor measured")
+    return Image.open(path, formats=_formats())
+
+
+def unreadable(path: Path, problem: BaseException) -> SceneError:
+    """What to say of a file that cannot be decoded.
+
+    Args:
+        path: The file.
+        problem: What its decoder says.
+    """
+    if (other := stand_in(path)) is not None:
+        return SceneError(f"{path} {other}.")
+    kind = "a camera's raw format" if path.suffix.lower() in RAW else None
+    with suppress(OSError), path.open("rb") as file:
+        start = file.read(16).decode("latin-1")
+        kind = kind or next((KINDS[text] for text in KINDS if re.match(text, start, re.S)), None)
+    if kind is not None:
+        return SceneError(
+            f"{path} is in {kind}, which is not read. Convert all such files to PNG and name "
+            f"these where the capture lists them: magick mogrify -format png *{path.suffix}"
+        )
+    return SceneError(
+        f"{path} cannot be decoded as an image ({problem}). It is probably truncated or damaged: "
+        "export or download it again."
+    )

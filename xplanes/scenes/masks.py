@@ -1,0 +1,210 @@
+"""Mask files: what their values and black parts stand for, decided over a whole capture."""
+
+import logging
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.formats import (
+    SIXTEEN_BIT_MODES,
+    UNREADABLE,
+    mask_misfit,
+    open_image,
+    unreadable,
+)
+
+logger = logging.getLogger(__name__)
+
+MaskUse = Literal["auto", "alpha", "ignore", "lrm"]
+"""What the black parts of masks are: empty space, pixels to ignore, or of no concern but to LRMs.
+
+auto: empty space where masks look like silhouettes, else pixels to ignore.
+"""
+
+SURVEYED = 32
+"""Masks of a capture that are looked at to find out what its masks mean."""
+
+COLOURED = 16
+"""Difference of channels above which a mask is coloured; what JPEG makes of grey stays below."""
+
+MOST_LABELS = 64
+"""Distinct numbers that a capture's masks may have if they are labels of things."""
+
+WHITE = 0.94
+"""Share of the largest value that labels do not exceed."""
+
+LOSSY = ("JPEG", "MPO", "WEBP", "AVIF", "JPEG2000")
+"""Formats whose values are near those that were meant."""
+
+NOISE = 8 / 255
+"""Difference from black and from white below which lossy formats may have made it."""
+
+SILHOUETTE_EDGE, UNCLEAR = 0.5, (0.25, 0.75)
+"""Share of the images' edges from which on masks are silhouettes, and where it may be either."""
+
+KEPT = 0.9
+"""Share of a pixel that a mask must show for the pixel not to be ignored."""
+
+
+@dataclass(frozen=True)
+class MaskKind:
+    """What the masks of a capture mean.
+
+    Attributes:
+        labels: Whether their values are numbers of things, all of which but 0 belong to the mask.
+        edge: Share of the pixels at the images' edges that they leave out.
+        share: Share of all pixels that they leave out.
+    """
+
+    labels: bool
+    edge: float
+    share: float
+
+    @property
+    def use(self) -> Literal["alpha", "ignore"]:
+        """What their black parts are: empty where they are silhouettes, else to be ignored."""
+        return "alpha" if self.edge >= SILHOUETTE_EDGE else "ignore"
+
+
+def survey(masks: Sequence[Path | None]) -> MaskKind:
+    """Look at some masks of a capture to find out what all of them mean.
+
+    Args:
+        masks: A file for each image, or None. [V]
+
+    Raises:
+        SceneError: If a mask cannot be decoded.
+    """
+    files = list(dict.fromkeys(mask for mask in masks if mask is not None))
+    files = files[:: -(-len(files) // SURVEYED) or 1]
+    numbers: set[float] = set()
+    for path in files:
+        with _picture(path) as picture:
+            grey = _grey(picture)
+            # Lossy formats have no labels, whose numbers must be exact.
+            white = 65535 if picture.mode in SIXTEEN_BIT_MODES else 255
+            numbers |= {1} if picture.format in LOSSY else set(np.unique(grey / white).tolist())
+    labels = len(numbers) <= MOST_LABELS and max(numbers, default=0) <= WHITE
+    edges, shares = [], []
+    for path in files:
+        out = 1 - read_mask(path, labels)
+        rim = np.concatenate([out[0], out[-1], out[1:-1, 0], out[1:-1, -1]])
+        edges.append(float(rim.mean()))
+        shares.append(float(out.mean()))
+    return MaskKind(labels, float(np.mean(edges)), float(np.mean(shares)))
+
+
+def chosen_use(use: MaskUse, kind: MaskKind, where: str) -> MaskUse:
+    """The use of a capture's masks, said in words; a warning where they may be either.
+
+    Args:
+        use: The setting ``data.mask_use``.
+        kind: What `survey` found.
+        where: Where the masks are, for messages.
+    """
+    if use == "lrm":
+        return use
+    found: MaskUse = kind.use if use == "auto" else use
+    meaning = {
+        "alpha": "silhouettes: what they leave out is empty",
+        "ignore": "pixels to ignore: what they leave out is neither trained on nor scored",
+    }
+    other: MaskUse = "ignore" if found == "alpha" else "alpha"
+    text = f"{where}: masks leave out {kind.share:.1%} of the pixels. They are taken for"
+    if use == "auto" and UNCLEAR[0] < kind.edge < UNCLEAR[1]:
+        warnings.warn(
+            f"{text} {meaning[found]}. Both readings are possible: set data.mask_use={found} to "
+            f"confirm it, or data.mask_use={other} if they are {meaning[other]}.",
+            stacklevel=4,
+        )
+    else:
+        logger.info("%s %s (data.mask_use=%s)", text, meaning[found], found)
+    return found
+
+
+def read_mask(path: Path, labels: bool, image: Path | None = None) -> np.ndarray:
+    """A mask as factors from 0, where it is black, to 1. float32 [H, W]
+
+    Transparent masks count by their alpha; in coloured ones all but black belongs to the mask.
+
+    Args:
+        path: The file.
+        labels: Whether its values are numbers of things, all of which but 0 belong to the mask.
+        image: The image whose size it must have; None for any size.
+
+    Raises:
+        SceneError: If it cannot be decoded, or has another size.
+    """
+    with _picture(path) as picture:
+        if image is not None:
+            with _picture(image) as other:
+                size, wanted = picture.size[::-1], other.size[::-1]
+            if size != wanted:
+                raise SceneError(mask_misfit(path, size, image, wanted))
+        lossy = picture.format in LOSSY
+        white = 65535 if picture.mode in SIXTEEN_BIT_MODES else 255
+        values = _grey(picture).astype(np.float32)
+    if labels:
+        return (values > 0).astype(np.float32)
+    values = values / white
+    if lossy:
+        values[values < NOISE], values[values > 1 - NOISE] = 0, 1
+    return values
+
+
+def ignored_pixels(
+    masks: Sequence[Path | None],
+    images: Sequence[Path],
+    sizes: Sequence[tuple[int, int]],
+    labels: bool,
+) -> Tensor:
+    """Pixels of reduced images that masks leave out, in part at least, with padding. bool [V, H, W]
+
+    Args:
+        masks: A file for each image, or None. [V]
+        images: The images. [V]
+        sizes: Their heights and widths. [V]
+        labels: As for `read_mask`.
+
+    Raises:
+        SceneError: If a mask cannot be decoded, or has another size than its image.
+    """
+    height, width = (max(size[axis] for size in sizes) for axis in (0, 1))
+    found = torch.zeros(len(masks), height, width, dtype=torch.bool)
+    for index, (mask, image, (rows, columns)) in enumerate(zip(masks, images, sizes, strict=True)):
+        if mask is not None:
+            shown = Image.fromarray(read_mask(mask, labels, image))
+            shown = np.asarray(shown.resize((columns, rows), Image.Resampling.BOX))
+            found[index, :rows, :columns] = torch.from_numpy(shown < KEPT)
+    return found
+
+
+def _picture(path: Path) -> Image.Image:
+    try:
+        picture = open_image(path)
+        picture.load()
+    except UNREADABLE as problem:
+        raise unreadable(path, problem) from problem
+    return picture
+
+
+def _grey(picture: Image.Image) -> np.ndarray:
+    """The values of a mask as they are stored; of coloured ones 255 for all but black. [H, W]"""
+    if picture.mode in SIXTEEN_BIT_MODES:
+        return np.asarray(picture)
+    colours = np.asarray(picture.convert("RGBA"))
+    if colours[..., 3].min() < 255:
+        return colours[..., 3]
+    channels = colours[..., :3].astype(np.int16)
+    if np.ptp(channels, axis=-1).max() > COLOURED:
+        least = COLOURED if picture.format in LOSSY else 0
+        return np.where(channels.max(axis=-1) > least, 255, 0)
+    return np.asarray(picture.convert("L"))

@@ -21,7 +21,7 @@ import yaml
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger
 
-from tests.synthetic import ball_scene
+from tests.balls import ball_scene
 from tests.training.runs import changed, composed
 from xplanes.components import build
 from xplanes.config import CONF, compose_plain, to_plain
@@ -52,7 +52,7 @@ OPTIONS = sorted(
     # Chosen by two groups together, or by an option.
     if not {CONF / "recipe", CONF / "scale", CONF / "entry"} & set(path.parent.parents)
 )
-"""Every option of every group that train.py knows; tests/pretraining looks after the other."""
+"""Every option of every group that train.py knows."""
 
 KINDS = {
     "data": SceneSettings,

@@ -8,18 +8,23 @@ import numpy as np
 import pytest
 import torch
 
+from tests.balls import ball_scene, ball_views, swinging
 from tests.baselines.runs import baseline_config
 from tests.baselines.test_gaussians import FRAME, control, stepped, trained
-from tests.synthetic import ball_scene, ball_views, swinging
+from xplanes.baselines.gaussians import points
+from xplanes.baselines.gaussians.densification import densify
+from xplanes.baselines.gaussians.field import (
+    BASE,
+    DeformedGaussians,
+    PointCloud,
+    SpacetimeGaussians,
+)
+from xplanes.baselines.gaussians.model import camera_extent
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.evaluation.export import write_gaussians
-from xplanes.fields.gaussians import BASE, DeformedGaussians, PointCloud, SpacetimeGaussians
 from xplanes.metrics import ssim
-from xplanes.models.densification import densify
-from xplanes.models.gaussians import camera_extent
 from xplanes.models.initialisation import Method
-from xplanes.preparation import points
 from xplanes.preparation.reconstruct import LoadedLRM
 from xplanes.preparation.sources import BundledLRMSettings, LRMInitialiser
 from xplanes.rendering.sampler import Site

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
+from tests.balls import ball_views
 from tests.baselines.checks import check_learns, check_refused, check_reload, check_resume
 from tests.baselines.runs import OCCUPANCY, TINEUVOX, baseline_config
-from tests.synthetic import ball_views
+from xplanes.baselines.tineuvox.model import frusta_box
 from xplanes.models.initialisation import Method
-from xplanes.models.tineuvox import frusta_box
 from xplanes.rendering.sampler import Site
 
 FAST = ("model.network_learning_rate=0.004", "trainer.max_steps=34")

@@ -12,17 +12,17 @@ from tests.baselines.test_kplanes_field import products
 from tests.baselines.test_tensor4d_field import surface as tensor4d
 from tests.baselines.test_tineuvox_field import field as tineuvox
 from tests.scenes.test_lenses import lenses_of
+from xplanes.baselines.kplanes.field import DensityField, HybridDecoder, KPlanes
+from xplanes.baselines.proposal import ProposalRenderer
+from xplanes.baselines.tensor4d.neus import NeusRenderer
+from xplanes.baselines.tineuvox.fixed_step import FixedStepRenderer
 from xplanes.evaluation.drawing import Masked, Picture, Shot, camera_outlines, draw, in_box
 from xplanes.fields.background import Background
 from xplanes.fields.base import ViewDependentField
-from xplanes.fields.kplanes import DensityField, HybridDecoder, KPlanes
 from xplanes.rendering.base import RayRenderer
-from xplanes.rendering.fixed_step import FixedStepRenderer
 from xplanes.rendering.grid_renderer import GridRenderer
-from xplanes.rendering.neus import NeusRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.pictures import depth_picture
-from xplanes.rendering.proposal import ProposalRenderer
 from xplanes.scenes.cameras import look_at, orbit, project
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Intrinsics, Views

@@ -24,6 +24,7 @@ MOVED = {
     "xplanes.models.tensor4d": "xplanes.baselines.tensor4d.model",
     "xplanes.models.tineuvox": "xplanes.baselines.tineuvox.model",
     "xplanes.preparation.points": "xplanes.baselines.gaussians.points",
+    "xplanes.pretraining.settings": "xplanes.synthetic.pretraining.settings",
     "xplanes.rendering.fixed_step": "xplanes.baselines.tineuvox.fixed_step",
     "xplanes.rendering.gaussians.renderer": "xplanes.baselines.gaussians.renderer",
     "xplanes.rendering.neus": "xplanes.baselines.tensor4d.neus",

@@ -68,7 +68,7 @@ def test_settings_that_cannot_work_are_refused(scenes):
         ("model.sampler.threshold=1", "must lie between 0 and 1"),
         ("model.alpha_start=1", "must lie between 0 and 1"),
         ("model.alpha_start=0", "must lie between 0 and 1"),
-        ("lrm=file", "triplanes initialise X-Planes alone"),
+        ("lrm=file", "the initialisation is planes, and the model takes none; set lrm=none"),
         ("model.sampler.step=0", "must be above 0"),
     ):
         check_refused(scenes, words, "model=tineuvox_s", override)

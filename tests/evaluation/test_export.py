@@ -474,9 +474,6 @@ def test_times():
 
 def test_bad_options_are_refused(tmp_path: Path):
     for options, words in {
-        ExportOptions(
-            what="video"
-        ): "--what video: must be mesh or points or planes or gaussians or path",
         ExportOptions(form="obj"): "--format obj",
         ExportOptions(resolution=4): "--resolution 4: must lie between 8 and",
         ExportOptions(count=0): "--points 0",

@@ -9,12 +9,12 @@ import lightning
 import pytest
 import torch
 
+from tests.balls import ball_views, swinging
 from tests.baselines.runs import KPLANES, PROPOSAL, TINEUVOX
-from tests.synthetic import ball_views, swinging
 from tests.training.runs import small_config
 from xplanes import RadianceModule, SceneDataModule
+from xplanes.baselines.proposal import spaced, unspaced
 from xplanes.rendering.behind import look
-from xplanes.rendering.proposal import spaced, unspaced
 from xplanes.scenes.views import Scene
 from xplanes.training.collapse import CollapseWatch
 from xplanes.training.fit import Trainer

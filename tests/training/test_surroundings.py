@@ -149,6 +149,12 @@ def test_training_learns_what_lies_behind(trained):
         torch.testing.assert_close(found["colour"][clear], behind[clear], atol=1e-3, rtol=0)
 
 
+def test_the_sparsity_prior_leaves_a_world_alone():
+    for kind, kept in (("alpha", True), ("world", False)):
+        module = built(kind)
+        assert bool(module.sampler.regularisers(module.field, module.state)) is kept
+
+
 def test_nothing_is_known_of_opacity(trained):
     module, _, _ = trained
     assert "foreground" not in module.last

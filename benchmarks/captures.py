@@ -24,7 +24,7 @@ from figures import bars, panels, save
 from runner import CPU_CLOCK, RESULTS, Measured, command, machine, markdown, run_apart
 
 from xplanes.files import write_rows, write_text
-from xplanes.scenes.demo.suite import SUITE_SCENES
+from xplanes.synthetic.demo.suite import SUITE_SCENES
 
 VARIANTS = {
     "plain": ["lrm=none", "model.background=null"],

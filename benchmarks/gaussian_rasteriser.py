@@ -30,9 +30,9 @@ from runner import RESULTS, command, machine, markdown
 from torch import Tensor
 
 from xplanes.backend import compiled
+from xplanes.baselines.gaussians.camera import Camera
+from xplanes.baselines.gaussians.rasteriser import rasterise
 from xplanes.files import replacing, write_rows, write_text
-from xplanes.rendering.gaussians.camera import Camera
-from xplanes.rendering.gaussians.rasteriser import rasterise
 from xplanes.scenes.cameras import camera_around
 
 COUNT, SIZE = 20_000, 200
@@ -113,7 +113,7 @@ def series(count: int, size: int, repeats: int) -> list[tuple[float, float]]:
 
 def parts(repeats: int) -> dict[str, float]:
     """CPU seconds of each part of an iteration, at best."""
-    cpu = compiled("xplanes.rendering.gaussians.cpu")
+    cpu = compiled("xplanes.baselines.gaussians.rasteriser_numba")
     names = {name: part for part, members in PARTS.items() for name in members}
     kept = {name: getattr(cpu, name) for name in names}
     taken: Counter[str] = Counter()

@@ -30,8 +30,8 @@ import torch
 from figures import bars, panels, save
 from runner import RESULTS, command, lego, machine, markdown, spread
 
+from xplanes.baselines.gaussians.field import Gaussians
 from xplanes.config import compose_plain
-from xplanes.fields.gaussians import Gaussians
 from xplanes.files import read_json, write_json, write_rows, write_text
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Views

@@ -28,7 +28,7 @@ from safetensors.torch import save_file
 from xplanes.files import write_text
 from xplanes.lrm.checkpoint import build, load
 from xplanes.lrm.config import PUBLISHED, parse_config, published_config
-from xplanes.pretraining.run import published_state
+from xplanes.synthetic.pretraining.run import published_state
 
 COLUMNS = (
     "model",

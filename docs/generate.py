@@ -18,9 +18,9 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import yaml
 
-from xplanes.cli import build_parser
-from xplanes.pretraining.settings import PretrainingSettings
+from xplanes.cli import build_parser, further_commands
 from xplanes.settings import Settings
+from xplanes.synthetic.pretraining.settings import PretrainingSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 CONF = ROOT / "conf"
@@ -310,7 +310,7 @@ def command_line() -> str:
     """The page of all commands and their options."""
     commands = next(
         action
-        for action in build_parser()._actions
+        for action in build_parser(further_commands())._actions
         if isinstance(action, argparse._SubParsersAction)
     )
     lines = [
@@ -424,13 +424,13 @@ reloads.
 
 ## Rasterising Gaussians
 
-::: xplanes.rendering.gaussians.rasteriser.rasterise
+::: xplanes.baselines.gaussians.rasteriser.rasterise
 
-::: xplanes.rendering.gaussians.rasteriser.RasterisedImage
+::: xplanes.baselines.gaussians.rasteriser.RasterisedImage
 
-::: xplanes.rendering.gaussians.camera.Camera
+::: xplanes.baselines.gaussians.camera.Camera
 
-::: xplanes.rendering.gaussians.harmonics.spherical_harmonics
+::: xplanes.baselines.gaussians.harmonics.spherical_harmonics
 
 ## Errors
 

@@ -108,7 +108,8 @@ nothing = torch.zeros(4, dtype=torch.long)
 total, _ = composite(torch.rand(4), torch.rand(4, 3), torch.rand(4), nothing, nothing[:1])
 assert total.isfinite().all()
 print(backend.name(torch.device("cpu")))
-for name in ("fields.cpu", "rendering.cpu", "rendering.gaussians.cpu", "pretraining.cpu"):
+wings = "baselines.gaussians.rasteriser_numba", "synthetic.pretraining.cpu"
+for name in ("fields.cpu", "rendering.cpu", *wings):
     importlib.import_module(f"xplanes.{name}")
 """
 

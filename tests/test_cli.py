@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from tests import warm
+from xplanes.baselines.gaussians.rasteriser import GaussianError
 from xplanes.cli import main
-from xplanes.errors import DeviceError, GaussianError
+from xplanes.errors import DeviceError
 
 
 def python(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:

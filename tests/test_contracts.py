@@ -21,7 +21,7 @@ import yaml
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger
 
-from tests.synthetic import ball_scene
+from tests.balls import ball_scene
 from tests.training.runs import changed, composed
 from xplanes.components import build
 from xplanes.config import CONF, compose_plain, to_plain
@@ -52,7 +52,7 @@ OPTIONS = sorted(
     # Chosen by two groups together, or by an option.
     if not {CONF / "recipe", CONF / "scale", CONF / "entry"} & set(path.parent.parents)
 )
-"""Every option of every group that train.py knows; tests/pretraining looks after the other."""
+"""Every option of every group that train.py knows."""
 
 KINDS = {
     "data": SceneSettings,
@@ -659,7 +659,7 @@ LAYERS = (
     ("experiment",),
     ("preparation",),
     ("evaluation",),
-    ("pretraining",),
+    ("baselines", "synthetic"),
     ("run", "launch"),
     ("cli",),
     ("__main__",),
@@ -668,6 +668,9 @@ LAYERS = (
 
 An LRM brings a decoder of the fields' kind, so fields stand above it.
 """
+
+WINGS = {"baselines", "synthetic"}
+"""What the core never imports: both come in as plug-ins do, by `_target_` and entry points."""
 
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 
@@ -745,6 +748,28 @@ def test_imports_only_point_up_the_list():
                 assert LEVEL[target] <= LEVEL[own], f"{told}: that points down the list"
 
 
+def test_the_core_never_imports_a_wing():
+    for module, path in sources().items():
+        others = {room(name) for name in imported(path)} & WINGS - {room(module)}
+        assert not others, f"{module} imports {', '.join(sorted(others))}"
+
+
+def test_no_wing_is_loaded_with_the_core():
+    core = [name.removesuffix(".__init__") for name in sources() if room(name) not in WINGS]
+    kernels = ("cpu", "gpu", "triton")  # These need optional packages, or take long to compile.
+    core = [name for name in core if not name.split(".")[-1].startswith(kernels)]
+    script = (
+        f"import importlib, sys\nfor name in {sorted({*core} - {'train', 'xplanes.__main__'})}: "
+        "importlib.import_module(name)\n"
+        "print([name for name in sys.modules "
+        "if name.startswith(('xplanes.baselines', 'xplanes.synthetic'))])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
 def test_no_module_needs_itself_to_be_imported():
     modules = {name.removesuffix(".__init__"): path for name, path in sources().items()}
     needs = {}
@@ -816,3 +841,14 @@ def test_no_module_calls_anything_for_its_effect_when_imported():
             assert not loose or module in ("train", "xplanes.__main__", "xplanes.launch"), (
                 f"{module}:{node.lineno} calls at import"
             )
+
+
+def test_configurations_of_earlier_versions_find_classes_that_moved():
+    from xplanes.components import MOVED, class_of
+    from xplanes.models.base import ModelSettings
+
+    for old, new in MOVED.items():
+        assert importlib.util.find_spec(new), new
+        assert not (ROOT / (old.replace(".", "/") + ".py")).exists(), f"{old} is still there"
+    found = class_of("xplanes.models.kplanes.KPlanesSettings", ModelSettings, "model._target_")
+    assert found.__module__ == "xplanes.baselines.kplanes.model"

@@ -8,7 +8,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from tests.synthetic import ball_scene
+from tests.balls import ball_scene
 from tests.test_contracts import built, small
 from xplanes.config import CONF, compose_plain, group_options
 from xplanes.evaluation.published import check_published, read_published

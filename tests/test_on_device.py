@@ -16,12 +16,12 @@ import torch
 from lightning.pytorch.callbacks import Callback
 
 from tests import fake_device, on_device
+from tests.balls import ball_scene
 from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX, baseline_config
 from tests.baselines.test_gaussians_runs import SMALL as GAUSSIANS
 from tests.lrm.reduced import SIDES
 from tests.preparation.sequences import moving_sequence
 from tests.preparation.test_encode import frames_of, model_of
-from tests.synthetic import ball_scene
 from tests.training.runs import small_config
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.decomposition import decompose, space_planes, time_planes, unexplained_energy

@@ -14,10 +14,10 @@ from xplanes.experiment import Experiment
 from xplanes.files import DAY, MARK, StorageError
 from xplanes.launch import prepare
 from xplanes.preparation.cache import StageCache
-from xplanes.pretraining.pool import RECORD, SHARD, ensure_pool
 from xplanes.run import run
-from xplanes.scenes.demo import ensure_demo_scene, write
 from xplanes.scenes.errors import SceneError
+from xplanes.synthetic.demo import ensure_demo_scene, write
+from xplanes.synthetic.pretraining.pool import RECORD, SHARD, ensure_pool
 from xplanes.training.checkpoints import LAST
 from xplanes.training.evaluation import Curve
 

@@ -11,14 +11,14 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.balls import ball_views, swinging
 from tests.captures import NerfiesFolder, write_colmap
-from tests.synthetic import ball_views, swinging
 from tests.training.runs import SMALL
 from xplanes.cli import main
 from xplanes.config import compose_plain
 from xplanes.scenes.datamodule import SceneDataModule
-from xplanes.scenes.demo.write import ensure_demo_scene
 from xplanes.scenes.views import Views
+from xplanes.synthetic.demo.write import ensure_demo_scene
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "your_own_data.md"
 SIZE = 40

@@ -6,7 +6,7 @@ Heavy modules are imported by the commands that need them, so that the help is f
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,9 @@ from xplanes.process import defaults, train_command
 
 if TYPE_CHECKING:
     from xplanes.evaluation.runs import TrainedRun
+
+AddCommands = Callable[["argparse._SubParsersAction"], None]
+"""Adds parsers of commands; each sets ``command``, which is called with the parsed options."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -40,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Hydra parses the command line of training itself.
         train(words[1:], words[:1] if sys.argv[1:] == words else ())
         return 0
-    options = build_parser().parse_args(words)
+    options = build_parser(further_commands()).parse_args(words)
     try:
         options.command(options)
         sys.stdout.flush()
@@ -57,8 +60,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """All commands and their options."""
+def further_commands() -> list[AddCommands]:
+    """What installed packages add in the entry-point group ``xplanes.commands``."""
+    from importlib.metadata import entry_points
+
+    return [entry.load() for entry in sorted(entry_points(group="xplanes.commands"))]
+
+
+def build_parser(further: Sequence[AddCommands] = ()) -> argparse.ArgumentParser:
+    """All commands and their options.
+
+    Args:
+        further: Add the commands of plug-ins to the subparsers.
+    """
     parser = argparse.ArgumentParser(
         prog="xplanes",
         description="Dynamic radiance fields initialised from Large Reconstruction Models.",
@@ -72,7 +86,7 @@ def build_parser() -> argparse.ArgumentParser:
         "overrides", nargs="*", metavar="KEY=VALUE", help="what changes, and options of Hydra"
     )
     verbs = (_add_download, _add_inspect, _add_triplanes, _add_evaluate, _add_render, _add_view)
-    for add in (*verbs, _add_export, _add_table, _add_sheet, _add_pretrain, _add_score):
+    for add in (*verbs, _add_export, _add_table, _add_sheet, *further):
         add(commands)
     return parser
 
@@ -338,10 +352,9 @@ def _add_export(commands: "argparse._SubParsersAction") -> None:
     _add_run(parser)
     parser.add_argument(
         "--what",
-        choices=["mesh", "points", "planes", "gaussians", "path"],
         default="mesh",
-        help="what to write: mesh or points (extra: export), planes (X-Planes only), gaussians "
-        "(models of Gaussians only), or a path of the training cameras; default: %(default)s",
+        help="what to write: mesh or points (extra: export), planes (X-Planes only), path (of the "
+        "training cameras), or what a model adds, such as gaussians; default: %(default)s",
     )
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="empty or new; default: RUN/export/WHAT"
@@ -467,46 +480,3 @@ def _sheet(options: argparse.Namespace) -> None:
         size=options.size,
     )
     _say(f"wrote {path}")
-
-
-def _add_pretrain(commands: "argparse._SubParsersAction") -> None:
-    parser = commands.add_parser("pretrain-lrm", help="train a small LRM on procedural objects")
-    parser.add_argument(
-        "overrides", nargs="*", metavar="key=value", help="settings of conf/pretrain_lrm.yaml"
-    )
-    parser.set_defaults(command=_pretrain)
-
-
-def _pretrain(options: argparse.Namespace) -> None:
-    from xplanes.pretraining.run import run_pretraining
-
-    _say(f"wrote {run_pretraining(options.overrides, _say)}")
-
-
-def _add_score(commands: "argparse._SubParsersAction") -> None:
-    parser = commands.add_parser("score-lrm", help="evaluate a small LRM on held-out objects")
-    parser.add_argument("model", help="tiny, mini, or FOLDER/NAME.safetensors")
-    parser.add_argument(
-        "--objects", type=int, default=64, help="number of objects; default: %(default)s"
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("outputs/score-lrm"),
-        help="output folder; default: %(default)s",
-    )
-    parser.set_defaults(command=_score)
-
-
-def _score(options: argparse.Namespace) -> None:
-    from xplanes.errors import ConfigError
-    from xplanes.lrm.bundled import FOLDER, load_bundled
-    from xplanes.pretraining.score import score_all
-
-    if options.objects < 1:
-        raise ConfigError(f"--objects {options.objects}: must be at least 1")
-    path = Path(options.model)
-    own = path.suffix == ".safetensors"
-    model, _ = load_bundled(path.stem if own else options.model, path.parent if own else FOLDER)
-    score_all(model, options.out, objects=options.objects, announce=_say)
-    _say(f"wrote {options.out}/scores.json, objects.png, failures.png and demo.png")

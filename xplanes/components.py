@@ -16,6 +16,23 @@ T = TypeVar("T")
 TRUSTED = ("xplanes", "lightning", "torchmetrics")
 """Packages whose classes any configuration may name."""
 
+MOVED = {
+    "xplanes.models.gaussians_deform": "xplanes.baselines.gaussians.deform",
+    "xplanes.models.gaussians_hexplane": "xplanes.baselines.gaussians.hexplane",
+    "xplanes.models.gaussians_spacetime": "xplanes.baselines.gaussians.spacetime",
+    "xplanes.models.kplanes": "xplanes.baselines.kplanes.model",
+    "xplanes.models.tensor4d": "xplanes.baselines.tensor4d.model",
+    "xplanes.models.tineuvox": "xplanes.baselines.tineuvox.model",
+    "xplanes.preparation.points": "xplanes.baselines.gaussians.points",
+    "xplanes.pretraining.settings": "xplanes.synthetic.pretraining.settings",
+    "xplanes.rendering.fixed_step": "xplanes.baselines.tineuvox.fixed_step",
+    "xplanes.rendering.gaussians.renderer": "xplanes.baselines.gaussians.renderer",
+    "xplanes.rendering.neus": "xplanes.baselines.tensor4d.neus",
+    "xplanes.rendering.proposal": "xplanes.baselines.proposal",
+    "xplanes.scenes.demo.write": "xplanes.synthetic.demo.write",
+}
+"""Modules that runs and checkpoints of early 0.3 name, and where their classes are now."""
+
 _plugins: ContextVar[tuple[str, ...]] = ContextVar("plugins", default=())
 
 
@@ -125,6 +142,7 @@ def class_of(target: Any, kind: type, key: str) -> type:
             "your own with plugins=[MODULE], or --plugin MODULE for commands that read a run"
         )
     module, _, attribute = name.rpartition(".")
+    module = MOVED.get(module, module)
     try:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:

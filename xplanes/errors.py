@@ -11,7 +11,3 @@ class ConfigError(XPlanesError, ValueError):
 
 class DeviceError(XPlanesError, RuntimeError):
     """A device that does not work any more; the message names what it was doing and the way out."""
-
-
-class GaussianError(XPlanesError, ValueError):
-    """Gaussians that cannot be drawn; the message names the tensor and the Gaussian."""

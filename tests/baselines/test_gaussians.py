@@ -9,22 +9,27 @@ import numpy as np
 import pytest
 import torch
 
+from tests.balls import ball_scene, ball_views
 from tests.baselines.runs import baseline_config
-from tests.synthetic import ball_scene, ball_views
+from xplanes.baselines.gaussians.camera import Camera
+from xplanes.baselines.gaussians.densification import densify, reset_opacity, select_rows
+from xplanes.baselines.gaussians.field import (
+    Gaussians,
+    HexPlaneGaussians,
+    PointCloud,
+    neighbour_distance,
+)
+from xplanes.baselines.gaussians.harmonics import spherical_harmonics
+from xplanes.baselines.gaussians.hull import hull_points
+from xplanes.baselines.gaussians.model import camera_extent
+from xplanes.baselines.gaussians.rasteriser import GaussianError, rasterise
+from xplanes.baselines.gaussians.renderer import GaussianRenderer, camera_in
 from xplanes.config import compose_plain
-from xplanes.errors import ConfigError, GaussianError
-from xplanes.evaluation.export import ExportOptions, export, write_gaussians
-from xplanes.fields.gaussians import Gaussians, HexPlaneGaussians, PointCloud, neighbour_distance
+from xplanes.errors import ConfigError
+from xplanes.evaluation.export import ExportOptions, export
 from xplanes.fields.products import PlaneProducts
-from xplanes.models.densification import densify, reset_opacity, select_rows
-from xplanes.models.gaussians import camera_extent
-from xplanes.models.hull import hull_points
 from xplanes.models.initialisation import Method
 from xplanes.preparation.fixed_view import rendering_method
-from xplanes.rendering.gaussians.camera import Camera
-from xplanes.rendering.gaussians.harmonics import spherical_harmonics
-from xplanes.rendering.gaussians.rasteriser import rasterise
-from xplanes.rendering.gaussians.renderer import GaussianRenderer, camera_in
 from xplanes.rendering.sampler import Site
 from xplanes.scenes.batches import ViewBatches, ViewSettings
 from xplanes.scenes.cameras import project
@@ -469,10 +474,10 @@ def test_what_does_not_fit_is_refused(tmp_path, scenes):
     with pytest.raises(ConfigError, match=r"--what mesh: .* set --what gaussians"):
         export(trained(field), ExportOptions("mesh", times="2"), tmp_path / "a", say=print)
     with pytest.raises(ConfigError, match="frame is turned"):
-        write_gaussians(tmp_path / "b.ply", trained(field, TURNED), 0.0)
-    with pytest.raises(ConfigError, match=r"--what gaussians: gaussians_hexplane has none"):
-        write_gaussians(tmp_path / "b.ply", trained(torch.nn.Linear(1, 1)), 0.0)
-    assert not (tmp_path / "b.ply").exists()
+        field.exports["gaussians"](tmp_path / "b", 0.0, TURNED)
+    with pytest.raises(ConfigError, match=r"--what video: .* has none; set --what .*gaussians"):
+        export(trained(field), ExportOptions("video"), tmp_path / "b", say=print)
+    assert not list(tmp_path.glob("b*"))
     for model, sampler in (("gaussians_hexplane", "occupancy"), ("six_planes", "rasteriser")):
         overrides = [f"model={model}", f"model/sampler={sampler}", "lrm=none"]
         with pytest.raises(ConfigError, match=rf"sampler\.name={sampler}: .* leave model/sampler"):

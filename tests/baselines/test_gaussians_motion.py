@@ -8,18 +8,22 @@ import numpy as np
 import pytest
 import torch
 
+from tests.balls import ball_scene, ball_views, swinging
 from tests.baselines.runs import baseline_config
-from tests.baselines.test_gaussians import FRAME, control, stepped, trained
-from tests.synthetic import ball_scene, ball_views, swinging
+from tests.baselines.test_gaussians import FRAME, control, stepped
+from xplanes.baselines.gaussians import points
+from xplanes.baselines.gaussians.densification import densify
+from xplanes.baselines.gaussians.field import (
+    BASE,
+    DeformedGaussians,
+    PointCloud,
+    SpacetimeGaussians,
+)
+from xplanes.baselines.gaussians.model import camera_extent
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
-from xplanes.evaluation.export import write_gaussians
-from xplanes.fields.gaussians import BASE, DeformedGaussians, PointCloud, SpacetimeGaussians
 from xplanes.metrics import ssim
-from xplanes.models.densification import densify
-from xplanes.models.gaussians import camera_extent
 from xplanes.models.initialisation import Method
-from xplanes.preparation import points
 from xplanes.preparation.reconstruct import LoadedLRM
 from xplanes.preparation.sources import BundledLRMSettings, LRMInitialiser
 from xplanes.rendering.sampler import Site
@@ -228,7 +232,7 @@ def test_a_ply_has_finite_numbers_for_what_is_not_there(tmp_path):
         field.log_widths.fill_(math.log(0.01))
         field.centres.fill_(0.0)
     assert float(field.at(1.0).opacities.detach().max()) == 0
-    write_gaussians(tmp_path / "a.ply", trained(field), 1.0)
+    field.exports["gaussians"](tmp_path / "a", 1.0, FRAME)
     head, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
     names = [line.split()[-1] for line in head.decode().splitlines() if "property" in line]
     table = np.frombuffer(body, "<f4").reshape(12, -1)
@@ -254,7 +258,7 @@ def test_first_points_lie_on_what_a_field_shows(tmp_path, monkeypatch):
     assert len(field) == 300
     assert found.seconds["field"] > 0
     assert found.words == "300 points on the surfaces of six_planes, trained for 80 steps"
-    assert torch.equal(field.centres, found.values.points.times)
+    assert torch.equal(field.centres, found.values.cloud.times)
     assert set(field.centres.tolist()) <= set(views.times.tolist())
     places = frame.to_world(field.means.detach())
     centres = torch.stack([path(time) for time in field.centres.tolist()])
@@ -302,9 +306,18 @@ def test_points_of_other_weights_are_made_anew(tmp_path, monkeypatch):
 
 def test_what_cannot_begin_with_points_or_planes_is_refused(scenes):
     for overrides, words in (
-        (("model=six_planes", "lrm=field"), r"lrm=field with model=six_planes: points .* lrm=none"),
-        (("model=kplanes", "lrm=field"), r"points initialise Gaussians alone"),
-        (("model=gaussians_deform", "lrm=tiny"), r"triplanes .* lrm=none or lrm=field \(points\)"),
+        (
+            ("model=six_planes", "lrm=field"),
+            r"lrm=field with model=six_planes: the initialisation is points",
+        ),
+        (
+            ("model=kplanes", "lrm=field"),
+            "is points, and the model takes none; set lrm=none",
+        ),
+        (
+            ("model=gaussians_deform", "lrm=tiny"),
+            "is planes, and the model takes points",
+        ),
         (("model=gaussians_deform", "lrm=field", "lrm.source=field"), r"source=field: must be one"),
         (
             ("model=gaussians_deform", "model.final_network_lr=0"),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.baselines.oracles import product_features
-from xplanes.fields.kplanes import DensityField, ExplicitDecoder, HybridDecoder, KPlanes
+from xplanes.baselines.kplanes.field import DensityField, ExplicitDecoder, HybridDecoder, KPlanes
 from xplanes.fields.networks import PaddedMLP, octaves, spherical_harmonics, truncated_exponential
 from xplanes.fields.products import (
     PlaneProducts,

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from tests.balls import ball_scene, ball_views
 from tests.baselines.checks import check_learns, check_refused, check_reload, check_resume
 from tests.baselines.runs import (
     KPLANES,
@@ -14,7 +15,6 @@ from tests.baselines.runs import (
     TINEUVOX,
     baseline_config,
 )
-from tests.synthetic import ball_scene, ball_views
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from tests.baselines import oracles
-from xplanes.rendering.compositing import composite_reference
-from xplanes.rendering.proposal import (
+from xplanes.baselines.proposal import (
     Level,
     ProposalRenderer,
     dense_samples,
     histogram_loss,
 )
-from xplanes.rendering.resampling import covering_weights, ray_weights, resample, uniform_edges
+from xplanes.baselines.resampling import covering_weights, ray_weights, resample, uniform_edges
+from xplanes.rendering.compositing import composite_reference
 
 
 def bins(rays, count, seed=0):

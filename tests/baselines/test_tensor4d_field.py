@@ -7,15 +7,21 @@ import pytest
 import torch
 
 from tests.baselines import oracles
-from xplanes.fields.hierarchy import DYNAMIC, STATIC, HierarchicalPlanes, Level, bilinear
-from xplanes.fields.tensor4d import SkipNetwork, Tensor4D, Tensor4DDensity
-from xplanes.models.tensor4d import (
+from xplanes.baselines.tensor4d.field import SkipNetwork, Tensor4D, Tensor4DDensity
+from xplanes.baselines.tensor4d.hierarchy import (
+    DYNAMIC,
+    STATIC,
+    HierarchicalPlanes,
+    Level,
+    bilinear,
+)
+from xplanes.baselines.tensor4d.model import (
     eikonal_error,
     feature_change,
     masked_colour_error,
     silhouette_error,
 )
-from xplanes.rendering.neus import NeusRenderer, section_opacity, weights_of
+from xplanes.baselines.tensor4d.neus import NeusRenderer, section_opacity, weights_of
 
 
 def planes(groups=STATIC, *, fine=True, size=6, filled=True):

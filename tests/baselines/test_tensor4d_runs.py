@@ -2,9 +2,9 @@
 
 import pytest
 
+from tests.balls import ball_views
 from tests.baselines.checks import check_learns, check_refused, check_reload, check_resume
 from tests.baselines.runs import NEUS, OCCUPANCY, TENSOR4D, baseline_config
-from tests.synthetic import ball_views
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
 from xplanes.models.initialisation import Method

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from tests.baselines import oracles
-from xplanes.fields.tineuvox import TiNeuVox
-from xplanes.models.tineuvox import MaskedAdam, light_entropy, sample_colour_error
-from xplanes.rendering.fixed_step import FixedStepRenderer
+from xplanes.baselines.tineuvox.field import TiNeuVox
+from xplanes.baselines.tineuvox.fixed_step import FixedStepRenderer
+from xplanes.baselines.tineuvox.model import MaskedAdam, light_entropy, sample_colour_error
 
 BOX = torch.tensor([[-2.0, -1.5, -1.0], [2.0, 1.0, 1.2]])
 

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
+from tests.balls import ball_views
 from tests.baselines.checks import check_learns, check_refused, check_reload, check_resume
 from tests.baselines.runs import OCCUPANCY, TINEUVOX, baseline_config
-from tests.synthetic import ball_views
+from xplanes.baselines.tineuvox.model import frusta_box
 from xplanes.models.initialisation import Method
-from xplanes.models.tineuvox import frusta_box
 from xplanes.rendering.sampler import Site
 
 FAST = ("model.network_learning_rate=0.004", "trainer.max_steps=34")
@@ -68,7 +68,7 @@ def test_settings_that_cannot_work_are_refused(scenes):
         ("model.sampler.threshold=1", "must lie between 0 and 1"),
         ("model.alpha_start=1", "must lie between 0 and 1"),
         ("model.alpha_start=0", "must lie between 0 and 1"),
-        ("lrm=file", "triplanes initialise X-Planes alone"),
+        ("lrm=file", "the initialisation is planes, and the model takes none; set lrm=none"),
         ("model.sampler.step=0", "must be above 0"),
     ):
         check_refused(scenes, words, "model=tineuvox_s", override)

@@ -12,17 +12,17 @@ from tests.baselines.test_kplanes_field import products
 from tests.baselines.test_tensor4d_field import surface as tensor4d
 from tests.baselines.test_tineuvox_field import field as tineuvox
 from tests.scenes.test_lenses import lenses_of
-from xplanes.evaluation.drawing import Masked, Picture, Shot, camera_outlines, draw, in_box
+from xplanes.baselines.kplanes.field import DensityField, HybridDecoder, KPlanes
+from xplanes.baselines.proposal import ProposalRenderer
+from xplanes.baselines.tensor4d.neus import NeusRenderer
+from xplanes.baselines.tineuvox.fixed_step import FixedStepRenderer
+from xplanes.evaluation.drawing import Picture, Shot, camera_outlines, draw, in_box
 from xplanes.fields.background import Background
 from xplanes.fields.base import ViewDependentField
-from xplanes.fields.kplanes import DensityField, HybridDecoder, KPlanes
 from xplanes.rendering.base import RayRenderer
-from xplanes.rendering.fixed_step import FixedStepRenderer
 from xplanes.rendering.grid_renderer import GridRenderer
-from xplanes.rendering.neus import NeusRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.pictures import depth_picture
-from xplanes.rendering.proposal import ProposalRenderer
 from xplanes.scenes.cameras import look_at, orbit, project
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Intrinsics, Views
@@ -269,7 +269,7 @@ def test_drawing_ends_once_it_is_not_wanted():
 def test_a_masked_field_is_the_field_where_it_is_kept():
     field = Balls(FRONT)
     points, times = 2 * torch.rand(500, 3) - 1, torch.zeros(500)
-    masked = Masked(field, lambda places: places[:, 0] > 0)
+    masked = field.masked(lambda places: places[:, 0] > 0)
     colour, density = field(points, times)
     kept = points[:, 0] > 0
     assert torch.equal(masked(points, times)[0], colour)

@@ -17,6 +17,10 @@ from tests.baselines.test_kplanes_field import products
 from tests.baselines.test_tensor4d_field import surface as tensor4d
 from tests.baselines.test_tineuvox_field import BOX
 from tests.training.runs import changed
+from xplanes.baselines.kplanes.field import HybridDecoder, KPlanes
+from xplanes.baselines.tensor4d.neus import NeusRenderer
+from xplanes.baselines.tineuvox.field import TiNeuVox
+from xplanes.baselines.tineuvox.fixed_step import FixedStepRenderer
 from xplanes.cli import main
 from xplanes.errors import ConfigError
 from xplanes.evaluation import export as module
@@ -31,15 +35,11 @@ from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.fields import Decoder, XPlanes
 from xplanes.fields.background import Background
 from xplanes.fields.base import ViewDependentField
-from xplanes.fields.kplanes import HybridDecoder, KPlanes
-from xplanes.fields.tineuvox import TiNeuVox
 from xplanes.fields.xplanes import random_planes
 from xplanes.optional import MissingExtraError
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.behind import look
-from xplanes.rendering.fixed_step import FixedStepRenderer
 from xplanes.rendering.grid_renderer import GridRenderer
-from xplanes.rendering.neus import NeusRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.pictures import to_bytes
 from xplanes.run import run
@@ -474,9 +474,6 @@ def test_times():
 
 def test_bad_options_are_refused(tmp_path: Path):
     for options, words in {
-        ExportOptions(
-            what="video"
-        ): "--what video: must be mesh or points or planes or gaussians or path",
         ExportOptions(form="obj"): "--format obj",
         ExportOptions(resolution=4): "--resolution 4: must lie between 8 and",
         ExportOptions(count=0): "--points 0",

@@ -13,9 +13,9 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.balls import ball_views, surrounding, swinging
 from tests.lens_oracle import direction, pixel
 from tests.refusals import assert_refused
-from tests.synthetic import ball_views, surrounding, swinging
 from xplanes.cli import main
 from xplanes.components import build
 from xplanes.config import compose_plain

@@ -17,9 +17,9 @@ from xplanes.errors import ConfigError
 from xplanes.lrm import LRMError, load
 from xplanes.lrm.bundled import FOLDER, load_bundled
 from xplanes.preparation.sequence import TriplaneSequence, load_triplanes, save_triplanes
-from xplanes.pretraining.pool import SHARD, ensure_pool
 from xplanes.run import run
 from xplanes.scenes.errors import SceneError
+from xplanes.synthetic.pretraining.pool import SHARD, ensure_pool
 from xplanes.training.checkpoints import load_checkpoint
 
 pytestmark = pytest.mark.stress

@@ -6,11 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from xplanes.baselines.proposal import dense_samples
 from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.rendering.box import ray_box, shade
 from xplanes.rendering.compositing import composite
-from xplanes.rendering.proposal import dense_samples
 from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Count

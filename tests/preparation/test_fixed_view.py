@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.balls import ball_scene, ball_views, inside_ball, surrounding, swinging
 from tests.baselines.runs import KPLANES, PROPOSAL
 from tests.refusals import assert_refused
-from tests.synthetic import ball_scene, ball_views, inside_ball, surrounding, swinging
 from tests.training.runs import small_config
 from tests.training.test_health import spoil_gradient
 from xplanes.config import compose_plain

@@ -9,9 +9,9 @@ from typing import get_args, get_type_hints
 import pytest
 import torch
 
+from tests.balls import ball_scene
 from tests.preparation.sequences import blob, moving_sequence, static_features
 from tests.refusals import assert_refused
-from tests.synthetic import ball_scene
 from tests.training.runs import small_config
 from xplanes import decomposition, run
 from xplanes.decomposition import unexplained_energy

@@ -9,9 +9,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from tests.balls import ball_scene, ball_views, inside_ball, surrounding
 from tests.lrm.reduced import SIDES, reduced
 from tests.lrm.reference import compare
-from tests.synthetic import ball_scene, ball_views, inside_ball, surrounding
 from tests.training.runs import small_config
 from xplanes.errors import ConfigError
 from xplanes.fields import Decoder, XPlanes

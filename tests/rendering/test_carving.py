@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from tests.synthetic import ball_views, inside_ball, surrounding, swinging
+from tests.balls import ball_views, inside_ball, surrounding, swinging
 from xplanes.rendering.carving import carve
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.frame import Frame, cube_frame

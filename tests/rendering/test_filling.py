@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
+from tests.balls import ball_views, inside_ball, swinging
 from tests.rendering.test_carving import allowed_at
-from tests.synthetic import ball_views, inside_ball, swinging
 from xplanes.rendering import filling
 from xplanes.rendering.filling import fill
 from xplanes.rendering.marching import march

@@ -7,8 +7,8 @@ from itertools import product
 import pytest
 import torch
 
+from tests.balls import ball_views
 from tests.oracles import project
-from tests.synthetic import ball_views
 from xplanes.errors import ConfigError
 from xplanes.scenes.batches import NEAR_SILHOUETTE, RayBatches, RaySettings
 from xplanes.scenes.frame import Frame, cube_frame

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.synthetic import ball_views, surrounding, swinging
+from tests.balls import ball_views, surrounding, swinging
 from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.models.base import ModelSettings

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.utils.data import DistributedSampler
 
-from tests.synthetic import ball_scene
+from tests.balls import ball_scene
 from xplanes.errors import ConfigError
 from xplanes.scenes.batches import RayBatches, RaySettings
 from xplanes.scenes.datamodule import UNIFORM, SceneDataModule, spread_order

@@ -11,9 +11,9 @@ import pytest
 import torch
 from lightning import Trainer
 
+from tests.balls import ball_views, surrounding, swinging
 from tests.captures import save, settings, write_colmap
 from tests.refusals import assert_refused
-from tests.synthetic import ball_views, surrounding, swinging
 from tests.training.runs import SMALL, changed
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.scenes.colmap import ColmapSettings

@@ -7,7 +7,7 @@ from itertools import product
 import pytest
 import torch
 
-from tests.synthetic import ball_views, inside_ball, swinging
+from tests.balls import ball_views, inside_ball, swinging
 from xplanes.scenes.cameras import look_at, orbit
 from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, _reach, cube_frame, optical_centre, scene_frame

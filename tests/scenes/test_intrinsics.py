@@ -10,11 +10,11 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.balls import ball_views, inside_ball, surrounding
 from tests.refusals import assert_refused
-from tests.synthetic import ball_views, inside_ball, surrounding
+from xplanes.baselines.tineuvox.model import frusta_box
 from xplanes.evaluation.render import VideoOptions, lens
 from xplanes.metrics import psnr
-from xplanes.models.tineuvox import frusta_box
 from xplanes.preparation.fixed_view import check_camera
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.carving import carve

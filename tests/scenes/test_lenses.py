@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from tests.balls import ball_views, inside_ball, surrounding
 from tests.lens_oracle import direction, pixel
-from tests.synthetic import ball_views, inside_ball, surrounding
 from xplanes.evaluation.render import lens as lens_of_picture
 from xplanes.preparation.fixed_view import check_camera
 from xplanes.scenes.batches import RayBatches

@@ -8,7 +8,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from tests.synthetic import ball_views
+from tests.balls import ball_views
 from xplanes.rendering.carving import carve
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.batches import RayBatches

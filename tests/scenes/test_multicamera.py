@@ -11,8 +11,8 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.balls import ball_views, surrounding, swinging
 from tests.captures import write_colmap
-from tests.synthetic import ball_views, surrounding, swinging
 from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError

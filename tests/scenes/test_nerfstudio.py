@@ -10,9 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.balls import ball_views, surrounding
 from tests.lens_oracle import direction
 from tests.refusals import assert_refused
-from tests.synthetic import ball_views, surrounding
 from xplanes.config import compose_plain
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.errors import MissingSplitError, SceneError

@@ -80,7 +80,7 @@ GROWTH = """
 from pathlib import Path
 import torch
 from tests.scenes.test_store import FRAME, RAYS, replace
-from tests.synthetic import ball_views
+from tests.balls import ball_views
 from xplanes.scenes.batches import RayBatches
 
 def peak():

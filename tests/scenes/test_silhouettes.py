@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from tests.balls import ball_views, inside_ball, swinging
 from tests.oracles import project, visual_hull
-from tests.synthetic import ball_views, inside_ball, swinging
 from xplanes.scenes.silhouettes import MOST_VIEWS, WINDOW, foreground, join_in_time, may_hold
 
 

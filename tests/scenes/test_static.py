@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from tests.synthetic import ball_scene, ball_views
+from tests.balls import ball_scene, ball_views
 from xplanes.scenes.source import SAME, as_static, frames_are_equal
 
 

@@ -15,7 +15,7 @@ import torch
 from filelock import FileLock
 from PIL import Image
 
-from tests.synthetic import ball_views
+from tests.balls import ball_views
 from xplanes.files import DAY, MARK, StorageError
 from xplanes.scenes import store
 from xplanes.scenes.batches import AHEAD, RayBatches, RaySettings

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.synthetic import ball_views
+from tests.balls import ball_views
 from tests.training.runs import small_config
 from xplanes.components import build
 from xplanes.scenes.dnerf import BlenderSettings
@@ -33,7 +33,7 @@ def config(tmp_path_factory):
     plain = small_config(folder, "data.resolution=8", "data.views=4")
     config = build(plain["data"], SceneSettings, "data")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("xplanes.scenes.demo.write.VIDEO_FRAMES", 5)
+        patch.setattr("xplanes.synthetic.demo.write.VIDEO_FRAMES", 5)
         config.read()
         yield config
 

@@ -7,7 +7,7 @@ import pytest
 
 from xplanes.config import compose_plain
 from xplanes.run import run
-from xplanes.scenes.demo.suite import KINDS
+from xplanes.synthetic.demo.suite import KINDS
 
 pytestmark = pytest.mark.stress
 

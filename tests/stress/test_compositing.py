@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from tests import oracles
 from tests.stress import references
 from tests.stress.references import worst
+from xplanes.baselines.resampling import ray_weights
 from xplanes.rendering.compositing import composite
-from xplanes.rendering.resampling import ray_weights
 
 pytestmark = pytest.mark.stress
 

@@ -8,11 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests import gaussian_oracle as oracle
+from tests.baselines import gaussian_oracle as oracle
 from tests.stress.references import worst
-from xplanes.errors import GaussianError
-from xplanes.rendering.gaussians.camera import Camera
-from xplanes.rendering.gaussians.rasteriser import rasterise
+from xplanes.baselines.gaussians.camera import Camera
+from xplanes.baselines.gaussians.rasteriser import GaussianError, rasterise
 
 pytestmark = pytest.mark.stress
 

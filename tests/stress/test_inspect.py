@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from xplanes.evaluation.inspect import choose, inspect
-from xplanes.scenes.demo.scenes import DEMO_SCENES
-from xplanes.scenes.demo.suite import SUITE_SCENES
+from xplanes.synthetic.demo.scenes import DEMO_SCENES
+from xplanes.synthetic.demo.suite import SUITE_SCENES
 
 pytestmark = pytest.mark.stress
 

@@ -193,7 +193,7 @@ def test_a_run_full_of_floaters_says_so(
 
 
 def test_blank_images_are_the_background() -> None:
-    from tests.synthetic import ball_scene
+    from tests.balls import ball_scene
 
     views = ball_scene().splits["test"]
     black = blank_psnr(views, torch.zeros(3))

@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.balls import ball_scene
 from tests.baselines.runs import KPLANES, PROPOSAL
 from tests.preparation.sequences import moving_sequence
-from tests.synthetic import ball_scene
 from tests.training.runs import SMALL, changed
+from xplanes.baselines.tensor4d.model import FeatureSmoothness
 from xplanes.config import compose_plain
 from xplanes.decomposition import decompose, time_planes
 from xplanes.decomposition.sparse_loss import SparseProduct
@@ -24,7 +25,6 @@ from xplanes.fields.regularisers import PlaneTerms
 from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 from xplanes.models.base import InitialValues
 from xplanes.models.initialisation import Initialisation
-from xplanes.models.tensor4d import FeatureSmoothness
 from xplanes.preparation import TriplaneSequence, fixed_view, save_triplanes
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.stages import convert_stage, decompose_stage

@@ -9,12 +9,12 @@ import lightning
 import pytest
 import torch
 
+from tests.balls import ball_views, swinging
 from tests.baselines.runs import KPLANES, PROPOSAL, TINEUVOX
-from tests.synthetic import ball_views, swinging
 from tests.training.runs import small_config
 from xplanes import RadianceModule, SceneDataModule
+from xplanes.baselines.proposal import spaced, unspaced
 from xplanes.rendering.behind import look
-from xplanes.rendering.proposal import spaced, unspaced
 from xplanes.scenes.views import Scene
 from xplanes.training.collapse import CollapseWatch
 from xplanes.training.fit import Trainer
@@ -147,6 +147,12 @@ def test_training_learns_what_lies_behind(trained):
     clear = found["opacity"] < 1e-4
     if clear.any():
         torch.testing.assert_close(found["colour"][clear], behind[clear], atol=1e-3, rtol=0)
+
+
+def test_the_sparsity_prior_leaves_a_world_alone():
+    for kind, kept in (("alpha", True), ("world", False)):
+        module = built(kind)
+        assert bool(module.sampler.regularisers(module.field, module.state)) is kept
 
 
 def test_nothing_is_known_of_opacity(trained):

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from xplanes.fields.gaussians import PosedGaussians
 from xplanes.rendering.base import RayRenderer, Renderer
 from xplanes.rendering.box import snapshot
 from xplanes.rendering.grid_renderer import GridRenderer
@@ -27,9 +26,6 @@ SLACK = 0.02
 """Distance from a silhouette, in the field's frame, at which something may still belong to it."""
 
 RED = (0.9, 0.1, 0.1)
-
-OUTSIDE = 1.0
-"""Signed distance of what is left out; far from the surface, where nothing is seen."""
 
 
 @dataclass(frozen=True)
@@ -84,45 +80,6 @@ class Picture:
     depth: Tensor
 
 
-class Masked:
-    """A field that is empty in some places; all else is the field's own.
-
-    Args:
-        field: Any field that a renderer takes.
-        keep: Tells of points [N, 3] which of them are not emptied. bool [N]
-    """
-
-    def __init__(self, field: Any, keep: Callable[[Tensor], Tensor]) -> None:
-        self._field, self._keep = field, keep
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._field, name)
-
-    def __call__(self, points: Tensor, times: Tensor, *directions: Tensor) -> tuple[Tensor, Tensor]:
-        """As `RadianceField.forward`."""
-        colour, density = self._field(points, times, *directions)
-        return colour, density * self._keep(points)
-
-    def geometry(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
-        """As `ViewDependentField.geometry`."""
-        density, features = self._field.geometry(points, times)
-        return density * self._keep(points), features
-
-    def distance_and_slope(self, points: Tensor, times: Tensor) -> tuple[Tensor, ...]:
-        """As that of a field of signed distances."""
-        distance, *others = self._field.distance_and_slope(points, times)
-        return torch.where(self._keep(points), distance, OUTSIDE), *others
-
-    def snapshot(self, time: float) -> "Masked":
-        """As `RadianceField.snapshot`."""
-        return Masked(snapshot(self._field, time), self._keep)
-
-    def at(self, time: float) -> PosedGaussians:
-        """As `Gaussians.at`; a Gaussian is where its mean is."""
-        posed = self._field.at(time)
-        return replace(posed, opacities=posed.opacities * self._keep(posed.means))
-
-
 def draw(
     field: Any,
     renderer: Renderer,
@@ -157,10 +114,10 @@ def draw(
         # What the grid knows to be opaque may be left out, and hides nothing then.
         solid = replace(renderer, occlusion=0.0) if isinstance(renderer, GridRenderer) else renderer
     if box is not None:
-        shown = Masked(field, in_box(box.to(device)))
+        shown = field.masked(in_box(box.to(device)))
     outside = None
     if shot.mode == "floaters":
-        outside = Masked(shown, ruled_out(views, frame, shot.time))
+        outside = shown.masked(ruled_out(views, frame, shot.time))
     origins, directions = shot.rays()
     moved = shift(renderer, shot.pose[:3, 3], views, frame)
     at_once = at_once if isinstance(renderer, RayRenderer) else len(origins)

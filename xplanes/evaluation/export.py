@@ -1,4 +1,4 @@
-"""Meshes, points, planes, Gaussians and camera paths for other programs: `xplanes export`."""
+"""Meshes, points, planes and camera paths for other programs: `xplanes export`."""
 
 import json
 import math
@@ -17,10 +17,7 @@ from xplanes.evaluation.camera_path import nerfstudio_content, path_of, transfor
 from xplanes.evaluation.progress import progress
 from xplanes.evaluation.render import FPS
 from xplanes.evaluation.runs import TrainedRun
-from xplanes.fields.base import ViewDependentField
-from xplanes.fields.gaussians import Gaussians
-from xplanes.fields.tensor4d import Tensor4D
-from xplanes.fields.tineuvox import TiNeuVox
+from xplanes.fields.base import SurfaceField, ViewDependentField
 from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES, XPlanes
 from xplanes.files import replacing, require_writable, write_json
 from xplanes.optional import require
@@ -28,7 +25,8 @@ from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.box import ray_box
 from xplanes.rendering.grid_renderer import GridRenderer
 
-KINDS = ("mesh", "points", "planes", "gaussians", "path")
+KINDS = ("mesh", "points", "planes", "path")
+"""What is written of every field, or of X-Planes; a field may have more in its `exports`."""
 FORMATS = ("ply", "glb")
 
 TIMES = 10
@@ -52,7 +50,7 @@ class ExportOptions:
     """What to export.
 
     Attributes:
-        what: ``mesh``, ``points``, ``planes``, ``gaussians`` or ``path``.
+        what: ``mesh``, ``points``, ``planes``, ``path``, or a name in the field's `exports`.
         times: A number of times spread evenly from 0 to 1, or times separated by commas; None for
             10, or for 1 in a static scene.
         resolution: Grid points along each side of the field's cube.
@@ -75,9 +73,8 @@ class ExportOptions:
             ConfigError: With the option, its value and what is allowed.
             MissingExtraError: For meshes and points without the extra ``export``.
         """
-        for name, value, allowed in (("what", self.what, KINDS), ("format", self.form, FORMATS)):
-            if value not in allowed:
-                raise ConfigError(f"--{name} {value}: must be {' or '.join(allowed)}")
+        if self.form not in FORMATS:
+            raise ConfigError(f"--format {self.form}: must be {' or '.join(FORMATS)}")
         for name, value, least, most in (
             ("resolution", self.resolution, 8, LARGEST),
             ("points", self.count, 1, 10**8),
@@ -94,16 +91,16 @@ class ExportOptions:
             require("trimesh", extra="export")
 
     def _refuse_what_is_not_used(self) -> None:
-        surfaces = ("mesh", "points")
+        surface = self.what in ("mesh", "points")
         default = ExportOptions()
-        for name, value, ordinary, kinds in (
-            ("times", self.times, default.times, (*surfaces, "gaussians")),
-            ("resolution", self.resolution, default.resolution, surfaces),
-            ("threshold", self.threshold, default.threshold, surfaces),
-            ("points", self.count, default.count, ("points",)),
-            ("format", self.form, default.form, surfaces),
+        for name, value, ordinary, used in (
+            ("times", self.times, default.times, self.what not in ("planes", "path")),
+            ("resolution", self.resolution, default.resolution, surface),
+            ("threshold", self.threshold, default.threshold, surface),
+            ("points", self.count, default.count, self.what == "points"),
+            ("format", self.form, default.form, surface),
         ):
-            if value != ordinary and self.what not in kinds:
+            if value != ordinary and not used:
                 raise ConfigError(
                     f"--{name} {value}: --what {self.what} does not use it; leave it out"
                 )
@@ -153,6 +150,10 @@ def export(
         MissingExtraError: For meshes and points without the extra ``export``.
     """
     options.check()
+    field, name = trained.module.field, trained.experiment.method.model.name
+    if options.what not in (*KINDS, *field.exports):
+        allowed = " or ".join((*KINDS, *field.exports))
+        raise ConfigError(f"--what {options.what}: {name} has none; set --what {allowed}")
     folder = out or trained.path / "export" / options.what
     check_folder(folder)
     require_writable(folder)
@@ -166,23 +167,26 @@ def export(
         write = write_planes if options.what == "planes" else write_paths
         write_json(folder / "export.json", {**facts, "files": write(folder, trained)})
         return folder
-    if getattr(trained.module.field, "background", None) is not None:
+    if getattr(field, "background", None) is not None:
         facts["left_out"] = "what lies behind the field's cube"
         say(f"left out    {facts['left_out']}, which has no surface; --what planes has it")
     times = export_times(options.times or str(1 if trained.is_static else TIMES))
-    if options.what == "gaussians":
-        names = [f"gaussians_{number:04d}.ply" for number in range(len(times))]
-        for name, time in zip(names, times, strict=True):
-            write_gaussians(folder / name, trained, time)
+    if (write_own := field.exports.get(options.what)) is not None:
+        paths = [folder / f"{options.what}_{number:04d}" for number in range(len(times))]
+        written = [
+            write_own(path, time, trained.frame) for path, time in zip(paths, times, strict=True)
+        ]
+        names = [path.name for path in written]
         write_json(folder / "export.json", {**facts, "files": names, "times": times})
         return folder
     if not isinstance(trained.module.renderer, RayRenderer):
+        others = " or ".join((*field.exports, "path"))
         raise ConfigError(
-            f"--what {options.what}: {trained.experiment.method.model.name} has Gaussians and no "
-            "density; set --what gaussians"
+            f"--what {options.what}: {name} has neither a density nor a surface; set --what "
+            f"{others}"
         )
     threshold = options.threshold
-    if isinstance(trained.module.field, Tensor4D):
+    if isinstance(field, SurfaceField):
         if threshold is not None:
             raise ConfigError(
                 f"--threshold {threshold:g}: this field has a surface of its own and no density; "
@@ -328,7 +332,7 @@ def solidity(trained: TrainedRun, time: float, resolution: int) -> tuple[Tensor,
     """
     field, renderer = trained.module.field, trained.module.renderer
     device, cell = renderer.device, 2 / resolution
-    empty = -cell if isinstance(field, Tensor4D) else 0.0
+    empty = -cell if isinstance(field, SurfaceField) else 0.0
     volume = torch.full((resolution**3,), empty)
     chunk = 2**15 if device.type == "cpu" else 2**19
     for index in torch.arange(resolution**3).split(chunk):
@@ -339,8 +343,8 @@ def solidity(trained: TrainedRun, time: float, resolution: int) -> tuple[Tensor,
             continue
         points = points[seen]
         times = torch.full_like(points[:, 0], time)
-        if isinstance(field, Tensor4D):
-            value = -field.distance(field.canonical(points, times))[0].clamp(-cell, cell)
+        if isinstance(field, SurfaceField):
+            value = -field.signed_distance(points, times).clamp(-cell, cell)
         else:
             whole = not isinstance(field, ViewDependentField)
             density = field(points, times)[1] if whole else field.geometry(points, times)[0]
@@ -351,14 +355,12 @@ def solidity(trained: TrainedRun, time: float, resolution: int) -> tuple[Tensor,
 
 def _looked_at(trained: TrainedRun, points: Tensor, time: float) -> Tensor:
     """Whether rays that pass points of the cube see what is there. bool [N]"""
-    renderer, field = trained.module.renderer, trained.module.field
+    renderer = trained.module.renderer
     if isinstance(renderer, GridRenderer) and renderer.skip_empty:
         grid = renderer.grid
         return grid.occupied[grid.cells(points, torch.full_like(points[:, 0], time))]
-    if isinstance(field, TiNeuVox):
-        low, high = field.bounds()
-        return ((points >= low) & (points <= high)).all(dim=1)
-    return torch.ones_like(points[:, 0], dtype=torch.bool)
+    assert isinstance(renderer, RayRenderer)
+    return renderer.reaches(points)
 
 
 @torch.no_grad()
@@ -440,65 +442,14 @@ def surface_colours(trained: TrainedRun, points: Tensor, normals: Tensor, time: 
     for part, normal in zip(points.split(2**15), normals.split(2**15), strict=True):
         place, facing = part.to(device), -normal.to(device)
         times = torch.full_like(place[:, 0], time)
-        if isinstance(field, Tensor4D):
-            _, slopes, features, _ = field.distance_and_slope(place, times)
-            colour = field.colour(place, slopes, features, facing)
+        if isinstance(field, SurfaceField):
+            colour = field.surface_colour(place, times, facing)
         elif field.view_dependent:
             colour = field(place, times, facing)[0]
         else:
             colour = field(place, times)[0]
         colours.append(colour.float().clamp(0, 1).cpu())
     return torch.cat(colours)
-
-
-@torch.no_grad()
-def write_gaussians(path: Path, trained: TrainedRun, time: float) -> None:
-    """Write the Gaussians of one timestep, in the world, as 3DGS and its viewers lay out a PLY.
-
-    Opacities are written before the sigmoid, scales as logarithms, colours as coefficients of
-    spherical harmonics, those of degree 1 and higher channel by channel.
-
-    Args:
-        path: The file.
-        trained: The run.
-        time: From 0 to 1.
-
-    Raises:
-        ConfigError: If the run's field is another one, or its frame is turned.
-
-    Source: Kerbl et al. 2023, released code.
-    """
-    field, frame = trained.module.field, trained.frame
-    if not isinstance(field, Gaussians):
-        raise ConfigError(
-            f"--what gaussians: {trained.experiment.method.model.name} has none; mesh and points "
-            "work with every radiance field"
-        )
-    if not torch.equal(frame.rotation, torch.eye(3)):
-        raise ConfigError(
-            "--what gaussians: the field's frame is turned against the world; train without a "
-            "frame of your own"
-        )
-    posed = field.at(time)
-    means, harmonics = frame.to_world(posed.means.cpu()), posed.harmonics
-    columns = {
-        "x y z": means,
-        "nx ny nz": torch.zeros_like(means),
-        "f_dc_0 f_dc_1 f_dc_2": harmonics[:, 0],
-        " ".join(f"f_rest_{n}" for n in range(3 * (harmonics.shape[1] - 1))): harmonics[:, 1:]
-        .transpose(1, 2)
-        .flatten(1),
-        # Of opacities of 0 and 1 it would be infinite.
-        "opacity": posed.opacities.logit(eps=1e-6)[:, None],
-        "scale_0 scale_1 scale_2": posed.scales.log() - math.log(frame.scale),
-        "rot_0 rot_1 rot_2 rot_3": F.normalize(posed.quaternions, dim=1),
-    }
-    names = " ".join(columns).split()
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(means)}"]
-    header += [*(f"property float {name}" for name in names), "end_header", ""]
-    table = torch.cat([part.cpu().float() for part in columns.values()], dim=1).numpy()
-    with replacing(path) as temporary:
-        temporary.write_bytes("\n".join(header).encode() + table.astype("<f4").tobytes())
 
 
 def write_paths(folder: Path, trained: TrainedRun) -> list[str]:

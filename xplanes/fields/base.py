@@ -1,10 +1,17 @@
 """Base classes of fields: what renderers and training require of them."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from torch import Tensor, nn
+
+from xplanes.scenes.frame import Frame
+
+Writer = Callable[[Path, float, Frame], Path]
+"""Writes a field at one time from 0 to 1: takes a path without suffix, the time and the field's
+frame, and returns the path of the file."""
 
 
 class Representation(nn.Module, ABC):
@@ -36,6 +43,19 @@ class Representation(nn.Module, ABC):
     def outline(self) -> str:
         """Short description for reports, such as the number of channels."""
         return type(self).__name__
+
+    @property
+    def exports(self) -> Mapping[str, Writer]:
+        """Files of its own that `xplanes export --what NAME` writes, by name."""
+        return {}
+
+    def masked(self, keep: Callable[[Tensor], Tensor]) -> Any:
+        """The same, empty in some places, for a renderer of this field.
+
+        Args:
+            keep: Tells of points [N, 3] of the field's frame whether they are kept. bool [N]
+        """
+        return Masked(self, keep)
 
     def __setattr__(self, name: str, value: Any) -> None:
         # torch would keep the part, and the property would go on hiding it.
@@ -100,3 +120,48 @@ class ViewDependentField(RadianceField):
         if directions is None:
             directions = points.new_tensor([0.0, 0.0, -1.0]).expand_as(points)
         return self.colour(features, directions), density
+
+
+class SurfaceField(RadianceField):
+    """A field with a surface, where a signed distance is 0, in place of a density."""
+
+    @abstractmethod
+    def signed_distance(self, points: Tensor, times: Tensor) -> Tensor:
+        """Distance to the surface, negative inside. [N, 3], [N] -> [N]"""
+
+    @abstractmethod
+    def surface_colour(self, points: Tensor, times: Tensor, directions: Tensor) -> Tensor:
+        """Colour on the surface seen along unit directions. [N, 3], [N], [N, 3] -> [N, 3]"""
+
+
+class Masked:
+    """A field that is empty in some places; all else is the field's own.
+
+    Args:
+        field: Any field that a renderer takes.
+        keep: Tells of points [N, 3] which of them are not emptied. bool [N]
+    """
+
+    def __init__(self, field: Any, keep: Callable[[Tensor], Tensor]) -> None:
+        self._field, self._keep = field, keep
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._field, name)
+
+    def __call__(self, points: Tensor, times: Tensor, *directions: Tensor) -> tuple[Tensor, Tensor]:
+        """As `RadianceField.forward`."""
+        colour, density = self._field(points, times, *directions)
+        return colour, density * self._keep(points)
+
+    def geometry(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+        """As `ViewDependentField.geometry`."""
+        density, features = self._field.geometry(points, times)
+        return density * self._keep(points), features
+
+    def snapshot(self, time: float) -> Any:
+        """As `RadianceField.snapshot`."""
+        return self._field.snapshot(time).masked(self._keep)
+
+    def masked(self, keep: Callable[[Tensor], Tensor]) -> Any:
+        """As `Representation.masked`."""
+        return type(self)(self, keep)

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from xplanes.fields.base import Representation
-from xplanes.fields.gaussians import PointCloud
 from xplanes.rendering.base import Rendering
 from xplanes.rendering.sampler import Group, SamplerSettings, Site, scene_cube
 from xplanes.scenes.batches import Batch, RaySettings
@@ -24,18 +23,18 @@ from xplanes.streams import TrainingState
 class InitialValues:
     """Initial values of a field that is not initialised randomly.
 
+    Models that take something else than planes derive a class from this one.
+
     Attributes:
-        planes: Planes by name; none for Gaussians. [C, rows, columns] each
+        planes: Planes by name. [C, rows, columns] each
         decoder: Weights of the decoder; None for a fresh one.
         sparse: Target of the regulariser L_r for the time planes; None disables L_r.
             [T, 3, C, H, H]
-        points: What Gaussians are made from; None for planes.
     """
 
     planes: Mapping[str, Tensor]
     decoder: Mapping[str, Tensor] | None = None
     sparse: Tensor | None = None
-    points: PointCloud | None = None
 
 
 class Model(ABC):
@@ -131,8 +130,8 @@ class Model(ABC):
 class ModelSettings(Settings, ABC):
     """Base class of the settings of models."""
 
-    takes: ClassVar[Literal["planes", "points"] | None] = None
-    """Kind of initialisation that the field accepts; None if only random."""
+    takes: ClassVar[str | None] = None
+    """Kind of initialisation that the field accepts, such as "planes"; None if only random."""
     devices: ClassVar[int | None] = 1
     """Maximum number of devices for training; None for no limit."""
     field_class: ClassVar[type[Representation] | None] = None

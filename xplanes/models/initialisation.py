@@ -106,8 +106,8 @@ class Initialiser(ABC):
 class InitialiserSettings(Settings, ABC):
     """Base of the settings in the group ``lrm``."""
 
-    gives: ClassVar[Literal["planes", "points"]] = "planes"
-    """What a field is initialised with."""
+    gives: ClassVar[str] = "planes"
+    """What a field is initialised with; a model whose `takes` is another refuses it."""
 
     name: str  # Name in run directories and tables.
 
@@ -223,16 +223,12 @@ class Method:
             )
         lrm = build(config["lrm"], InitialiserSettings, "lrm")
         if not isinstance(lrm, RandomSettings) and lrm.gives != model.takes:
-            where = f"lrm={lrm.name} with model={model.name}: "
-            if lrm.gives == "points":
-                raise ConfigError(
-                    f"{where}points initialise Gaussians alone; set lrm=none, or "
-                    "model=gaussians_hexplane or another model of Gaussians"
-                )
-            points = " or lrm=field (points)" if model.takes == "points" else ""
+            same = "" if model.takes is None else f", an lrm that gives {model.takes}"
+            models = "model=six_planes or model=nine_planes"
             raise ConfigError(
-                f"{where}triplanes initialise X-Planes alone; set lrm=none{points}, or "
-                "model=six_planes or model=nine_planes"
+                f"lrm={lrm.name} with model={model.name}: the initialisation is {lrm.gives}, and "
+                f"the model takes {model.takes or 'none'}; set lrm=none{same}, or "
+                f"{models if lrm.gives == 'planes' else f'a model that takes {lrm.gives}'}"
             )
         if model.field_class is not None:
             model.sampler.require_kind(model.field_class)

@@ -80,6 +80,10 @@ class RayRenderer(Renderer):
 
     rays_at_once = 4096
 
+    def reaches(self, points: Tensor) -> Tensor:
+        """Whether points of the cube [N, 3] can have samples: by default all of them. bool [N]"""
+        return torch.ones_like(points[:, 0], dtype=torch.bool)
+
     def view(
         self, field: Any, frame: Frame, camera: PosedCamera, time: float, background: Tensor
     ) -> dict[str, Tensor]:

@@ -172,7 +172,8 @@ class OccupancySettings(SamplerSettings):
     silhouettes: bool  # Prune cells outside the silhouettes (alpha).
     fill: bool  # Prune empty cells of an initialised field.
     # Weight of the mean opacity of random points in occupied cells, one step long. It empties what
-    # no training ray sees, such as the space below a ground plate.
+    # no training ray sees, such as the space below a ground plate. 0 if a background is learnt,
+    # which would take over what it empties.
     sparsity: Weight
     sweep_at: list[int]  # Steps at which all occupied cells are updated.
     sweep_every: Count  # Steps between updates of all occupied cells afterwards.
@@ -217,8 +218,8 @@ class OccupancySettings(SamplerSettings):
                 carve(grid, site.views, site.frame)
             if site.initialised and self.fill:
                 fill_seconds = _fill(renderer, field, site)
-        samples = site.samples_per_batch
-        return OccupancySampler(renderer, self.scaled(site), samples, fill_seconds)
+        settings = self.scaled(site) if plain else replace(self.scaled(site), sparsity=0.0)
+        return OccupancySampler(renderer, settings, site.samples_per_batch, fill_seconds)
 
     def scaled(self, site: Site) -> "OccupancySettings":
         """The same schedule in steps of the batches of a site.

@@ -1,0 +1,447 @@
+"""Gaussian splatting: values and gradients against the formulas, and what is at the edges."""
+
+import dataclasses
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from tests.baselines import gaussian_oracle as oracle
+from xplanes.backend import threads
+from xplanes.baselines.gaussians import rasteriser_cuda
+from xplanes.baselines.gaussians.camera import Camera
+from xplanes.baselines.gaussians.harmonics import spherical_harmonics
+from xplanes.baselines.gaussians.rasteriser import GaussianError, rasterise
+from xplanes.baselines.gaussians.rasteriser_numba import _power
+from xplanes.optional import MissingExtraError
+from xplanes.scenes.cameras import camera_around, project
+
+NAMES = ("means", "quaternions", "scales", "opacities", "colours")
+KINDS = ("loops", "float32", "float64")
+"""The compiled loops, and plain torch in two precisions."""
+
+TOLERANCE = {"loops": 5e-6, "float32": 5e-6, "float64": 1e-9}
+
+
+def camera_of(width=23, height=18, distance=4.0, near=0.01, far=100.0):
+    pose = camera_around(40, 25, distance)
+    focal, centre = (1.3 * width, 1.25 * width), (0.5 * width + 0.7, 0.5 * height - 0.4)
+    size = {"width": width, "height": height}
+    return Camera.from_pose(pose, focal=focal, centre=centre, **size, near=near, far=far)
+
+
+def gaussians(count, *, seed=0, channels=3, size=0.15, spread=0.8):
+    draw = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=draw, dtype=torch.float64)
+
+    return [
+        spread * normal(count, 3),
+        normal(count, 4),
+        size * (0.7 * normal(count, 3)).exp(),
+        torch.rand(count, generator=draw, dtype=torch.float64),
+        torch.rand(count, channels, generator=draw, dtype=torch.float64),
+    ]
+
+
+def at_float32(given):
+    """The numbers that float32 holds, so that all precisions draw the same Gaussians."""
+    return [t.float().double() for t in given]
+
+
+@pytest.fixture(params=KINDS)
+def kind(request, monkeypatch):
+    monkeypatch.setenv("XPLANES_CPU_LOOPS", str(int(request.param == "loops")))
+    return request.param
+
+
+def drawn(kind, given, camera, **options):
+    dtype = torch.float64 if kind == "float64" else torch.float32
+    given = [t.detach().to(dtype, copy=True).requires_grad_() for t in given]
+    image = rasterise(*given, camera, **options)
+    if len(given[0]):
+        image.means2d.retain_grad()
+    return image, given
+
+
+def close(ours, theirs, most):
+    """Difference as a share of the largest expected value."""
+    ours, theirs = ours.detach().double().numpy(), np.asarray(theirs)
+    assert ours.shape == theirs.shape
+    if theirs.size:
+        scale = max(np.abs(theirs).max(), 1e-9)
+        worst = np.abs(ours - theirs).max() / scale
+        assert worst <= most, f"error {worst:.1e} of {scale:.1e}"
+
+
+def upstream(image):
+    draw = torch.Generator().manual_seed(5)
+    outputs = (image.colour, image.opacity, image.depth)
+    return [torch.randn(t.shape, generator=draw, dtype=torch.float64) for t in outputs]
+
+
+def back(image, weights):
+    outputs = (image.colour, image.opacity, image.depth)
+    sum((t * w.to(t)).sum() for t, w in zip(outputs, weights, strict=True)).backward()
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_images_are_those_of_the_formulas(kind, antialiased):
+    # Several tiles, Gaussians across their edges and beyond the image's, behind, and too near.
+    for channels, size in ((3, 0.15), (1, 0.5), (7, 0.02), (0, 0.1)):
+        given = at_float32(gaussians(60, channels=channels, size=size))
+        camera = camera_of(45, 70, distance=2.5, near=1.0, far=4.0)
+        background = torch.linspace(0, 1, channels)
+        options = {"background": background, "antialiased": antialiased}
+        image, _ = drawn(kind, given, camera, **options)
+        expected = oracle.splat(given, camera, **options)
+        outputs = (image.colour, image.opacity, image.depth)
+        for ours, theirs in zip(outputs, expected, strict=True):
+            close(ours, theirs, TOLERANCE[kind])
+        assert 0 < (image.radii > 0).sum() < 60
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gradients_are_slopes_of_the_formulas(kind, antialiased):
+    for channels in (3, 5):
+        given = at_float32(gaussians(5, seed=3, channels=channels, size=0.3))
+        camera, background = camera_of(), torch.linspace(0.2, 1, channels, dtype=torch.float64)
+        image, ours = drawn(kind, given, camera, background=background, antialiased=antialiased)
+        weights = upstream(image)
+        back(image, weights)
+
+        def loss(*arrays, camera=camera, weights=weights, background=background):
+            outputs = oracle.splat(arrays, camera, background, antialiased)
+            return sum((w.numpy() * t).sum() for w, t in zip(weights, outputs, strict=True))
+
+        arrays = [t.numpy() for t in given]
+        for tensor, theirs in zip(ours, oracle.slopes(loss, arrays), strict=True):
+            close(tensor.grad, theirs, 2e-5 if kind != "float64" else 1e-6)
+
+        def moved(centre, arrays=arrays, loss=loss, camera=camera):
+            return loss(*arrays, camera=dataclasses.replace(camera, cx=centre[0], cy=centre[1]))
+
+        # Moving the principal point moves all projected means alike, and nothing else.
+        (shift,) = oracle.slopes(moved, [np.array([camera.cx, camera.cy])])
+        close(image.means2d.grad.sum(0), shift, 2e-5)
+
+
+def test_gradients_through_plain_torch_pass_gradcheck(monkeypatch):
+    monkeypatch.setenv("XPLANES_CPU_LOOPS", "0")
+    given = [t.requires_grad_() for t in gaussians(3, seed=1, size=0.3)]
+
+    def outputs(*given):
+        image = rasterise(*given, camera_of(7, 6), torch.ones(3), antialiased=True)
+        return image.colour, image.opacity, image.depth
+
+    assert torch.autograd.gradcheck(outputs, given)
+
+
+def test_loops_and_plain_torch_agree_on_many_gaussians(monkeypatch):
+    camera = camera_of(90, 75)
+    found = []
+    for kind in ("loops", "float64"):
+        monkeypatch.setenv("XPLANES_CPU_LOOPS", str(int(kind == "loops")))
+        given = at_float32(gaussians(1500, size=0.04))
+        image, leaves = drawn(kind, given, camera, background=torch.ones(3))
+        back(image, upstream(image))
+        gradients = [image.means2d.grad, *(t.grad for t in leaves)]
+        found.append([image.colour, image.opacity, image.depth, image.radii, *gradients])
+    for ours, theirs in zip(*found, strict=True):
+        close(ours, theirs.detach().double(), 1e-5)
+
+
+def test_the_same_bits_on_any_number_of_threads(monkeypatch):
+    monkeypatch.setenv("XPLANES_CPU_LOOPS", "1")
+    found = []
+    for count in (1, 2, 2):
+        with threads(count):
+            image, given = drawn("loops", gaussians(800, size=0.05), camera_of(100, 80))
+            back(image, upstream(image))
+        tensors = (image.colour, image.opacity, image.depth, image.means2d.grad)
+        found.append([*tensors, *(t.grad for t in given)])
+    for first, *others in zip(*found, strict=True):
+        for other in others:
+            assert torch.equal(first, other)
+
+
+def in_front(camera, across=0.0, distance=0.0):
+    """A point on the camera's axis, ``distance`` beyond the origin, moved to its right."""
+    local = torch.tensor([across, 0.0, 4.0 + distance, 1.0], dtype=torch.float64)
+    return (torch.linalg.inv(camera.world_to_camera.double()) @ local)[:3]
+
+
+def single(camera, scale=(0.1, 0.1, 0.1), opacity=0.8, quaternion=(1, 0, 0, 0), **where):
+    return [
+        in_front(camera, **where)[None],
+        torch.tensor([quaternion], dtype=torch.float64),
+        torch.tensor([scale], dtype=torch.float64),
+        torch.tensor([opacity], dtype=torch.float64),
+        torch.tensor([[0.2, 0.5, 0.9]], dtype=torch.float64),
+    ]
+
+
+@pytest.mark.parametrize(
+    "scale", [(0, 0, 0), (0, 0.3, 0.3), (0, 0, 0.5), (1e-9, 1e-9, 1), (1e-4, 3, 3), (5, 5, 5)]
+)
+def test_points_needles_discs_and_giants(kind, scale):
+    camera = camera_of()
+    given = at_float32(single(camera, scale, quaternion=(0.3, 0.8, -0.2, 0.5)))
+    for antialiased in (False, True):
+        image, leaves = drawn(kind, given, camera, antialiased=antialiased)
+        expected = oracle.splat(given, camera, antialiased=antialiased)
+        # Compensation of a needle is a difference of squares in the oracle.
+        most = max(TOLERANCE[kind], 1e-6 if antialiased else 0)
+        close(image.opacity, expected[1], most)
+        close(image.colour, expected[0], most)
+        back(image, upstream(image))
+        for leaf in leaves:
+            assert leaf.grad.isfinite().all()
+
+
+def test_a_giant_in_every_tile_hides_what_is_behind(kind):
+    camera = camera_of(40, 70)
+    front, behind = single(camera, (50, 50, 1e-3), 1.0), gaussians(30)
+    given = [torch.cat(pair) for pair in zip(front, behind, strict=True)]
+    given[0][1:] += in_front(camera, distance=4.0)
+    image, _ = drawn(kind, given, camera)
+    expected = oracle.splat(given, camera)
+    close(image.colour, expected[0], TOLERANCE[kind])
+    assert (image.opacity > 0.99).all()
+
+
+def test_thousands_of_layers_stop_at_the_cut_off(kind):
+    camera, layers = camera_of(20, 20), 3000
+    given = [t.repeat(layers, *[1] * (t.ndim - 1)) for t in single(camera, (2, 2, 2), 0.006)]
+    given[4] = torch.linspace(0, 1, 3 * layers, dtype=torch.float64).view(layers, 3)
+    image, leaves = drawn(kind, given, camera)
+    expected = oracle.splat(given, camera)
+    close(image.opacity, expected[1], 10 * TOLERANCE[kind])
+    close(image.colour, expected[0], 10 * TOLERANCE[kind])
+    assert (1 - image.opacity > 0.9e-4).all()
+    back(image, upstream(image))
+    # Behind the cut-off nothing is seen, and nothing is learnt.
+    assert (leaves[4].grad[-500:] == 0).all()
+    assert (leaves[4].grad[:500] != 0).all()
+
+
+def test_gaussians_of_equal_depth_keep_their_order(kind):
+    camera = camera_of()
+    pair = [t.repeat(2, *[1] * (t.ndim - 1)) for t in single(camera, opacity=0.999)]
+    pair[4] = torch.tensor([[1.0, 0, 0], [0, 1, 0]], dtype=torch.float64)
+    image, _ = drawn(kind, pair, camera)
+    swapped, _ = drawn(kind, [t.flip(0) for t in pair], camera)
+    row, column = int(camera.cy), int(camera.cx)
+    assert image.colour[row, column, 0] > 2 * image.colour[row, column, 1]
+    assert torch.equal(image.colour[..., 0], swapped.colour[..., 1])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"distance": -5.0},  # Behind the camera.
+        {"distance": -3.995},  # Nearer than near.
+        {"across": 40.0},
+        {"opacity": 0.0},
+        {"opacity": 0.0039},
+        {"scale": (1e30, 1.0, 1e25), "distance": 1e12},  # Beyond far.
+    ],
+)
+def test_what_is_not_seen_changes_nothing(kind, change):
+    camera = camera_of()
+    seen = single(camera)
+    both = [torch.cat(pair) for pair in zip(seen, single(camera, **change), strict=True)]
+    alone, given = drawn(kind, seen, camera)
+    back(alone, upstream(alone))
+    image, leaves = drawn(kind, both, camera)
+    back(image, upstream(image))
+    assert torch.equal(alone.colour, image.colour)
+    assert image.radii.tolist() == [*alone.radii.tolist(), 0]
+    for leaf, lone in zip(leaves, given, strict=True):
+        torch.testing.assert_close(leaf.grad[:1], lone.grad)
+        assert (leaf.grad[1:] == 0).all()
+
+
+def test_projections_that_overflow_leave_the_rest_alone(kind):
+    camera = camera_of()
+    seen = single(camera)
+    far = single(camera, (3e38, 3e38, 1e-30), 1.0)
+    image, leaves = drawn(kind, [torch.cat(p) for p in zip(seen, far, strict=True)], camera)
+    back(image, upstream(image))
+    assert image.colour.isfinite().all()
+    for leaf in leaves:
+        assert leaf.grad.isfinite().all()
+
+
+def test_no_gaussians_show_the_background(kind):
+    given = [t[:0] for t in single(camera_of())]
+    image, leaves = drawn(kind, given, camera_of(), background=torch.tensor([0.25, 0.5, 1.0]))
+    assert (image.colour == image.colour.new_tensor([0.25, 0.5, 1.0])).all()
+    assert (image.opacity == 0).all()
+    assert (image.depth == 0).all()
+    image.colour.sum().backward()
+    assert leaves[0].grad is None or leaves[0].grad.shape == (0, 3)
+
+
+def test_quaternions_of_any_length_and_none(kind):
+    camera = camera_of()
+    turned = (0.3, 0.8, -0.2, 0.5)
+    scale = (0.4, 0.1, 0.05)
+    images = {}
+    for length in (1.0, 1e-6, 1e6):
+        quaternion = tuple(length * part for part in turned)
+        images[length], _ = drawn(kind, single(camera, scale, quaternion=quaternion), camera)
+        torch.testing.assert_close(images[length].colour, images[1.0].colour)
+    plain, _ = drawn(kind, single(camera, scale), camera)
+    for quaternion in ((0, 0, 0, 0), (0, 1e-30, 0, 0), (1e-38, 0, 0, 0)):
+        image, leaves = drawn(kind, single(camera, scale, quaternion=quaternion), camera)
+        torch.testing.assert_close(image.colour, plain.colour)
+        back(image, upstream(image))
+        assert leaves[1].grad.isfinite().all()
+
+
+def test_half_precision_is_drawn_in_float32(kind):
+    given = gaussians(20)
+    image = rasterise(*(t.half() for t in given), camera_of())
+    expected = oracle.splat([t.half().double() for t in given], camera_of())
+    close(image.colour, expected[0], TOLERANCE["float32"])
+
+
+def test_radii_are_three_deviations_of_the_longest_axis(kind):
+    given, camera = gaussians(20, size=0.05, spread=0.3), camera_of()
+    image, _ = drawn(kind, given, camera)
+    parts = zip(*(t.numpy() for t in given[:3]), strict=True)
+    longest = [np.linalg.eigvalsh(oracle.projected(*part, camera)[1])[-1] for part in parts]
+    expected = np.ceil(3 * np.sqrt(np.array(longest) + 0.3))
+    seen = image.radii.numpy() > 0
+    assert seen.sum() > 15
+    assert (image.radii.numpy()[seen] == expected[seen]).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_numbers_that_are_not_finite_are_named(kind, name):
+    for bad in (float("nan"), float("inf")):
+        given = gaussians(5)
+        given[NAMES.index(name)][3] = bad
+        with pytest.raises(GaussianError, match=rf"^{name} of Gaussian 3 of 5 are .*finite"):
+            drawn(kind, given, camera_of())
+
+
+def test_shapes_and_values_that_cannot_be_are_named():
+    for position, name in enumerate(NAMES):
+        given = gaussians(5)
+        given[position] = given[position][:4] if position else given[position][:, :2]
+        with pytest.raises(GaussianError, match=rf"^{name} are \[.*must be \["):
+            rasterise(*given, camera_of())
+    with pytest.raises(GaussianError, match=r"^background is \[2\], but must be \[3\]"):
+        rasterise(*gaussians(5), camera_of(), torch.ones(2))
+    for name, value in (("scales", -0.1), ("opacities", 1.1)):
+        given = gaussians(5)
+        given[NAMES.index(name)][2] = value
+        with pytest.raises(GaussianError, match=rf"^{name} of Gaussian 2 are .*{value}"):
+            rasterise(*given, camera_of())
+
+
+def test_cameras_see_points_where_views_do():
+    pose, focal, centre = camera_around(70, 10, 3.0), (40.0, 44.0), (21.0, 13.0)
+    camera = Camera.from_pose(pose, focal=focal, centre=centre, width=40, height=30)
+    given = gaussians(10, spread=0.3)
+    image = rasterise(*given, camera)
+    pair = (torch.tensor(focal).double(), torch.tensor(centre).double())
+    x, y, _ = project(pose, given[0], focal=pair[0], centre=pair[1])
+    seen = image.radii > 0
+    assert seen.sum() > 5
+    torch.testing.assert_close(image.means2d[seen], torch.stack([x, y], dim=1)[seen])
+
+
+def test_cameras_that_cannot_be_are_refused():
+    for name, value in (("fx", 0.0), ("width", -1), ("near", 0.0), ("far", 0.001)):
+        with pytest.raises(ValueError, match=rf"^camera\.{name}={value}"):
+            dataclasses.replace(camera_of(), **{name: value})
+    with pytest.raises(ValueError, match=r"^camera\.world_to_camera is \[3, 4\]"):
+        dataclasses.replace(camera_of(), world_to_camera=torch.zeros(3, 4))
+    with pytest.raises(ValueError, match=r"^camera\.world_to_camera is not finite"):
+        dataclasses.replace(camera_of(), world_to_camera=torch.full((4, 4), float("nan")))
+
+
+def test_powers_of_two():
+    x = np.linspace(-90, 0, 100_001).astype(np.float32)
+    found = np.array([_power(value) for value in x])
+    assert np.abs(found / 2.0 ** x.astype(np.float64) - 1).max() < 2e-7
+    assert _power(np.float32(0)) == 1
+    assert _power(np.float32(-1e30)) < 1e-30
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_spherical_harmonics_are_those_of_legendre(degree):
+    draw = np.random.default_rng(0)
+    directions = draw.standard_normal((6, 3)) * 3
+    coefficients = draw.standard_normal((6, 16, 3))
+    found = spherical_harmonics(degree, torch.tensor(coefficients), torch.tensor(directions))
+    pairs = [(d, order) for d in range(degree + 1) for order in range(-d, d + 1)]
+    for n in range(6):
+        basis = np.array([oracle.harmonic(*pair, directions[n]) for pair in pairs])
+        np.testing.assert_allclose(found[n], basis @ coefficients[n, : len(pairs)], atol=1e-12)
+
+
+def test_spherical_harmonics_say_what_they_need():
+    with pytest.raises(ValueError, match="degree=4: must be 0 to 3"):
+        spherical_harmonics(4, torch.zeros(1, 25, 3), torch.ones(1, 3))
+    with pytest.raises(ValueError, match="degree 2 needs 9 of them"):
+        spherical_harmonics(2, torch.zeros(1, 4, 3), torch.ones(1, 3))
+
+
+@pytest.mark.slow
+def test_a_million_gaussians(monkeypatch):
+    monkeypatch.setenv("XPLANES_CPU_LOOPS", "1")
+    given, camera = at_float32(gaussians(10**6, size=0.01)), camera_of(400, 300)
+    image, leaves = drawn("loops", given, camera)
+    back(image, upstream(image))
+    for leaf in leaves:
+        assert leaf.grad.isfinite().all()
+        assert (leaf.grad != 0).any()
+    places = np.array([[57, 40], [200, 150], [333, 222]])
+    near = [reaching(given, camera, place + 0.5) for place in places]
+    for (column, row), members in zip(places, near, strict=True):
+        few = [t[members] for t in given]
+        expected = oracle.splat(few, camera, pixels=[(column + 0.5, row + 0.5)])
+        for ours, theirs in zip((image.colour, image.opacity), expected, strict=False):
+            close(ours[row, column], theirs[0], 1e-5)
+
+
+def reaching(given, camera, place):
+    """Indices of Gaussians that may reach a pixel: no nearer bound than a ball's."""
+    means, scales = given[0], given[2]
+    pose = camera.world_to_camera.double()
+    local = means @ pose[:3, :3].T + pose[:3, 3]
+    depth = local[:, 2]
+    pixels = local[:, :2] / depth[:, None] * torch.tensor([camera.fx, camera.fy])
+    pixels += torch.tensor([camera.cx, camera.cy])
+    largest = scales.amax(1) * max(camera.fx, camera.fy) / depth * 1.5 + 1
+    distance = (pixels - torch.tensor(place)).norm(dim=-1)
+    return ((depth > camera.near) & (distance < 3.5 * largest)).nonzero()[:, 0]
+
+
+def test_cuda_says_what_brings_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(MissingExtraError, match=r"xplanes\[gaussians\]"):
+        rasteriser_cuda.draw(*(t.float() for t in gaussians(3)), camera_of(), False)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gsplat_draws_what_plain_torch_draws(antialiased):
+    pytest.importorskip("gsplat", reason="needs the extra gaussians")
+    given, camera = at_float32(gaussians(300, size=0.1)), camera_of(120, 90)
+    found = []
+    for device, dtype in (("cuda", torch.float32), ("cpu", torch.float64)):
+        leaves = [t.to(device, dtype).requires_grad_() for t in given]
+        image = rasterise(*leaves, camera, antialiased=antialiased)
+        image.means2d.retain_grad()
+        back(image, upstream(image))
+        tensors = (image.colour, image.opacity, image.depth, image.means2d.grad)
+        found.append([t.detach().cpu() for t in (*tensors, *(t.grad for t in leaves))])
+    for ours, theirs in zip(*found, strict=True):
+        close(ours, theirs, 2e-3)  # gsplat's exponential is approximate.

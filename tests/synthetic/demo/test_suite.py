@@ -1,0 +1,412 @@
+"""The suite: every scene has the property that its kind is named after."""
+
+import functools
+import json
+import math
+from itertools import combinations, pairwise
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+from tests.refusals import assert_refused
+from xplanes.components import build
+from xplanes.config import CONF, compose_plain
+from xplanes.scenes.cameras import focal_length, pixel_rays
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.source import SceneSettings
+from xplanes.synthetic.demo.assembly import Assembly, Part
+from xplanes.synthetic.demo.geometry import Box, Plain, Translucent, Unlit
+from xplanes.synthetic.demo.implicit import Fluid, Implicit
+from xplanes.synthetic.demo.motions import Variation
+from xplanes.synthetic.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE, render_image
+from xplanes.synthetic.demo.shading import Light
+from xplanes.synthetic.demo.suite import KINDS, SUITE_SCENES, suite_scene
+from xplanes.synthetic.demo.suite.pieces import ball
+from xplanes.synthetic.demo.write import MASKS, ensure_suite_scene
+
+SIDE = 24
+COUNTS = {"train": 50, "val": 10, "test": 12}
+
+
+@functools.cache
+def capture_of(name):
+    return SUITE_SCENES[name].rig.capture(COUNTS, f"{name} 0")
+
+
+@functools.cache
+def assembly_of(name):
+    return SUITE_SCENES[name].build(Variation(name, 0))
+
+
+def picture(name, time, camera, side=SIDE):
+    posed = assembly_of(name).pose(time)
+    return render_image(posed, camera, side, samples=1, angle_x=capture_of(name).angle_x)
+
+
+@functools.cache
+def pictures(name):
+    """Some views of a scene. uint8 [V, H, W, 4]"""
+    shots = capture_of(name).shots
+    chosen = [*(shots["train"][i] for i in (0, 31)), shots["val"][4], shots["test"][7]]
+    return np.stack([picture(name, time, camera) for time, camera in chosen])
+
+
+def both(kind):
+    return kind, f"{kind}_test"
+
+
+def cameras(name, split="train"):
+    return torch.stack([camera for _, camera in capture_of(name).shots[split]])
+
+
+def times(name, split="train"):
+    return [time for time, _ in capture_of(name).shots[split]]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_scene_to_tune_on_and_another_to_test_on(kind):
+    tuning, test = both(kind)
+    assert test in SUITE_SCENES
+    assert not np.array_equal(pictures(tuning), pictures(test))
+    assert not torch.equal(cameras(tuning), cameras(test))
+    assert repr(assembly_of(tuning)) != repr(assembly_of(test))
+    shapes = [{repr(part.shape) for part in assembly_of(name).parts} for name in both(kind)]
+    assert len(shapes[0] & shapes[1]) < 0.2 * min(map(len, shapes))
+
+
+@pytest.mark.parametrize("name", SUITE_SCENES)
+def test_every_view_shows_the_scene_within_the_picture(name):
+    alpha = pictures(name)[..., 3]
+    assert ((alpha > 127).mean(axis=(1, 2)) > 0.015).all()
+    if "white_floor" not in name:
+        border = np.concatenate([alpha[:, [0, -1]], alpha.transpose(0, 2, 1)[:, [0, -1]]], axis=1)
+        assert (border > 127).mean() < 0.05
+
+
+@pytest.mark.parametrize("name", SUITE_SCENES)
+def test_times_and_cameras_of_the_splits(name):
+    last = SUITE_SCENES[name].rig.end
+    expected = np.linspace(0, last, 50)
+    if name in both("rig"):  # Eight cameras at each of seven times, but for six at the last.
+        expected = np.linspace(0, last, 7).repeat(8)[:50]
+    assert times(name) == pytest.approx(expected.tolist())
+    for split in ("val", "test"):
+        held_out = times(name, split)
+        assert held_out[0] == 0
+        if name in both("rig"):  # A held-out camera takes its pictures with the others.
+            assert set(held_out) <= set(times(name))
+            assert held_out == sorted(held_out)
+            assert len(set(held_out)) == 7
+        else:
+            assert all(a < b < last for a, b in pairwise(held_out))
+        distances = torch.cdist(cameras(name, split)[:, :3, 3], cameras(name)[:, :3, 3])
+        assert distances.min() > 1e-3 * SUITE_SCENES[name].rig.distance
+
+
+@pytest.mark.parametrize("name", SUITE_SCENES)
+def test_things_move_unless_the_scene_is_static(name):
+    camera = cameras(name)[5]
+    first, later = (picture(name, time, camera).astype(int) for time in (0.0, 0.37))
+    moved = (np.abs(first - later) > 25).any(axis=-1).sum()
+    assert moved == 0 if name.startswith("static") else moved >= 4
+    assert len(set(times(name))) == (7 if name in both("rig") else 50)
+
+
+@pytest.mark.parametrize("name", both("white_floor"))
+def test_much_of_every_view_is_opaque_and_white(name):
+    shots = [*capture_of(name).shots["train"][:12], *capture_of(name).shots["test"][:4]]
+    white = np.stack([(picture(name, *shot) == 255).all(axis=-1) for shot in shots])
+    assert (white.mean(axis=(1, 2)) >= 0.35).all()
+    assert 0.4 < white.mean() < 0.65
+    places = cameras(name)[:, :3, 3]
+    assert len(places.unique(dim=0)) == 12
+    assert torch.equal(places[:12], places[12:24])
+    low, high = assembly_of(name).pose(0).bounds()
+    assert (high - low).max() == pytest.approx(8, abs=0.3)
+
+
+@pytest.mark.parametrize("name", both("dark"))
+def test_dark_things_are_dark_and_grey(name):
+    rgba = pictures(name).astype(int)
+    colours = rgba[rgba[..., 3] > 250][:, :3]
+    assert np.percentile(colours, 95) < 110
+    assert np.ptp(colours, axis=-1).max() < 20
+
+
+@pytest.mark.parametrize("name", both("wires"))
+def test_wires_are_thin_and_many(name):
+    thin = [part for part in assembly_of(name).parts if part.shape.extent[1] < 0.02
+            or part.shape.extent[2] < 0.02]  # fmt: skip
+    assert len(thin) == len(assembly_of(name).parts) >= 20
+    rgba = picture(name, 0.0, cameras(name)[0], side=200)
+    assert 0.02 < (rgba[..., 3] > 127).mean() < 0.2
+
+
+@pytest.mark.parametrize("name", both("transparent"))
+def test_glass_lets_a_part_of_the_light_through(name):
+    shots = capture_of(name).shots["train"]
+    soft = []
+    for index in (0, 20, 40):
+        alpha = picture(name, *shots[index], side=64)[..., 3] / 255.0
+        between = (alpha > 0.1) & (alpha < 0.9)
+        inner = between[1:-1, 1:-1] & between[:-2, 1:-1] & between[2:, 1:-1]
+        soft.append((inner & between[1:-1, :-2] & between[1:-1, 2:]).mean())
+    assert min(soft) > 0.03
+
+
+@pytest.mark.parametrize("name", both("fast_motion"))
+def test_fast_things_move_further_than_their_size_between_views(name):
+    poses = [assembly_of(name).pose(time) for time in times(name)]
+    places = torch.stack([torch.stack([p.translation for p in pose.parts]) for pose in poses])
+    ways = places.diff(dim=0).norm(dim=-1).amax(dim=0)
+    assert (ways > 0.15).sum() >= 3
+    assert (ways == 0).any()
+
+
+@pytest.mark.parametrize("name", both("deformation"))
+def test_shapes_deform(name):
+    parts = assembly_of(name).parts
+    changing = [part.shape for part in parts if isinstance(part.shape, Implicit)]
+    assert len(changing) >= 4
+    torch.manual_seed(0)
+    for shape in changing:
+        points = (2 * torch.rand(4000, 3) - 1) * torch.tensor(shape.at(0.3).extent)
+        within = [shape.at(time).inside(points) for time in (0.05, 0.3)]
+        assert (within[0] != within[1]).float().mean() > 0.01
+
+
+@pytest.mark.parametrize("name", both("topology"))
+def test_drops_merge_and_part(name):
+    """The number of pieces of the fluid changes."""
+    fluid = next(p.shape for p in assembly_of(name).parts if isinstance(p.shape, Fluid))
+    pieces = set()
+    for time in np.linspace(0, 1, 12):
+        drops = [drop.at(float(time)) for drop in fluid.drops]
+        group = list(range(len(drops)))
+        for i, j in combinations(range(len(drops)), 2):
+            ends = drops[i][:3], drops[j][:3]
+            middle = torch.tensor([[(a + b) / 2 for a, b in zip(*ends, strict=True)]])
+            if fluid.at(float(time)).inside(middle):
+                group = [group[i] if k == group[j] else k for k in group]
+        pieces.add(len(set(group)))
+    assert len(pieces) >= 2
+
+
+@pytest.mark.parametrize("name", both("scaling"))
+def test_things_grow_and_shrink(name):
+    scales = torch.tensor(
+        [[p.scale for p in assembly_of(name).pose(time).parts] for time in (0.0, 0.5, 1.0)]
+    )
+    ratio = scales.amax(dim=0) / scales.amin(dim=0)
+    assert ratio.max() > 2
+    assert (ratio > 1.3).sum() >= 8
+
+
+@pytest.mark.parametrize("name", both("occlusion"))
+def test_things_are_hidden_by_turns(name):
+    """From one place a moving part is seen at some times only."""
+    camera = cameras(name)[9]
+    posed = [assembly_of(name).pose(time) for time in np.linspace(0, 1, 9)]
+    places = torch.stack([torch.stack([p.translation for p in pose.parts]) for pose in posed])
+    moving = (places.std(dim=0).sum(dim=-1) > 0.02).nonzero()[:, 0].tolist()
+    steps = torch.arange(40) - 0.5
+    rows, columns = (grid.flatten() for grid in torch.meshgrid(steps, steps, indexing="ij"))
+    focal = focal_length(CAMERA_ANGLE_X, 40)
+    rays = pixel_rays(camera.float(), rows, columns, focal=focal, height=40, width=40)
+    seen = [set(pose.cast(*rays).part.tolist()) for pose in posed]
+    changing = [part for part in moving if 0 < sum(part in view for view in seen) < len(seen)]
+    assert len(changing) >= 2
+
+
+@pytest.mark.parametrize("name", both("texture"))
+def test_patterns_are_fine(name):
+    """Between neighbouring pixels within the scene colours differ much more than elsewhere."""
+
+    def roughness(scene):
+        rgba = picture(scene, 0.2, cameras(scene)[3], side=100).astype(float)
+        steps = np.abs(np.diff(rgba, axis=1))
+        inside = (rgba[:, 1:, 3] == 255) & (rgba[:, :-1, 3] == 255)
+        return steps[inside][:, :3].mean()
+
+    assert roughness(name) > 25
+    assert roughness(name) > 2.5 * roughness("occlusion")
+
+
+@pytest.mark.parametrize("name", both("off_centre"))
+def test_the_scene_is_far_from_the_origin(name):
+    low, high = assembly_of(name).pose(0.5).bounds()
+    assert (0.5 * (low + high)).norm() > 4.5
+    target = torch.tensor(SUITE_SCENES[name].rig.target)
+    assert ((low < target) & (target < high)).all()
+    poses = cameras(name)
+    beside = torch.linalg.cross(target - poses[:, :3, 3], poses[:, :3, 2])
+    assert beside.norm(dim=-1).max() < 1e-5
+
+
+@pytest.mark.parametrize(("name", "factor"), [("scale", 10.0), ("scale_test", 0.1)])
+def test_a_scene_of_another_scale(name, factor):
+    low, high = assembly_of(name).pose(0.5).bounds()
+    assert 1.2 < (high - low).max() / factor < 2.4
+    distances = cameras(name)[:, :3, 3].norm(dim=-1)
+    assert distances / factor == pytest.approx(torch.full((50,), CAMERA_DISTANCE))
+
+
+@pytest.mark.parametrize("name", both("fixed_cameras"))
+def test_six_cameras_take_turns(name):
+    poses = cameras(name)
+    assert len(poses.unique(dim=0)) == 6
+    assert torch.equal(poses[:44], poses[6:])
+    assert len(cameras(name, "test").unique(dim=0)) == 12
+
+
+@pytest.mark.parametrize("name", both("half_circle"))
+def test_cameras_stand_on_one_side(name):
+    first, last = SUITE_SCENES[name].rig.azimuths
+    assert last - first == 180
+    middle = math.radians(0.5 * (first + last))
+    for split in COUNTS:
+        places = cameras(name, split)[:, :2, 3]
+        assert (places @ torch.tensor([math.cos(middle), math.sin(middle)]).double() > 0).all()
+
+
+@pytest.mark.parametrize("name", both("short_times"))
+def test_times_end_early(name):
+    assert max(times(name)) == SUITE_SCENES[name].rig.end <= 0.6
+    assert max(times(name, "test")) < SUITE_SCENES[name].rig.end
+
+
+@pytest.mark.parametrize("name", both("phone"))
+def test_a_phone_is_carried_along_an_arc(name):
+    poses = cameras(name)
+    places = poses[:, :2, 3]
+    turns = torch.atan2(places[:, 1], places[:, 0]).diff()
+    assert (turns * turns[0].sign() > 0).all()
+    assert 1.9 < turns.sum().abs() < 2.6
+    assert poses[:, 2, 3].std() > 0.1
+    # Held-out cameras stand where the phone was at another time, and above.
+    for (time, pose), distance in zip(
+        capture_of(name).shots["test"],
+        torch.cdist(cameras(name, "test")[:, :3, 3], poses[:, :3, 3]),
+        strict=True,
+    ):
+        assert abs(times(name)[int(distance.argmin())] - time) > 0.04, pose
+
+
+@pytest.mark.parametrize("name", both("rig"))
+def test_a_rig_takes_eight_pictures_at_once(name):
+    poses = cameras(name)
+    assert len(poses[:8].unique(dim=0)) == 8
+    assert torch.equal(poses[:42], poses[8:])
+
+
+@pytest.mark.parametrize("name", [*both("phone"), *both("rig")])
+def test_captures_have_a_world_behind_and_masks_of_the_thing(name, tmp_path):
+    counts = {"train_views": 3, "val_views": 1, "test_views": 2}
+    folder = ensure_suite_scene(tmp_path, name, resolution=SIDE, **counts, announce=lambda _: None)
+    data = ("data=suite", f"data.scene={name}", f"data.resolution={SIDE}", f"data.root={tmp_path}",
+            *(f"data.{key}={value}" for key, value in counts.items()))  # fmt: skip
+    scene = build(compose_plain("train", data)["data"], SceneSettings, "data").read()
+    assert scene.splits["train"].is_opaque
+    assert set(scene.splits) == {"train", "val", "test"}
+    shots = SUITE_SCENES[name].rig.capture({"train": 3}, f"{name} 0").shots["train"]
+    for number, (time, camera) in enumerate(shots):
+        mask = np.asarray(Image.open(folder / MASKS / "train" / f"r_{number:03d}.png"))
+        assert np.array_equal(scene.splits["train"].thing_in(number), mask)
+        alone = render_image(assembly_of(name).pose(time), camera, SIDE)
+        # The world hides nothing of the thing, but for what a pixel's rays share with it.
+        assert np.abs(mask.astype(int) - alone[..., 3]).max() <= 64
+        colours = scene.splits["train"].image(number)[..., :3].numpy()
+        border = np.concatenate([colours[0], colours[-1], colours[:, 0], colours[:, -1]])
+        assert len(np.unique(border // 16, axis=0)) > 8
+        assert 0.03 < (mask > 127).mean() < 0.5
+
+
+def test_masks_of_a_thing_cut_it_out_where_that_is_asked_for(tmp_path):
+    folder = ("data=suite", f"data.root={tmp_path}", f"data.resolution={SIDE}",
+              "data.train_views=2", "data.val_views=1", "data.test_views=1")  # fmt: skip
+
+    def scene(name, use):
+        given = compose_plain("train", [*folder, f"data.scene={name}", f"data.mask_use={use}"])
+        return build(given["data"], SceneSettings, "data").read()
+
+    whole, alpha, lrm = (scene("phone", use) for use in ("score", "alpha", "lrm"))
+    masks = whole.splits["train"].thing
+    assert whole.cut is None
+    assert alpha.cut is None
+    assert torch.equal(alpha.splits["train"].images[..., 3], masks)
+    assert alpha.splits["test"].is_opaque
+    assert torch.equal(lrm.cut.images, alpha.splits["train"].images)
+    assert torch.equal(lrm.splits["train"].images, whole.splits["train"].images)
+    shown = masks == 255
+    assert torch.equal(lrm.cut.images[shown], whole.splits["train"].images[shown])
+    assert not lrm.cut.images[masks == 0].any()
+    words = "data.mask_use=alpha: dark stands in no world.*score"
+    assert_refused(SceneError, words, lambda: scene("dark", "alpha"), "dark")
+
+
+def test_layers_are_composited_from_front_to_back():
+    """Through a ball of jelly in a box of glass, against the formula."""
+    jelly = Translucent(Plain((0.0, 1.0, 0.0)), density=2.0)
+    glass = Translucent(Plain((1.0, 0.0, 0.0)), shell=0.3)
+    parts = (Part(ball(0.5), jelly), Part(Box((1.0, 1.0, 1.0)), glass))
+    origins, directions = torch.tensor([[0.0, 0.0, 4.0]]), torch.tensor([[0.0, 0.0, -1.0]])
+    ray = Assembly(parts, light=None).pose(0).render(origins, directions)[0]
+    filling = 1 - math.exp(-2.0)
+    red, green = 0.3 + 0.7 * (1 - filling) * 0.3, 0.7 * filling
+    expected = torch.tensor([red, green, 0.0, 1 - 0.49 * (1 - filling)])
+    assert torch.allclose(ray, expected, atol=1e-3)
+
+
+def test_an_opaque_thing_ends_the_ray_and_unlit_paint_keeps_its_colour():
+    glass = Translucent(Plain((1.0, 0.0, 0.0)), shell=0.3)
+    parts = (Part(ball(0.5), Unlit(Plain((0.0, 0.6, 0.0)))), Part(Box((1.0, 1.0, 1.0)), glass))
+    origins, directions = torch.tensor([[0.0, 0.0, 4.0]]), torch.tensor([[0.0, 0.0, -1.0]])
+    posed = Assembly(parts, light=Light(ambient=1.0, sun=0.0, sky=0.0)).pose(0)
+    ray = posed.render(origins, directions)[0]
+    assert torch.allclose(ray, torch.tensor([0.3, 0.7 * 0.6, 0.0, 1.0]), atol=1e-4)
+
+
+def test_a_folder_in_the_layout_of_d_nerf(tmp_path):
+    settings = ("data=suite", "data.scene=dark", "data.resolution=8", f"data.root={tmp_path}",
+                "data.train_views=3", "data.test_views=2", "data.val_views=1")  # fmt: skip
+    data = build(compose_plain("train", settings)["data"], SceneSettings, "data")
+    scene = data.read(("train", "val", "test"))
+    assert {split: len(views) for split, views in scene.splits.items()} == {
+        "train": 3,
+        "val": 1,
+        "test": 2,
+    }
+    assert scene.video is None
+    assert data.folder.name == "dark_8px_s0_3-1-2"
+    index = json.loads((data.folder / "transforms_test.json").read_text())
+    assert index["camera_angle_x"] == SUITE_SCENES["dark"].rig.angle_x
+    with Image.open(data.folder / (index["frames"][1]["file_path"] + ".png")) as image:
+        assert image.mode == "RGBA"
+    again = ensure_suite_scene(
+        tmp_path,
+        "dark",
+        resolution=8,
+        train_views=3,
+        test_views=2,
+        val_views=1,
+        announce=pytest.fail,
+    )
+    assert again == data.folder
+
+
+@pytest.mark.parametrize(("experiment", "ending"), [("suite", ""), ("suite_test", "_test")])
+def test_the_experiments_list_every_kind(experiment, ending):
+    text = (CONF / "experiment" / f"{experiment}.yaml").read_text(encoding="utf-8")
+    listed = yaml.safe_load(text)["hydra"]["sweeper"]["params"]["data.scene"].split(",")
+    assert listed == [kind + ending for kind in KINDS]
+    assert len(listed) == 18
+
+
+def test_unknown_names_are_refused_with_the_nearest():
+    message = assert_refused(
+        SceneError, "Did you mean 'wires'", lambda: suite_scene("wire"), "wire"
+    )
+    assert all(name in message for name in SUITE_SCENES)

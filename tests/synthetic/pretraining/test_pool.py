@@ -1,0 +1,175 @@
+"""Records of objects on disk, and batches drawn from them."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from tests.synthetic.pretraining.small import SIDE, small_pool
+from xplanes.errors import ConfigError
+from xplanes.lrm.canonical import OPENLRM_VIEW, CanonicalView
+from xplanes.synthetic.pretraining import pool as pool_module
+from xplanes.synthetic.pretraining.objects import TRAINING_SEEDS, procedural_object
+from xplanes.synthetic.pretraining.pool import (
+    FOCAL,
+    PretrainingBatches,
+    cast,
+    draw_sample,
+    ensure_pool,
+    inside,
+)
+
+VIEW = CanonicalView(OPENLRM_VIEW.rotation, 2.9, FOCAL, 1.0, 1.0)
+
+
+@pytest.fixture
+def short_shards(monkeypatch):
+    monkeypatch.setattr(pool_module, "SHARD", 2)
+
+
+def silent(_):
+    pass
+
+
+def drawn(folder, count=6, **other):
+    kind = {"views": 2, "side": 16, "announce": silent, **other}
+    return ensure_pool(folder, TRAINING_SEEDS[:count], **kind)
+
+
+def content(pool):
+    return [pool[i].tobytes() for i in range(len(pool))]
+
+
+def test_records_depend_on_their_seed_only(short_shards, tmp_path):
+    pool = drawn(tmp_path)
+    assert len(pool) == 6
+    assert content(pool)[3] == draw_sample(3, 2, 16)[0].tobytes()
+
+
+def test_an_interrupted_pool_is_resumed(short_shards, tmp_path, monkeypatch):
+    whole = content(drawn(tmp_path / "whole"))
+    calls, real = [], pool_module.draw_sample
+
+    def stops(seed, views, side):
+        calls.append(seed)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return real(seed, views, side)
+
+    monkeypatch.setattr(pool_module, "draw_sample", stops)
+    with pytest.raises(KeyboardInterrupt):
+        drawn(tmp_path / "cut")
+    assert content(drawn(tmp_path / "cut")) == whole
+    assert calls[4:] == [2, 3, 4, 5]
+    calls.clear()
+    drawn(tmp_path / "cut")
+    assert not calls
+
+
+def test_a_damaged_shard_is_generated_again(short_shards, tmp_path):
+    whole = content(drawn(tmp_path))
+    path = tmp_path / "00001.npy"
+    damaged = bytearray(path.read_bytes())
+    damaged[-7] ^= 1
+    path.write_bytes(damaged)
+    assert content(drawn(tmp_path)) == whole
+
+
+def test_a_pool_of_another_kind_is_refused(short_shards, tmp_path):
+    drawn(tmp_path)
+    with pytest.raises(ConfigError, match=f"{tmp_path}.*'side': 16.*'side': 8"):
+        drawn(tmp_path, side=8)
+    record = json.loads((tmp_path / "pool.json").read_text())
+    assert set(record["sha256"]) == {"00000.npy", "00001.npy", "00002.npy"}
+
+
+def test_a_pool_is_a_whole_number_of_shards(tmp_path):
+    with pytest.raises(ConfigError, match=r"pool\.objects=100"):
+        drawn(tmp_path, count=100)
+
+
+def test_records_tell_the_truth():
+    record, solids = draw_sample(8, 2, SIDE)[0], procedural_object(8)
+    truth = inside(solids, record["points"].astype(np.float64))
+    assert (truth == record["inside"]).all()
+    # Seen from outside along the normal, the kept surface points are surface.
+    nudged = record["surface"].astype(np.float64)
+    distances = np.abs(solids.posed().signed_distance(torch.from_numpy(nudged))[0].numpy())
+    assert np.quantile(distances, 0.95) < 2e-3
+
+
+def batches(pool, **other):
+    counts = {"objects": 3, "near": 200, "volume": 100, "free": 100, "colour": 50, "rays": 60}
+    return PretrainingBatches(pool, VIEW, seed=3, **{**counts, **other})
+
+
+def test_batches_depend_on_seed_and_step_alone():
+    pool = small_pool()
+    first, again = batches(pool), batches(pool)
+    again.draw(0)
+    for a, b in zip(first.draw(5), again.draw(5), strict=True):
+        assert torch.equal(a, b)
+    assert not torch.equal(first.draw(4).points, first.draw(5).points)
+
+
+def test_every_object_is_used_once_per_epoch(monkeypatch):
+    seen, data = [], batches(small_pool(6))
+    real = PretrainingBatches._sample
+    monkeypatch.setattr(
+        PretrainingBatches,
+        "_sample",
+        lambda self, record, random: (seen.append(record.tobytes()), real(self, record, random))[1],
+    )
+    for step in range(2):
+        data.draw(step)
+    assert len(set(seen)) == 6
+
+
+def test_images_points_and_rays_lie_in_one_frame():
+    """Points project to where the picture shows them, mirrored or not."""
+    data = batches(small_pool(6))
+    mirrored = set()
+    for step in range(4):
+        batch = data.draw(step)
+        for i in range(3):
+            points = batch.points[i][batch.inside[i] > 0]
+            depth = points[:, 1] + VIEW.distance
+            column = (points[:, 0] / depth * FOCAL + 0.5) * SIDE
+            row = (0.5 - points[:, 2] / depth * FOCAL) * SIDE
+            shown = batch.images[i][:, row.long().clamp(0, 23), column.long().clamp(0, 23)]
+            assert ((shown.min(dim=0).values < 0.995).float().mean()) > 0.97
+            own = (batch.origins[i] - torch.tensor([0, -VIEW.distance, 0])).norm(dim=-1) < 1e-4
+            pixel = batch.directions[i][own]
+            column = ((pixel[:, 0] / pixel[:, 1] * FOCAL + 0.5) * SIDE).long()
+            row = ((0.5 - pixel[:, 2] / pixel[:, 1] * FOCAL) * SIDE).long()
+            assert torch.equal(batch.images[i][:, row, column].T, batch.ray_colours[i][own])
+            assert 10 < own.sum() < 60
+        mirrored.add(float(batch.points[0, 0, 0]) > 0)
+
+
+def test_free_points_are_empty_and_in_the_box():
+    solids, data = (
+        procedural_object(0),
+        batches(small_pool(1), objects=1, near=0, volume=0, free=400),
+    )
+    record = data.pool[0]
+    turn = data._turn(record["poses"][1])
+    points = data._free_points(record, 1, turn, np.random.default_rng(0))
+    assert np.abs(points).max() <= 1 + 1e-9
+    world = points @ np.linalg.inv(turn).T
+    assert inside(solids, world).mean() < 0.005
+    assert np.ptp(points, axis=0).min() > 1.2
+
+
+def test_rays_hit_where_the_object_is():
+    solids, data = procedural_object(0), batches(small_pool(1), objects=1)
+    record = data.pool[0]
+    turn = data._turn(record["poses"][0])
+    random = np.random.default_rng(1)
+    origins, directions, _, hits = data._rays(record, 0, turn, random, 200, middle=False)
+    back = np.linalg.inv(turn)
+    distance = cast(solids, origins @ back.T, directions @ back.T * data.scale)[0] * data.scale
+    both = np.isfinite(hits) & np.isfinite(distance)
+    assert (np.isfinite(hits) == np.isfinite(distance)).mean() > 0.98
+    assert np.quantile(np.abs(hits[both] - distance[both]), 0.95) < 3e-3

@@ -1,0 +1,194 @@
+"""Short pretraining runs: losses fall, and resumed runs equal uninterrupted ones."""
+
+import copy
+import json
+import os
+import shutil
+import signal
+
+import pytest
+import torch
+
+from tests.synthetic.pretraining.small import OVERRIDES, same, small_config, small_pool, small_sizes
+from xplanes.cli import main
+from xplanes.locks import alone_in
+from xplanes.lrm import load
+from xplanes.synthetic.pretraining import pool as pool_module
+from xplanes.synthetic.pretraining.initialisation import init_model
+from xplanes.synthetic.pretraining.module import (
+    PATIENCE,
+    PretrainingError,
+    PretrainingModule,
+    Upkeep,
+)
+from xplanes.synthetic.pretraining.pool import PretrainingBatches
+from xplanes.synthetic.pretraining.run import CHECKPOINT
+
+
+@pytest.fixture(autouse=True)
+def short_shards(monkeypatch):
+    monkeypatch.setattr(pool_module, "SHARD", 8)
+    monkeypatch.setattr("xplanes.synthetic.pretraining.run.SHARD", 8)
+
+
+@pytest.fixture(scope="module")
+def pool_folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("pool")
+
+
+def command(run, pool, *overrides):
+    paths = [f"run={run}", f"pool.root={pool}", "pool.objects=8"]
+    return main(["pretrain-lrm", *OVERRIDES, *paths, *overrides])
+
+
+def state(run):
+    return torch.load(run / CHECKPOINT, weights_only=True)
+
+
+def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, pool_folder, monkeypatch, capsys):
+    steps = "schedule.max_steps=6"
+    assert command(tmp_path / "whole", pool_folder, steps) == 0
+    real = Upkeep.on_train_batch_end
+
+    def stops(self, trainer, module, *others):
+        real(self, trainer, module, *others)
+        if module.steps == 4:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Upkeep, "on_train_batch_end", stops)
+    assert command(tmp_path / "cut", pool_folder, steps) == 130
+    monkeypatch.setattr(Upkeep, "on_train_batch_end", real)
+    assert state(tmp_path / "cut")["progress"]["steps"] == 4
+    assert command(tmp_path / "cut", pool_folder, steps) == 0
+    assert "resuming" in capsys.readouterr().out
+    whole, cut = state(tmp_path / "whole"), state(tmp_path / "cut")
+    assert whole["progress"]["steps"] == cut["progress"]["steps"] == 6
+    assert same(whole["state_dict"], cut["state_dict"])
+    weights = tmp_path / "cut" / "tiny.safetensors"
+    assert weights.read_bytes() == (tmp_path / "whole" / "tiny.safetensors").read_bytes()
+    assert load(json.loads(weights.with_suffix(".json").read_text()), weights).image_size == 24
+    assert list((tmp_path / "cut" / "tb").glob("events*"))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, pool_folder):
+    """The folder of a pretraining of one step."""
+    folder = tmp_path_factory.mktemp("finished")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pool_module, "SHARD", 8)
+        patch.setattr("xplanes.synthetic.pretraining.run.SHARD", 8)
+        assert command(folder, pool_folder, "schedule.max_steps=1") == 0
+    return folder
+
+
+def test_another_model_is_not_resumed_in_the_same_folder(finished, pool_folder, capsys):
+    assert command(finished, pool_folder, "schedule.max_steps=1", "model.width=24") == 1
+    assert f"run={finished}" in capsys.readouterr().err
+
+
+def test_finer_planes_are_initialised_from_a_finished_run(finished, tmp_path, pool_folder, capsys):
+    coarse = f"init_from={finished}/tiny.safetensors"
+    finer = ("model.low_resolution=8", coarse, "schedule.max_steps=1")
+    assert command(tmp_path / "fine", pool_folder, *finer) == 0
+    assert command(tmp_path / "wrong", pool_folder, *finer, "model.width=24") == 1
+    assert "init_from=" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("changed", ["model.heads=1", "model.distance=5", "model.density_scale=3"])
+def test_weights_of_a_model_that_differs_in_more_are_refused(
+    finished, tmp_path, pool_folder, capsys, changed
+):
+    coarse = f"init_from={finished}/tiny.safetensors"
+    assert command(tmp_path, pool_folder, coarse, "schedule.max_steps=1", changed) == 1
+    assert "init_from=" in capsys.readouterr().err
+
+
+def test_a_damaged_or_used_run_is_said_in_words(finished, tmp_path, pool_folder, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    steps = "schedule.max_steps=2"
+    with alone_in(run):
+        assert command(run, pool_folder, steps) == 1
+    assert "in use" in capsys.readouterr().err
+    whole = (run / CHECKPOINT).read_bytes()
+    (run / CHECKPOINT).write_bytes(whole[: len(whole) // 2])
+    assert command(run, pool_folder, steps) == 1
+    assert "last.ckpt is damaged: delete it" in capsys.readouterr().err
+    (run / CHECKPOINT).write_bytes(whole)
+    settings = (run / "config.json").read_text()
+    (run / "config.json").write_text(settings[:50])
+    assert command(run, pool_folder, steps) == 1
+    assert "config.json is damaged" in capsys.readouterr().err
+    (run / "config.json").write_text(settings)
+    assert command(run, pool_folder, steps) == 0
+
+
+def test_a_score_that_fails_loses_no_step(tmp_path, pool_folder, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("no score")
+
+    monkeypatch.setattr("xplanes.synthetic.pretraining.quick.QuickLook.scores", fail)
+    with pytest.raises(RuntimeError, match="no score"):
+        command(tmp_path, pool_folder, "schedule.max_steps=3")
+    assert state(tmp_path)["progress"]["steps"] == 3
+
+
+def module(*overrides):
+    config = small_config("schedule.max_steps=40", "schedule.render_from=0", *overrides)
+    model = init_model(small_sizes(), 0)
+    return config, PretrainingModule(model, config.batch, config.schedule, 0, bf16=False)
+
+
+def test_losses_fall():
+    config, taught = module("schedule.muon_lr=0.02", "schedule.adam_lr=0.01")
+    optimizers = taught.configure_optimizers()
+    taught.optimizers = lambda: optimizers
+    taught.manual_backward = lambda loss: loss.backward()
+    batch = config.batch
+    data = PretrainingBatches(
+        small_pool(3), taught.model.view, seed=0, objects=3, near=batch.near, volume=batch.volume,
+        free=batch.free, colour=batch.colour, rays=batch.rays,
+    )  # fmt: skip
+    loss, parts = taught.losses(data.draw(0))
+    first, options = float(loss.detach()), config.schedule
+    rendered = parts["render"] + 0.3 * parts["opacity"]
+    total = parts["occupancy"] + options.colour_weight * parts["colour"]
+    assert first == pytest.approx(total + options.render_weight * rendered, rel=1e-5)
+    start = copy.deepcopy(taught.model.state_dict())
+    for step in range(20):
+        taught.training_step(data.draw(step), step)
+    assert taught.steps == 20
+    assert float(taught.losses(data.draw(0))[0].detach()) < 0.6 * first
+    assert {"occupancy", "colour", "render", "opacity"} <= set(taught.last)
+    average = taught.average.state_dict()
+    for name, value in taught.model.named_parameters():
+        assert not torch.equal(value, start[name]), name
+        assert not torch.equal(value, average[name]), name
+
+
+def test_every_parameter_has_one_optimizer_and_rates_rise_stay_and_fall():
+    _, taught = module("schedule.warmup_steps=4", "schedule.decay_share=0.5")
+    listed = [p for o in taught.configure_optimizers() for g in o.param_groups for p in g["params"]]
+    assert len(listed) == len(set(map(id, listed))) == len(list(taught.model.parameters()))
+    rates = []
+    for taught.steps in (0, 3, 10, 20, 30, 40):
+        rates.append(taught.rate)
+    assert rates == [0.25, 1, 1, 1, 0.5, 0]
+
+
+def test_non_finite_losses_end_training_with_a_message(monkeypatch):
+    _, taught = module()
+    optimizers = taught.configure_optimizers()
+    taught.optimizers = lambda: optimizers
+    broken = (torch.tensor(float("nan")), {})
+    monkeypatch.setattr(taught, "losses", lambda batch: broken)
+    for step in range(PATIENCE - 1):
+        taught.training_step(None, step)  # type: ignore[arg-type]
+    with pytest.raises(PretrainingError, match=r"schedule\.muon_lr"):
+        taught.training_step(None, PATIENCE)  # type: ignore[arg-type]
+    assert taught.steps == 0
+
+
+def test_invalid_settings_end_the_command_with_a_message(capsys):
+    assert main(["pretrain-lrm", "batch.objects=0"]) == 1
+    assert "batch.objects=0" in capsys.readouterr().err

@@ -1,0 +1,422 @@
+"""Gaussians as a representation: their parameters, and how planes, a network or they move them."""
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from xplanes.baselines.gaussians.ply import write_gaussians
+from xplanes.fields.base import Masked, Representation, Writer
+from xplanes.fields.networks import layers, octaves
+from xplanes.fields.products import PlaneProducts
+from xplanes.streams import Stream, TrainingState
+
+BASE = 0.28209479177387814
+"""The spherical harmonic of degree 0."""
+
+NEIGHBOURS = 3
+"""Whose mean squared distance is the first variance of a Gaussian (Kerbl et al. 2023)."""
+
+FIRST_OPACITY = 0.1
+"""Of every Gaussian, where nothing is known of surfaces (Kerbl et al. 2023)."""
+
+ROWS = 1024
+"""Points whose distances to all others are in memory at once."""
+
+TIME_FEATURES = 30
+"""What the network of time makes of it (Yang et al. 2024)."""
+
+HEADS = {"shift": 3, "turn": 4, "growth": 3}
+"""What is added to means, quaternions and scales, and its columns."""
+
+ORDER = 3
+"""Of the polynomials of means in time (Li et al. 2024)."""
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """What Gaussians are made from.
+
+    Attributes:
+        points: Places in the field's frame. [N, 3]
+        colours: From 0 to 1. [N, 3]
+        times: When each was seen there, from 0 to 1; None where that is not known. [N]
+        scales: Standard deviations; None for the distances to neighbours. [N]
+        opacity: Of all of them, from 0 to 1.
+    """
+
+    points: Tensor
+    colours: Tensor
+    times: Tensor | None = None
+    scales: Tensor | None = None
+    opacity: float = FIRST_OPACITY
+
+
+@dataclass(frozen=True)
+class PosedGaussians:
+    """Gaussians at one time, as a rasteriser takes them.
+
+    Attributes:
+        means: In the field's frame. [N, 3]
+        quaternions: Rotations (w, x, y, z) of any length. [N, 4]
+        scales: Standard deviations along the rotated axes. [N, 3]
+        opacities: From 0 to 1. [N]
+        harmonics: Coefficients of the colours' spherical harmonics, of which 0.5 is left out.
+            [N, K, 3]
+        degree: Highest degree that is in use.
+    """
+
+    means: Tensor
+    quaternions: Tensor
+    scales: Tensor
+    opacities: Tensor
+    harmonics: Tensor
+    degree: int
+
+
+class Gaussians(Representation):
+    """Canonical Gaussians, whose number changes in training, and their motion.
+
+    Tensors with a row for each Gaussian are those that `rows` names. A state of another number of
+    Gaussians can be loaded.
+
+    Args:
+        cloud: First means and colours.
+        degree: Highest degree of the spherical harmonics.
+        extent: How far apart the cameras stand, in units of the field's frame.
+        moves: Whether there is any motion.
+
+    Source: Kerbl et al. 2023, released code.
+    """
+
+    PARAMETERS: ClassVar[tuple[str, ...]] = (
+        *("means", "quaternions", "log_scales", "logits", "base", "detail"),
+    )
+    STATISTICS = ("slopes", "seen")
+
+    def __init__(self, cloud: PointCloud, *, degree: int, extent: float, moves: bool) -> None:
+        super().__init__()
+        points, count = cloud.points, len(cloud.points)
+        scales = neighbour_distance(points) if cloud.scales is None else cloud.scales
+        self.means = nn.Parameter(points.clone())
+        self.quaternions = nn.Parameter(points.new_tensor([1.0, 0, 0, 0]).repeat(count, 1))
+        self.log_scales = nn.Parameter(scales.log()[:, None].repeat(1, 3))
+        self.logits = nn.Parameter(torch.full((count,), cloud.opacity).logit())
+        self.base = nn.Parameter((cloud.colours - 0.5)[:, None] / BASE)  # [N, 1, 3]
+        self.detail = nn.Parameter(torch.zeros(count, (degree + 1) ** 2 - 1, 3))
+        self._moves = moves
+        # Sum of the projected means' gradients, and how often each Gaussian was drawn.
+        self.register_buffer("slopes", torch.zeros(count))
+        self.register_buffer("seen", torch.zeros(count))
+        self.register_buffer("degree", torch.tensor(0))
+        self.register_buffer("deforms", torch.tensor(False))
+        self.register_buffer("extent", torch.tensor(extent))
+
+    slopes: Tensor
+    seen: Tensor
+    degree: Tensor
+    deforms: Tensor
+    extent: Tensor
+
+    @property
+    def moves(self) -> bool:
+        return self._moves
+
+    @property
+    def precision(self) -> str:
+        return "32"
+
+    @property
+    def outline(self) -> str:
+        return f"{len(self):,} Gaussians"
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def exports(self) -> Mapping[str, Writer]:
+        return {"gaussians": lambda path, time, frame: write_gaussians(path, self.at(time), frame)}
+
+    def masked(self, keep: Callable[[Tensor], Tensor]) -> "MaskedGaussians":
+        return MaskedGaussians(self, keep)
+
+    @property
+    def rows(self) -> dict[str, Tensor]:
+        """The tensors with a row for each Gaussian."""
+        return {name: getattr(self, name) for name in (*self.PARAMETERS, *self.STATISTICS)}
+
+    @property
+    def scales(self) -> Tensor:
+        """Canonical standard deviations. [N, 3]"""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        """From 0 to 1. [N]"""
+        return self.logits.sigmoid()
+
+    @abstractmethod
+    def moved(self, still: PosedGaussians, time: float) -> PosedGaussians:
+        """What moves, at a time from 0 to 1.
+
+        Args:
+            still: The canonical Gaussians.
+            time: From 0 to 1.
+        """
+
+    def at(self, time: float) -> PosedGaussians:
+        """The Gaussians at a time from 0 to 1; gradients reach the parameters."""
+        still = PosedGaussians(
+            self.means,
+            self.quaternions,
+            self.scales,
+            self.opacities,
+            torch.cat([self.base, self.detail], dim=1),
+            int(self.degree),
+        )
+        return self.moved(still, time) if self.moves and self.deforms else still
+
+    def training_time(self, time: float, state: TrainingState) -> float:
+        """The time at which a view of some time is drawn in training."""
+        return time
+
+    def _load_from_state_dict(
+        self,
+        state_dict: Any,
+        prefix: str,
+        local_metadata: Any,
+        strict: bool,
+        missing_keys: list[str],
+        unexpected_keys: list[str],
+        error_msgs: list[str],
+    ) -> None:
+        count = len(state_dict.get(f"{prefix}means", self.means))
+        if count != len(self):
+            for tensor in self.rows.values():
+                tensor.data = tensor.new_zeros(count, *tensor.shape[1:])
+        super()._load_from_state_dict(
+            *(state_dict, prefix, local_metadata, strict),
+            *(missing_keys, unexpected_keys, error_msgs),
+        )
+
+
+class MaskedGaussians(Masked):
+    """Gaussians without those whose means lie in some places."""
+
+    def at(self, time: float) -> PosedGaussians:
+        """As `Gaussians.at`."""
+        posed = self._field.at(time)
+        return replace(posed, opacities=posed.opacities * self._keep(posed.means))
+
+
+class HexPlaneGaussians(Gaussians):
+    """Gaussians that a multi-resolution field of six planes moves, turns and scales.
+
+    Gradients of the deformation reach planes and networks, and the means only as what is added to.
+
+    Args:
+        cloud: As `Gaussians`.
+        degree: As `Gaussians`.
+        extent: As `Gaussians`.
+        planes: The field's planes; None where nothing moves.
+        width: Neurons of the hidden layers.
+
+    Source: 4D-GS (Wu et al. 2024), Section 4.
+    """
+
+    def __init__(
+        self,
+        cloud: PointCloud,
+        *,
+        degree: int,
+        extent: float,
+        planes: PlaneProducts | None,
+        width: int,
+    ) -> None:
+        super().__init__(cloud, degree=degree, extent=extent, moves=planes is not None)
+        self.products = planes
+        self.network = nn.ModuleDict()
+        if planes is not None:
+            self.network["features"] = _linear(planes.features, width)
+            for name, outputs in HEADS.items():
+                self.network[name] = nn.Sequential(
+                    nn.ReLU(), _linear(width, width), nn.ReLU(), _still(width, outputs)
+                )
+
+    @property
+    def planes(self) -> Mapping[str, Tensor]:
+        """The planes of the finest scale. [C, rows, columns] each"""
+        if self.products is None:
+            return {}
+        names = self.products.names
+        return {name: plane[0] for name, plane in self.products.planes()[-len(names) :]}
+
+    def moved(self, still: PosedGaussians, time: float) -> PosedGaussians:
+        assert self.products is not None
+        times = torch.full_like(self.means[:, 0], time)
+        hidden = self.network["features"](self.products(self.means.detach(), times))
+        shift, turn, growth = (self.network[name](hidden) for name in HEADS)
+        return replace(
+            still,
+            means=still.means + shift,
+            quaternions=still.quaternions + turn,
+            scales=(self.log_scales + growth).exp(),
+        )
+
+
+class DeformedGaussians(Gaussians):
+    """Gaussians that a network of place and time moves, turns and scales.
+
+    Gradients of the deformation reach the network, and the means only as what is added to.
+
+    Args:
+        cloud: As `Gaussians`.
+        degree: As `Gaussians`.
+        extent: As `Gaussians`.
+        moves: As `Gaussians`.
+        depth: Hidden layers; the encoded input enters once more after the middle one.
+        width: Neurons of the hidden layers.
+        octaves: Frequencies of the encodings of places and times.
+        noise: Standard deviation of the noise on time, at the beginning of training.
+        noise_until: Share of training over which it fades to 0.
+
+    Source: Deformable 3D Gaussians (Yang et al. 2024), Section 3, and its released code.
+    """
+
+    def __init__(
+        self,
+        cloud: PointCloud,
+        *,
+        degree: int,
+        extent: float,
+        moves: bool,
+        depth: int,
+        width: int,
+        octaves: tuple[int, int],
+        noise: float = 0.0,
+        noise_until: float = 0.0,
+    ) -> None:
+        super().__init__(cloud, degree=degree, extent=extent, moves=moves)
+        self.octaves, self.noise, self.noise_until = octaves, noise, noise_until
+        self.network = nn.ModuleDict()
+        if moves:
+            of_place, of_time = 3 * (1 + 2 * octaves[0]), 1 + 2 * octaves[1]
+            inputs, self._entry = of_place + TIME_FEATURES, depth // 2 + 1
+            self.network["time"] = layers([of_time, width, TIME_FEATURES])
+            columns = [inputs, *[width] * (depth - 1)]
+            if self._entry < depth:
+                columns[self._entry] += inputs
+            self.network["hidden"] = nn.ModuleList(nn.Linear(count, width) for count in columns)
+            for name, outputs in HEADS.items():
+                self.network[name] = _still(width, outputs)
+
+    @property
+    def planes(self) -> Mapping[str, Tensor]:
+        return {}
+
+    def moved(self, still: PosedGaussians, time: float) -> PosedGaussians:
+        places = octaves(self.means.detach(), self.octaves[0])
+        times = self.network["time"](octaves(places.new_tensor([[time]]), self.octaves[1]))
+        given = torch.cat([places, times.expand(len(places), -1)], dim=1)
+        hidden = given
+        for number, layer in enumerate(self.network["hidden"]):  # type: ignore[arg-type]
+            if number == self._entry:
+                hidden = torch.cat([given, hidden], dim=1)
+            hidden = layer(hidden).relu()
+        shift, turn, growth = (self.network[name](hidden) for name in HEADS)
+        return replace(
+            still,
+            means=still.means + shift,
+            quaternions=F.normalize(still.quaternions, dim=1) + turn,
+            # A covariance knows no signs.
+            scales=(still.scales + growth).abs(),
+        )
+
+    def training_time(self, time: float, state: TrainingState) -> float:
+        """The time and noise that fades, so that motion is smooth in time (the paper's Eq. 6)."""
+        left = 1 - state.progress / self.noise_until if self.noise_until else 0.0
+        if not (self.noise and left > 0 and self.deforms):
+            return time
+        generator = state.generator(torch.device("cpu"), Stream.TIME_NOISE)
+        return time + left * self.noise * float(torch.randn((), generator=generator))
+
+
+class SpacetimeGaussians(Gaussians):
+    """Gaussians that come and go, and move along polynomials in time.
+
+    Opacity is a radial basis in time around each Gaussian's own centre; means are polynomials of
+    degree 3 and quaternions of degree 1 in the time since that centre.
+
+    Args:
+        cloud: As `Gaussians`; its times are the centres, which are random where it has none.
+        degree: As `Gaussians`.
+        extent: As `Gaussians`.
+        moves: As `Gaussians`.
+        width: First width of the radial basis, where 1 is the whole time.
+
+    Source: Spacetime Gaussians (Li et al. 2024), Section 4.1, in its lite version: without the
+    network behind the rasteriser.
+    """
+
+    PARAMETERS = (*Gaussians.PARAMETERS, "centres", "log_widths", "motion", "spin")
+
+    def __init__(
+        self, cloud: PointCloud, *, degree: int, extent: float, moves: bool, width: float
+    ) -> None:
+        super().__init__(cloud, degree=degree, extent=extent, moves=moves)
+        count = len(cloud.points)
+        centres = torch.rand(count) if cloud.times is None else cloud.times.clone()
+        self.centres = nn.Parameter(centres)
+        self.log_widths = nn.Parameter(torch.full((count,), math.log(width)))
+        self.motion = nn.Parameter(torch.zeros(count, ORDER, 3))
+        self.spin = nn.Parameter(torch.zeros(count, 4))
+        self.deforms.fill_(moves)
+
+    @property
+    def planes(self) -> Mapping[str, Tensor]:
+        return {}
+
+    def moved(self, still: PosedGaussians, time: float) -> PosedGaussians:
+        since = time - self.centres
+        life = (-(since / self.log_widths.exp()).square()).exp()
+        # As released: motion says nothing about when a Gaussian is there.
+        since = since.detach()[:, None]
+        powers = torch.cat([since**power for power in range(1, ORDER + 1)], dim=1)
+        return replace(
+            still,
+            means=still.means + (powers[..., None] * self.motion).sum(dim=1),
+            quaternions=still.quaternions + since * self.spin,
+            opacities=still.opacities * life,
+        )
+
+
+def _still(inputs: int, outputs: int) -> nn.Linear:
+    """A last layer of zeros: what moves begins where it lies."""
+    layer = nn.Linear(inputs, outputs)
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def _linear(inputs: int, outputs: int) -> nn.Linear:
+    layer = nn.Linear(inputs, outputs)
+    nn.init.xavier_uniform_(layer.weight)
+    return layer
+
+
+def neighbour_distance(points: Tensor) -> Tensor:
+    """Root of the mean squared distance to the three nearest other points, at least 3e-4. [N]"""
+    if len(points) < 2:
+        return torch.full_like(points[:, 0], 0.1)
+    count = min(NEIGHBOURS, len(points) - 1)
+    found = [
+        # The nearest is the point itself.
+        torch.cdist(part, points).topk(count + 1, largest=False).values[:, 1:]
+        for part in points.split(ROWS)
+    ]
+    return torch.cat(found).square().mean(dim=1).clamp(min=1e-7).sqrt()

@@ -1,0 +1,173 @@
+"""What all models of Gaussians share: first points, learning rates, loss, density control."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from xplanes.baselines.gaussians.densification import DensifySettings, densify, reset_opacity
+from xplanes.baselines.gaussians.field import Gaussians, PointCloud
+from xplanes.baselines.gaussians.harmonics import MAX_DEGREE
+from xplanes.baselines.gaussians.hull import hull_points, random_points
+from xplanes.errors import ConfigError
+from xplanes.metrics import dissimilarity
+from xplanes.models.base import InitialValues, Model, ModelSettings
+from xplanes.rendering.sampler import Group, Site
+from xplanes.scenes.batches import Batch, ViewSettings
+from xplanes.settings import Count, Positive, Settings, Share, Steps
+from xplanes.streams import Stream, TrainingState
+
+EXTENT = 1.1
+"""Factor on the largest distance of a camera from their mean (Kerbl et al. 2023)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InitialPoints(InitialValues):
+    """Points that Gaussians are made from."""
+
+    planes: Mapping[str, Tensor] = field(default_factory=dict)
+    cloud: PointCloud
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussiansLoss(Settings):
+    """Weights of the terms of the loss."""
+
+    dissimilarity: Share  # Share of 1 - SSIM; the rest is the mean absolute colour error.
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussiansSettings(ModelSettings):
+    """Base of the settings of models of Gaussians."""
+
+    takes: ClassVar = "points"
+
+    rays: ViewSettings  # pyright: ignore[reportIncompatibleVariableOverride]
+    # Initial means if lrm gives none: on the visual hull, or random in the cube.
+    points: Literal["silhouettes", "random"]
+    count: Count  # Number of these initial means.
+    degree: Steps  # Highest degree of the spherical harmonics.
+    degree_every: Count  # Steps between increases of the degree.
+    mean_lr: Positive  # Learning rate of means, times the cameras' extent.
+    colour_lr: Positive  # Learning rate of colours; a twentieth for their view-dependent part.
+    opacity_lr: Positive  # Learning rate of opacity logits.
+    scale_lr: Positive  # Learning rate of log scales.
+    rotation_lr: Positive  # Learning rate of quaternions.
+    final_lr: Share  # Final value of decaying learning rates relative to the initial one.
+    densify: DensifySettings
+    loss: GaussiansLoss
+
+    def check(self) -> None:
+        if self.precision == "bf16":
+            raise ConfigError("precision=bf16: Gaussians are computed in float32; set 32 or auto")
+        if self.degree > MAX_DEGREE:
+            raise ConfigError(f"degree={self.degree}: must be 0 to {MAX_DEGREE}")
+        if self.final_lr == 0:
+            raise ConfigError(
+                "final_lr=0.0: the decay is exponential; set 0.01 or any share above 0"
+            )
+        if self.count > self.densify.most:
+            raise ConfigError(
+                f"count={self.count}: must not be above densify.most={self.densify.most}"
+            )
+
+    def first_points(self, site: Site, initial: InitialValues | None) -> PointCloud:
+        """What the Gaussians are made from; places are drawn with torch's generator."""
+        if isinstance(initial, InitialPoints):
+            return initial.cloud
+        if site.views is None:
+            return random_points(1)  # A checkpoint brings its own.
+        if self.points == "silhouettes":
+            return hull_points(site.views, site.frame, self.count)
+        return random_points(self.count)
+
+
+class GaussiansModel(Model):
+    """Absolute and structural errors of colours, and adaptive density control.
+
+    Args:
+        settings: Learning rates, schedule and weights.
+        field: The Gaussians.
+    """
+
+    static_share = 0.0
+    """Share of the budget before anything moves."""
+
+    def __init__(self, settings: GaussiansSettings, field: Gaussians) -> None:
+        self._field, self._settings = field, settings
+        self.advice = (
+            f"Lower model.scale_lr={settings.scale_lr} or model.mean_lr={settings.mean_lr}"
+        )
+
+    @property
+    def field(self) -> Gaussians:
+        return self._field
+
+    def groups(self) -> list[Group]:
+        settings, field = self._settings, self._field
+        rates = {
+            "means": settings.mean_lr * float(field.extent),
+            "quaternions": settings.rotation_lr,
+            "log_scales": settings.scale_lr,
+            "logits": settings.opacity_lr,
+            "base": settings.colour_lr,
+            "detail": settings.colour_lr / 20,
+        }
+        return [
+            {"params": [getattr(field, name)], "lr": rate, "name": name}
+            for name, rate in rates.items()
+        ]
+
+    def rate(self, step: int, progress: float) -> float:
+        return 1.0
+
+    def rate_of(self, group: str, step: int, progress: float) -> float:
+        """Exponential decay of the means' learning rate."""
+        return self._settings.final_lr**progress if group == "means" else 1.0
+
+    def before_step(self, state: TrainingState, optimizer: torch.optim.Optimizer) -> None:
+        settings, field, step = self._settings, self._field, state.step
+        field.degree.fill_(min(settings.degree, step // settings.degree_every))
+        if field.moves and not field.deforms and state.progress >= self.static_share:
+            field.deforms.fill_(True)
+            self.begin_to_move(optimizer)
+        control = settings.densify
+        if not step or state.progress >= control.until:
+            return
+        reset = control.reset_every
+        if step > control.first and step % control.every == 0:
+            generator = state.generator(torch.device("cpu"), Stream.SPLITTING)
+            late = reset is not None and step > reset
+            views = max(1, round(state.batch / step))
+            densify(field, optimizer, control, generator, remove_large=late, views=views)
+        if reset is not None and step % reset == 0:
+            reset_opacity(field, optimizer)
+
+    def begin_to_move(self, optimizer: torch.optim.Optimizer) -> None:
+        """Do what is due when the static stage ends."""
+        return
+
+    def losses(self, rendering: Any, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
+        share = self._settings.loss.dissimilarity
+        terms = {"colour": (1 - share) * (rendering.colour - rays["target"]).abs().mean()}
+        if share:
+            image = rendering.image.colour
+            terms["dissimilarity"] = share * dissimilarity(image, rays["target"].view_as(image))
+        return terms
+
+    def scalars(self) -> dict[str, float]:
+        return {"gaussians": float(len(self._field))}
+
+
+def camera_extent(site: Site) -> float:
+    """How far the cameras stand from their mean at most, 1.1 times, in units of the frame.
+
+    At least 1, half the cube: cameras may all stand in one place.
+    """
+    if site.views is None:
+        return 1.0
+    places = site.views.camera_to_world[:, :3, 3]
+    farthest = float((places - places.mean(dim=0)).norm(dim=1).max())
+    return max(1.0, EXTENT * farthest * site.frame.scale)

@@ -1,0 +1,194 @@
+"""Projection and blending of Gaussians in plain torch, differentiated by autograd.
+
+Zwicker et al. 2002 (EWA splatting), Kerbl et al. 2023 (3D Gaussian splatting).
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from xplanes.baselines.gaussians.camera import Camera
+
+LOW_PASS = 0.3
+"""Variance in pixels^2 that is added to every projected Gaussian (Kerbl et al. 2023)."""
+
+LEAST_ALPHA = 1 / 255
+"""Alpha below which a Gaussian leaves a pixel alone (Kerbl et al. 2023)."""
+
+MOST_ALPHA = 0.999
+"""Alpha of a pixel at most. Kerbl et al. take 0.99, gsplat this."""
+
+LEAST_TRANSMITTANCE = 1e-4
+"""A pixel is done before the first Gaussian that would leave less light (Kerbl et al. 2023)."""
+
+LEAST_QUATERNION = 1e-12
+"""Shorter quaternions are divided by this length instead of their own: zero rotates nothing."""
+
+TILE = 16
+"""Side of the square tiles, in pixels. The image does not depend on it."""
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Gaussians as an image plane sees them.
+
+    Attributes:
+        means: In pixels from the left and the top edge. [N, 2]
+        whitening: Entries xx, xy and yy of the upper triangular W with W^T W the inverse of the
+            covariance: W times an offset in pixels is the offset in standard deviations. [N, 3]
+        depths: Of the means, along the camera's axis. [N]
+        opacities: Alpha at the means. [N]
+        radii: See `RasterisedImage`; 0 for those that are not drawn, whose other numbers mean
+            nothing. int64 [N]
+    """
+
+    means: Tensor
+    whitening: Tensor
+    depths: Tensor
+    opacities: Tensor
+    radii: Tensor
+
+
+def project(
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    camera: Camera,
+    *,
+    antialiased: bool,
+) -> Projection:
+    """Project Gaussians by the linearised perspective of EWA; arguments as in `rasterise`."""
+    parts = (means, quaternions, scales, opacities)
+    with torch.no_grad():
+        radii = _project(*parts, camera, antialiased, means.new_ones(len(means)).bool()).radii
+    # Those that are not drawn are replaced: what overflows there must not reach the gradients.
+    return replace(_project(*parts, camera, antialiased, radii > 0), radii=radii)
+
+
+def _project(
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    camera: Camera,
+    antialiased: bool,
+    wanted: Tensor,
+) -> Projection:
+    """The same; of those that are not wanted, a Gaussian in front of the camera."""
+    world_to_camera = camera.world_to_camera.to(means)
+    rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
+    x, y, z = (means @ rotation.T + translation).unbind(-1)
+    x, y, z = torch.where(wanted, x, 0), torch.where(wanted, y, 0), torch.where(wanted, z, 1)
+    scales = torch.where(wanted[:, None], scales, 1)
+    left, right, top, bottom = camera.slant
+    slant_x, slant_y = (x / z).clamp(left, right), (y / z).clamp(top, bottom)
+    zero = torch.zeros_like(z)
+    along_x = torch.stack([camera.fx / z, zero, -camera.fx * slant_x / z], dim=-1)
+    along_y = torch.stack([zero, camera.fy / z, -camera.fy * slant_y / z], dim=-1)
+    jacobian = torch.stack([along_x, along_y], dim=1)
+    root = jacobian @ rotation @ rotations(quaternions) * scales[:, None, :]  # [N, 2, 3]
+    # The covariance is root root^T + LOW_PASS. Its determinant is made of areas, without a
+    # difference of large numbers, however thin the Gaussian.
+    area = torch.linalg.cross(root[:, 0], root[:, 1]).norm(dim=-1)
+    xx, yy = root.square().sum(-1).unbind(-1)
+    determinant = area.square() + LOW_PASS * (xx + yy) + LOW_PASS**2
+    xx, yy = xx + LOW_PASS, yy + LOW_PASS
+    xy = (root[:, 0] * root[:, 1]).sum(-1)
+    first = (yy / determinant).sqrt()
+    whitening = torch.stack([first, -first * xy / yy, yy.rsqrt()], dim=-1)
+    projected = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
+    if antialiased:
+        opacities = opacities * area / determinant.sqrt()
+    with torch.no_grad():
+        finite = torch.cat([projected, whitening], dim=1).isfinite().all(-1)
+        extent = extents(whitening, opacities)
+        size = extent.new_tensor([camera.width, camera.height])
+        touches = ((projected + extent > 0) & (projected - extent < size)).all(-1)
+        drawn = finite & touches & (whitening[:, 0] > 0) & (opacities >= LEAST_ALPHA)
+        drawn &= (z > camera.near) & (z < camera.far)
+        longest = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
+        radii = torch.where(drawn, (3 * longest.sqrt()).ceil().clamp(max=1e9), 0).long()
+    return Projection(projected, whitening, z, opacities, radii)
+
+
+def rotations(quaternions: Tensor) -> Tensor:
+    """Rotation matrices of quaternions (w, x, y, z) of any length. [N, 4] -> [N, 3, 3]"""
+    w, x, y, z = F.normalize(quaternions, dim=-1, eps=LEAST_QUATERNION).unbind(-1)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(rows, dim=-1).view(-1, 3, 3)
+
+
+def extents(whitening: Tensor, opacities: Tensor) -> Tensor:
+    """How far alpha is `LEAST_ALPHA` or more along x and y, in pixels; 0 where nowhere. [N, 2]
+
+    At most 3.33 standard deviations, those of an opacity of 1.
+    """
+    first, shear, last = whitening.unbind(-1)
+    reach = (2 * (opacities / LEAST_ALPHA).clamp(min=1).log()).sqrt()
+    deviation_y = 1 / last
+    deviation_x = torch.hypot(torch.ones_like(shear), shear * deviation_y) / first
+    return reach[:, None] * torch.stack([deviation_x, deviation_y], dim=-1)
+
+
+def blend(projection: Projection, features: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Blend projected Gaussians from front to back, one tile of the image after the other.
+
+    Args:
+        projection: Gaussians of equal depth keep their order.
+        features: What is blended. [N, K]
+        camera: Size of the image.
+
+    Returns:
+        Sums of weight times feature, and opacity. [H, W, K], [H, W]
+    """
+    order = projection.depths.detach().argsort(stable=True)
+    order = order[projection.radii[order] > 0]
+    means, whitening, opacities = (
+        t[order] for t in (projection.means, projection.whitening, projection.opacities)
+    )
+    features = features[order]
+    with torch.no_grad():
+        extent = extents(whitening, opacities) + 1  # A pixel for rounding.
+        low, high = means - extent, means + extent
+    rows = []
+    for top in range(0, camera.height, TILE):
+        bottom = min(top + TILE, camera.height)
+        columns = []
+        for left in range(0, camera.width, TILE):
+            right = min(left + TILE, camera.width)
+            near = (low < low.new_tensor([right, bottom])) & (high > low.new_tensor([left, top]))
+            members = near.all(-1).nonzero()[:, 0]
+            given = (t[members] for t in (means, whitening, opacities, features))
+            columns.append(_blend_tile(*given, box=(top, bottom, left, right)))
+        rows.append(torch.cat(columns, dim=1))
+    image = torch.cat(rows)
+    return image[..., :-1], image[..., -1]
+
+
+def _blend_tile(
+    means: Tensor,
+    whitening: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    *,
+    box: tuple[int, int, int, int],
+) -> Tensor:
+    """Features and opacity of the pixels of a box; Gaussians sorted by depth. [h, w, K + 1]"""
+    top, bottom, left, right = box
+    y = torch.arange(top, bottom).to(means)[:, None, None] + 0.5 - means[:, 1]
+    x = torch.arange(left, right).to(means)[:, None] + 0.5 - means[:, 0]
+    u, v = whitening[:, 0] * x + whitening[:, 1] * y, whitening[:, 2] * y
+    alpha = (opacities * (-0.5 * (u * u + v * v)).exp()).clamp(max=MOST_ALPHA)  # [h, w, n]
+    alpha = torch.where(alpha >= LEAST_ALPHA, alpha, 0.0)
+    alpha = torch.where((1 - alpha).cumprod(-1) >= LEAST_TRANSMITTANCE, alpha, 0.0)
+    after = (1 - alpha).cumprod(-1)
+    before = torch.cat([torch.ones_like(x + y)[..., :1], after[..., :-1]], dim=-1)
+    weights = alpha * before
+    return torch.cat([weights @ features, weights.sum(-1, keepdim=True)], dim=-1)

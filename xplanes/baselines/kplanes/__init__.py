@@ -1,0 +1,1 @@
+"""K-Planes (Fridovich-Keil et al. 2023)."""

@@ -1,0 +1,1 @@
+"""Tensor4D (Shao et al. 2023)."""

@@ -1,0 +1,1 @@
+"""TiNeuVox (Fang et al. 2022)."""

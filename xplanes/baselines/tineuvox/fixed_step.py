@@ -1,0 +1,207 @@
+"""Rays through a field's box at equal steps; colour only where it counts."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated, Any
+
+import torch
+from torch import Tensor
+
+from xplanes.errors import ConfigError
+from xplanes.fields.base import RadianceField
+from xplanes.rendering.base import RayRenderer, Rendering
+from xplanes.rendering.behind import behind
+from xplanes.rendering.compositing import composite
+from xplanes.rendering.marching import Samples
+from xplanes.rendering.sampler import Sampler, SamplerSettings, Site, check_range
+from xplanes.scenes.batches import Batch
+from xplanes.settings import Positive, Range, Weight
+from xplanes.streams import TrainingState
+
+
+@dataclass(frozen=True)
+class FixedStepRendering(Rendering):
+    """What rays see, and the samples that had a colour.
+
+    Attributes:
+        colours: Colour of each of them. [M, 3]
+        weights: Share of its ray's light that each sends, without gradient. [M]
+        ray: Ray of each. [M]
+    """
+
+    colours: Tensor
+    weights: Tensor
+    ray: Tensor
+
+
+class FixedStepRenderer(RayRenderer):
+    """Samples at equal distances, first where a ray enters the field's box.
+
+    Samples whose opacity, and then whose weight, does not exceed a threshold get no colour.
+
+    Args:
+        field: Whose ``bounds`` and ``cell`` count; takes geometry and colour in two stages.
+        near: Distance at which samples begin at the earliest, in the field's frame.
+        far: Distance at which they end at the latest.
+        step: Distance between samples, in cells.
+        threshold: Opacity and weight up to which a sample is dropped.
+
+    Source: TiNeuVox, released code; DirectVoxGO.
+    """
+
+    rays_at_once = 2048
+
+    def __init__(
+        self, field: Any, *, near: float, far: float, step: float, threshold: float
+    ) -> None:
+        self.field, self.near, self.far = field, near, far
+        self.step, self.threshold = step, threshold
+
+    @property
+    def device(self) -> torch.device:
+        return self.field.grid.device
+
+    def render(
+        self,
+        field: Any,
+        origins: Tensor,
+        directions: Tensor,
+        times: Tensor,
+        background: Tensor,
+        jitter: None = None,
+    ) -> FixedStepRendering:
+        step = self.step * field.cell
+        box = field.bounds()
+        samples = self.place(origins, directions, box, step)
+        density, features = field.geometry(samples.points, times[samples.ray])
+        depth = density * step
+        with torch.no_grad():
+            # A sample's weight depends on those in front of it, faint ones left out.
+            clear = -torch.expm1(-depth) <= self.threshold
+            depth_kept = torch.where(clear, 0, depth)
+            nothing = torch.zeros_like(samples.points)
+            rays = samples.distances, samples.ray, samples.starts
+            seen = (composite(depth_kept, nothing, *rays)[1] > self.threshold).nonzero()[:, 0]
+        ray = samples.ray[seen]
+        colours = field.colour(features[seen], directions[ray])
+        colour = nothing.to(colours.dtype).index_put((seen,), colours)
+        total, weights = composite(torch.where(clear, 0, depth), colour, *rays)
+        opacity = total[:, 3]
+        ends = partial(self.ends, box=box)
+        background = behind(field, origins, directions, opacity, background, ends=ends)
+        return FixedStepRendering(
+            colour=total[:, :3] + (1 - opacity)[:, None] * background,
+            opacity=opacity,
+            depth=(total[:, 4] / opacity.clamp_min(1e-6)).detach(),
+            density=density.detach(),
+            samples=samples,
+            colours=colours,
+            weights=weights[seen],
+            ray=ray,
+        )
+
+    def reaches(self, points: Tensor) -> Tensor:
+        low, high = self.field.bounds()
+        return ((points >= low) & (points <= high)).all(dim=1)
+
+    def ends(self, origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
+        """Distances, from near to far, between which rays are in a box. [R, 3] -> [R], [R]"""
+        slopes = torch.where(directions == 0, 1e-6, directions)
+        first, second = (box[0] - origins) / slopes, (box[1] - origins) / slopes
+        enter = torch.minimum(first, second).amax(dim=1).clamp(self.near, self.far)
+        leave = torch.maximum(first, second).amin(dim=1).clamp(self.near, self.far)
+        return enter, leave
+
+    @torch.no_grad()
+    def place(self, origins: Tensor, directions: Tensor, box: Tensor, step: float) -> Samples:
+        """All samples of rays in the box and between near and far.
+
+        Args:
+            origins: [R, 3]
+            directions: Unit directions. [R, 3]
+            box: Least and largest corner. [2, 3]
+            step: Distance between samples.
+        """
+        enter, leave = self.ends(origins, directions, box)
+        count = ((leave - enter) / step).ceil().long().clamp_min(1)
+        number = torch.arange(int(count.max()) if len(count) else 0, device=count.device)
+        distances = enter[:, None] + number * step
+        points = origins[:, None] + distances[..., None] * directions[:, None]
+        inside = ((points >= box[0]) & (points <= box[1])).all(dim=-1)
+        inside &= number < count[:, None]
+        ray, place = inside.nonzero(as_tuple=True)
+        each = inside.sum(dim=1)
+        return Samples(
+            ray=ray,
+            starts=each.cumsum(0) - each,
+            points=points[ray, place],
+            distances=distances[ray, place],
+            cells=ray.new_empty(0),
+            candidates=len(ray),
+            empty=0,
+            occluded=0,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FixedStepSettings(SamplerSettings):
+    """Equal steps through a field's bounding box; negligible samples are dropped."""
+
+    near: Weight  # Near bound in world units.
+    far: Positive  # Far bound in world units.
+    step: Positive  # Distance between samples, in cells.
+    # Opacity, and weight, up to which samples are dropped.
+    threshold: Annotated[float, Range(0, 1, open=True)]
+
+    def check(self) -> None:
+        if self.near >= self.far:
+            raise ConfigError(f"near={self.near}: must be below far={self.far}")
+
+    def require(self, field: RadianceField | type[RadianceField]) -> None:
+        if not hasattr(field, "cell"):
+            raise ConfigError(
+                f"model.sampler.name={self.name}: needs a field of cells, as TiNeuVox's; set "
+                "model/sampler=occupancy or proposal"
+            )
+
+    def holds(self, near: float, far: float) -> bool:
+        return self.near <= near and far <= self.far
+
+    def bounded(self, near: float, far: float) -> "FixedStepSettings":
+        return replace(self, near=near, far=far)
+
+    def build(self, field: RadianceField, site: Site) -> "FixedStepSampler":
+        self.require(field)
+        check_range(site, self.near, self.far)
+        renderer = FixedStepRenderer(
+            field,
+            near=self.near * site.frame.scale,
+            far=self.far * site.frame.scale,
+            step=self.step,
+            threshold=self.threshold,
+        )
+        return FixedStepSampler(renderer)
+
+
+class FixedStepSampler(Sampler):
+    """Nothing to update: samples lie where the box and the cells' size put them, without jitter.
+
+    Args:
+        renderer: Places them.
+    """
+
+    def __init__(self, renderer: FixedStepRenderer) -> None:
+        self._renderer = renderer
+
+    @property
+    def renderer(self) -> FixedStepRenderer:
+        return self._renderer
+
+    @property
+    def outline(self) -> str:
+        return f"samples {self._renderer.step:g} cells apart throughout the field's box"
+
+    def render(self, field: Any, rays: Batch, state: TrainingState) -> FixedStepRendering:
+        return self._renderer.render(
+            field, rays["origins"], rays["directions"], rays["times"], rays["background"]
+        )

@@ -1,1 +1,0 @@
-"""3D Gaussians to pixels: projection, sorting, blending, and colours that depend on direction."""

@@ -1,0 +1,393 @@
+"""Demo scenes on disk, in the format of D-NeRF's scenes."""
+
+import hashlib
+import json
+import os
+import random
+import secrets
+import shutil
+import threading
+from abc import ABC
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import time as now
+from typing import Any, ClassVar, Literal
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from xplanes.backend import threads
+from xplanes.errors import ConfigError
+from xplanes.scenes.dnerf import read_scene
+from xplanes.scenes.errors import SceneError
+from xplanes.scenes.images import load_images
+from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.views import Scene, Views
+from xplanes.settings import Count, Steps
+from xplanes.synthetic.demo.assembly import Assembly
+from xplanes.synthetic.demo.capture import Capture, even_times, held_out_times
+from xplanes.synthetic.demo.motions import Variation
+from xplanes.synthetic.demo.render import camera_at, hemisphere_cameras, render_image
+from xplanes.synthetic.demo.scenes import build_demo_scene, demo_scene
+from xplanes.synthetic.demo.suite import suite_scene
+from xplanes.synthetic.demo.world import World
+
+VERSION = 2
+"""Version of the renderer; increase it whenever the images of a scene change."""
+
+SUITE_VERSION = 2
+"""The same for the scenes of the suite."""
+
+RECORD = "demo.json"
+"""File that describes the content of a scene folder; written last."""
+
+MASKS = "masks"
+"""Folder of the masks of a thing in a world, with the names of the images."""
+
+USUAL_VIEWS = {"train": 50, "val": 10, "test": 12}
+"""Default number of views per split; other numbers become part of the folder name."""
+
+VIDEO_FRAMES = 50
+"""Frames of the fixed-camera video."""
+
+DAY = 86_400.0
+"""Age in seconds from which an unfinished folder counts as abandoned."""
+
+_RENDERING = threading.Lock()
+
+
+def ensure_demo_scene(
+    root: Path,
+    name: str,
+    *,
+    resolution: int,
+    seed: int = 0,
+    train_views: int = USUAL_VIEWS["train"],
+    val_views: int = USUAL_VIEWS["val"],
+    test_views: int = USUAL_VIEWS["test"],
+    announce: Callable[[str], None] | None = None,
+) -> Path:
+    """Render a demo scene unless its folder exists already.
+
+    The folder is created atomically, even if several processes render the same scene.
+
+    Args:
+        root: Folder of the demo scenes; created if missing.
+        name: Name of the scene.
+        resolution: Height and width of the images in pixels.
+        seed: Seed of colours, motion phases and cameras.
+        train_views: Number of training views; one random camera per timestep, evenly spaced times.
+        val_views: Number of validation views.
+        test_views: Number of test views.
+        announce: Receives a message before rendering; `print` when None.
+
+    Returns:
+        The scene's folder.
+
+    Raises:
+        ValueError: If no scene has that name, or a count is below 1.
+    """
+    counts = {"train": train_views, "val": val_views, "test": test_views}
+    _require_some(resolution, counts)
+    assembly = build_demo_scene(name, seed)
+    record = {
+        "version": VERSION,
+        "scene": name,
+        "seed": seed,
+        "resolution": resolution,
+        "views": {**counts, "video": VIDEO_FRAMES},
+        # Parts and motions are hashed, so that an edited scene is rendered again.
+        "assembly": hashlib.sha256(repr(assembly).encode()).hexdigest(),
+    }
+    return _ensure(
+        Path(root) / _folder_name(name, resolution, seed, counts),
+        f"demo scene {name}",
+        assembly,
+        _demo_capture(name, seed, counts),
+        record,
+        announce or print,
+    )
+
+
+def ensure_suite_scene(
+    root: Path,
+    name: str,
+    *,
+    resolution: int,
+    seed: int = 0,
+    train_views: int = USUAL_VIEWS["train"],
+    val_views: int = USUAL_VIEWS["val"],
+    test_views: int = USUAL_VIEWS["test"],
+    announce: Callable[[str], None] | None = None,
+) -> Path:
+    """Render a scene of the suite unless its folder exists already.
+
+    Arguments, folder and errors are those of `ensure_demo_scene`. There is no fixed-view video.
+    Beside the opaque images of a thing in a world lie masks of the thing, in ``masks``, which
+    nothing but scores may read.
+    """
+    counts = {"train": train_views, "val": val_views, "test": test_views}
+    _require_some(resolution, counts)
+    scene = suite_scene(name)
+    variation = Variation(name, seed)
+    assembly = scene.build(variation)
+    world = None if scene.world is None else scene.world(assembly, variation)
+    capture = scene.rig.capture(counts, f"{name} {seed}")
+    around = () if world is None else (world,)
+    content = repr((SUITE_VERSION, assembly, scene.rig, *around))
+    record = {
+        "version": SUITE_VERSION,
+        "scene": name,
+        "seed": seed,
+        "resolution": resolution,
+        "views": counts,
+        "content": hashlib.sha256(content.encode()).hexdigest(),
+    }
+    return _ensure(
+        Path(root) / _folder_name(name, resolution, seed, counts),
+        f"suite scene {name}",
+        assembly,
+        capture,
+        record,
+        announce or print,
+        world,
+    )
+
+
+def _require_some(resolution: int, counts: dict[str, int]) -> None:
+    for key, value in {
+        "resolution": resolution,
+        **{f"{k}_views": v for k, v in counts.items()},
+    }.items():
+        if value < 1:
+            raise ValueError(f"{key} is {value}; it must be at least 1")
+
+
+def _ensure(
+    folder: Path,
+    title: str,
+    assembly: Assembly,
+    capture: Capture,
+    record: dict[str, Any],
+    announce: Callable[[str], None],
+    world: World | None = None,
+) -> Path:
+    """Render a scene to a folder unless the folder matches the record."""
+    if _holds(folder, record):
+        return folder
+    total, resolution = sum(record["views"].values()), record["resolution"]
+    announce(f"Rendering {title} ({total} images of {resolution} px) to {folder}")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    _clear_unfinished(folder)
+    fresh = _sibling(folder)
+    try:
+        with _one_thread():
+            for split in capture.shots:
+                _write_split(fresh, split, capture, assembly, resolution, world)
+        (fresh / RECORD).write_text(json.dumps(record, indent=2) + "\n")
+        _publish(fresh, folder, record)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+    return folder
+
+
+def _demo_capture(name: str, seed: int, counts: dict[str, int]) -> Capture:
+    """Times and cameras of a demo scene; each split has its own random stream."""
+    shots = {}
+    for split, count in counts.items():
+        draw = random.Random(f"{split} {seed}")
+        cameras = hemisphere_cameras(count, draw)
+        times = even_times(count) if split == "train" else held_out_times(count, draw)
+        shots[split] = list(zip(times, cameras, strict=True))
+    camera = camera_at(demo_scene(name).azimuth, 0.0)
+    shots["video"] = [(time, camera) for time in even_times(VIDEO_FRAMES)]
+    return Capture(shots)
+
+
+def _write_split(
+    folder: Path,
+    split: str,
+    capture: Capture,
+    assembly: Assembly,
+    resolution: int,
+    world: World | None,
+) -> None:
+    (folder / split).mkdir()
+    if world is not None:
+        (folder / MASKS / split).mkdir(parents=True)
+    frames = []
+    for number, (time, camera) in enumerate(capture.shots[split]):
+        file = f"./{split}/r_{number:03d}"
+        how = (camera, resolution, capture.samples, capture.angle_x)
+        if world is None:
+            image = render_image(assembly.pose(time), *how)
+        else:
+            image, mask = world.picture(assembly, time, *how)
+            Image.fromarray(mask).save(folder / MASKS / f"{file}.png", compress_level=6)
+        Image.fromarray(image).save(folder / f"{file}.png", compress_level=6)
+        frames.append({"file_path": file, "time": time, "transform_matrix": camera.tolist()})
+    index = {"camera_angle_x": capture.angle_x, "frames": frames}
+    (folder / f"transforms_{split}.json").write_text(json.dumps(index, indent=1) + "\n")
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Limit PyTorch to one thread: parallelising many small operations costs more than it gains."""
+    with _RENDERING, threads(1):
+        yield
+
+
+def _folder_name(name: str, resolution: int, seed: int, counts: dict[str, int]) -> str:
+    suffix = "" if counts == USUAL_VIEWS else "_" + "-".join(map(str, counts.values()))
+    return f"{name}_{resolution}px_s{seed}{suffix}"
+
+
+def _holds(folder: Path, record: dict[str, Any]) -> bool:
+    """Whether a folder matches the record and has all its files."""
+    try:
+        if json.loads((folder / RECORD).read_text()) != record:
+            return False
+    except (OSError, ValueError):
+        return False
+    return all(
+        (folder / f"transforms_{split}.json").is_file()
+        and all((folder / split / f"r_{number:03d}.png").is_file() for number in range(count))
+        for split, count in record["views"].items()
+    )
+
+
+def _sibling(folder: Path) -> Path:
+    """A new empty folder next to ``folder`` with a unique name."""
+    sibling = folder.with_name(f".{folder.name}.{os.getpid()}.{secrets.token_hex(4)}")
+    sibling.mkdir()
+    return sibling
+
+
+def _clear_unfinished(folder: Path) -> None:
+    """Remove abandoned temporary folders next to ``folder``."""
+    for path in folder.parent.glob(f".{folder.name}.*"):
+        if now() - path.stat().st_mtime > DAY:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _publish(fresh: Path, folder: Path, record: dict[str, Any]) -> None:
+    """Move a finished folder into place, unless another process was first."""
+    while not _holds(folder, record):
+        stale = _sibling(folder)
+        try:
+            if folder.exists():
+                folder.replace(stale)
+            fresh.rename(folder)
+            return
+        except OSError:
+            # Another process changed the folder in the meantime: check again.
+            continue
+        finally:
+            shutil.rmtree(stale, ignore_errors=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProceduralSettings(SceneSettings, ABC):
+    """A procedural scene, rendered on first use."""
+
+    seed: Steps  # Seed of colours, motion phases and cameras.
+    train_views: Count  # Training views, each at its own timestep.
+    test_views: Count  # Test views, at timesteps other than the training views'.
+    val_views: Count  # Validation views.
+
+    find: ClassVar[Callable[[str], object]]
+    ensure: ClassVar[Callable[..., Path]]
+
+    def check(self) -> None:
+        try:
+            type(self).find(self.scene)
+        except SceneError as error:
+            raise ConfigError(f"scene={self.scene}: {error}") from None
+
+    @property
+    def folder(self) -> Path:
+        return type(self).ensure(
+            Path(self.root),
+            self.scene,
+            resolution=self.resolution or 128,
+            seed=self.seed,
+            train_views=self.train_views,
+            val_views=self.val_views,
+            test_views=self.test_views,
+        )
+
+    def prepare(self) -> None:
+        _ = self.folder
+
+    def load(self, splits: Sequence[str]) -> Scene:
+        folder = self.folder
+        try:
+            scene = read_scene(
+                folder,
+                resolution=self.resolution,
+                splits=splits,
+                views=self.views,
+                eval_views=self.eval_views,
+                cache=self.image_cache,
+            )
+            return _with_masks(scene, folder / MASKS)
+        except SceneError as problem:
+            raise SceneError(
+                f"{problem} This is a demo scene: delete {folder} to render it again"
+            ) from problem
+
+
+def _with_masks(scene: Scene, folder: Path) -> Scene:
+    """The scene with the masks of its thing, if it stands in a world."""
+    if not folder.is_dir():
+        return scene
+    splits = {}
+    for split, views in scene.splits.items():
+        masks = load_images([folder / file for file in views.files], None)
+        splits[split] = replace(views, thing=masks[..., 0])
+    return replace(scene, splits=splits)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoSettings(ProceduralSettings):
+    """A procedural scene, rendered on first use."""
+
+    find = staticmethod(demo_scene)
+    ensure = staticmethod(ensure_demo_scene)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteSettings(ProceduralSettings):
+    """A procedural scene of the suite, rendered on first use."""
+
+    find = staticmethod(suite_scene)
+    ensure = staticmethod(ensure_suite_scene)
+
+    # Foreground masks, used for scores. alpha: also as training alpha; lrm: also for LRM input.
+    mask_use: Literal["score", "alpha", "lrm"]
+
+    def load(self, splits: Sequence[str]) -> Scene:
+        scene = super().load(splits)
+        train = scene.splits.get("train")
+        if self.mask_use == "score" or train is None:
+            return scene
+        if train.thing is None:
+            raise SceneError(
+                f"data.mask_use={self.mask_use}: {self.scene} stands in no world, so it has no "
+                "masks. Set it to score."
+            )
+        cut = cut_out(train, train.thing)
+        if self.mask_use == "lrm":
+            return replace(scene, cut=cut)
+        return replace(scene, splits=scene.splits | {"train": cut})
+
+
+def cut_out(views: Views, thing: Tensor) -> Views:
+    """Opaque views with the share of each pixel that shows the thing as alpha. uint8 [V, H, W]"""
+    images = views.in_memory().clone()
+    images[..., :3] = (images[..., :3].float() * thing[..., None] / 255).round().to(torch.uint8)
+    images[..., 3] = thing
+    return replace(views, images=images)

@@ -1,0 +1,447 @@
+"""Training objects on disk: generated once, in checksummed shards; generation is resumable."""
+
+import hashlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from xplanes.backend import compiled
+from xplanes.errors import ConfigError
+from xplanes.files import read_json, replacing, write_json
+from xplanes.lrm.canonical import CanonicalView
+from xplanes.scenes.cameras import look_at
+from xplanes.synthetic.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE
+from xplanes.synthetic.pretraining.objects import procedural_object
+from xplanes.synthetic.pretraining.solids import Array, Solids
+
+FOCAL = 0.5 / math.tan(0.5 * CAMERA_ANGLE_X)
+"""Focal length of D-NeRF's cameras as a share of the image side."""
+
+
+def camera(azimuth: float, elevation: float) -> Array:
+    """Pose of a camera that looks at the origin, at D-NeRF's distance; degrees. [4, 4]"""
+    turn, rise = math.radians(azimuth), math.radians(elevation)
+    flat = math.cos(rise)
+    place = [flat * math.cos(turn), flat * math.sin(turn), math.sin(rise)]
+    return look_at(CAMERA_DISTANCE * torch.tensor([place], dtype=torch.float64))[0].numpy()
+
+
+def render_solids(
+    solids: Solids, pose: Array, side: int, samples: int = 2
+) -> tuple[Array, Array, Array]:
+    """Render one image.
+
+    Args:
+        solids: The object.
+        pose: Camera-to-world matrix. [4, 4]
+        side: Height and width in pixels.
+        samples: Rays per pixel and axis.
+
+    Returns:
+        Colour on white, opacity, and the depth along each pixel's first ray (inf if it misses),
+        which passes through the centre of the pixel's first sample. [S, S, 3], [S, S], [S, S]
+    """
+    colour, alpha, depth = np.empty((side, side, 3)), np.empty((side, side)), np.empty((side, side))
+    cpu = compiled("xplanes.synthetic.pretraining.cpu")
+    seen = _rectangles(solids, pose, side * samples)
+    cpu.render(solids.arrays, seen, pose, FOCAL, samples, colour, alpha, depth)
+    return colour, alpha, depth
+
+
+def cast(
+    solids: Solids, origins: Array, directions: Array
+) -> tuple[Array, NDArray[np.int64], Array, Array]:
+    """First hit of each ray [N, 3]: distance, part, normal, colour. [N], [N], [N, 3], [N, 3]"""
+    distances, owners = np.empty(len(origins)), np.empty(len(origins), dtype=np.int64)
+    seen = np.zeros((len(origins), 6))
+    cpu = compiled("xplanes.synthetic.pretraining.cpu")
+    cpu.cast(solids.arrays, origins, directions, distances, owners, seen)
+    return distances, owners, seen[:, :3], seen[:, 3:]
+
+
+def inside(solids: Solids, points: Array) -> NDArray[np.bool_]:
+    """Whether points [N, 3] lie inside any part. [N]"""
+    result = np.zeros(len(points), dtype=np.bool_)
+    compiled("xplanes.synthetic.pretraining.cpu").inside(solids.arrays, points, result)
+    return result
+
+
+_CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(8, 3)
+
+
+def _rectangles(solids: Solids, pose: Array, side: int) -> NDArray[np.int64]:
+    """Bounding rectangle of each part in the image: rows and columns (from, to). [P, 4]"""
+    local = solids.extents[:, None] * _CORNERS
+    corners = np.einsum("pij,pcj->pci", solids.rotations, local) + solids.centres[:, None]
+    x, y, z = np.moveaxis((corners - pose[:3, 3]) @ pose[:3, :3], -1, 0)
+    depth = np.maximum(-z, 0.05)
+    columns = (x / depth * FOCAL + 0.5) * side
+    rows = (0.5 - y / depth * FOCAL) * side
+    limits = [rows.min(1) - 1, rows.max(1) + 2, columns.min(1) - 1, columns.max(1) + 2]
+    return np.clip(np.stack(limits, axis=-1), 0, side).astype(np.int64)
+
+
+SURFACE, VOLUME = 2048, 1024
+"""Points stored per object: near the surface, and in the volume around the object."""
+
+SPREADS = (0.01, 0.03, 0.09)
+"""Standard deviations of the distance between the surface and points near it."""
+
+STREAM = 41_011
+"""Random stream of cameras and points, independent of the objects' own stream."""
+
+
+def sample_type(views: int, side: int) -> np.dtype:
+    """Record type of one object.
+
+    Fields: RGB on white and opacity of each view; depth along each pixel's first ray minus the
+    camera distance (inf if it misses); camera poses; points and their occupancy; surface points and
+    their colours.
+    """
+    return np.dtype(
+        [
+            ("pictures", "u1", (views, side, side, 4)),
+            ("depths", "f2", (views, side, side)),
+            ("poses", "f4", (views, 4, 4)),
+            ("points", "f2", (SURFACE + VOLUME, 3)),
+            ("inside", "u1", (SURFACE + VOLUME,)),
+            ("surface", "f2", (SURFACE, 3)),
+            ("colours", "u1", (SURFACE, 3)),
+        ]
+    )
+
+
+def draw_sample(seed: int, views: int, side: int) -> NDArray:
+    """Generate the record of an object, deterministically from its seed. [1]"""
+    solids, random = procedural_object(seed), np.random.default_rng([STREAM, seed])
+    record = np.zeros(1, sample_type(views, side))
+    for view, (azimuth, elevation) in enumerate(_cameras(random, views)):
+        pose = camera(azimuth, elevation)
+        colour, alpha, depth = render_solids(solids, pose, side)
+        record["pictures"][0, view, ..., :3] = np.rint(255 * colour)
+        record["pictures"][0, view, ..., 3] = np.rint(255 * alpha)
+        record["depths"][0, view] = depth - CAMERA_DISTANCE
+        record["poses"][0, view] = pose
+    found, colours = surface_points(solids, random, SURFACE)
+    record["surface"][0], record["colours"][0] = found, np.rint(255 * colours)
+    spread = random.choice(SPREADS, SURFACE)[:, None]
+    low, high = solids.bounds()
+    near = found + spread * random.normal(size=found.shape)
+    around = random.uniform(low - 0.15, high + 0.15, (VOLUME, 3))
+    record["points"][0] = np.concatenate([near, around])
+    # Occupancy is evaluated at the rounded points.
+    record["inside"][0] = inside(solids, record["points"][0].astype(np.float64))
+    return record
+
+
+def view_cameras(seed: int, views: int) -> list[tuple[float, float]]:
+    """Azimuth and elevation of an object's cameras, in degrees."""
+    return _cameras(np.random.default_rng([STREAM, seed]), views)
+
+
+def _cameras(random: np.random.Generator, views: int) -> list[tuple[float, float]]:
+    """Elevation is mostly low; 15% of the views are from above."""
+    found = []
+    for _ in range(views):
+        elevation = random.uniform(3, 50) if random.random() < 0.85 else random.uniform(50, 85)
+        found.append((random.uniform(0, 360), elevation))
+    return found
+
+
+def surface_points(solids: Solids, random: np.random.Generator, count: int) -> tuple[Array, Array]:
+    """Sample the surface by casting random rays from above and from the sides.
+
+    Returns:
+        Positions and shaded colours. [N, 3], [N, 3]
+    """
+    low, high = solids.bounds()
+    middle, radius = 0.5 * (low + high), float(np.linalg.norm(0.5 * (high - low)))
+    found, colours, missing = [], [], count
+    while missing > 0:
+        lines = 3 * missing + 64
+        height = random.uniform(-0.35, 1, lines)
+        turn, flat = random.uniform(0, 2 * math.pi, lines), np.sqrt(1 - height**2)
+        away = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=-1)
+        across = np.stack([-np.sin(turn), np.cos(turn), np.zeros(lines)], axis=-1)
+        angle, far = random.uniform(0, 2 * math.pi, lines), radius * np.sqrt(random.random(lines))
+        upwards = np.cross(away, across)
+        offset = (far * np.cos(angle))[:, None] * across + (far * np.sin(angle))[:, None] * upwards
+        origins = middle + offset + 1.5 * radius * away
+        distance, part, _, colour = cast(solids, origins, -away)
+        hit = part >= 0
+        found.append((origins - distance[:, None] * away)[hit][:missing])
+        colours.append(colour[hit][:missing])
+        missing -= len(found[-1])
+    return np.concatenate(found), np.concatenate(colours)
+
+
+VERSION = 1
+"""Version of the records; increase it whenever a seed gives a different record."""
+
+SHARD = 256
+"""Objects per file."""
+
+RECORD = "pool.json"
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Records of objects, read from disk on demand.
+
+    Attributes:
+        shards: Memory-mapped records of `sample_type`. [SHARD] each
+    """
+
+    shards: tuple[NDArray, ...]
+
+    def __len__(self) -> int:
+        return sum(len(shard) for shard in self.shards)
+
+    def __getitem__(self, number: int) -> Any:
+        """The record of an object by its index in the pool."""
+        shard, index = divmod(number, SHARD)
+        return self.shards[shard][index]
+
+
+def ensure_pool(
+    folder: Path,
+    seeds: range,
+    *,
+    views: int,
+    side: int,
+    announce: Callable[[str], None] = print,
+) -> Pool:
+    """Records of all objects with these seeds; missing shards are generated.
+
+    Args:
+        folder: Folder of the shards; created if missing.
+        seeds: Seeds of the objects, a whole number of shards.
+        views: Images per object.
+        side: Height and width of an image in pixels.
+        announce: Receives progress messages.
+
+    Raises:
+        ConfigError: If the folder holds a pool with other settings, or its index is damaged.
+    """
+    if len(seeds) % SHARD:
+        raise ConfigError(f"pool.objects={len(seeds)}: must be a multiple of {SHARD}")
+    kind = {"version": VERSION, "first": seeds.start, "views": views, "side": side, "shard": SHARD}
+    record = _read(folder, kind)
+    shards = []
+    for number in range(len(seeds) // SHARD):
+        path = folder / f"{number:05d}.npy"
+        if path.name not in record["sha256"] or record["sha256"][path.name] != _digest(path):
+            first = seeds[number * SHARD]
+            drawn = [draw_sample(seed, views, side) for seed in range(first, first + SHARD)]
+            with replacing(path) as temporary:
+                np.save(temporary, np.concatenate(drawn))
+            record["sha256"][path.name] = _digest(path)
+            write_json(folder / RECORD, record)
+            if number % 8 == 7 or (number + 1) * SHARD == len(seeds):
+                announce(f"generated {(number + 1) * SHARD} of {len(seeds)} objects")
+        shards.append(np.load(path, mmap_mode="r"))
+    return Pool(tuple(shards))
+
+
+def _read(folder: Path, kind: dict[str, int]) -> dict[str, Any]:
+    path = folder / RECORD
+    if not path.is_file():
+        return {**kind, "sha256": {}}
+    try:
+        record = read_json(path)
+    except ValueError as problem:
+        raise ConfigError(
+            f"pool.root={folder}: {problem}; delete it to generate the objects again"
+        ) from problem
+    found = {key: record.get(key) for key in kind}
+    if found != kind:
+        raise ConfigError(
+            f"pool.root={folder} holds a pool with {found}, not {kind}: name another folder"
+        )
+    return record
+
+
+def _digest(path: Path) -> str | None:
+    """SHA-256 of a file; None if it does not exist."""
+    if not path.is_file():
+        return None
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+DITHER = 0.01
+"""Standard deviation of the offset from the surface at which colours are supervised."""
+
+
+TRIES = 3
+"""Candidates per point near the surface; the farthest from the surface is used."""
+
+
+class PretrainingBatch(NamedTuple):
+    """Input images and supervision, in the model's frame.
+
+    Attributes:
+        images: RGB on white, in [0, 1]. [B, 3, S, S]
+        points: Positions. [B, N, 3]
+        inside: Their occupancy, 0 or 1. [B, N]
+        surface: Positions near the surface. [B, M, 3]
+        colours: Their colours, in [0, 1]. [B, M, 3]
+        origins: Ray origins. [B, R, 3]
+        directions: Unit ray directions. [B, R, 3]
+        ray_colours: Colours of their pixels, on white. [B, R, 3]
+        ray_alpha: Opacity of their pixels. [B, R]
+        ray_hits: Distance to the surface, inf for rays that miss. [B, R]
+    """
+
+    images: Tensor
+    points: Tensor
+    inside: Tensor
+    surface: Tensor
+    colours: Tensor
+    origins: Tensor
+    directions: Tensor
+    ray_colours: Tensor
+    ray_alpha: Tensor
+    ray_hits: Tensor
+
+
+class PretrainingBatches:
+    """Batches of objects from a pool.
+
+    Args:
+        pool: The objects.
+        view: The model's camera.
+        seed: Seed of all random choices.
+        objects: Objects per batch.
+        near: Points near the surface, per object.
+        volume: Points in the volume around the object, per object.
+        free: Points in the free space in front of the visible surface, per object.
+        colour: Surface points with colour supervision, per object.
+        rays: Rays per object, half of them from the input view; 0 for none.
+    """
+
+    def __init__(
+        self,
+        pool: Pool,
+        view: CanonicalView,
+        *,
+        seed: int,
+        objects: int,
+        near: int,
+        volume: int,
+        free: int,
+        colour: int,
+        rays: int,
+    ) -> None:
+        self.pool, self.view, self.seed, self.objects = pool, view, seed, objects
+        self.near, self.volume, self.free = near, volume, free
+        self.colour, self.rays = colour, rays
+        self.scale = view.distance / CAMERA_DISTANCE
+
+    def draw(self, step: int) -> PretrainingBatch:
+        """The batch of a step; each epoch uses every object at most once."""
+        turns = len(self.pool) // self.objects
+        order = np.random.default_rng([self.seed, step // turns]).permutation(len(self.pool))
+        random = np.random.default_rng([self.seed, step, 1])
+        start = step % turns * self.objects
+        drawn = [
+            self._sample(self.pool[int(number)], random)
+            for number in order[start : start + self.objects]
+        ]
+        return PretrainingBatch(
+            *(torch.from_numpy(np.stack(part)).float() for part in zip(*drawn, strict=True))
+        )
+
+    def _sample(self, record: NDArray, random: np.random.Generator) -> tuple[NDArray, ...]:
+        views = len(record["poses"])
+        source = int(random.integers(views))
+        turn = self._turn(record["poses"][source])
+        near = self._near(record, random)
+        chosen = np.concatenate([near, SURFACE + random.integers(VOLUME, size=self.volume)])
+        points, inside = record["points"][chosen] @ turn.T, record["inside"][chosen]
+        free = self._free_points(record, source, turn, random)
+        at = random.integers(SURFACE, size=self.colour)
+        surface = record["surface"][at] + DITHER * random.normal(size=(self.colour, 3))
+        origins, directions, pixels, hits = self._rays(record, source, turn, random, self.rays)
+        image = record["pictures"][source, ..., :3]
+        # Augmentation: mirroring and permuting the colour channels.
+        mirror, channels = random.random() < 0.5, random.permutation(3)
+        if mirror:
+            image = image[:, ::-1]
+        sign = np.array([-1.0 if mirror else 1.0, 1.0, 1.0])
+        return (
+            (image[..., channels] / np.float32(255)).transpose(2, 0, 1),
+            np.concatenate([points, free]) * sign,
+            np.concatenate([inside, np.zeros(self.free, np.uint8)]),
+            surface @ turn.T * sign,
+            record["colours"][at][:, channels] / np.float32(255),
+            origins * sign,
+            directions * sign,
+            pixels[:, channels] / np.float32(255),
+            pixels[:, 3] / np.float32(255),
+            hits,
+        )
+
+    def _near(self, record: NDArray, random: np.random.Generator) -> NDArray:
+        """Indices of points near the surface: of `TRIES` candidates, the farthest from it. [N]
+
+        Points much closer to the surface than one texel carry little information.
+        """
+        tries = random.integers(SURFACE, size=(TRIES, self.near))
+        apart = record["points"][tries].astype(np.float32) - record["surface"][tries]
+        best = np.square(apart).sum(axis=-1).argmax(axis=0)
+        return tries[best, np.arange(self.near)]
+
+    def _turn(self, pose: NDArray) -> NDArray:
+        """Rotation and scale from the object's world to the model's frame. [3, 3]"""
+        return self.scale * self.view.rotation_matrix().numpy() @ pose[:3, :3].T.astype(float)
+
+    def _rays(
+        self,
+        record: NDArray,
+        source: int,
+        turn: NDArray,
+        random: np.random.Generator,
+        count: int,
+        middle: bool = True,
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Rays through pixels: origins, directions, pixels and hits, in the model's frame."""
+        pictures = record["pictures"]
+        views, side = pictures.shape[:2]
+        view = np.where(random.random(count) < 0.5, source, random.integers(views, size=count))
+        # Of two candidates, take the second if the first is background: fewer background rays.
+        pixel = random.integers(side, size=(2, count, 2))
+        empty = pictures[view, pixel[0, :, 0], pixel[0, :, 1], 3] == 0
+        row, column = np.where(empty[:, None], pixel[1], pixel[0]).T
+        # Depth belongs to the first of the 2 x 2 samples of a pixel.
+        shift = 0.5 if middle else 0.25
+        up = (0.5 - (row + shift) / side) / FOCAL
+        right = ((column + shift) / side - 0.5) / FOCAL
+        local = np.stack([right, up, -np.ones(count)], axis=-1)
+        local /= np.linalg.norm(local, axis=-1, keepdims=True)
+        poses = record["poses"][view].astype(float)
+        directions = np.einsum("rij,rj->ri", poses[:, :3, :3], local) @ turn.T / self.scale
+        origins = poses[:, :3, 3] @ turn.T
+        hits = self.scale * (record["depths"][view, row, column].astype(float) + CAMERA_DISTANCE)
+        return origins, directions, pictures[view, row, column], hits
+
+    def _free_points(
+        self, record: NDArray, source: int, turn: NDArray, random: np.random.Generator
+    ) -> NDArray:
+        """Points between the near bound of the box and the first hit of a ray. [F, 3]"""
+        origins, directions, _, hits = self._rays(
+            record, source, turn, random, self.free, middle=False
+        )
+        inverse = 1 / np.where(np.abs(directions) < 1e-9, 1e-9, directions)
+        reach = self.view.half_side * np.abs(inverse)
+        near = np.max(-origins * inverse - reach, axis=-1)
+        far = np.minimum(np.min(-origins * inverse + reach, axis=-1), hits - 0.01)
+        distance = near + random.random(self.free) * np.maximum(far - near, 0)
+        return origins + distance[:, None] * directions

@@ -13,10 +13,16 @@ from PIL import Image
 from tests.balls import ball_views, surrounding
 from tests.lens_oracle import direction
 from tests.refusals import assert_refused
+from xplanes.components import build
 from xplanes.config import compose_plain
-from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.errors import ConfigError
+from xplanes.scenes.batches import RayBatches, ViewBatches, ViewSettings
+from xplanes.scenes.datamodule import UNIFORM, SceneDataModule, whole_view
 from xplanes.scenes.errors import MissingSplitError, SceneError
+from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.nerfstudio import read_capture
+from xplanes.scenes.source import SceneSettings
+from xplanes.training.scores import score_image
 
 SIZE, ANGLE = 24, 0.7
 FOCAL = 0.5 * SIZE / math.tan(0.5 * ANGLE)
@@ -289,32 +295,38 @@ def disc():
 @pytest.mark.parametrize(("ending", "value"), [("png", 255), ("png", 1), ("jpg", 255)])
 def test_pixels_that_masks_leave_out_are_neither_drawn_nor_scored(capture, caplog, ending, value):
     masked(capture, band() // 255 * value, ending, quality=95)
+    shown = torch.from_numpy(band() > 0)
+    for index, frame in enumerate(capture.frames):
+        pixels = capture.views.image(index)
+        pixels[~shown] = torch.tensor([255, 0, 255, 255], dtype=torch.uint8)
+        Image.fromarray(pixels.numpy()).save(capture.path / frame["file_path"])
     with caplog.at_level("INFO"):
         scene = capture.read(eval_every=5)
     assert "masks leave out 25.0% of the pixels. They are taken for pixels to ignore" in caplog.text
     train = scene.splits["train"]
-    shown = torch.from_numpy(band() > 0)
     assert torch.equal(train.image(0), capture.views.image(0)), "colours stay as they are"
     assert all(torch.equal(train.shown(index), shown) for index in range(len(train)))
     assert torch.equal(train.valid()[1], shown)
     assert torch.equal(train.subset(torch.tensor([2])).shown(0), shown)
-    module = built(scene)
-    batches = SceneDataModule.of(scene).batches_for(module, 0)
-    rows = torch.cat([batches.draw(step)["row"] for step in range(3)])
-    assert len(rows) > 100
-    assert int(rows.max()) < SIZE - SIZE // 4
+    batches = RayBatches(train, scene_frame(train), UNIFORM, seed=0)
+    colours = torch.cat([batches.draw(step)["target"] for step in range(3)])
+    assert len(colours) > 500
+    marked = (colours - torch.tensor([1.0, 0.0, 1.0])).abs().amax(dim=1) < 0.01
+    assert not marked.any()
+    with pytest.raises(ConfigError, match="trains on whole images"):
+        ViewBatches(train, ViewSettings(background="white"), seed=0)
 
 
 def test_scores_leave_ignored_pixels_out(capture):
     masked(capture, band())
-    views = capture.read(eval_every=5).splits["val"]
+    views = capture.read(("val",), eval_every=5).splits["val"]
     item = whole_view(views, 0, torch.ones(3))
     image = {"colour": item["target"].clone(), "opacity": torch.ones(SIZE, SIZE)}
     image["colour"][-SIZE // 4 :] = 0.5
     found = score_image(image, item)
     assert found.psnr == 100
     assert found.ssim > 0.8, "only windows beside the ignored pixels see them"
-    image["colour"][0, 0] += 0.1
+    image["colour"][0, 0] -= 0.1
     assert score_image(image, item).psnr < 60
 
 
@@ -452,3 +464,35 @@ def test_lenses_and_poses_of_many_cameras_stay_with_their_images(capture):
             assert float(lens.coefficients[0, 0]) == pytest.approx(0.01 * (number + 1))
             expected = surrounding(10, 4.0)[number]
             torch.testing.assert_close(views.camera_to_world[index], expected)
+
+
+def test_keys_that_are_not_read_are_named(capture):
+    capture.content |= {"white_transparent": True, "n_extra_learnable_dims": 0, "aabb_scale": 4}
+    capture.frames[2]["rolling_shutter"] = [1, 0, 0, 0]
+    with pytest.warns(UserWarning, match="not read are rolling_shutter, white_transparent"):
+        capture.read()
+
+
+def test_two_fields_of_view_give_pixels_that_are_not_square(capture):
+    for key in PINHOLE:
+        del capture.content[key]
+    capture.content |= {"camera_angle_x": ANGLE, "camera_angle_y": ANGLE}
+    assert capture.read().splits["train"].intrinsics.focal[0].tolist() == pytest.approx([FOCAL] * 2)
+    capture.content["camera_angle_y"] = 2 * math.atan(math.tan(0.5 * ANGLE) / 1.25)
+    focal = capture.read(resolution=12).splits["train"].intrinsics.focal[0]
+    assert focal.tolist() == pytest.approx([FOCAL / 2, 1.25 * FOCAL / 2])
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_a_few_images_are_trained_on_and_scored(tmp_path, count):
+    few = Capture(tmp_path / "few", count)
+    few.read()
+    settings = {**compose_plain("train", ["data=nerfstudio"])["data"], "resolution": None}
+    settings |= {"root": str(tmp_path), "scene": "few"}
+    read = build(settings, SceneSettings, "data").read
+    if count == 1:
+        with pytest.warns(UserWarning, match="1 images are too few to hold some out"):
+            splits = read().splits
+        assert splits["val"].files == splits["train"].files
+    else:
+        assert len(read().splits["train"]) + len(read().splits["val"]) >= count

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from xplanes.backend import memory_left
+from xplanes.errors import ConfigError
 from xplanes.scenes.changes import changing
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.pools import PixelPools, TilePool, in_cells, pixels_of, tile_pools
@@ -173,11 +174,19 @@ class ViewBatches(Batches):
         settings: What lies behind them.
         seed: The run's seed.
         rank: Number of this process among those that share the run.
+
+    Raises:
+        ConfigError: If pixels of the views are to be ignored.
     """
 
     skipped = 0.0
 
     def __init__(self, views: Views, settings: ViewSettings, *, seed: int, rank: int = 0) -> None:
+        if views.ignored is not None:
+            raise ConfigError(
+                "data.mask_use=ignore: this model trains on whole images and cannot leave pixels "
+                "out; set data.mask_use=alpha, or lrm to use no masks in training"
+            )
         self.views, self.seed, self.stream = views, seed, Stream.VIEWS + rank
         self.background = settings.background
         self.rays = max(1, views.pixels // len(views))

@@ -1,5 +1,6 @@
 """Scenes on disk in the format of D-NeRF and Blender: transforms_train.json and its images."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,7 +67,7 @@ def read_scene(
     folder = Path(folder)
     _check_folder(folder)
     paths = {split: _transforms_path(folder, split) for split in dict.fromkeys(splits)}
-    listed = {split: read_transforms(path) for split, path in paths.items()}
+    listed = {split: _listed(split, path) for split, path in paths.items()}
     listed = thinned(listed, views, eval_views, folder)
     video = _list_video(folder)
     others = listed if video is None else {**listed, "video": video}
@@ -76,6 +77,16 @@ def read_scene(
         {split: read_views(part, resolution, cache) for split, part in listed.items()},
         video=None if video is None else read_views(video, resolution, cache),
     )
+
+
+def _listed(split: str, path: Path) -> Listing:
+    """The frames of a split; a warning tells why those of a split that is only scored are none."""
+    try:
+        return read_transforms(path)
+    except MissingSplitError as problem:
+        if split != "train":
+            warnings.warn(f"The {split} split is left out. {problem}", stacklevel=4)
+        raise
 
 
 def _require_times(folder: Path, train: Listing | None, others: Mapping[str, Listing]) -> None:

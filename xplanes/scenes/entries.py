@@ -3,10 +3,12 @@
 import json
 import logging
 import math
+import os
 import re
 import warnings
 from collections.abc import Iterator, Sequence
-from pathlib import Path, PureWindowsPath
+from functools import lru_cache
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -14,8 +16,8 @@ import torch
 
 from xplanes.files import stand_in
 from xplanes.scenes.cameras import upright
-from xplanes.scenes.errors import SceneError
-from xplanes.scenes.formats import ENDINGS, orientation
+from xplanes.scenes.errors import BrokenFrameError, SceneError
+from xplanes.scenes.formats import ENDINGS, is_image, orientation
 
 logger = logging.getLogger(__name__)
 
@@ -33,33 +35,59 @@ ROUNDING = 1e-4
 
 
 def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> Path:
-    """The file that ``name`` stands for, with or without its suffix, inside ``folder``.
+    """The file that ``name`` stands for inside ``folder``.
+
+    Suffixes may be left out, be those of another format, or differ in case, as long as one file
+    alone has the name. Of a path that leads nowhere, such as one of another machine, the first
+    folders are left out.
 
     Args:
         label: The file and frame that name it, for messages.
-        folder: The scene's folder, with its links resolved.
-        name: Name relative to ``folder``.
+        folder: The scene's folder.
+        name: Name relative to ``folder``, or an absolute path into it.
         key: The key that holds the name.
 
     Raises:
-        SceneError: If it is no name, leaves the folder, or there is no such file.
+        BrokenFrameError: If there is no such file.
+        SceneError: If it is no name, or leaves the folder.
     """
-    for image in paths_inside(label, folder, name, key, "./train/r_000"):
+    choices = list(paths_inside(label, folder, name, key, "./train/r_000"))
+    for image in choices:
         if image.is_file():
             return image
-    raise SceneError(
+    for image in choices:
+        stems = _stems(image.parent) if image.parent.is_dir() else {}
+        wanted = image.stem if image.suffix.lower() in ENDINGS else image.name
+        if len(found := stems.get(wanted.lower(), ())) == 1:
+            return found[0]
+    raise BrokenFrameError(
         f"{label}: no image {folder / name}, nor with {', '.join(SUFFIXES[1:4])}, ... added. "
         f"Add the file or take the frame out of the list."
     )
 
 
+def _stems(folder: Path) -> dict[str, list[Path]]:
+    """Images of a folder by their names without suffix, in lower case."""
+    return _stems_at(folder, folder.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=64)
+def _stems_at(folder: Path, changed: int) -> dict[str, list[Path]]:
+    found: dict[str, list[Path]] = {}
+    for path in sorted(filter(is_image, folder.iterdir())):
+        found.setdefault(path.stem.lower(), []).append(path)
+    return found
+
+
 def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) -> Iterator[Path]:
     """What a name may stand for, as it is and with the suffix of an image, inside ``folder``.
 
+    Links are followed, wherever they lead; ``..`` does not leave the folder.
+
     Args:
         label: The file and frame that name it, for messages.
-        folder: The scene's folder, with its links resolved.
-        name: Name relative to ``folder``.
+        folder: The scene's folder.
+        name: Name relative to ``folder``, or an absolute path.
         key: The key that holds the name.
         example: Such a name, for messages.
 
@@ -69,19 +97,24 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
     if not isinstance(name, str) or not name or "\0" in name:
         raise SceneError(f"{label}: {key} is {short(name)}; it must be text such as {example}.")
     # Blender on Windows writes backslashes.
-    relative = Path(name.replace("\\", "/"))
-    if relative.is_absolute() or PureWindowsPath(name).anchor:
+    parts = PurePosixPath(os.path.normpath(name.replace("\\", "/"))).parts
+    absolute = bool(PureWindowsPath(name).anchor)
+    if absolute:
+        whole = Path(*parts)
+        if whole.is_relative_to(folder):
+            parts = whole.relative_to(folder).parts
+    elif ".." in parts:
         raise SceneError(
-            f"{label}: {key} is absolute. Write it relative to {folder}, as in {example}."
+            f"{label}: {key} leaves the scene's folder {folder} (it is {name}). Put its files "
+            f"inside the folder and correct {key}."
         )
-    for suffix in (*SUFFIXES, *(suffix.upper() for suffix in SUFFIXES[1:])):
-        path = (folder / f"{relative}{suffix}").resolve()
-        if not path.is_relative_to(folder):
-            raise SceneError(
-                f"{label}: {key} leaves the scene's folder {folder} (it leads to {path}). Put its "
-                f"files inside the folder and correct {key}."
-            )
-        yield path
+    # Of a path that leads nowhere, folders are left out from the front.
+    for first in range(max(1, len(parts))):
+        relative = Path(*parts[first:])
+        if relative.is_absolute() or (first and not (folder / relative).parent.is_dir()):
+            continue
+        for suffix in (*SUFFIXES, *(suffix.upper() for suffix in SUFFIXES[1:])):
+            yield folder / f"{relative}{suffix}"
 
 
 def mask_files(
@@ -168,6 +201,7 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
         The matrix. float64 [4, 4]
 
     Raises:
+        BrokenFrameError: If it is not finite.
         SceneError: If it is no such matrix.
     """
     try:
@@ -179,7 +213,7 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
     if pose.shape != (4, 4):
         raise SceneError(f"{label}: {key} must be 4 rows of 4 numbers, not {short(matrix)}.")
     if not np.isfinite(pose).all():
-        raise SceneError(f"{label}: {key} holds NaN or infinity. Export it again.")
+        raise BrokenFrameError(f"{label}: {key} holds NaN or infinity. Export it again.")
     if np.abs(pose[3] - [0, 0, 0, 1]).max() > RIGID_TOLERANCE:
         raise SceneError(
             f"{label}: the last row of {key} is {pose[3].tolist()}, not [0, 0, 0, 1]. "

@@ -13,6 +13,10 @@ class MissingSplitError(SceneError):
     """A scene has no split of a name."""
 
 
+class BrokenFrameError(SceneError):
+    """One frame cannot be used; a capture can do without it."""
+
+
 SHOWN = 5
 """Problems of a capture that are shown in full."""
 
@@ -24,6 +28,11 @@ def refuse_all(problems: Sequence[str]) -> None:
         SceneError: With the first of many problems, and their number.
     """
     if problems:
-        more = len(problems) - SHOWN
-        rest = [f"... and {more} more problems like these."] * (more > 0)
-        raise SceneError("\n".join([*problems[:SHOWN], *rest]))
+        raise SceneError(first_of(problems))
+
+
+def first_of(problems: Sequence[str]) -> str:
+    """The first of many problems, a line each, and how many more there are."""
+    more = len(problems) - SHOWN
+    rest = [f"... and {more} more problems like these."] * (more > 0)
+    return "\n".join([*problems[:SHOWN], *rest])

@@ -47,7 +47,7 @@ LOSSY = ("JPEG", "MPO", "WEBP", "AVIF", "JPEG2000")
 NOISE = 8 / 255
 """Difference from black and from white below which lossy formats may have made it."""
 
-SILHOUETTE_EDGE, UNCLEAR = 0.5, (0.25, 0.75)
+SILHOUETTE_EDGE, UNCLEAR = 0.5, (0.4, 0.7)
 """Share of the images' edges from which on masks are silhouettes, and where it may be either."""
 
 KEPT = 0.9

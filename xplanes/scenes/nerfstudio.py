@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from xplanes.scenes.entries import image_path, short
-from xplanes.scenes.errors import MissingSplitError, SceneError
+from xplanes.scenes.errors import BrokenFrameError, MissingSplitError, SceneError
 from xplanes.scenes.listing import Listing, held_out, read_splits, thinned
 from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.source import SceneSettings
@@ -121,7 +121,12 @@ def _listed_splits(
         if not isinstance(names, list):
             raise SceneError(f"{path}: {key} is {short(names)}, not a list of file names.")
         for name in names:
-            image = image_path(str(path), path.parent.resolve(), name, key)
+            try:
+                image = image_path(str(path), path.parent.resolve(), name, key)
+            except BrokenFrameError:
+                if name in {frame["file_path"] for frame in content["frames"]}:
+                    continue  # A warning told of it.
+                raise
             if image not in places:
                 raise SceneError(
                     f"{path}: {key} names {name}, which no frame shows. Add the frame, or take the "

@@ -1,5 +1,6 @@
 """Base class of data formats: common settings and handling of static scenes."""
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
@@ -147,6 +148,12 @@ class SceneSettings(Settings, ABC):
             return self.load(("train", "test"))
         except MissingSplitError:
             scene = self.load(("train",))
-            if not may_hold_out(scene.splits["train"]):
-                raise
-            return scene
+            train = scene.splits["train"]
+            if may_hold_out(train):
+                return scene
+            warnings.warn(
+                f"{self.folder}: {len(train)} images are too few to hold some out: the images that "
+                "are trained on are scored, which says little of other views.",
+                stacklevel=4,
+            )
+            return replace(scene, splits={**scene.splits, "val": train})

@@ -2,7 +2,8 @@
 
 import logging
 import math
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,14 @@ from xplanes.scenes.entries import (
     short,
     unit_times,
 )
-from xplanes.scenes.errors import SceneError
+from xplanes.scenes.errors import (
+    BrokenFrameError,
+    MissingSplitError,
+    SceneError,
+    first_of,
+    refuse_all,
+)
+from xplanes.scenes.images import read_header
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
 from xplanes.scenes.listing import Calibration, Listing, require_shapes
 
@@ -41,6 +49,27 @@ OTHER_LENSES = ("equirectangular", "latlong", "orthographic", "ftheta_p0")
 
 DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Order of the list of coefficients that nerfstudio writes and reads."""
+
+SQUARE = 0.01
+"""Difference of focal lengths along x and y above which pixels are not square."""
+
+KNOWN = (
+    *("frames", "file_path", "transform_matrix", "mask_path", "time", "timestamp"),
+    *("camera_angle_x", "camera_angle_y", "camera_model", "is_fisheye", "distortion_params"),
+    *("omega", "train_filenames", "val_filenames", "test_filenames", *PIXELS, *COEFFICIENTS),
+    *("sx1", "sy1", *OTHER_LENSES, "from_mitsuba", "from_na"),
+)
+"""Keys that are read, or refused."""
+
+IGNORED = (
+    *("aabb", "aabb_scale", "offset", "scale", "up", "applied_transform", "applied_scale"),
+    *("orientation_override", "auto_scale_poses_override", "ply_file_path", "sharpness"),
+    *("colmap_im_id", "colmap_image_id", "camera_id", "cam_id", "id", "name", "n_frames"),
+    *("depth_file_path", "depth_path", "integer_depth_scale", "enable_depth_loading"),
+    *("normal_file_path", "depth_unit_scale_factor", "rotation", "render_aabb", "path"),
+    *("crop_width", "crop_height", "blur_score", "intrinsic_matrix", "n_images", "fps"),
+)
+"""Keys of other programs that change nothing here."""
 
 SYNONYMS = {"sx1": "s1", "sy1": "s3"}
 """What COLMAP calls the prism coefficients of a fisheye lens."""
@@ -67,17 +96,9 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
     Raises:
         SceneError: Anything is missing, out of range, repeated, or outside the scene's folder.
     """
-    frames, folder = content["frames"], path.parent.resolve()
-    labels = [f"{path}: frame {index} ({frame['file_path']})" for index, frame in enumerate(frames)]
-    named = list(zip(labels, frames, strict=True))
-    paths = [image_path(label, folder, frame["file_path"]) for label, frame in named]
-    poses = np.stack([checked_pose(label, frame["transform_matrix"]) for label, frame in named])
-    masks = tuple(
-        None
-        if frame.get("mask_path") is None
-        else image_path(label, folder, frame["mask_path"], "mask_path")
-        for label, frame in named
-    )
+    folder = path.parent.resolve()
+    named, paths, masks, matrices = _usable(path, content["frames"], folder)
+    poses, labels = np.stack(matrices), [label for label, _ in named]
     times = _times(path, named, any_unit)
     require_precision(path, poses[:, :3, 3])
     refuse_repeats(labels, paths, poses, times)
@@ -85,13 +106,92 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
         paths=tuple(paths),
         files=tuple(image.relative_to(folder).as_posix() for image in paths),
         camera_to_world=torch.from_numpy(poses).float(),
-        times=torch.tensor(times or [0.0] * len(frames), dtype=torch.float32),
-        calibrations=tuple(read_calibration(str(path), content, *each) for each in named),
+        times=torch.tensor(times or [0.0] * len(named), dtype=torch.float32),
+        calibrations=tuple(
+            _with_height(
+                read_calibration(str(path), content, label, frame), {**content, **frame}, image
+            )
+            for (label, frame), image in zip(named, paths, strict=True)
+        ),
         timed=bool(times),
-        masks=masks if any(masks) else (),
+        masks=tuple(masks) if any(masks) else (),
     )
     require_shapes(listing)
+    _warn_of_unknown(path, content)
     return listing
+
+
+def _usable(
+    path: Path, frames: Sequence[dict[str, Any]], folder: Path
+) -> tuple[list[tuple[str, dict[str, Any]]], list[Path], list[Path | None], list[np.ndarray]]:
+    """Frames that can be used, with their labels, images, masks and poses.
+
+    A warning tells of those without an image or with a pose that is not finite.
+
+    Raises:
+        MissingSplitError: If no frame can be used.
+        SceneError: If others are wrong; it names all of them.
+    """
+    named: list[tuple[str, dict[str, Any]]] = []
+    paths: list[Path] = []
+    masks: list[Path | None] = []
+    poses: list[np.ndarray] = []
+    left_out, wrong = [], []
+    for index, frame in enumerate(frames):
+        label = f"{path}: frame {index} ({frame['file_path']})"
+        try:
+            image = image_path(label, folder, frame["file_path"])
+            pose = checked_pose(label, frame["transform_matrix"])
+            mask = frame.get("mask_path")
+            mask = None if mask is None else image_path(label, folder, mask, "mask_path")
+        except BrokenFrameError as problem:
+            left_out.append(str(problem))
+        except SceneError as problem:
+            wrong.append(str(problem))
+        else:
+            named.append((label, frame))
+            paths.append(image)
+            masks.append(mask)
+            poses.append(pose)
+    refuse_all(wrong)
+    if not named:
+        raise MissingSplitError(first_of(left_out))
+    if left_out:
+        warnings.warn(
+            f"{len(left_out)} of {len(frames)} frames are left out:\n{first_of(left_out)}",
+            stacklevel=5,
+        )
+    return named, paths, masks, poses
+
+
+def _with_height(camera: Calibration, keys: Mapping[str, Any], image: Path) -> Calibration:
+    """A camera whose pixels are not square where its two fields of view say so."""
+    angle = keys.get("camera_angle_y")
+    if camera.per_width is None or camera.fl_y is not None or not is_positive(angle):
+        return camera
+    if angle >= math.pi:
+        return camera
+    (height, width), _ = read_header(image)
+    across, down = camera.per_width * width, focal_length(angle, height)
+    if abs(down / across - 1) < SQUARE:
+        return camera
+    logger.info(
+        "%s: camera_angle_x and camera_angle_y give pixels that are %.3g times as high as wide",
+        *(image, across / down),
+    )
+    return replace(camera, per_width=None, fl_x=across, fl_y=down, w=width, h=height)
+
+
+def _warn_of_unknown(path: Path, content: Mapping[str, Any]) -> None:
+    """Warn of keys that are not read and may change what images or cameras mean."""
+    keys = {key for each in (content, *content["frames"]) for key in each}
+    given = {key for key in keys if any(each.get(key) for each in (content, *content["frames"]))}
+    if unknown := sorted(given - {*KNOWN, *IGNORED}):
+        warnings.warn(
+            f"{path}: keys that are not read are {', '.join(map(short, unknown))}. Where one of "
+            "them changes what the images or cameras mean, convert these and take the key out.",
+            stacklevel=5,
+        )
 
 
 def read_frames(path: Path) -> dict[str, Any]:
@@ -103,7 +203,7 @@ def read_frames(path: Path) -> dict[str, Any]:
     content = read_object(path, '"frames"')
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise SceneError(f'{path} lists no frames. Its key "frames" must hold at least one.')
+        raise MissingSplitError(f'{path} lists no frames. Its key "frames" must hold at least one.')
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise SceneError(f"{path}: frame {index} is {short(frame)}, not an object with keys.")

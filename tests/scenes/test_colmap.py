@@ -300,10 +300,18 @@ def test_times_are_the_last_numbers_in_names(tmp_path, caplog):
     ends = ["034_cam0.png", "036cam1.png", "044-Camera_2.png"]
     assert Capture(tmp_path / "ends", ends).views().times.tolist() == pytest.approx([0, 0.2, 1])
     bare = Capture(tmp_path / "bare", ["a.png", "b.png"])
-    bare.refused(r"a\.png has no number\. Set data\.time_pattern.*data\.times.*data\.static=true")
+    words = r"2 of 2 images have no number, such as a\.png: all images are taken for one timestep"
+    with pytest.warns(UserWarning, match=words):
+        assert bare.views().times.tolist() == [0, 0]
     assert bare.views(static=True).times.tolist() == [0, 0]
     same = Capture(tmp_path / "same", ["a_1_4k.png", "a_2_4k.png"])
-    same.refused("names of all 2 images, such as a_1_4k.png, give the number 4")
+    with pytest.warns(UserWarning, match=r"all 2 images, such as a_1_4k.png, give one number"):
+        assert same.views().times.tolist() == [0, 0]
+    hashes = [
+        f"{hash_}.png" for hash_ in ("3f2a9c", "b07d1e", "9e4410", "c5a8f2", "77e0b3", "0d1f6a")
+    ]
+    with pytest.warns(UserWarning, match=r"differ in more than their numbers.*data\.static=true"):
+        assert not Capture(tmp_path / "hashes", hashes).views().times.any()
     assert same.views(time_pattern=r"_(\d+)_").times.tolist() == [0, 1]
 
 

@@ -321,6 +321,13 @@ def test_settings_of_the_command_line(videos: Path) -> None:
             replace(settings, frames=frames)
 
 
+def test_a_camera_is_held_out_by_default(videos: Path, tmp_path: Path, caplog) -> None:
+    with caplog.at_level("INFO"):
+        scene = read(videos, test_cameras=None)
+    assert {file.split("/")[0] for file in scene.splits["test"].files} == {"cam00"}
+    assert "held out cam00 of the cameras cam00, cam01" in caplog.text
+
+
 def test_cameras_of_different_lengths_and_rates(videos: Path, tmp_path: Path, caplog) -> None:
     folder = tmp_path / "scene"
     folder.mkdir()

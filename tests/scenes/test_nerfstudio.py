@@ -469,7 +469,7 @@ def test_lenses_and_poses_of_many_cameras_stay_with_their_images(capture):
 def test_keys_that_are_not_read_are_named(capture):
     capture.content |= {"white_transparent": True, "n_extra_learnable_dims": 0, "aabb_scale": 4}
     capture.frames[2]["rolling_shutter"] = [1, 0, 0, 0]
-    with pytest.warns(UserWarning, match="not read are rolling_shutter, white_transparent"):
+    with pytest.warns(UserWarning, match="not read are 'rolling_shutter', 'white_transparent'"):
         capture.read()
 
 

@@ -3,6 +3,7 @@
 import csv
 import logging
 import re
+import warnings
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -167,6 +168,8 @@ class ColmapSettings(SceneSettings):
             return []
         if self.times is None:
             found = _numbers(names, labels, self.time_pattern)
+            if not found:
+                return []
             origin = "the numbers in their names"
         elif self.times == "rank":
             found = _ranks(names, present)
@@ -280,18 +283,20 @@ def _time_in(stem: str) -> str | None:
 
 
 def _numbers(names: Sequence[str], labels: Sequence[str], pattern: str | None) -> list[float]:
-    """The number in each name."""
+    """The number in each name; none, with a warning, where they tell no times."""
+    if pattern is None and (why := _no_series(names)):
+        warnings.warn(f"{why}: all images are taken for one timestep. {_OTHER_TIMES}", stacklevel=5)
+        return []
     found: list[float] = []
     for name, label in zip(names, labels, strict=True):
         if pattern is None:
             text = _time_in(PurePosixPath(name).stem)
-            wanted = "no number"
         else:
             match = re.search(pattern, name)
             text = None if match is None else match[1]
-            wanted = f"no number where data.time_pattern={pattern} has its group"
         number = None if text is None else _number(text)
         if number is None:
+            wanted = f"no number where data.time_pattern={pattern} has its group"
             raise SceneError(f"{label} has {wanted}. {_OTHER_TIMES}")
         found.append(number)
     if len(names) > 1 and len(set(found)) == 1:
@@ -300,6 +305,22 @@ def _numbers(names: Sequence[str], labels: Sequence[str], pattern: str | None) -
             f"for their time. {_OTHER_TIMES}"
         )
     return found
+
+
+def _no_series(names: Sequence[str]) -> str | None:
+    """Why names are not those of a series of images, such as hashes; None if they are."""
+    stems = [PurePosixPath(name).stem for name in names]
+    bare = [name for name, stem in zip(names, stems, strict=True) if _time_in(stem) is None]
+    if bare:
+        return f"The names of {len(bare)} of {len(names)} images have no number, such as {bare[0]}"
+    # All names of a series are equal but for their numbers.
+    kinds = {re.sub(r"\d+", "#", stem) for stem in stems}
+    if len(kinds) > max(4, len(names) // 2):
+        return f"The names of the images, such as {some(names)}, differ in more than their numbers"
+    numbers = {_time_in(stem) for stem in stems}
+    if len(names) > 1 and len(numbers) == 1:
+        return f"The names of all {len(names)} images, such as {names[0]}, give one number"
+    return None
 
 
 _OTHER_TIMES = (

@@ -38,7 +38,7 @@ LENSES: dict[str, tuple[int, LensModel, str]] = {
 }
 """COLMAP's camera models: their numbers in binary files, and their parameters in order."""
 
-MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
+MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "sparse_/0", "sparse_", "colmap/sparse")
 """Where sparse models are looked for. That in colmap/ is what transforms.json was made of."""
 
 UNIT_TOLERANCE = 1e-2

@@ -28,6 +28,9 @@ SHORTEST, LONGEST = 1e-3, 1e5
 FARTHEST_ASIDE, STRONGEST = 1e3, 1e6
 """Largest distance of a principal point, in sizes of the image, and largest coefficient."""
 
+MOST_FOLDED = 0.5
+"""Share of an image's pixels that a perspective lens may map no direction to."""
+
 SHAPE_TOLERANCE = 0.02
 """By how much the aspect ratio of an image may differ from that of its camera."""
 
@@ -460,7 +463,9 @@ def _require_real(
 
 
 def require_rays(label: str, lens: Calibration, shown: Tensor) -> None:
-    """Refuse images whose lens folds back inside them, or that show nothing at all.
+    """Refuse images most of which show nothing, as where their lens folds back inside them.
+
+    A warning tells of pixels that a perspective lens maps no direction to: they are left out.
 
     Args:
         label: The image, for messages.
@@ -472,6 +477,13 @@ def require_rays(label: str, lens: Calibration, shown: Tensor) -> None:
     """
     share = float((~shown).float().mean())
     if lens.model != LensModel.PERSPECTIVE and share < 1:
+        return
+    if share <= MOST_FOLDED:
+        warnings.warn(
+            f"{label}: its {lens.words} folds back inside the image: the {share:.1%} of the pixels "
+            "that no direction belongs to are left out.",
+            stacklevel=4,
+        )
         return
     row, column = (~shown).nonzero()[0].tolist()
     raise SceneError(

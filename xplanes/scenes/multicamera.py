@@ -71,7 +71,8 @@ class MultiCameraSettings(SceneSettings):
     """Synchronised videos of several fixed cameras."""
 
     frames: list[int] | None  # First frame, last frame and stride; null for all frames.
-    test_cameras: list[str]  # Names of the held-out cameras: scored, not trained on.
+    # Names of the held-out cameras: scored, not trained on. null: cam00, or else the most central.
+    test_cameras: list[str] | None
     video_camera: str | None  # Camera whose video the LRM sees; null: the most central one.
 
     def check(self) -> None:
@@ -157,7 +158,7 @@ def read_multicamera(
     resolution: int | None,
     splits: Sequence[str],
     frames: Sequence[int] | None = None,
-    test_cameras: Sequence[str] = (),
+    test_cameras: Sequence[str] | None = (),
     video_camera: str | None = None,
     views: int | None = None,
     eval_views: int | None = None,
@@ -172,6 +173,8 @@ def read_multicamera(
         frames: First frame, last frame and stride; None for all that every camera has. They get
             times from 0 to 1.
         test_cameras: Names of the cameras that make up the test split; all others are trained on.
+            None takes cam00, as is usual for Neural 3D Video, or else the most central camera; none
+            of fewer than three.
         video_camera: Camera whose frames are ``Scene.video``; the most central training camera when
             None.
         views: Number of views to keep of the train split, spread evenly over time; None keeps all.
@@ -394,10 +397,19 @@ def _source(label: str, folder: Path, name: Any) -> Path:
 
 
 def _split_cameras(
-    folder: Path, cameras: Sequence[Camera], test_cameras: Sequence[str]
+    folder: Path, cameras: Sequence[Camera], test_cameras: Sequence[str] | None
 ) -> dict[str, list[int]]:
     """Numbers of the cameras of each split."""
     names = [camera.name for camera in cameras]
+    if test_cameras is None:
+        places = np.stack([camera.pose[:3, 3] for camera in cameras])
+        central = int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmin())
+        chosen = "cam00" if "cam00" in names else names[central]
+        test_cameras = [chosen] if len(names) > 2 else []
+        logger.info(
+            "%s: held out %s of the cameras %s (data.test_cameras)",
+            *(folder, ", ".join(test_cameras) or "none", ", ".join(names)),
+        )
     for name in test_cameras:
         if name not in names:
             raise SceneError(
@@ -441,10 +453,10 @@ def _recording(camera: Camera) -> Recording:
         video = videos.read_header(camera.source)
         rate = None if video.rate is None else float(video.rate)
         return Recording(camera, video.size, video.count, rate)
-    images = sorted(
-        (path for path in camera.source.iterdir() if is_image(path)),
-        key=lambda path: natural(path.name),
-    )
+    images = _images_in(camera.source)
+    folders = [path for path in camera.source.iterdir() if path.is_dir() and path.name[0] != "."]
+    if not images and len(folders) == 1:  # Such as images/
+        images = _images_in(folders[0])
     if not images:
         raise SceneError(
             f"{camera.source} holds no images ({', '.join(ENDINGS)}). Add the frames of the "
@@ -458,6 +470,12 @@ def _recording(camera: Camera) -> Recording:
                 f"{sizes[0][1]}x{sizes[0][0]}. Export its frames alike."
             )
     return Recording(camera, sizes[0], len(images), None, tuple(images))
+
+
+def _images_in(folder: Path) -> list[Path]:
+    """Images of a folder, in the order of the numbers in their names."""
+    found = (path for path in folder.iterdir() if is_image(path))
+    return sorted(found, key=lambda path: natural(path.name))
 
 
 def _require_one_rate(recordings: Sequence[Recording]) -> None:

@@ -2,6 +2,7 @@
 
 import logging
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -334,15 +335,30 @@ def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) 
         )
     enough = {name: width for name, width in widths.items() if width >= (resolution or math.inf)}
     chosen = min(enough, key=enough.__getitem__) if enough else max(widths, key=widths.__getitem__)
+    # Where images of that scale are missing, another that is whole will do, the next larger first.
+    others = sorted(
+        widths, key=lambda name: (widths[name] < widths[chosen], abs(widths[name] - widths[chosen]))
+    )
+    whole = [name for name in others if not _missing(folder / "rgb" / name, names, SUFFIXES[1:])]
+    if whole and whole[0] != chosen:
+        lost = _missing(folder / "rgb" / chosen, names, SUFFIXES[1:])
+        warnings.warn(
+            f"{len(lost)} of {len(names)} images are not in {folder / 'rgb' / chosen}: "
+            f"{some(lost)}. Those of rgb/{whole[0]} are read.",
+            stacklevel=5,
+        )
+        return whole[0]
     _require_files(folder / "rgb" / chosen, names, SUFFIXES[1:])
     return chosen
 
 
+def _missing(folder: Path, names: Sequence[str], ends: Sequence[str]) -> list[str]:
+    """Names of which a folder has no file."""
+    return [name for name in names if not any((folder / f"{name}{end}").is_file() for end in ends)]
+
+
 def _require_files(folder: Path, names: Sequence[str], ends: Sequence[str]) -> None:
-    missing = [
-        name for name in names if not any((folder / f"{name}{end}").is_file() for end in ends)
-    ]
-    if missing:
+    if missing := _missing(folder, names, ends):
         raise SceneError(
             f"{len(missing)} of {len(names)} files are not in {folder}: {some(missing)} "
             f"({' or '.join(ends)}). {DOWNLOAD}"

@@ -1,5 +1,6 @@
 """`python train.py` as a user types it."""
 
+import itertools
 import json
 import os
 import shlex
@@ -18,9 +19,9 @@ from omegaconf import OmegaConf
 from tests import warm
 from tests.training.runs import SMALL
 from tests.warm import train
-from xplanes import launch
+from xplanes import SceneDataModule, launch
 from xplanes import run as whole_run
-from xplanes.config import CONF, quoted
+from xplanes.config import CONF, quoted, unquoted, with_names
 from xplanes.errors import ConfigError
 from xplanes.launch import SettingsCheck, file_name, prepare
 from xplanes.process import resume_command
@@ -257,8 +258,47 @@ def test_names_of_scenes_may_look_like_numbers() -> None:
             config = compose("train", prepare([f"data.scene={name}", f"data.root={name}"]))
         assert (config.data.scene, config.data.root) == (name, name)
     assert prepare(["-m", "data.scene=001,lego,1_0"]) == ["-m", "data.scene='001',lego,'1_0'"]
-    for plain in ("data.scene=lego", "data.scene='1'", "seed=1_0", "data.scene=[1,2]"):
-        assert prepare([plain]) == [plain]
+    plain = ("data.scene=lego", "data.scene='1'", "seed=1_0", "data.scene=[1,2]", "data.scene=a,b")
+    for text in (*plain, "data.scene=choice(a,b)", "data.masks=null", "data.root=${oc.env:HOME}"):
+        assert prepare([text]) == [text]
+
+
+HARD = (
+    *("/home/josé/x", "李明", "a b", "take (1)", "a=b", "it's", 'say "x"', "a,b", "50%", "x:y"),
+    *("[x]", "{x}", "a#b", "a\\\\b", "ends\\\\", "é'", "$x", "!x", "&", ";", "null-x", "True"),
+)
+"""Names that a file system allows and a grammar may not."""
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_any_path_can_be_given(name: str, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    if name[0] in "[{":
+        name = f"x/{name}"
+    keys = ("data.root", "data.cache", "resume", "hydra.run.dir")
+    given = [f"{key}={name}" for key in keys if key != "resume"]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("train", prepare(given), return_hydra_config=True)
+        assert compose("train", [with_names(f"resume={name}")]).resume == name
+    assert (config.data.root, config.data.cache) == (name, name)
+    assert config.hydra.run.dir == name
+    assert unquoted(quoted(name)) == name
+
+
+def test_quotes_keep_any_text() -> None:
+    for length in range(1, 5):
+        for text in map("".join, itertools.product("\\\\'\"a ", repeat=length)):
+            assert unquoted(quoted(text)) == text
+
+
+def test_home_is_expanded(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    assert with_names("data.root=~/my captures") == f"data.root='{tmp_path}/my captures'"
+    assert with_names("resume=~/runs/a") == f"resume={tmp_path}/runs/a"
+    assert with_names("data.scene=~/a,~/b", several=True) == f"data.scene={tmp_path}/a,{tmp_path}/b"
+    data = SceneDataModule.compose("data=blender", "data.root='~/a'", "data.scene=b")
+    assert data.settings.folder == tmp_path / "a" / "b"
 
 
 def test_the_configuration_of_an_experiment_is_shown_as_hydra_shows_it(tmp_path: Path) -> None:

@@ -17,10 +17,12 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / 
 CHOICES = ("experiment", "entry", "recipe", "scale")
 """Groups whose files set keys of other groups."""
 
-NAMES = ("data.root", "data.scene")
-"""Settings whose values are names, even where they look like numbers."""
-
-_NUMBER = re.compile(r"[+-]?[\d._]+(?:[eE][+-]?\d+)?")
+NAMES = (
+    *("data.root", "data.scene", "data.cache", "data.masks", "data.images", "data.model"),
+    *("data.times", "lrm.weights", "lrm.config", "lrm.triplanes", "preparation.cache"),
+    *("resume", "hydra.run.dir", "hydra.sweep.dir"),
+)
+"""Settings whose values are names or paths, whatever they look like."""
 
 _PLAIN = re.compile(r"(?!\.\d)[A-Za-z_./][A-Za-z0-9_./-]*")
 """Text that Hydra reads as it is; other letters it takes in quotes alone."""
@@ -123,18 +125,44 @@ def quoted(text: str) -> str:
     """Text as Hydra reads it in an override."""
     if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
         return text
-    escaped = re.sub(r"(\\*)'", r"\1\1\'", text)
+    # Backslashes count only before a quote, and the closing one is a quote, too.
+    escaped = re.sub(r"(\\+)$", r"\1\1", re.sub(r"(\\*)'", r"\1\1\'", text))
     return f"'{escaped}'"
 
 
-def with_names(override: str) -> str:
-    """An override, in quotes where Hydra would make a number of a name: 2024_05_01 is 20240501."""
+def unquoted(text: str) -> str:
+    """The value of an override as text: what `quoted` was given, if it was quoted."""
+    if text[:1] not in ("'", '"'):
+        return text
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    return str(OverridesParser.create().parse_override(f"key={text}").value())
+
+
+def with_names(override: str, *, several: bool = False) -> str:
+    """An override whose name or path Hydra reads as it stands, with ``~`` as the user's folder.
+
+    Hydra would make a number of 2024_05_01, and refuse accents, spaces and brackets.
+
+    Args:
+        override: ``key=value``, or anything else, which stays as it is.
+        several: Whether a comma separates values, as in a multirun.
+    """
     key, equals, value = override.partition("=")
-    names = value.split(",")
-    if not equals or key.lstrip("+~") not in NAMES or not any(map(_NUMBER.fullmatch, names)):
+    if not equals or key.lstrip("+~") not in NAMES:
         return override
-    found = [f"'{name}'" if _NUMBER.fullmatch(name) else name for name in names]
-    return f"{key}={','.join(found)}"
+    if value[:1] in ("'", '"', "[", "{") or "${" in value or value.lower() in ("", "null"):
+        return override
+    if "(" in value and re.fullmatch(r"(choice|range|interval|glob|sort|shuffle)\(.*\)", value):
+        return override
+    if "," in value and not several and key.lstrip("+~") == "data.scene":
+        return override  # Hydra says that a list of scenes needs --multirun.
+    parts = value.split(",") if several else [value]
+    return f"{key}={','.join(quoted(_at_home(part)) for part in parts)}"
+
+
+def _at_home(path: str) -> str:
+    return str(Path(path).expanduser()) if path.startswith("~") else path
 
 
 def near_names(

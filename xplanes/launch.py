@@ -20,7 +20,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from xplanes import __version__
-from xplanes.config import CONF, near_names, quoted, to_plain, with_names
+from xplanes.config import CONF, near_names, quoted, to_plain, unquoted, with_names
 from xplanes.errors import ConfigError
 from xplanes.files import StorageError, read_json, require_writable
 
@@ -195,24 +195,25 @@ def prepare(arguments: list[str]) -> list[str]:
         ConfigError: If the run cannot be resumed.
         StorageError: If the folder of the run cannot be written.
     """
-    arguments = [with_names(text) for text in arguments]
+    several = _is_multirun(arguments)
+    arguments = [with_names(text, several=several) for text in arguments]
     values = {key: value for key, value in map(_split, arguments) if key}
     for key, value in values.items():
         if value in ("null", "None") and (CONF / key).is_dir():
             names = ", ".join(sorted(path.stem for path in (CONF / key).glob("*.yaml")))
             raise ConfigError(f"{key}={value}: must be one of {names}")
-    resume = values.get("resume", "null").strip("\"'")
+    resume = unquoted(values.get("resume", "null"))
     if resume in ("null", "", "None", "auto"):
         # Before Hydra makes the folder, whose errors are tracebacks.
-        place = "hydra.sweep.dir" if _is_multirun(arguments) else "hydra.run.dir"
-        require_writable(Path(values.get(place, "outputs").strip("\"'")))
+        place = "hydra.sweep.dir" if several else "hydra.run.dir"
+        require_writable(Path(unquoted(values.get(place, "outputs"))))
     if not resume or resume in ("null", "None") or "resume" not in values:
         return arguments
     folder = values.get("hydra.run.dir")
     if folder is not None:
-        folder = folder.strip("\"'")  # As Lightning hands it on to the other processes of a run.
+        folder = unquoted(folder)  # As Lightning hands it on to the other processes of a run.
     if resume == "auto":
-        if _is_multirun(arguments):
+        if several:
             return arguments
         own = [a for a in arguments if not a.startswith("resume=")]
         found = Path(folder) if folder else _latest(Path("outputs"), own)
@@ -220,7 +221,7 @@ def prepare(arguments: list[str]) -> list[str]:
             print("resume=auto: no unfinished run with these settings, so a new one begins")
             return [*own, "resume=null"]
         resume = str(found)
-    if _is_multirun(arguments):
+    if several:
         raise ConfigError(f"resume={resume} with --multirun: resume one run at a time, or auto")
     if folder is not None and Path(folder).resolve() != Path(resume).resolve():
         raise ConfigError(

@@ -43,7 +43,7 @@ class BundledLRMSettings(ImageLRMSettings):
         if self.weights is None:
             model, path = load_bundled(self.bundled)
         else:
-            own = Path(self.weights)
+            own = Path(self.weights).expanduser()
             if own.suffix != ".safetensors" or not own.is_file():
                 raise LRMError(
                     f"{own} is no file that ends in .safetensors: name one that xplanes "
@@ -78,8 +78,8 @@ class PublishedLRMSettings(ImageLRMSettings):
             revision=self.revision,
             licence=self.licence,
             megabytes=self.megabytes,
-            weights=None if self.weights is None else Path(self.weights),
-            config=None if self.config is None else Path(self.config),
+            weights=None if self.weights is None else Path(self.weights).expanduser(),
+            config=None if self.config is None else Path(self.config).expanduser(),
         )
 
     def load_model(self, say: Callable[[str], None]) -> LoadedLRM:
@@ -127,9 +127,9 @@ class TriplaneFileSettings(InitialiserSettings):
     def load(self, say: Callable[[str], None] = print) -> "FileInitialiser":
         if self.triplanes is None:
             raise ConfigError("lrm=file needs lrm.triplanes=FILE, a file written by save_triplanes")
-        if not Path(self.triplanes).is_file():
+        if not Path(self.triplanes).expanduser().is_file():
             raise ConfigError(f"lrm.triplanes={self.triplanes}: there is no such file")
-        return FileInitialiser(Path(self.triplanes))
+        return FileInitialiser(Path(self.triplanes).expanduser())
 
 
 class FileInitialiser(Initialiser):
@@ -163,7 +163,7 @@ def cache_of(method: Method, place: Place) -> StageCache:
             f"{place.devices}: the processes share the initialisation through the cache; name a "
             "folder"
         )
-    cache = StageCache(None if folder is None else Path(folder))
+    cache = StageCache(None if folder is None else Path(folder).expanduser())
     if place.devices > 1 and not cache.writable:
         raise ConfigError(
             f"preparation.cache={folder} cannot be written, and the {place.devices} processes "

@@ -77,12 +77,12 @@ class SceneSettings(Settings, ABC):
     @property
     def folder(self) -> Path:
         """The scene's folder."""
-        return Path(self.root) / self.scene
+        return Path(self.root).expanduser() / Path(self.scene).expanduser()
 
     @property
     def image_cache(self) -> Path | None:
         """Folder for decoded images; None for the user's cache folder."""
-        return None if self.cache is None else Path(self.cache)
+        return None if self.cache is None else Path(self.cache).expanduser()
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:

@@ -310,7 +310,7 @@ class ProceduralSettings(SceneSettings, ABC):
     @property
     def folder(self) -> Path:
         return type(self).ensure(
-            Path(self.root),
+            Path(self.root).expanduser(),
             self.scene,
             resolution=self.resolution or 128,
             seed=self.seed,

@@ -123,6 +123,17 @@ def test_other_commands_of_the_pages_parse() -> None:
         assert build_parser(further_commands()).parse_args(arguments), arguments
 
 
+def test_shells_leave_the_commands_of_the_pages_alone() -> None:
+    # zsh, the shell of every Mac, takes brackets, braces, * and ? outside of quotes for file names.
+    for page in PAGES:
+        for line in page.read_text(encoding="utf-8").splitlines():
+            if not re.match(r"    (\w+=\S+ )*(python|xplanes) ", line):
+                continue
+            words = line.partition("   #")[0]
+            bare = re.sub(r"\"[^\"]*\"|'[^']*'|\$\{?\w+\}?", "", words)
+            assert not re.search(r"[\[\]{}*?()]", bare), f"{page.name}: {line}"
+
+
 KEY = re.compile(
     r"`\+?((?:data|model|lrm|preparation|decomposition|trainer|callbacks|logger)"
     r"(?:\.\w+)+)(?:=[^`]*)?`"

@@ -3,15 +3,19 @@
 import json
 import subprocess
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from lightning.pytorch.loggers import TensorBoardLogger
 
 from tests.training.runs import small_config
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.launch import prepare
 from xplanes.run import run
+from xplanes.training.logs import forget_later
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -239,3 +243,26 @@ def test_the_header_estimates_time_and_the_end_says_what_memory_it_took(
     peak = json.loads((tmp_path / "run" / "metrics.json").read_text())["peak_memory_bytes"]
     assert f"memory   {peak / 2**30:.1f} GB" in printed.split("step 3/3")[1]
     assert printed.index("estimate") < printed.index("step 3/3")
+
+
+def test_tensorboard_drops_what_a_run_that_was_cut_off_has_left(tmp_path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    def trainer():
+        log = TensorBoardLogger(str(tmp_path), name="", version="tb")
+        return SimpleNamespace(loggers=[log]), log
+
+    _, first = trainer()
+    for step in (10, 20, 30):
+        first.log_metrics({"loss": float(step)}, step)
+    first.experiment.close()
+    time.sleep(1.1)  # Event files are read in the order of the seconds in their names.
+    goes_on, second = trainer()
+    forget_later(goes_on, 20)
+    for step in (30, 40):
+        second.log_metrics({"loss": 100.0 + step}, step)
+    second.experiment.close()
+    events = EventAccumulator(str(tmp_path / "tb"))
+    events.Reload()
+    found = [(event.step, event.value) for event in events.Scalars("loss")]
+    assert found == [(10, 10.0), (20, 20.0), (30, 130.0), (40, 140.0)]

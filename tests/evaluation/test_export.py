@@ -142,11 +142,28 @@ def test_a_ball_comes_out_where_it_is_in_the_world(tmp_path: Path, form: str):
         mesh = trimesh.load(folder / name, force="mesh")
         mesh.merge_vertices()
         centre = FRAME.to_world(Ball.centre(time)).numpy()
+        if form == "glb":  # Whose y axis points up.
+            centre = centre[[0, 2, 1]] * [1, 1, -1]
         distance = np.linalg.norm(mesh.vertices - centre, axis=1)
         assert np.abs(mesh.bounds.mean(axis=0) - centre).max() < 0.5 * texel
         assert np.abs(distance - Ball.RADIUS / FRAME.scale).max() < texel
         assert mesh.is_watertight
         assert mesh.volume > 0
+
+
+@pytest.mark.parametrize("what", ["mesh", "points"])
+def test_glb_files_are_matt_and_leave_the_world_to_a_node(tmp_path: Path, what: str):
+    options = ExportOptions(what, times="0,1", resolution=24, form="glb")
+    folder = export(set_up(tmp_path, Ball(500.0, 0.002)), options, say=quiet)
+    content = (folder / f"{what}_0000.glb").read_bytes()
+    tree = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    (primitive,) = (each for mesh in tree["meshes"] for each in mesh["primitives"])
+    surface = tree["materials"][primitive["material"]]["pbrMetallicRoughness"]
+    assert (surface["metallicFactor"], surface["roughnessFactor"]) == (0, 1)
+    assert "COLOR_0" in primitive["attributes"]
+    (node,) = (node for node in tree["nodes"] if "mesh" in node)
+    turn = np.array(node["matrix"]).reshape(4, 4).T
+    assert (turn[:3, :3] @ [0, 0, 1]).round(6).tolist() == [0, 1, 0]
 
 
 @pytest.mark.parametrize(("density", "softness"), [(500.0, 0.002), (60.0, 0.02), (6.0, 0.05)])

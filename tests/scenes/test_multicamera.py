@@ -2,6 +2,7 @@
 
 import json
 import logging
+import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -23,13 +24,14 @@ from xplanes.optional import MissingExtraError
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.fixed_view import fixed_view
 from xplanes.scenes import store
+from xplanes.scenes import videos as recordings
 from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.multicamera import read_cameras, read_multicamera
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Views
 
-pytest.importorskip("av")
+av = pytest.importorskip("av")
 imageio = pytest.importorskip("imageio.v2")
 
 CAMERAS, FRAMES, SIZE = 4, 6, 48
@@ -422,3 +424,17 @@ def test_cameras_of_images_need_no_pyav(tmp_path: Path, monkeypatch, videos: Pat
     assert len(read(folder).splits["train"]) == 3 * FRAMES
     with pytest.raises(MissingExtraError, match=r'pip install "xplanes\[video\]"'):
         read(videos)
+
+
+def test_frames_that_an_edit_list_hides_are_not_counted(tmp_path: Path) -> None:
+    whole, cut = tmp_path / "whole.mp4", tmp_path / "cut.mp4"
+    write_video(whole, np.stack([np.full((32, 32, 3), 8 * i, np.uint8) for i in range(30)]))
+    tool = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    command = [tool, "-loglevel", "error", "-ss", "0.5", "-i", whole, "-c", "copy", cut]
+    subprocess.run([str(word) for word in command], check=True)
+    with av.open(str(cut)) as container:
+        assert container.streams.video[0].frames > 15, "frames before the cut are still there"
+    count = recordings.read_header(cut).count
+    assert count == 15
+    shown = [int(frame.mean()) for frame in recordings.frames(cut, range(count))]
+    assert shown == pytest.approx([8 * i for i in range(15, 30)], abs=2)

@@ -45,6 +45,10 @@ PLATEAU = 0.001
 """Intersections over union that differ by less count as equal."""
 
 
+Z_UP_TO_Y_UP = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
+"""Turns a world whose z axis points up, as this program's, into one whose y axis does."""
+
+
 @dataclass(frozen=True)
 class ExportOptions:
     """What to export.
@@ -260,9 +264,30 @@ def _write_each(
         else:
             found = trimesh.Trimesh(world, mesh.faces, vertex_colors=pixels, process=False)
         with replacing(path) as temporary:
-            scene = trimesh.Scene(found) if options.form == "glb" else found
-            temporary.write_bytes(scene.export(file_type=options.form))
+            temporary.write_bytes(
+                _glb(found) if options.form == "glb" else found.export(file_type="ply")
+            )
         yield path
+
+
+def _glb(geometry: Any) -> bytes:
+    """A GLB that viewers show upright and matt.
+
+    The standard's y axis points up, the world's z axis does; without a material, surfaces would be
+    of metal, black where nothing is reflected.
+    """
+    trimesh = require("trimesh", extra="export")
+    scene = trimesh.Scene()
+    scene.add_geometry(geometry, transform=Z_UP_TO_Y_UP)
+
+    def matt(tree: dict[str, Any]) -> None:
+        plain = {"baseColorFactor": [1.0] * 4, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+        tree["materials"] = [{"pbrMetallicRoughness": plain}]
+        for mesh in tree["meshes"]:
+            for primitive in mesh["primitives"]:
+                primitive["material"] = 0
+
+    return scene.export(file_type="glb", tree_postprocessor=matt)
 
 
 def _linear(colours: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """Frames of video files, decoded with PyAV (extra `video`)."""
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -17,6 +18,10 @@ SUFFIXES = """.mp4 .mov .m4v .mkv .webm .avi .mpg .mpeg .ts .mts .m2ts .3gp .wmv
 """Suffixes of files that are taken for videos."""
 
 
+HDR = {16: "PQ", 18: "HLG"}
+"""Transfer characteristics of HDR videos, by their numbers in ITU-T H.273."""
+
+
 @dataclass(frozen=True)
 class Video:
     """What a video file says about itself.
@@ -24,7 +29,7 @@ class Video:
     Attributes:
         path: The file.
         size: Height and width of its frames.
-        count: Number of its frames.
+        count: Number of the frames that it shows.
         rate: Frames per second; None where the file does not tell.
     """
 
@@ -45,8 +50,18 @@ def read_header(path: Path) -> Video:
     try:
         with av.open(str(path)) as container:
             stream = _stream(path, container)
-            # Not every container tells; counting packets decodes none.
-            count = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
+            # Not every container tells, and those of MP4 tell of frames that its edit list hides.
+            # Counting packets decodes none.
+            count = 0 if "mp4" in container.format.name else stream.frames
+            count = count or sum(
+                packet.size > 0 and not packet.is_discard for packet in container.demux(stream)
+            )
+            if (curve := stream.codec_context.color_trc) in HDR:
+                warnings.warn(
+                    f"{path} is an HDR video ({HDR[curve]}): its colours look pale where they are "
+                    "taken for ordinary ones. Convert it to SDR (tone mapping) before.",
+                    stacklevel=4,
+                )
             size = (stream.codec_context.height, stream.codec_context.width)
             return Video(path, size, count, stream.average_rate)
     except av.FFmpegError as problem:

@@ -16,6 +16,7 @@ from xplanes.errors import ConfigError
 from xplanes.files import read_rows, write_rows
 from xplanes.rendering.pictures import plane_sheet, strip, write_png
 from xplanes.training.clock import off_clock, training_seconds
+from xplanes.training.logs import forget_later
 from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore, mean
 
@@ -93,6 +94,8 @@ class Evaluation(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, RadianceModule)
         trainer.val_check_batch = sys.maxsize
+        if trainer.global_step and trainer.is_global_zero:
+            forget_later(trainer, trainer.global_step)
         passed = sum(share <= pl_module.progress for share in self.at)
         # Stopped while it scored, a run scores again; with more of a budget, less of it is passed.
         self._passed = passed if self._passed is None else min(self._passed, passed)

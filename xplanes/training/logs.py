@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from lightning import Trainer
+from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
 from xplanes.streams import TrainingState
@@ -19,6 +20,24 @@ def logs_now(trainer: Trainer) -> bool:
     # As the Trainer counts, for which a module that was loaded begins again.
     batch = trainer.fit_loop.epoch_loop.total_batch_idx + 1
     return bool(every and not batch % every and trainer.loggers)
+
+
+def forget_later(trainer: Trainer, step: int) -> None:
+    """Let TensorBoard drop the points after a step, which a run that was cut off has left.
+
+    Args:
+        trainer: Has the loggers.
+        step: Where the run goes on.
+    """
+    for log in trainer.loggers:
+        if isinstance(log, TensorBoardLogger):
+            from tensorboard.compat.proto.event_pb2 import (  # pyright: ignore
+                Event,  # pyright: ignore[reportAttributeAccessIssue]
+                SessionLog,  # pyright: ignore[reportAttributeAccessIssue]
+            )
+
+            begins = Event(session_log=SessionLog(status=SessionLog.START))
+            log.experiment.file_writer.add_event(begins, step + 1)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def log_terms(module: "RadianceModule", terms: Mapping[str, Tensor], state: TrainingState) -> None:

@@ -304,7 +304,8 @@ def ranks(folder: Path) -> str:
 def section(name: str, work: Path) -> list[str]:
     """The lines of a sweep."""
     sweep, folder = SWEEPS[name], OUT / name
-    lines = [sweep.title, "", f"    python train.py {' '.join(sweep.given)}", ""]
+    given = " ".join(f'"{word}"' if "[" in word else word for word in sweep.given)
+    lines = [sweep.title, "", f"    python train.py {given}", ""]
     lines += [sweep.text, ""] if sweep.text else []
     if name == "rank":
         lines += [ranks(work / name), ""]

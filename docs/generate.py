@@ -375,9 +375,9 @@ reloads.
 
 ::: xplanes.decomposition.rpca.RobustPCA
 
-::: xplanes.decomposition.decompose.decompose
+::: xplanes.decomposition.rpca.decompose
 
-::: xplanes.decomposition.decompose.Decomposition
+::: xplanes.decomposition.rpca.Decomposition
 
 ::: xplanes.decomposition.conversion.space_planes
 

@@ -118,7 +118,7 @@ COMPOSITIONS = [
 """What is composed, so that every option is in it."""
 
 TINY_MODELS = {
-    "XPlanesSettings": ("model.resolution=6", "model.channels=2", "model.decoder.width=8"),
+    "XPlanesSettings": ("model.resolution=6", "model.channels=8", "model.decoder.width=8"),
     "KPlanesSettings": (
         *("model.resolution=4", "model.scales=[1,2]", "model.channels=2", "model.width=16"),
     ),

@@ -6,7 +6,7 @@
 Writes results/decomposition_speed.md, .png and two .csv beside this file; what is not measured this
 time keeps its rows. Parts: reference (first, once per matrix: long, float64), then svd (the paper's
 ADMM with a full singular value decomposition), gram (the same with the Gram matrix), and the
-package's adaptive, growing and admm: errors after so many iterations, tolerance 1e-5. Then clock:
+package's adaptive and admm: errors after so many iterations, tolerance 1e-5. Then clock:
 all methods in turn, several rounds, the least time of each, because other work on the machine only
 ever adds to it.
 """
@@ -24,11 +24,11 @@ from decomposition_speed_report import CLOCK, TABLE, report
 from torch import Tensor
 
 from xplanes.decomposition import RobustPCA, robust_pca
-from xplanes.decomposition.svt import Step, Workspace, iterate, shrinkage_from_gram, start
+from xplanes.decomposition.admm import Step, Workspace, iterate, shrinkage_from_gram, start
 from xplanes.files import read_rows, write_rows
 
-PARTS = ("reference", "svd", "gram", "adaptive", "growing", "admm", "clock")
-CLOCKED = {"svd": (1, 3), "gram": (1, 3), "admm": (8, 24), "growing": (8, 24), "adaptive": (8, 24)}
+PARTS = ("reference", "svd", "gram", "adaptive", "admm", "clock")
+CLOCKED = {"svd": (1, 3), "gram": (1, 3), "admm": (8, 24), "adaptive": (8, 24)}
 FIELDS = (
     *("frames", "weight", "part", "iterations", "seconds"),
     *("residual", "objective", "low_rank", "sparse", "rank"),

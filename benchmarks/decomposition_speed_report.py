@@ -14,7 +14,6 @@ NAMES = {
     "svd": "(a) paper's ADMM, full SVD",
     "gram": "(b) paper's ADMM, Gram matrix",
     "admm": "paper's ADMM, fused passes",
-    "growing": "growing penalty (inexact ALM)",
     "adaptive": "default (adaptive)",
 }
 TARGETS = (

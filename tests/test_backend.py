@@ -47,7 +47,7 @@ total, _ = composite(torch.rand(4), torch.rand(4, 3), torch.rand(4), nothing, no
 assert total.isfinite().all()
 print(backend.name(torch.device("cpu")))
 try:
-    backend.gpu_module("xplanes.fields.gpu")
+    backend.gpu_module("xplanes.fields.lookup_triton")
     print("loaded")
 except ModuleNotFoundError as error:
     print(error.name)
@@ -108,8 +108,8 @@ nothing = torch.zeros(4, dtype=torch.long)
 total, _ = composite(torch.rand(4), torch.rand(4, 3), torch.rand(4), nothing, nothing[:1])
 assert total.isfinite().all()
 print(backend.name(torch.device("cpu")))
-wings = "baselines.gaussians.rasteriser_numba", "synthetic.pretraining.cpu"
-for name in ("fields.cpu", "rendering.cpu", *wings):
+wings = "baselines.gaussians.rasteriser_numba", "synthetic.pretraining.solids_numba"
+for name in ("fields.lookup_numba", "rendering.rays_numba", *wings):
     importlib.import_module(f"xplanes.{name}")
 """
 

@@ -14,9 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from xplanes.cli import build_parser, further_commands
+from xplanes.cli import build_parser
 from xplanes.config import compose_plain, near_names
 from xplanes.experiment import Experiment
+from xplanes.synthetic.pretraining.commands import add_commands
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -120,7 +121,7 @@ def test_other_commands_of_the_pages_parse() -> None:
     others = [words for words in commands() if words[:1] != ["train"]]
     assert len(others) > 12
     for arguments in others:
-        assert build_parser(further_commands()).parse_args(arguments), arguments
+        assert build_parser([add_commands]).parse_args(arguments), arguments
 
 
 def test_shells_leave_the_commands_of_the_pages_alone() -> None:

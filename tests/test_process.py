@@ -30,7 +30,7 @@ def test_who_has_no_home_gets_one_that_takes_no_folders(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "command", [("train.py", "hydra.run.dir=run"), ("xplanes/__main__.py", "score-lrm", "tiny")]
+    "command", [("train.py", "hydra.run.dir=run"), ("xplanes/__main__.py", "evaluate", "run")]
 )
 def test_commands_set_it_before_torch_reads_it(command, tmp_path):
     code = f"""

@@ -55,6 +55,7 @@ def test_commands_work_from_an_empty_folder(installed: Path, tmp_path: Path) -> 
     assert Path(found.strip()) == installed / "xplanes" / "__init__.py"
     composed = xplanes("train", "model=nine_planes", "lrm=xlarge", "--cfg", "job")
     assert "architecture: openlrm-large-1.1" in composed
+    assert "pretrain-lrm" in xplanes("--help")
     printed = xplanes("train", *SMALL, "trainer.max_steps=5", "hydra.run.dir=outputs/run")
     assert "psnr" in printed
     assert "xplanes train resume=" in printed

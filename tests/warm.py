@@ -24,8 +24,8 @@ from xplanes.process import defaults
 ROOT = Path(__file__).resolve().parent.parent
 
 HEAVY = (
-    *("torch.utils.tensorboard.writer", "xplanes.fields.cpu", "xplanes.run"),
-    "xplanes.rendering.cpu",
+    *("torch.utils.tensorboard.writer", "xplanes.fields.lookup_numba", "xplanes.run"),
+    "xplanes.rendering.rays_numba",
 )
 
 

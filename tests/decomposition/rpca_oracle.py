@@ -1,6 +1,7 @@
-"""Independent float64 references for the decomposition, written from the formulas alone."""
+"""Independent references for the decomposition, written from the formulas alone."""
 
 import numpy as np
+import torch
 
 
 def oracle(matrix, weight, penalty=None, iterations=3000, stop=1e-11):
@@ -31,3 +32,21 @@ def objective(low, matrix, weight):
 def relative(value, truth):
     value = np.asarray(value, dtype=np.float64)
     return np.linalg.norm(value - truth) / max(np.linalg.norm(truth), 1e-300)
+
+
+def singular_value_threshold(matrix, threshold):
+    """The matrix with its singular values shrunk (the paper's Eq. 24-25), and its rank."""
+    left, singular, right = torch.linalg.svd(matrix, full_matrices=False)
+    shrunk = (singular - threshold).clamp_min(0)
+    return (left * shrunk) @ right, int((shrunk > 0).sum())
+
+
+def plain_admm(matrix, *, weight, penalty, iterations):
+    """Algorithm 1 of the paper as it is printed: low-rank part, sparse part and rank."""
+    multiplier, sparse = torch.zeros_like(matrix), torch.zeros_like(matrix)
+    for _ in range(iterations):
+        low, rank = singular_value_threshold(matrix - sparse - multiplier / penalty, 1 / penalty)
+        argument = matrix - low - multiplier / penalty
+        sparse = argument.sign() * (argument.abs() - weight / penalty).clamp_min(0)
+        multiplier = multiplier + penalty * (low + sparse - matrix)
+    return low, sparse, rank

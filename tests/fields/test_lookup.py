@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.oracles import plane_features as oracle
-from xplanes.fields import cpu
+from xplanes.fields import lookup_numba as cpu
 from xplanes.fields.lookup import plane_features, plane_features_reference, time_plane_axes
 from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES
 
@@ -291,7 +291,7 @@ MANY_THREADS = """
 import torch
 from tests.fields.test_lookup import both, scattered, stacks
 from xplanes.backend import threads
-from xplanes.fields import cpu
+from xplanes.fields import lookup_numba as cpu
 
 shared = set()
 for plane_set in ("three", "six", "nine"):

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from xplanes.decomposition.decompose import check_triplanes
+from xplanes.decomposition.rpca import check_triplanes
 from xplanes.fields.lookup import Rows
 from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 

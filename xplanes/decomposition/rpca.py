@@ -1,20 +1,25 @@
-"""Robust PCA: a matrix as the sum of a low-rank and a sparse matrix."""
+"""Robust PCA: a matrix, or a triplane sequence, as a low-rank plus a sparse part."""
 
 import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from xplanes.decomposition.reference import plain_admm
-from xplanes.decomposition.schedule import SCHEDULES
-from xplanes.decomposition.solver import CHANGE_OVER_TOLERANCE, Progress, minimise
-from xplanes.decomposition.svt import block_rows
+from xplanes.decomposition.admm import (
+    CHANGE_OVER_TOLERANCE,
+    SCHEDULES,
+    Progress,
+    block_rows,
+    minimise,
+)
 
-METHODS = (*SCHEDULES, "exact")
+ORIENTATIONS = ("xy", "xz", "yz")
+METHODS = tuple(SCHEDULES)
 SCALES = ("rms", "none")
 
 
@@ -29,7 +34,7 @@ class RobustPCA:
         iterations: Iterations made.
         residual: ``|L + S - Y| / |Y|``, Frobenius norms, measured on the result.
         converged: Whether the tolerance was reached within the maximum number of iterations.
-        change: Relative step size at the last check (see ``solver.Progress``). A small residual
+        change: Relative step size at the last check (see ``admm.Progress``). A small residual
             with a large change means that the split is feasible but not yet optimal.
         sparsity: Share of non-zero entries in S.
         low_rank_energy: ``|L|^2 / |Y|^2``.
@@ -93,15 +98,13 @@ def robust_pca(
             in float32. [M, T]
         sparsity_weight: Weight of S, above 0; "auto" is ``1 / sqrt(max(M, T))`` (Candes et al.
             2011).
-        penalty: Penalty of ADMM, above 0; the initial one for "adaptive", unused by "growing".
+        penalty: Penalty of ADMM, above 0; the initial one for "adaptive".
         tolerance: Bound on ``|L + S - Y| / |Y|``, above 0; "adaptive" also requires a relative step
             below ten times this. float32 cannot reach much below 1e-6.
         max_iterations: Maximum number of iterations, at least 1. A warning is given if they do not
             suffice.
         method: "adaptive" (over-relaxed ADMM with a balanced penalty that then grows no faster
-            than the split converges), "growing" (inexact ALM, Lin et al. 2010, growth 1.2: fastest
-            to a small residual, but the split is slightly off), "admm" (the paper's Algorithm 1),
-            "exact" (Algorithm 1 with a full singular value decomposition: the slow reference).
+            than the split converges) or "admm" (the paper's Algorithm 1).
         scale: Unit of Y for the penalty: "rms" (root mean square) or "none" (1).
         progress: Show a progress bar after two seconds.
         out: Output tensors for L and S, with the computation type and layout of the matrix; new
@@ -132,23 +135,14 @@ def robust_pca(
         work = work * factor
     unit = (_norm(work) / math.sqrt(work.numel())) if scale == "rms" else factor
     with _full_precision(work.device), _bar(max_iterations, progress) as show:
-        if method == "exact":
-            end = plain_admm(
-                work, low_rank, sparse, sparsity_weight=weight, penalty=penalty / unit,
-                tolerance=tolerance, max_iterations=max_iterations, on_iteration=show,
-            )  # fmt: skip
-        else:
-            begin = penalty / unit
-            if method == "adaptive":
-                begin = penalty * math.sqrt(work.numel()) / _norm(work)
-            elif method == "growing":
-                # Lin et al. initialise with 1.25 / spectral norm; the Frobenius norm is cheaper.
-                begin = 1.25 / _norm(work)
-            end = minimise(
-                work, low_rank, sparse, sparsity_weight=weight, penalty=begin,
-                schedule=SCHEDULES[method], tolerance=tolerance, max_iterations=max_iterations,
-                on_iteration=show,
-            )  # fmt: skip
+        begin = penalty / unit
+        if method == "adaptive":
+            begin = penalty * math.sqrt(work.numel()) / _norm(work)
+        end = minimise(
+            work, low_rank, sparse, sparsity_weight=weight, penalty=begin,
+            schedule=SCHEDULES[method], tolerance=tolerance, max_iterations=max_iterations,
+            on_iteration=show,
+        )  # fmt: skip
     result = _result(work, low_rank, sparse, end, weight, unit, method, tolerance, factor)
     if not result.converged:
         warnings.warn(
@@ -295,3 +289,61 @@ def _bar(limit: int, wanted: bool):
             bar.update()
 
         yield show
+
+
+@dataclass(frozen=True)
+class Decomposition:
+    """Low-rank and sparse parts of a triplane sequence, with reports of robust PCA.
+
+    Attributes:
+        low_rank: The static part. [T, 3, C, H, W]
+        sparse: The dynamic part. [T, 3, C, H, W]
+        reports: Output of `RobustPCA.report` for each of "xy", "xz" and "yz".
+    """
+
+    low_rank: Tensor
+    sparse: Tensor
+    reports: dict[str, dict[str, Any]]
+
+
+def decompose(triplanes: Tensor, **options: Any) -> Decomposition:
+    """Apply robust PCA to each orientation, with one column per frame (X-Planes, Eq. 8-12).
+
+    The columns are read in place. The tensor is copied only if it has half precision or its planes
+    are not contiguous.
+
+    Args:
+        triplanes: One triplane per frame: planes xy, xz, yz, the first axis along W. Any
+            floating-point type; not modified. [T, 3, C, H, W]
+        **options: Options of `robust_pca` except ``out``.
+
+    Raises:
+        ValueError: If the shape is wrong, a value is NaN or infinite, or an option is out of range.
+        TypeError: If the tensor is not of a floating-point type.
+    """
+    check_triplanes(triplanes, "triplanes")
+    kind = triplanes.dtype if triplanes.dtype == torch.float64 else torch.float32
+    low_rank = torch.empty(triplanes.shape, dtype=kind, device=triplanes.device)
+    sparse = torch.empty_like(low_rank)
+    reports = {}
+    for index, name in enumerate(ORIENTATIONS):
+        parts = low_rank[:, index].flatten(1).mT, sparse[:, index].flatten(1).mT
+        matrix = triplanes[:, index].flatten(1).mT
+        reports[name] = robust_pca(matrix, out=parts, **options).report()
+    return Decomposition(low_rank, sparse, reports)
+
+
+def check_triplanes(triplanes: Tensor, name: str) -> None:
+    """Check that a tensor is a non-empty triplane sequence.
+
+    Args:
+        triplanes: The tensor. [T, 3, C, H, W]
+        name: Its name in error messages.
+
+    Raises:
+        ValueError: For a wrong shape.
+    """
+    if triplanes.dim() != 5 or triplanes.shape[1] != 3 or not triplanes.numel():
+        raise ValueError(
+            f"{name} must be [T, 3, C, H, W] and not empty, not {tuple(triplanes.shape)}"
+        )

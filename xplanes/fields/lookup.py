@@ -103,7 +103,7 @@ class _Features(torch.autograd.Function):
     def forward(
         ctx: Any, space: Tensor, time: Tensor | None, points: Tensor, times: Tensor, rows: Rows
     ) -> Tensor:
-        cpu = compiled("xplanes.fields.cpu")
+        cpu = compiled("xplanes.fields.lookup_numba")
         moving = space.new_zeros(0, 1, 1, space.shape[3]) if time is None else time
         count, channels = len(points), space.shape[3]
         points, times = points.to(space.dtype).contiguous(), times.to(space.dtype).contiguous()
@@ -121,7 +121,7 @@ class _Features(torch.autograd.Function):
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any, *gradients: Tensor
     ) -> tuple[Tensor | None, ...]:
-        cpu = compiled("xplanes.fields.cpu")
+        cpu = compiled("xplanes.fields.lookup_numba")
         points, times, pairs, axes, factors = ctx.saved_tensors
         gradient = gradients[0].to(factors.dtype).contiguous()
         space = time = None
@@ -149,7 +149,7 @@ class _Kernels(torch.autograd.Function):
         axes = () if time is None else tuple(time_plane_axes(rows))
         features = space.new_empty(len(points), 3, space.shape[3])
         if len(points):
-            gpu = gpu_module("xplanes.fields.gpu")
+            gpu = gpu_module("xplanes.fields.lookup_triton")
             gpu.gather(space, time, points, times, rows, axes, features)
         ctx.save_for_backward(time, points, times)
         ctx.space, ctx.rows, ctx.axes = (space.shape, space.dtype), rows, axes
@@ -166,7 +166,7 @@ class _Kernels(torch.autograd.Function):
         of_space = gradient.new_zeros(shape) if ctx.needs_input_grad[0] else None
         of_time = gradient.new_zeros(time.shape) if ctx.needs_input_grad[1] else None
         if len(points):
-            gpu = gpu_module("xplanes.fields.gpu")
+            gpu = gpu_module("xplanes.fields.lookup_triton")
             gpu.scatter(shape[1], time, points, times, rows, axes, gradient, of_space, of_time)
         of_space = None if of_space is None else of_space.to(dtype)
         of_time = None if of_time is None else of_time.to(time.dtype)

@@ -144,7 +144,7 @@ class _Product(torch.autograd.Function):
     def forward(ctx: Any, places: Tensor, axes: Tensor, *planes: Tensor) -> Tensor:
         product = places.new_empty(len(places), planes[0].shape[1])
         arrays = tuple(_array(plane) for plane in planes)
-        cpu = compiled("xplanes.fields.cpu")
+        cpu = compiled("xplanes.fields.lookup_numba")
         cpu.multiply(arrays, places.numpy(), axes.numpy(), product.numpy())
         ctx.save_for_backward(places, axes, *planes)
         return product
@@ -157,7 +157,7 @@ class _Product(torch.autograd.Function):
         places, axes, *planes = ctx.saved_tensors
         found = [torch.zeros_like(plane, memory_format=torch.channels_last) for plane in planes]
         spread = places.new_empty(BLOCK, len(planes), planes[0].shape[1])
-        compiled("xplanes.fields.cpu").multiply_backward(
+        compiled("xplanes.fields.lookup_numba").multiply_backward(
             tuple(_array(plane) for plane in planes),
             places.numpy(),
             axes.numpy(),
@@ -177,7 +177,7 @@ class _Kernels(torch.autograd.Function):
         places = places.to(torch.promote_types(first.dtype, torch.float32)).contiguous()
         product = first.new_empty(len(places), first.shape[1])
         if len(places):
-            gpu = gpu_module("xplanes.fields.gpu_products")
+            gpu = gpu_module("xplanes.fields.products_triton")
             gpu.multiply(tuple(_rows(plane) for plane in planes), places, axes, product)
         ctx.save_for_backward(places, *planes)
         ctx.axes = axes
@@ -195,7 +195,7 @@ class _Kernels(torch.autograd.Function):
             for plane in planes
         ]
         if len(places):
-            gpu_module("xplanes.fields.gpu_products").multiply_backward(
+            gpu_module("xplanes.fields.products_triton").multiply_backward(
                 tuple(_rows(plane) for plane in planes),
                 places,
                 ctx.axes,

@@ -160,8 +160,7 @@ class DecompositionSettings(Settings):
     """Decomposition of triplanes into low-rank and sparse parts, and their conversion to planes."""
 
     name: str  # Name of the settings.
-    # Robust PCA solver. admm: the paper's; exact: slow reference.
-    method: Literal["adaptive", "growing", "admm", "exact"]
+    method: Literal["adaptive", "admm"]  # Robust PCA solver. admm: the paper's.
     sparsity_weight: Positive | Literal["auto"]  # Weight of the sparse part; auto: by matrix size.
     penalty: Positive  # Penalty of ADMM; for adaptive, its initial value.
     scale: Literal["rms", "none"]  # Unit of the penalty. rms: RMS of the features; none: 1.

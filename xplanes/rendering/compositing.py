@@ -102,7 +102,7 @@ class _Composite(torch.autograd.Function):
     def forward(
         ctx: Any, optical_depth: Tensor, colour: Tensor, distances: Tensor, starts: Tensor
     ) -> tuple[Tensor, Tensor]:
-        cpu = compiled("xplanes.rendering.cpu")
+        cpu = compiled("xplanes.rendering.rays_numba")
         inputs = [t.contiguous() for t in (optical_depth, colour, distances, starts)]
         weights = torch.empty_like(optical_depth)
         total = optical_depth.new_empty(len(starts), 5)
@@ -117,7 +117,7 @@ class _Composite(torch.autograd.Function):
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any, *gradients: Tensor
     ) -> tuple[Tensor | None, ...]:
-        cpu = compiled("xplanes.rendering.cpu")
+        cpu = compiled("xplanes.rendering.rays_numba")
         *inputs, weights = ctx.saved_tensors
         d_depth, d_colour = torch.empty_like(inputs[0]), torch.empty_like(inputs[1])
         arrays = [t.detach().numpy() for t in inputs]
@@ -142,7 +142,7 @@ class _Kernels(torch.autograd.Function):
         starts: Tensor,
         number: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        gpu = gpu_module("xplanes.rendering.gpu")
+        gpu = gpu_module("xplanes.rendering.compositing_triton")
         if number is None:
             number = starts.new_full((), len(optical_depth))
         inputs = [t.contiguous() for t in (optical_depth, colour, distances, starts, number)]
@@ -159,7 +159,7 @@ class _Kernels(torch.autograd.Function):
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any, *gradients: Tensor
     ) -> tuple[Tensor | None, ...]:
-        gpu = gpu_module("xplanes.rendering.gpu")
+        gpu = gpu_module("xplanes.rendering.compositing_triton")
         *inputs, weights, light = ctx.saved_tensors
         d_depth, d_colour = torch.zeros_like(inputs[0]), torch.zeros_like(inputs[1])
         gradient = gradients[0].to(weights.dtype).contiguous()

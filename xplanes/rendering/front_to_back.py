@@ -45,7 +45,7 @@ def front_to_back(
     Returns:
         Sums of weight times (colour, 1, distance). [R, 5]
     """
-    cpu = compiled("xplanes.rendering.cpu")
+    cpu = compiled("xplanes.rendering.rays_numba")
     limit = -math.log(occlusion) if occlusion > 0 else math.inf
     total = torch.zeros(len(times), 5, dtype=torch.float64)
     depth = torch.zeros(len(times), dtype=torch.float64)

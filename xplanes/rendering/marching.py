@@ -234,7 +234,7 @@ def march_gpu(
 
     It runs twice, to count the samples of each ray and to write them down.
     """
-    gpu = gpu_module("xplanes.rendering.gpu_march")
+    gpu = gpu_module("xplanes.rendering.marching_triton")
     rays, device = len(origins), origins.device
     given = [t.contiguous() for t in (origins, directions, times, jitter)]
     limited = math.isfinite(limit)
@@ -317,7 +317,7 @@ def _march_cpu(
     occupied: Tensor | None,
     limit: float,
 ) -> Samples:
-    cpu = compiled("xplanes.rendering.cpu")
+    cpu = compiled("xplanes.rendering.rays_numba")
     near, far = ray_box(origins, directions)
     half = 0.5 * grid.resolution
     origins, directions = origins.contiguous(), directions.contiguous()

@@ -49,7 +49,7 @@ def render_solids(
         which passes through the centre of the pixel's first sample. [S, S, 3], [S, S], [S, S]
     """
     colour, alpha, depth = np.empty((side, side, 3)), np.empty((side, side)), np.empty((side, side))
-    cpu = compiled("xplanes.synthetic.pretraining.cpu")
+    cpu = compiled("xplanes.synthetic.pretraining.solids_numba")
     seen = _rectangles(solids, pose, side * samples)
     cpu.render(solids.arrays, seen, pose, FOCAL, samples, colour, alpha, depth)
     return colour, alpha, depth
@@ -61,7 +61,7 @@ def cast(
     """First hit of each ray [N, 3]: distance, part, normal, colour. [N], [N], [N, 3], [N, 3]"""
     distances, owners = np.empty(len(origins)), np.empty(len(origins), dtype=np.int64)
     seen = np.zeros((len(origins), 6))
-    cpu = compiled("xplanes.synthetic.pretraining.cpu")
+    cpu = compiled("xplanes.synthetic.pretraining.solids_numba")
     cpu.cast(solids.arrays, origins, directions, distances, owners, seen)
     return distances, owners, seen[:, :3], seen[:, 3:]
 
@@ -69,7 +69,7 @@ def cast(
 def inside(solids: Solids, points: Array) -> NDArray[np.bool_]:
     """Whether points [N, 3] lie inside any part. [N]"""
     result = np.zeros(len(points), dtype=np.bool_)
-    compiled("xplanes.synthetic.pretraining.cpu").inside(solids.arrays, points, result)
+    compiled("xplanes.synthetic.pretraining.solids_numba").inside(solids.arrays, points, result)
     return result
 
 

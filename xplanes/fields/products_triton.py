@@ -6,7 +6,7 @@ import torch
 import triton
 import triton.language as tl
 
-from xplanes.fields.gpu import read, spread, tiles, time_taps
+from xplanes.fields.lookup_triton import read, spread, tiles, time_taps
 
 
 @triton.jit

@@ -1,5 +1,10 @@
-"""Singular value thresholding of tall matrices through their small Gram matrix."""
+"""The iterations of robust PCA: ADMM in fused passes over blocks of rows.
 
+Singular values of tall matrices are shrunk through their small Gram matrix.
+"""
+
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -7,6 +12,13 @@ from torch import Tensor
 
 _BLOCK_ELEMENTS = {"cpu": 1 << 20, "cuda": 1 << 27}
 _SINGLE_PRECISION_ERROR = 3e-9
+_NARROW_FROM_COLUMNS = 96
+_WARM_UP = 10
+_WARM_STEP = 3.0
+_LARGEST = 1e6
+_SPARSE_FLOOR = 0.05
+_CHECK_EVERY = 4
+CHANGE_OVER_TOLERANCE = 10.0
 
 
 def block_rows(matrix: Tensor) -> int:
@@ -46,6 +58,8 @@ def needs_double(largest: float, threshold: float, tolerance: float) -> bool:
 def shrinkage_from_gram(gram: Tensor, threshold: float) -> tuple[Tensor, Tensor, Tensor]:
     """Directions kept by singular value thresholding, and the factor that shrinks each.
 
+    Thresholding is the proximal operator of the nuclear norm (X-Planes, Eq. 24-25).
+
     Args:
         gram: Gram matrix of the columns, float64. [T, T]
         threshold: Value subtracted from every singular value.
@@ -59,34 +73,6 @@ def shrinkage_from_gram(gram: Tensor, threshold: float) -> tuple[Tensor, Tensor,
     kept = singular > threshold
     factors = 1 - threshold / singular[kept]
     return vectors[:, kept], factors, singular
-
-
-def singular_value_threshold(
-    matrix: Tensor, threshold: float, *, exact: bool = False
-) -> tuple[Tensor, int]:
-    """Shrink the singular values: the proximal operator of the nuclear norm (X-Planes, Eq. 24-25).
-
-    Args:
-        matrix: A matrix with many more rows than columns, float32 or float64. [M, T]
-        threshold: Value subtracted from every singular value; negative results become zero.
-        exact: Use a full singular value decomposition instead of the Gram matrix.
-
-    Returns:
-        The shrunk matrix and its rank. [M, T]
-    """
-    if exact:
-        left, singular, right = torch.linalg.svd(matrix, full_matrices=False)
-        shrunk = (singular - threshold).clamp_min(0)
-        return (left * shrunk) @ right, int((shrunk > 0).sum())
-    gram = torch.zeros(matrix.shape[1], matrix.shape[1], dtype=torch.float64, device=matrix.device)
-    for block in matrix.split(block_rows(matrix)):
-        add_gram(gram, block, double=True)
-    basis, factors, _ = shrinkage_from_gram(gram, threshold)
-    weights = ((basis * factors) @ basis.mT).to(matrix.dtype)
-    return matrix @ weights, len(factors)
-
-
-_NARROW_FROM_COLUMNS = 96
 
 
 @dataclass(frozen=True)
@@ -226,3 +212,203 @@ def finish(work: Workspace, low_rank: Tensor, step: Step) -> None:
 
 def _squared(block: Tensor) -> Tensor:
     return torch.linalg.vector_norm(block).double().square()
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Schedule of the penalty, and over-relaxation.
+
+    The adaptive values minimise the iterations to a given error on feature-like matrices.
+
+    Attributes:
+        relaxation: Over-relaxation of the low-rank part; 1 is plain ADMM.
+        growth: Factor on the penalty per iteration when it grows.
+        adaptive: Set the penalty from the iterates for ten iterations, then balance it.
+        ratio: Initial target of ``penalty * |S| / |multiplier|``.
+        grow_above: Grow while relative residual over relative change is above this.
+        shrink_below: Shrink while it is below this.
+    """
+
+    relaxation: float = 1.0
+    growth: float = 1.0
+    adaptive: bool = False
+    ratio: float = 1.5
+    grow_above: float = 0.35
+    shrink_below: float = 0.02
+
+
+SCHEDULES = {
+    "adaptive": Schedule(relaxation=1.6, growth=1.2, adaptive=True),
+    "admm": Schedule(),
+}
+
+
+@dataclass(frozen=True)
+class Norms:
+    """Frobenius norms after an iteration.
+
+    Attributes:
+        sparse: The sparse part.
+        multiplier: The multiplier over the penalty.
+        change: The change of the sparse part.
+        residual: ``L + S - Y``.
+    """
+
+    sparse: float
+    multiplier: float
+    change: float
+    residual: float
+
+
+class Penalty:
+    """The penalty of this iteration, the one before and the one after.
+
+    A pass prepares the next one, so its measurements change the penalty of the pass after that.
+    """
+
+    def __init__(self, schedule: Schedule, start: float, norm: float) -> None:
+        self.before = self.now = self.after = start
+        self._schedule = schedule
+        self._norm = norm
+        self._rate = 1.0
+        self._growth = schedule.growth
+        self._direction = 0
+
+    def warm(self, iteration: int) -> bool:
+        """Whether the penalty is still set from the norms of the iterates."""
+        return self._schedule.adaptive and iteration <= _WARM_UP
+
+    def relative(self, norms: Norms) -> tuple[float, float]:
+        """Residual relative to the sparse part, and change relative to the multiplier.
+
+        A lower bound excludes rounding errors if the sparse part is nearly zero.
+        """
+        primal = norms.residual / max(norms.sparse, _SPARSE_FLOOR * self._norm)
+        return primal, norms.change / max(norms.multiplier, 1e-30 * self._norm)
+
+    def balance(self, iteration: int, norms: Norms, *, feasible: bool) -> None:
+        """Choose whether to grow, keep or shrink until the next check.
+
+        Each change of direction halves the logarithmic rate, so that the penalty settles.
+
+        Args:
+            iteration: Number of this iteration.
+            norms: Norms of the last iteration.
+            feasible: Whether the residual is far below the tolerance (growth has no benefit).
+        """
+        if not self._schedule.adaptive or self.warm(iteration):
+            return
+        primal, dual = self.relative(norms)
+        direction = 0
+        if primal > self._schedule.grow_above * dual and not feasible:
+            direction = 1
+        elif primal < self._schedule.shrink_below * dual:
+            direction = -1
+        if direction * self._direction < 0:
+            self._growth = math.sqrt(self._growth)
+        self._direction = direction or self._direction
+        self._rate = self._growth**direction
+
+    def advance(self, iteration: int, norms: Norms) -> None:
+        """Go on to the next iteration."""
+        self.before, self.now = self.now, self.after
+        if self.warm(iteration):
+            sparse = max(norms.sparse, _SPARSE_FLOOR * self._norm)
+            target = self._schedule.ratio * self.before * norms.multiplier / sparse
+            self.after = min(max(target, self.now / _WARM_STEP), self.now * _WARM_STEP)
+        elif self._rate != 1:
+            self.after = min(self.now * self._rate, max(self.now, _LARGEST / self._norm))
+
+
+@dataclass
+class Progress:
+    """State of the loop.
+
+    Attributes:
+        iterations: Passes made.
+        rank: Rank of the low-rank part.
+        penalty: Penalty of the last pass, absolute.
+        residual: ``|L + S - Y| / |Y|`` at the last check, Frobenius norms.
+        change: Relative step size at the last check: the larger of ``|L + S - Y| / |S|`` and the
+            change of S relative to the scaled multiplier.
+    """
+
+    iterations: int = 0
+    rank: int = 0
+    penalty: float = 0.0
+    residual: float = math.inf
+    change: float = math.inf
+
+
+def minimise(
+    matrix: Tensor,
+    low_rank: Tensor,
+    sparse: Tensor,
+    *,
+    sparsity_weight: float,
+    penalty: float,
+    schedule: Schedule,
+    tolerance: float,
+    max_iterations: int,
+    on_iteration: Callable[[Progress], None] | None = None,
+) -> Progress:
+    """Minimise ``|L|_* + sparsity_weight |S|_1`` subject to ``L + S = Y`` into the given outputs.
+
+    Args:
+        matrix: Y, float32 or float64, rows or columns contiguous, not zero. [M, T]
+        low_rank: Output L. [M, T]
+        sparse: Output S; stores the state during the iterations. [M, T]
+        sparsity_weight: Weight of the sparse part.
+        penalty: Penalty of the first pass, absolute.
+        schedule: Schedule of the penalty.
+        tolerance: Stop when the residual is below this and, for an adaptive schedule, the change
+            below ten times this.
+        max_iterations: Maximum number of passes, at least 1.
+        on_iteration: Called after each pass.
+
+    Returns:
+        The final state; the last pass is plain ADMM and is not included in its measurements.
+    """
+    work = Workspace(matrix, sparse)
+    gram = start(work)
+    norm = gram.trace().sqrt().item()
+    single = matrix.dtype == torch.float32
+    path = Penalty(schedule, penalty, norm)
+    progress = Progress()
+    last = max_iterations == 1
+    while True:
+        basis, factors, singular = shrinkage_from_gram(gram, 1 / path.now)
+        progress.iterations += 1
+        progress.rank = len(factors)
+        progress.penalty = path.now
+        step = Step(
+            basis,
+            factors,
+            old_limit=sparsity_weight / path.before,
+            limit=sparsity_weight / path.now,
+            rescale=path.before / path.now,
+            next_rescale=path.now / path.after,
+            relaxation=schedule.relaxation,
+            double=not single or needs_double(singular[-1].item(), 1 / path.after, tolerance),
+        )
+        if last:
+            finish(work, low_rank, step)
+            if on_iteration:
+                on_iteration(progress)
+            return progress
+
+        check = progress.iterations % _CHECK_EVERY == 0
+        gram, values = iterate(work, step, norms=path.warm(progress.iterations), changes=check)
+        norms = Norms(*values)
+        if check:
+            progress.residual = norms.residual / norm
+            progress.change = max(path.relative(norms))
+            feasible = progress.residual <= 0.1 * tolerance
+            path.balance(progress.iterations, norms, feasible=feasible)
+            last = progress.residual <= tolerance
+            if schedule.adaptive:
+                last = last and progress.change <= CHANGE_OVER_TOLERANCE * tolerance
+        last = last or progress.iterations >= max_iterations - 1
+        path.advance(progress.iterations, norms)
+        if on_iteration:
+            on_iteration(progress)

@@ -17,7 +17,7 @@ from xplanes.fields.xplanes import PLANE_SETS
 triton = pytest.importorskip("triton", reason="triton is not installed")
 tl = triton.language
 
-from xplanes.fields import gpu  # noqa: E402 (needs triton)
+from xplanes.fields import lookup_triton as gpu  # noqa: E402 (needs triton)
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 BAD = [torch.inf, -torch.inf, torch.nan, 3e38, -3e38]

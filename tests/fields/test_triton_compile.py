@@ -27,12 +27,12 @@ def test_kernels_with_most_numbers_fit_the_registers_of_a_common_gpu(tmp_path):
     cases = ("nine planes, 40", "compositing", "marching")
     rows = compiled(tmp_path, "--arch", "86", "--only", *cases)
     assert [(row[0], row[1]) for row in rows] == [
-        ("nine planes, 40 channels", "gpu.forward"),
-        ("nine planes, 40 channels", "gpu.backward_by_row"),
-        ("compositing", "gpu.forward"),
-        ("compositing", "gpu.backward"),
-        ("marching", "gpu_march.march"),
-        ("marching", "gpu_march.march"),
+        ("nine planes, 40 channels", "lookup_triton.forward"),
+        ("nine planes, 40 channels", "lookup_triton.backward_by_row"),
+        ("compositing", "compositing_triton.forward"),
+        ("compositing", "compositing_triton.backward"),
+        ("marching", "marching_triton.march"),
+        ("marching", "marching_triton.march"),
     ]
     assert all(int(row[4]) == 0 for row in rows)
 
@@ -45,7 +45,7 @@ def test_kernels_compile_for_all_generations_and_move_four_numbers_at_once(tmp_p
     moved = {(row[0], row[1]): row[5:7] for row in rows if row[2] == "90"}
     # Four corners of each plane, each read once: three planes of space and three of time; the
     # backward reads the time planes and the three gradients, and adds to all corners.
-    assert moved["six planes, 40 channels", "gpu.forward"] == ["24", "0"]
-    assert moved["six planes, 40 channels", "gpu.backward"] == ["15", "24"]
-    assert moved["nine planes, 40 channels", "gpu.backward_by_row"] == ["27", "36"]
-    assert moved["products, 32 channels", "gpu_products.forward"] == ["24", "0"]
+    assert moved["six planes, 40 channels", "lookup_triton.forward"] == ["24", "0"]
+    assert moved["six planes, 40 channels", "lookup_triton.backward"] == ["15", "24"]
+    assert moved["nine planes, 40 channels", "lookup_triton.backward_by_row"] == ["27", "36"]
+    assert moved["products, 32 channels", "products_triton.forward"] == ["24", "0"]

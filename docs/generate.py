@@ -439,9 +439,9 @@ reloads.
 
 ::: xplanes.errors.ConfigError
 
-::: xplanes.scenes.errors.SceneError
+::: xplanes.errors.SceneError
 
-::: xplanes.lrm.errors.LRMError
+::: xplanes.errors.LRMError
 
 ::: xplanes.training.diagnosis.TrainingError
 

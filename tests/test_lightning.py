@@ -21,10 +21,9 @@ from lightning.pytorch.loggers import CSVLogger, Logger
 
 from tests.training.runs import small_config
 from xplanes import RadianceModule, SceneDataModule
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, SceneError
 from xplanes.experiment import Experiment
 from xplanes.run import run
-from xplanes.scenes.errors import SceneError
 from xplanes.training.fit import Trainer
 from xplanes.training.losses import loss_terms
 

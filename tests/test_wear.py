@@ -9,13 +9,12 @@ import pytest
 import torch
 
 from tests.training.runs import small_config
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, SceneError
 from xplanes.experiment import Experiment
 from xplanes.files import DAY, MARK, StorageError
 from xplanes.launch import prepare
 from xplanes.preparation.cache import StageCache
 from xplanes.run import run
-from xplanes.scenes.errors import SceneError
 from xplanes.synthetic.demo import ensure_demo_scene, write
 from xplanes.synthetic.pretraining.pool import RECORD, SHARD, ensure_pool
 from xplanes.training.checkpoints import LAST

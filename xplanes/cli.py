@@ -130,9 +130,9 @@ def _inspect(options: argparse.Namespace) -> None:
     import contextlib
     import json
 
+    from xplanes.errors import SceneError
     from xplanes.evaluation.inspect import check_out, choose, facts, inspect, next_command, table
     from xplanes.evaluation.inspect_picture import write_picture
-    from xplanes.scenes.errors import SceneError
 
     choice = choose(options.arguments)
     out = options.out or Path(f"inspect_{Path(choice.scene.scene).name}.png")

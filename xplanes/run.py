@@ -15,7 +15,7 @@ from lightning import seed_everything
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from xplanes.backend import warm_up
-from xplanes.errors import ConfigError, XPlanesError
+from xplanes.errors import ConfigError, SceneError, XPlanesError
 from xplanes.evaluation.findings import camera_findings, opaque_findings, stray_findings
 from xplanes.evaluation.published import check_published
 from xplanes.evaluation.render import VIDEO_FRAMES, write_orbit
@@ -29,7 +29,6 @@ from xplanes.models.initialisation import Initialisation, Place
 from xplanes.optional import MissingExtraError
 from xplanes.process import resume_command
 from xplanes.scenes.datamodule import SceneDataModule, found_root
-from xplanes.scenes.errors import SceneError
 from xplanes.training.checkpoints import find_resumable, has_checkpoint
 from xplanes.training.clock import find_callback, training_seconds
 from xplanes.training.evaluation import Evaluation

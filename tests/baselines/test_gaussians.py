@@ -25,7 +25,7 @@ from xplanes.baselines.gaussians.model import camera_extent
 from xplanes.baselines.gaussians.rasteriser import GaussianError, rasterise
 from xplanes.baselines.gaussians.renderer import GaussianRenderer, camera_in
 from xplanes.config import compose_plain
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, SceneError
 from xplanes.evaluation.export import ExportOptions, export
 from xplanes.fields.products import PlaneProducts
 from xplanes.models.initialisation import Method
@@ -33,7 +33,6 @@ from xplanes.preparation.fixed_view import rendering_method
 from xplanes.rendering.sampler import Site
 from xplanes.scenes.batches import ViewBatches, ViewSettings
 from xplanes.scenes.cameras import project
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.lenses import Lenses
 from xplanes.streams import TrainingState

@@ -10,12 +10,11 @@ import pytest
 import torch
 from PIL import Image
 
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, SceneError
 from xplanes.evaluation.camera_path import read_camera_path
 from xplanes.evaluation.render import VideoOptions, render_video
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.rendering.pictures import to_bytes
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.views import Views, camera_rays
 
 

@@ -19,7 +19,7 @@ from tests.refusals import assert_refused
 from xplanes.cli import main
 from xplanes.components import build
 from xplanes.config import compose_plain
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.evaluation.findings import camera_findings
 from xplanes.evaluation.inspect import (
     Choice,
@@ -35,7 +35,6 @@ from xplanes.evaluation.inspect import (
 from xplanes.evaluation.inspect_picture import CUBE, HEIGHT, POINT, SCALE, WIDTH, _sample, draw
 from xplanes.models.base import ModelSettings
 from xplanes.scenes.cameras import look_at
-from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.lenses import Lenses, LensModel
 from xplanes.scenes.source import SceneSettings

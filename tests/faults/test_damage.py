@@ -13,12 +13,11 @@ import torch
 
 from tests.faults.conftest import config_of, outcome
 from tests.lrm.reduced import CONFIGS
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, SceneError
 from xplanes.lrm import LRMError, load
 from xplanes.lrm.bundled import FOLDER, load_bundled
 from xplanes.preparation.sequence import TriplaneSequence, load_triplanes, save_triplanes
 from xplanes.run import run
-from xplanes.scenes.errors import SceneError
 from xplanes.synthetic.pretraining.pool import SHARD, ensure_pool
 from xplanes.training.checkpoints import load_checkpoint
 

@@ -5,9 +5,9 @@ import torch
 
 from tests.lrm.reduced import SIDES, reduced
 from tests.lrm.reference import compare
+from xplanes.errors import LRMError
 from xplanes.lrm.checkpoint import build, fill
 from xplanes.lrm.config import parse_config
-from xplanes.lrm.errors import LRMError
 from xplanes.lrm.images import square_crop
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.encode import encode, straight_alpha

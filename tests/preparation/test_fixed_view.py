@@ -15,7 +15,7 @@ from tests.refusals import assert_refused
 from tests.training.runs import small_config
 from tests.training.test_health import spoil_gradient
 from xplanes.config import compose_plain
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, SceneError
 from xplanes.lrm.alignment import align
 from xplanes.lrm.canonical import OPENLRM_VIEW, TRIPOSR_VIEW
 from xplanes.models.initialisation import Method, Place, RandomSettings
@@ -24,7 +24,6 @@ from xplanes.preparation.cache import StageCache
 from xplanes.preparation.fixed_view import canonical_pose, fixed_view, pick_frames, rendering_method
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.sampler import Site
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, scene_frame
 from xplanes.scenes.views import Scene
 from xplanes.training.module import TrainingError

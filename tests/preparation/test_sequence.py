@@ -10,10 +10,9 @@ import torch
 
 from tests.preparation.sequences import moving_sequence
 from tests.refusals import assert_refused
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, SceneError
 from xplanes.fields import Decoder
 from xplanes.preparation import TriplaneSequence, load_triplanes, save_triplanes
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame
 
 OPTIONS = {

@@ -21,12 +21,11 @@ from tests.lens_oracle import direction
 from tests.refusals import assert_refused
 from xplanes.components import build
 from xplanes.config import compose_plain
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.scenes.cameras import cast_rays
 from xplanes.scenes.colmap import ColmapSettings
 from xplanes.scenes.colmap_model import LENSES, read_model
 from xplanes.scenes.entries import require_precision
-from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses
 from xplanes.scenes.source import SceneSettings
 

@@ -16,9 +16,9 @@ from tests.captures import save, settings, write_colmap
 from tests.refusals import assert_refused
 from tests.training.runs import SMALL, changed
 from xplanes import RadianceModule, SceneDataModule
+from xplanes.errors import SceneError
 from xplanes.scenes.colmap import ColmapSettings
 from xplanes.scenes.dnerf import BlenderSettings
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.multicamera import MultiCameraSettings
 from xplanes.scenes.nerfies import NerfiesSettings
 from xplanes.scenes.nerfstudio import NerfstudioSettings

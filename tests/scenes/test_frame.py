@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from tests.balls import ball_views, inside_ball, swinging
+from xplanes.errors import SceneError
 from xplanes.scenes.cameras import look_at, orbit
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, _reach, cube_frame, optical_centre, scene_frame
 from xplanes.scenes.lenses import Lenses, LensModel
 from xplanes.scenes.views import Intrinsics, Views

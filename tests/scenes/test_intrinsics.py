@@ -13,6 +13,7 @@ from PIL import Image
 from tests.balls import ball_views, inside_ball, surrounding
 from tests.refusals import assert_refused
 from xplanes.baselines.tineuvox.model import frusta_box
+from xplanes.errors import SceneError
 from xplanes.evaluation.render import VideoOptions, lens
 from xplanes.metrics import psnr
 from xplanes.preparation.fixed_view import check_camera
@@ -24,7 +25,6 @@ from xplanes.scenes.batches import RayBatches, RaySettings
 from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.dnerf import read_scene
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import cube_frame, optical_centre, scene_frame
 from xplanes.scenes.silhouettes import foreground, may_hold
 from xplanes.scenes.source import frames_are_equal

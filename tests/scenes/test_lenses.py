@@ -9,12 +9,12 @@ import torch
 
 from tests.balls import ball_views, inside_ball, surrounding
 from tests.lens_oracle import direction, pixel
+from xplanes.errors import SceneError
 from xplanes.evaluation.render import lens as lens_of_picture
 from xplanes.preparation.fixed_view import check_camera
 from xplanes.scenes.batches import RayBatches
 from xplanes.scenes.cameras import ball_extent, cast_rays, look_at, project
 from xplanes.scenes.datamodule import UNIFORM
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import backwards, cube_frame, scene_frame
 from xplanes.scenes.lenses import COEFFICIENTS, WIDEST, Lenses, LensModel
 from xplanes.scenes.silhouettes import may_hold

@@ -16,7 +16,7 @@ from tests.balls import ball_views, surrounding, swinging
 from tests.captures import write_colmap
 from xplanes.components import build
 from xplanes.config import compose_plain
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.evaluation.inspect import choose
 from xplanes.lrm.canonical import OPENLRM_VIEW
 from xplanes.models.initialisation import Method, Place
@@ -25,7 +25,6 @@ from xplanes.preparation.cache import StageCache
 from xplanes.preparation.fixed_view import fixed_view
 from xplanes.scenes import store
 from xplanes.scenes import videos as recordings
-from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.multicamera import read_cameras, read_multicamera
 from xplanes.scenes.source import SceneSettings

@@ -12,8 +12,8 @@ import torch
 from tests.captures import HEIGHT, WIDTH, NerfiesFolder, picture, save, settings
 from tests.lens_oracle import direction
 from tests.refusals import assert_refused
+from xplanes.errors import MissingSplitError, SceneError
 from xplanes.scenes.cameras import project
-from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.nerfies import NerfiesSettings
 
 CENTRE, SCALE = np.array([0.5, -1, 2]), 0.25

@@ -15,10 +15,9 @@ from tests.lens_oracle import direction
 from tests.refusals import assert_refused
 from xplanes.components import build
 from xplanes.config import compose_plain
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.scenes.batches import RayBatches, ViewBatches, ViewSettings
 from xplanes.scenes.datamodule import UNIFORM, SceneDataModule, whole_view
-from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.nerfstudio import read_capture
 from xplanes.scenes.source import SceneSettings

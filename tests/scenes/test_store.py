@@ -16,10 +16,10 @@ from filelock import FileLock
 from PIL import Image
 
 from tests.balls import ball_views
+from xplanes.errors import SceneError
 from xplanes.files import DAY, MARK, StorageError
 from xplanes.scenes import store
 from xplanes.scenes.batches import AHEAD, RayBatches, RaySettings
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import cube_frame, scene_frame
 from xplanes.scenes.images import final_sizes, native_sizes
 from xplanes.scenes.images import read_images as read_sized

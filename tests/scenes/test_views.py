@@ -10,8 +10,8 @@ import torch
 from tests.balls import ball_views
 from tests.training.runs import small_config
 from xplanes.components import build
+from xplanes.errors import SceneError
 from xplanes.scenes.dnerf import BlenderSettings
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import joined
 

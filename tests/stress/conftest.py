@@ -7,9 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, SceneError
 from xplanes.lrm import LRMError
-from xplanes.scenes.errors import SceneError
 from xplanes.training.diagnosis import TrainingError
 
 

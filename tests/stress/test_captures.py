@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from tests.captures import NerfiesFolder, picture, poses, save, settings, write_colmap
+from xplanes.errors import SceneError
 from xplanes.scenes.colmap import ColmapSettings
 from xplanes.scenes.colmap_model import read_model
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.nerfies import NerfiesSettings
 
 pytestmark = pytest.mark.stress

@@ -11,14 +11,13 @@ import pytest
 from lightning.pytorch.callbacks import Callback
 
 from tests.training.runs import small_config
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, SceneError
 from xplanes.evaluation.runs import load_run
 from xplanes.files import read_rows
 from xplanes.process import resume_command
 from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.dnerf import BlenderSettings
-from xplanes.scenes.errors import SceneError
 from xplanes.training import scoring
 from xplanes.training.checkpoints import AtomicCheckpointIO
 from xplanes.training.module import RadianceModule

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from xplanes.errors import SceneError
 from xplanes.scenes.entries import checked_pose, is_number, is_positive, read_object, short
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.views import Views
 
 logger = logging.getLogger(__name__)

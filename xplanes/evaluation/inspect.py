@@ -11,7 +11,7 @@ import torch
 
 from xplanes.components import build, class_of, plugins
 from xplanes.config import compose_plain, group_options, quoted
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, SceneError
 from xplanes.evaluation.findings import (
     Finding,
     Look,
@@ -28,7 +28,6 @@ from xplanes.evaluation.tabulate import markdown
 from xplanes.models.base import ModelSettings
 from xplanes.process import train_command
 from xplanes.scenes.cameras import cast_rays, image_plane
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, pixels_across
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.source import SceneSettings

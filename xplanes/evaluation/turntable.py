@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, SceneError
 from xplanes.evaluation.render import render_path, write_video
 from xplanes.experiment import Experiment
 from xplanes.fields import XPlanes
@@ -21,7 +21,6 @@ from xplanes.preparation.sequence import TriplaneSequence, save_triplanes
 from xplanes.rendering.grid_renderer import DIAGONAL, GridRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.cameras import camera_around
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.formats import ENDINGS, is_image
 from xplanes.scenes.frame import cube_frame
 from xplanes.scenes.images import load_images

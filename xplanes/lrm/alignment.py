@@ -13,8 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from xplanes.errors import LRMError
 from xplanes.lrm.canonical import CanonicalView
-from xplanes.lrm.errors import LRMError
 from xplanes.lrm.images import Crop, square_crop
 from xplanes.scenes.frame import Frame
 

@@ -3,9 +3,9 @@
 import hashlib
 from pathlib import Path
 
+from xplanes.errors import LRMError
 from xplanes.files import stand_in
 from xplanes.lrm.checkpoint import load
-from xplanes.lrm.errors import LRMError
 from xplanes.lrm.model import LRM
 from xplanes.lrm.weights import read_config
 

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from xplanes.errors import LRMError
 from xplanes.files import stand_in
 from xplanes.lrm.config import PUBLISHED, LRMConfig, parse_config, published_config
-from xplanes.lrm.errors import LRMError
 from xplanes.lrm.keys import translator
 from xplanes.lrm.model import LRM
 from xplanes.lrm.openlrm import OpenLRM

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from xplanes.errors import LRMError
 from xplanes.lrm.canonical import OPENLRM_VIEW
-from xplanes.lrm.errors import LRMError
 from xplanes.lrm.reader import Reader
 
 

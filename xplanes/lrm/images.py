@@ -6,9 +6,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from xplanes.errors import LRMError
 from xplanes.lrm.canonical import OPENLRM_VIEW, TRIPOSR_VIEW
 from xplanes.lrm.config import Architecture
-from xplanes.lrm.errors import LRMError
 
 FOREGROUND_RATIO = 0.85
 """Share of the image side that the object fills in TripoSR's preprocessing."""

@@ -4,10 +4,10 @@ import copy
 
 from torch import Tensor, nn
 
+from xplanes.errors import LRMError
 from xplanes.fields.decoder import Decoder
 from xplanes.lrm.canonical import CanonicalView
 from xplanes.lrm.config import LRMConfig
-from xplanes.lrm.errors import LRMError
 from xplanes.lrm.images import prepare
 from xplanes.lrm.vit import VisionTransformer
 

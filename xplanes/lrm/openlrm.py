@@ -5,10 +5,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
+from xplanes.errors import LRMError
 from xplanes.fields.decoder import Decoder
 from xplanes.lrm.canonical import OPENLRM_VIEW, canonical_vector
 from xplanes.lrm.config import LRMConfig
-from xplanes.lrm.errors import LRMError
 from xplanes.lrm.model import LRM
 from xplanes.lrm.vit import Attention, feed_forward
 

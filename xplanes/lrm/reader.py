@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from xplanes.lrm.errors import LRMError
+from xplanes.errors import LRMError
 
 
 @dataclass(frozen=True)

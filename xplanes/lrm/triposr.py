@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor, nn
 
+from xplanes.errors import LRMError
 from xplanes.fields.decoder import Decoder
 from xplanes.lrm.canonical import TRIPOSR_VIEW
 from xplanes.lrm.config import LRMConfig
-from xplanes.lrm.errors import LRMError
 from xplanes.lrm.images import resize_triposr
 from xplanes.lrm.model import LRM
 from xplanes.lrm.vit import Attention, GatedFeedForward

@@ -13,9 +13,9 @@ from urllib.request import getproxies, proxy_bypass
 
 import yaml
 
+from xplanes.errors import LRMError
 from xplanes.files import stand_in
 from xplanes.lrm.checkpoint import MismatchError, load
-from xplanes.lrm.errors import LRMError
 from xplanes.lrm.model import LRM
 from xplanes.optional import require
 

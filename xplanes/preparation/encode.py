@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from xplanes.lrm.errors import LRMError
+from xplanes.errors import LRMError
 from xplanes.lrm.images import Crop
 from xplanes.lrm.model import LRM
 from xplanes.preparation.cache import StageCache, fingerprint

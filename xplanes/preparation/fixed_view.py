@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from xplanes.config import compose_plain
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, SceneError
 from xplanes.fields.base import RadianceField
 from xplanes.fields.xplanes import XPlanes
 from xplanes.lrm.canonical import CanonicalView
@@ -21,7 +21,6 @@ from xplanes.models.initialisation import Method, Place, PreparationSettings
 from xplanes.preparation.cache import StageCache
 from xplanes.rendering.base import RayRenderer
 from xplanes.scenes.cameras import camera_around
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, frame_content
 from xplanes.scenes.views import Intrinsics, Views, camera_rays
 from xplanes.training.fit import fit_quietly

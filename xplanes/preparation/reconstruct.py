@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from xplanes.backend import fast_bf16
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, LRMError
 from xplanes.lrm.alignment import Alignment, align, fit_cube
-from xplanes.lrm.errors import LRMError
 from xplanes.lrm.images import Crop, foreground_crop, square_crop
 from xplanes.lrm.model import LRM
 from xplanes.models.initialisation import InitialiserSettings, Method, Place

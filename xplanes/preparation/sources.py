@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, LRMError
 from xplanes.lrm.bundled import load_bundled
-from xplanes.lrm.errors import LRMError
 from xplanes.lrm.weights import WeightSource, find_weights, load_weights
 from xplanes.models.base import InitialValues
 from xplanes.models.initialisation import (

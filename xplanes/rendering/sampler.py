@@ -9,11 +9,10 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, SceneError
 from xplanes.fields.base import RadianceField, Representation
 from xplanes.rendering.base import Renderer, Rendering
 from xplanes.scenes.batches import Batch
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame, cube_frame, scene_frame
 from xplanes.scenes.views import Views
 from xplanes.settings import Settings

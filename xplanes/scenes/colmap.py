@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 import torch
 
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.files import natural
 from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, read_model
 from xplanes.scenes.entries import (
@@ -25,7 +25,6 @@ from xplanes.scenes.entries import (
     some,
     unit_times,
 )
-from xplanes.scenes.errors import MissingSplitError, SceneError
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.listing import (
     Listing,

@@ -16,8 +16,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from xplanes.errors import SceneError
 from xplanes.scenes.entries import require_fetched, short
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
 from xplanes.scenes.listing import Calibration
 

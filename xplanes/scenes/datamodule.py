@@ -14,10 +14,9 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler, IterableDa
 
 from xplanes.components import build, plugins
 from xplanes.config import compose_plain
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, MissingSplitError
 from xplanes.files import read_json
 from xplanes.scenes.batches import Batch, Batches, DeviceBatches, RayBatches, RaySettings
-from xplanes.scenes.errors import MissingSplitError
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.listing import even_ranks, held_out_places
 from xplanes.scenes.source import HELD_OUT, SceneSettings, may_hold_out

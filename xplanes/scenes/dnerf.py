@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from xplanes.scenes.errors import MissingSplitError, SceneError
+from xplanes.errors import MissingSplitError, SceneError
 from xplanes.scenes.listing import Listing, read_views, thinned
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.transforms import read_transforms

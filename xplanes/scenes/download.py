@@ -12,8 +12,8 @@ from pathlib import Path, PurePosixPath
 from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 
+from xplanes.errors import SceneError
 from xplanes.files import storage_error
-from xplanes.scenes.errors import SceneError
 
 CHUNK_BYTES = 1 << 20
 TIMEOUT_SECONDS = 30

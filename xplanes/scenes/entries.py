@@ -14,9 +14,9 @@ from typing import Any, TypeGuard
 import numpy as np
 import torch
 
+from xplanes.errors import BrokenFrameError, SceneError
 from xplanes.files import stand_in
 from xplanes.scenes.cameras import upright
-from xplanes.scenes.errors import BrokenFrameError, SceneError
 from xplanes.scenes.formats import ENDINGS, is_image, orientation
 
 logger = logging.getLogger(__name__)

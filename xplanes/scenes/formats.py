@@ -8,8 +8,8 @@ from pathlib import Path
 
 from PIL import Image
 
+from xplanes.errors import SceneError
 from xplanes.files import stand_in
-from xplanes.scenes.errors import SceneError
 
 FORMATS = """PNG JPEG MPO WEBP TIFF BMP AVIF JPEG2000 PPM TGA GIF QOI""".split()
 """Formats of Pillow that are read; it runs other programs for some of the others."""

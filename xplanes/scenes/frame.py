@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from xplanes.errors import SceneError
 from xplanes.scenes.cameras import cast_rays, project, turned
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.views import Views
 
 MARGIN = 1.03

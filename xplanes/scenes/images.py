@@ -8,8 +8,8 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
+from xplanes.errors import SceneError, refuse_all
 from xplanes.scenes import store
-from xplanes.scenes.errors import SceneError, refuse_all
 from xplanes.scenes.formats import SIXTEEN_BIT_MODES, UNREADABLE, open_image, unreadable
 from xplanes.scenes.masks import read_mask
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from xplanes.errors import MissingSplitError, SceneError, refuse_all
 from xplanes.scenes.entries import some
-from xplanes.scenes.errors import MissingSplitError, SceneError, refuse_all
 from xplanes.scenes.formats import UNTURN, mask_misfit, orientation
 from xplanes.scenes.images import (
     Size,

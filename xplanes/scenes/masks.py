@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from xplanes.scenes.errors import SceneError
+from xplanes.errors import SceneError
 from xplanes.scenes.formats import (
     SIXTEEN_BIT_MODES,
     UNREADABLE,

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, MissingSplitError, SceneError, refuse_all
 from xplanes.files import natural
 from xplanes.scenes import store, videos
 from xplanes.scenes.colmap_model import MODELS, find_model, read_model
@@ -30,7 +30,6 @@ from xplanes.scenes.entries import (
     require_precision,
     some,
 )
-from xplanes.scenes.errors import MissingSplitError, SceneError, refuse_all
 from xplanes.scenes.formats import ENDINGS, is_image
 from xplanes.scenes.images import (
     Size,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from xplanes.errors import SceneError
 from xplanes.scenes.entries import (
     SUFFIXES,
     checked_pose,
@@ -27,7 +28,6 @@ from xplanes.scenes.entries import (
     some,
     unit_times,
 )
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.images import native_sizes
 from xplanes.scenes.listing import (
     Calibration,

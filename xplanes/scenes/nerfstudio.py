@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from xplanes.errors import BrokenFrameError, MissingSplitError, SceneError
 from xplanes.scenes.entries import image_path, short
-from xplanes.scenes.errors import BrokenFrameError, MissingSplitError, SceneError
 from xplanes.scenes.listing import Listing, held_out, read_splits, thinned
 from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.source import SceneSettings

@@ -10,7 +10,7 @@ from typing import Literal
 
 import torch
 
-from xplanes.scenes.errors import MissingSplitError, SceneError
+from xplanes.errors import MissingSplitError, SceneError
 from xplanes.scenes.views import Scene, Views, joined
 from xplanes.settings import Count, Positive, Settings
 

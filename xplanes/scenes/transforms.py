@@ -11,6 +11,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from xplanes.errors import (
+    BrokenFrameError,
+    MissingSplitError,
+    SceneError,
+    first_of,
+    refuse_all,
+)
 from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.entries import (
     checked_pose,
@@ -22,13 +29,6 @@ from xplanes.scenes.entries import (
     require_precision,
     short,
     unit_times,
-)
-from xplanes.scenes.errors import (
-    BrokenFrameError,
-    MissingSplitError,
-    SceneError,
-    first_of,
-    refuse_all,
 )
 from xplanes.scenes.images import read_header
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from xplanes.errors import SceneError
 from xplanes.files import stand_in
 from xplanes.optional import require
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.images import Size
 
 SUFFIXES = """.mp4 .mov .m4v .mkv .webm .avi .mpg .mpeg .ts .mts .m2ts .3gp .wmv""".split()

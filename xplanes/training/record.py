@@ -16,11 +16,10 @@ import yaml
 
 import xplanes
 from xplanes import __version__
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, SceneError
 from xplanes.files import read_json, replacing, write_json, write_text
 from xplanes.lrm import LRMError
 from xplanes.process import resume_command
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.views import Views
 from xplanes.training.checkpoints import LAST, load_checkpoint
 

@@ -14,8 +14,8 @@ from PIL import Image
 from tests.refusals import assert_refused
 from xplanes.components import build
 from xplanes.config import CONF, compose_plain
+from xplanes.errors import SceneError
 from xplanes.scenes.cameras import focal_length, pixel_rays
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.source import SceneSettings
 from xplanes.synthetic.demo.assembly import Assembly, Part
 from xplanes.synthetic.demo.geometry import Box, Plain, Translucent, Unlit

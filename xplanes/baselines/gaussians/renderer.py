@@ -10,11 +10,11 @@ from xplanes.baselines.gaussians.camera import Camera
 from xplanes.baselines.gaussians.field import Gaussians
 from xplanes.baselines.gaussians.harmonics import spherical_harmonics
 from xplanes.baselines.gaussians.rasteriser import RasterisedImage, rasterise
+from xplanes.errors import SceneError
 from xplanes.rendering.base import Renderer, Rendering
 from xplanes.rendering.marching import Samples
 from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
 from xplanes.scenes.batches import Batch
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import PosedCamera
 from xplanes.streams import TrainingState

@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from xplanes.scenes.errors import SceneError
+from xplanes.errors import SceneError
 from xplanes.synthetic.demo.assembly import Assembly, Joint, Part, Vector
 from xplanes.synthetic.demo.geometry import (
     Box,

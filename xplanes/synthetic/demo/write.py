@@ -20,9 +20,8 @@ from PIL import Image
 from torch import Tensor
 
 from xplanes.backend import threads
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, SceneError
 from xplanes.scenes.dnerf import read_scene
-from xplanes.scenes.errors import SceneError
 from xplanes.scenes.images import load_images
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views

@@ -8,7 +8,7 @@ import difflib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from xplanes.scenes.errors import SceneError
+from xplanes.errors import SceneError
 from xplanes.synthetic.demo import scenes
 from xplanes.synthetic.demo.assembly import Assembly
 from xplanes.synthetic.demo.capture import Array, Phone, Rig

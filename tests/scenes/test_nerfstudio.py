@@ -3,6 +3,8 @@
 import json
 import logging
 import math
+import unicodedata
+import warnings
 from functools import partial
 
 import numpy as np
@@ -16,11 +18,14 @@ from tests.refusals import assert_refused
 from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
+from xplanes.scenes import store
 from xplanes.scenes.batches import RayBatches, ViewBatches, ViewSettings
 from xplanes.scenes.datamodule import UNIFORM, SceneDataModule, whole_view
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.nerfstudio import read_capture
 from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.views import joined
+from xplanes.streams import step_generator
 from xplanes.training.scores import score_image
 
 SIZE, ANGLE = 24, 0.7
@@ -340,6 +345,73 @@ def test_masks_that_look_like_silhouettes_bound_the_scene(capture, caplog):
     assert torch.equal(ignoring.shown(0), torch.from_numpy(disc() > 0))
 
 
+def test_rays_of_stored_images_leave_ignored_pixels_out(capture, monkeypatch, tmp_path):
+    masked(capture, band())
+    monkeypatch.setattr(store, "IN_MEMORY", 0)
+    views = capture.read(eval_every=100, cache=tmp_path / "tiles").splits["train"]
+    assert views.is_stored
+    batches = RayBatches(views, scene_frame(views), UNIFORM, seed=0)
+    for step in range(5):
+        _, _, row, _, _ = batches._from_tiles(
+            views.images, torch.rand(200, 3, dtype=torch.float64), step_generator(0, step)
+        )
+        assert int(row.max()) < SIZE - SIZE // 4
+
+
+def test_images_that_masks_leave_out_whole_are_left_out(capture):
+    masked(capture, band(), of=lambda index: index not in (2, 4))
+    with pytest.warns(UserWarning, match=r"all pixels of 2 of 10 images: images/frame_00002\.png"):
+        views = capture.read(eval_every=100).splits["train"]
+    assert numbers(views) == [0, 1, 3, 5, 6, 7, 8, 9]
+    assert len(views.ignored) == 8
+    masked(capture, 0 * band())
+    capture.refused("leave out all pixels of 10 of 10.*mask_use=alpha", mask_use="ignore")
+
+
+def test_ignored_pixels_stay_ignored_among_other_views(capture):
+    masked(capture, band())
+    views = capture.read(eval_every=100).splits["train"]
+    small = capture.read(eval_every=100, mask_use="lrm", resolution=8).splits["train"]
+    both = joined(small, views)
+    assert not both.ignored[:10].any()
+    assert torch.equal(both.shown(13), views.shown(3))
+    assert joined(small, small).ignored is None
+
+
+def test_dim_values_of_noise_and_of_video_are_no_labels(capture):
+    noise = np.random.default_rng(0).integers(0, 3, (SIZE, SIZE)).astype(np.uint8)
+    masked(capture, noise)
+    with pytest.warns(UserWarning, match="10 of 10 images show nothing"):
+        capture.read(eval_every=100, mask_use="alpha")
+    # Videos have black at 16 and white at 235.
+    masked(capture, np.where(band() > 0, 235, 16).astype(np.uint8))
+    views = capture.read(eval_every=100).splits["train"]
+    assert torch.equal(views.shown(0), torch.from_numpy(band() > 0))
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg"])
+def test_masks_of_instant_ngp_are_white_where_pixels_are_ignored(capture, ending):
+    for frame in capture.frames:
+        path = capture.path / frame["file_path"]
+        Image.open(path).convert("RGB").save(path.with_suffix(f".{ending}"))
+        frame["file_path"] = f"./images/{path.stem}.{ending}"
+        Image.fromarray(255 - band()).save(path.with_name(f"dynamic_mask_{path.stem}.png"))
+    scene = capture.read(eval_every=100)
+    views = scene.splits["train"]
+    assert torch.equal(views.shown(0), torch.from_numpy(band() > 0))
+    assert scene.notes["masks"].startswith("leave out 25.0% of the pixels. They are taken for pix")
+
+
+@pytest.mark.parametrize("name", ["{stem}.alpha.png", "{stem}.png.alpha.png"])
+def test_alpha_beside_images_is_read(capture, name):
+    for frame in capture.frames:
+        path = capture.path / frame["file_path"]
+        Image.fromarray(band()).save(path.with_name(name.format(stem=path.stem)))
+    views = capture.read(eval_every=100).splits["train"]
+    assert views.ignored is None
+    assert not views.image(0)[band() == 0].any()
+
+
 def test_masks_that_may_mean_either_are_asked_about(capture):
     masked(capture, band(5 * SIZE // 12))
     with pytest.warns(UserWarning, match=r"Both readings are possible.*data\.mask_use=alpha"):
@@ -480,6 +552,88 @@ def test_two_fields_of_view_give_pixels_that_are_not_square(capture):
     capture.content["camera_angle_y"] = 2 * math.atan(math.tan(0.5 * ANGLE) / 1.25)
     focal = capture.read(resolution=12).splits["train"].intrinsics.focal[0]
     assert focal.tolist() == pytest.approx([FOCAL / 2, 1.25 * FOCAL / 2])
+
+
+@pytest.mark.parametrize("place", ["file", "frames"])
+def test_fields_of_view_in_degrees(capture, place):
+    for key in PINHOLE:
+        del capture.content[key]
+    for entry in [capture.content] if place == "file" else capture.frames:
+        entry |= {"x_fov": math.degrees(ANGLE), "y_fov": math.degrees(ANGLE)}
+    assert capture.read().splits["train"].intrinsics.focal[0].tolist() == pytest.approx([FOCAL] * 2)
+    for entry in [capture.content] if place == "file" else capture.frames:
+        del entry["x_fov"], entry["y_fov"]
+        entry["camera_angle_x"] = math.degrees(ANGLE)
+    with pytest.warns(UserWarning, match=r"camera_angle_x=40\.1\d* is read in degrees"):
+        focal = capture.read().splits["train"].intrinsics.focal[0]
+    assert focal.tolist() == pytest.approx([FOCAL] * 2)
+
+
+def test_keys_that_say_nothing_are_not_named(capture):
+    capture.content |= {"rolling_shutter": [0, 0.0, [0]], "black_transparent": False, "sharpen": 0}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        capture.read()
+
+
+def test_where_times_come_from_is_told(capture):
+    capture.timed([7 + 2 * i for i in range(10)], "timestamp")
+    assert capture.read().notes["times"] == (
+        '"timestamp" of transforms.json, from 7 to 25: images/frame_00000.png -> 7, '
+        "images/frame_00004.png -> 15, images/frame_00009.png -> 25"
+    )
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-32"])
+def test_a_file_in_another_encoding_is_read(capture, encoding):
+    (capture.path / "images").rename(capture.path / "bildér")
+    for frame in capture.frames:
+        frame["file_path"] = frame["file_path"].replace("images", "bildér")
+    path = capture.path / "transforms.json"
+    path.write_text(json.dumps(capture.content, ensure_ascii=False), encoding=encoding)
+    read = partial(read_capture, capture.path, resolution=None, splits=["train"])
+    assert len(read().splits["train"]) == 9
+    for text, words in (
+        (json.dumps(capture.content, ensure_ascii=False).encode("cp1252"), "Save it as UTF-8"),
+        (
+            b'{"frames": [], /* none */ "w": 3}',
+            "JSON has no comments: take those that begin with /",
+        ),
+        (b'{"frames": [],}', "no comma before a closing bracket"),
+    ):
+        path.write_bytes(text)
+        assert_refused(SceneError, words, read, text[-40:])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda name: name.removeprefix("images/"),
+        lambda name: name.replace("images", "Images").upper(),
+        lambda name: unicodedata.normalize("NFD", name),
+        lambda name: f"/home/somebody/ball/{name}",
+    ],
+)
+def test_images_are_found_by_names_that_are_nearly_theirs(capture, change):
+    for frame in capture.frames:
+        path = capture.path / frame["file_path"]
+        named = path.with_name(f"é{path.name}")
+        path.rename(named)
+        frame["file_path"] = change(f"images/{named.name}")
+    assert len(capture.read(eval_every=100).splits["train"]) == 10
+
+
+def test_a_name_that_several_images_have_is_none_of_them(capture):
+    path = capture.path / capture.frames[3]["file_path"]
+    with Image.open(path) as picture:
+        picture.save(path.with_suffix(".webp"), lossless=True)
+        picture.save(path.with_suffix(".tif"))
+    path.unlink()
+    with pytest.warns(UserWarning, match=r"1 of 10 frames are left out"):
+        capture.read()
+    # The one of the same name but for case is the one.
+    path.with_suffix(".tif").rename(path.with_suffix(".pNg"))
+    assert len(capture.read(eval_every=100).splits["train"]) == 10
 
 
 @pytest.mark.parametrize("count", [1, 5])

@@ -112,8 +112,8 @@ def look(views: Views, index: int, background: Tensor, frame: Frame | None) -> L
     image = views.image(index)
     alpha = image[..., 3]
     height, width = alpha.shape
-    has_ray = views.intrinsics.has_ray(index)
-    valid = torch.ones_like(alpha, dtype=torch.bool) if has_ray is None else has_ray
+    shown = views.shown(index)
+    valid = torch.ones_like(alpha, dtype=torch.bool) if shown is None else shown
     opaque, clear = alpha > 127, (alpha <= 5) & valid
     pale = (image[..., :3].short() - (255 * background).short()).abs().amax(dim=-1) < PALE_STEPS
     pale &= alpha >= 250

@@ -307,6 +307,7 @@ def facts(capture: Capture) -> dict[str, Any]:
         },
         "video_frames": None if scene.video is None else len(scene.video),
         "static_reason": scene.static_reason,
+        "notes": dict(scene.notes),
         "cube": None,
         "texels": capture.texels,
         "pixels_per_texel": None,
@@ -379,6 +380,7 @@ def table(capture: Capture) -> str:
         markdown(["split", *splits], lines),
         "",
     ]
+    text += [f"{name:<7} {words}" for name, words in known["notes"].items()]
     if known["video_frames"]:
         text.append(f"video   {known['video_frames']} frames of a fixed camera")
     if known["static_reason"]:

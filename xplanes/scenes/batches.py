@@ -355,7 +355,7 @@ class RayBatches(Batches):
         columns = (size[:, 1] + TILE - 1) // TILE
         top, left = tile // columns * TILE, tile % columns * TILE
         inside = torch.rand(len(tile), per_tile, generator=generator, dtype=torch.float64)
-        if self.views.intrinsics.sights is None:
+        if self.views.intrinsics.sights is None and self.views.ignored is None:
             row, column = in_cells(cells, size[:, 0] - top, size[:, 1] - left, inside)
         else:
             row, column = self._with_rays(view, top, left, cells, inside)
@@ -368,7 +368,7 @@ class RayBatches(Batches):
     def _with_rays(
         self, view: Tensor, top: Tensor, left: Tensor, cells: Tensor, inside: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """As `in_cells`, among the pixels that the tiles' lenses map a direction to."""
+        """As `in_cells`, among the pixels that are trained on."""
         found = []
         side = TILE // CELL
         tiles = cells.view(-1, side, side).repeat_interleave(CELL, 1).repeat_interleave(CELL, 2)

@@ -33,6 +33,7 @@ from xplanes.scenes.listing import (
     read_splits,
     require_shapes,
     thinned,
+    time_words,
 )
 from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.multicamera import recordings_of_cameras
@@ -110,8 +111,10 @@ class ColmapSettings(SceneSettings):
             f"{self.eval_every}, or choose another data.eval_split.",
         )
         chosen = thinned(chosen, self.views, self.eval_views, self.folder)
-        splits_read, cut = read_splits(chosen, self.resolution, self.image_cache, self.mask_use)
-        return Scene(self.folder.resolve().name, splits_read, points=points, cut=cut)
+        read, cut, notes = read_splits(
+            chosen, self.resolution, self.image_cache, self.mask_use, listing
+        )
+        return Scene(self.folder.resolve().name, read, points=points, cut=cut, notes=notes)
 
     def _listing(self, model: SparseModel) -> tuple[Listing, torch.Tensor | None]:
         """All images of the capture, and the model's points."""
@@ -134,7 +137,7 @@ class ColmapSettings(SceneSettings):
             if is_image(path) and path.is_file()
         }
         _warn_of_unregistered(sorted(present - set(model.names)), len(present), images)
-        times = self._times(model.names, labels, present)
+        times, words = self._times(model.names, labels, present)
         poses, points = model.camera_to_world, model.points
         if self.orient:
             poses, points = oriented(poses, points, paths)
@@ -150,6 +153,7 @@ class ColmapSettings(SceneSettings):
             timed=bool(times),
             masks=() if self.masks is None else self._masks(model.names, self.masks),
             cameras=tuple(folders) if any(folders) else (),
+            time_words=words,
         )
         require_shapes(listing)
         return listing, None if points is None else torch.from_numpy(points).float()
@@ -161,14 +165,16 @@ class ColmapSettings(SceneSettings):
         ]
         return mask_files(self.folder / masks, kinds)
 
-    def _times(self, names: Sequence[str], labels: Sequence[str], present: set[str]) -> list[float]:
-        """Times from 0 to 1; none where the scene is said to be static."""
+    def _times(
+        self, names: Sequence[str], labels: Sequence[str], present: set[str]
+    ) -> tuple[list[float], str]:
+        """Times from 0 to 1, and where they come from; none where the scene is static."""
         if self.static:
-            return []
+            return [], ""
         if self.times is None:
             found = _numbers(names, labels, self.time_pattern)
             if not found:
-                return []
+                return [], ""
             origin = "the numbers in their names"
         elif self.times == "rank":
             found = _ranks(names, present)
@@ -181,7 +187,7 @@ class ColmapSettings(SceneSettings):
             "The times of %d images, from 0 to 1, are %s, from %s to %s",
             *(len(names), origin, min(found), max(found)),
         )
-        return unit_times(found)
+        return unit_times(found), time_words(origin, names, found)
 
     def _parts(self, listing: Listing) -> dict[str, Listing]:
         """The capture by splits."""

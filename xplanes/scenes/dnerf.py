@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from xplanes.errors import MissingSplitError, SceneError
-from xplanes.scenes.listing import Listing, read_views, thinned
+from xplanes.scenes.listing import Listing, read_splits, read_views, thinned
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.transforms import read_transforms
 from xplanes.scenes.views import Scene
@@ -72,10 +72,13 @@ def read_scene(
     video = _list_video(folder)
     others = listed if video is None else {**listed, "video": video}
     _require_times(folder, listed.get("train"), others)
+    told = any(part.mask_meaning for part in listed.values())
+    read, _, notes = read_splits(listed, resolution, cache, "auto" if told else "alpha")
     return Scene(
         folder.resolve().name,
-        {split: read_views(part, resolution, cache) for split, part in listed.items()},
+        read,
         video=None if video is None else read_views(video, resolution, cache),
+        notes=notes,
     )
 
 

@@ -1,10 +1,12 @@
 """Names, poses, numbers and times in files of cameras, read and checked."""
 
+import codecs
 import json
 import logging
 import math
 import os
 import re
+import unicodedata
 import warnings
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
@@ -37,9 +39,9 @@ ROUNDING = 1e-4
 def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> Path:
     """The file that ``name`` stands for inside ``folder``.
 
-    Suffixes may be left out, be those of another format, or differ in case, as long as one file
-    alone has the name. Of a path that leads nowhere, such as one of another machine, the first
-    folders are left out.
+    Suffixes may be left out or be those of another format, and names differ in case or in how
+    accents are written, as long as one file alone fits. Of a path that leads nowhere, such as one
+    of another machine, the first folders are left out; a name without folders may be in images.
 
     Args:
         label: The file and frame that name it, for messages.
@@ -52,14 +54,18 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         SceneError: If it is no name, or leaves the folder.
     """
     choices = list(paths_inside(label, folder, name, key, "./train/r_000"))
+    choices += [folder / "images" / path.name for path in choices if path.parent == folder]
     for image in choices:
         if image.is_file():
             return image
     for image in choices:
-        stems = _stems(image.parent) if image.parent.is_dir() else {}
+        if (parent := _like(image.parent)) is None:
+            continue
         wanted = image.stem if image.suffix.lower() in ENDINGS else image.name
-        if len(found := stems.get(wanted.lower(), ())) == 1:
-            return found[0]
+        found = _stems(parent).get(_plain(wanted), ())
+        same = [path for path in found if _plain(path.name) == _plain(image.name)]
+        if len(chosen := same or found) == 1:
+            return chosen[0]
     raise BrokenFrameError(
         f"{label}: no image {folder / name}, nor with {', '.join(SUFFIXES[1:4])}, ... added. "
         f"Add the file or take the frame out of the list."
@@ -75,8 +81,23 @@ def _stems(folder: Path) -> dict[str, list[Path]]:
 def _stems_at(folder: Path, changed: int) -> dict[str, list[Path]]:
     found: dict[str, list[Path]] = {}
     for path in sorted(filter(is_image, folder.iterdir())):
-        found.setdefault(path.stem.lower(), []).append(path)
+        found.setdefault(_plain(path.stem), []).append(path)
     return found
+
+
+def _plain(name: str) -> str:
+    """A name without case; macOS writes accents as letters of their own."""
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def _like(folder: Path) -> Path | None:
+    """A folder, or the only one beside it whose name differs in case or accents alone."""
+    if folder.is_dir() or folder.parent == folder:
+        return folder
+    if (parent := _like(folder.parent)) is None:
+        return None
+    names = [path for path in parent.iterdir() if _plain(path.name) == _plain(folder.name)]
+    return names[0] if len(names) == 1 and names[0].is_dir() else None
 
 
 def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) -> Iterator[Path]:
@@ -167,16 +188,36 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
     """
     require_fetched(path)
     try:
-        # Some editors begin files with a byte order mark.
-        found = json.loads(path.read_text(encoding="utf-8-sig"))
+        found = json.loads(_decoded(path.read_bytes()))
     except (OSError, ValueError, RecursionError) as problem:
         way_out = "Export or download it again"
-        if isinstance(problem, json.JSONDecodeError) and re.search(r"(?m)(^|[\s,])//", problem.doc):
-            way_out = "JSON has no comments: take those that begin with // out of it"
+        if isinstance(problem, UnicodeDecodeError):
+            way_out = "Save it as UTF-8"
+        elif isinstance(problem, json.JSONDecodeError):
+            if comment := re.search(r"(?m)(?:^|[\s,{\[])(//|/\*|#)", problem.doc):
+                way_out = f"JSON has no comments: take those that begin with {comment[1]} out of it"
+            elif re.search(r",\s*[}\]]", problem.doc):
+                way_out = "JSON has no comma before a closing bracket: take it out"
         raise SceneError(f"{path} cannot be read as JSON ({problem}). {way_out}.") from problem
     if not isinstance(found, dict):
         raise SceneError(f"{path} must hold a JSON object with {content}, not {short(found)}.")
     return found
+
+
+def _decoded(content: bytes) -> str:
+    """Text in UTF-8, or in UTF-16 or UTF-32 where a byte order mark says so.
+
+    Some editors begin files with a mark; PowerShell writes UTF-16.
+    """
+    for mark, encoding in (
+        (codecs.BOM_UTF32_LE, "utf-32"),
+        (codecs.BOM_UTF32_BE, "utf-32"),
+        (codecs.BOM_UTF16_LE, "utf-16"),
+        (codecs.BOM_UTF16_BE, "utf-16"),
+    ):
+        if content.startswith(mark):
+            return content.decode(encoding)
+    return content.decode("utf-8-sig")
 
 
 def require_fetched(path: Path) -> None:

@@ -11,12 +11,15 @@ from torch import Tensor
 from xplanes.errors import SceneError, refuse_all
 from xplanes.scenes import store
 from xplanes.scenes.formats import SIXTEEN_BIT_MODES, UNREADABLE, open_image, unreadable
-from xplanes.scenes.masks import read_mask
+from xplanes.scenes.masks import MaskKind, read_mask
 
 Size = tuple[int, int]
 """Height and width."""
 
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "P", "PA", "1")
+
+PLAIN = MaskKind(labels=False)
+"""Masks from black to white."""
 
 MASKS = 3
 """Version of what masks mean; increase it whenever decoded images change."""
@@ -83,7 +86,7 @@ def read_images(
     masks: Sequence[Path | None] = (),
     has_ray: Sequence[Tensor | None] = (),
     cache: Path | None = None,
-    labels: bool = False,
+    kind: MaskKind = PLAIN,
 ) -> Tensor | store.StoredImages:
     """Decode images of any sizes and reduce them.
 
@@ -96,7 +99,7 @@ def read_images(
         has_ray: Pixels of the reduced images that show anything, of each image bool [h, w], or None
             for all; all of all images where it is empty. [V]
         cache: Folder of decoded images; that of the user when None.
-        labels: Whether masks hold numbers of things, see `masks.read_mask`.
+        kind: What masks mean, see `masks.read_mask`.
 
     Returns:
         Colour, multiplied by alpha before it was averaged, and alpha, smaller images padded with
@@ -106,13 +109,14 @@ def read_images(
         SceneError: A file cannot be decoded, or a mask does not fit its image.
         StorageError: The cache cannot be written.
     """
-    jobs = _jobs(paths, sizes, masks, has_ray, labels)
+    jobs = _jobs(paths, sizes, masks, has_ray, kind)
     if not store.is_needed(sizes):
         return store.in_memory(sizes, jobs)
     cut = any(masks) or any(shown is not None for shown in has_ray)
     channels = 4 if cut or any(read_header(path)[1] for path in paths) else 3
     sources = [*paths, *(mask for mask in masks if mask is not None)]
-    recipe = ["images", MASKS, labels, [mask is not None for mask in masks], digests(has_ray)]
+    meaning = [MASKS, kind.labels, kind.inverted]
+    recipe = ["images", meaning, [mask is not None for mask in masks], digests(has_ray)]
     return store.decoded(sources, recipe, sizes, channels, jobs, cache)
 
 
@@ -121,14 +125,14 @@ def _jobs(
     sizes: Sequence[Size],
     masks: Sequence[Path | None] = (),
     has_ray: Sequence[Tensor | None] = (),
-    labels: bool = False,
+    kind: MaskKind = PLAIN,
 ) -> list[store.Job]:
     """What decodes the images, one each."""
 
     def job(index: int) -> store.Job:
         def decode() -> Iterator[tuple[int, np.ndarray]]:
             mask = masks[index] if masks else None
-            pixels = read_image(paths[index], sizes[index], mask, labels)
+            pixels = read_image(paths[index], sizes[index], mask, kind)
             yield index, cleared(pixels, has_ray[index] if has_ray else None)
 
         return decode
@@ -153,12 +157,12 @@ def digests(masks: Sequence[Tensor | None]) -> list[str]:
 
 
 def read_image(
-    path: Path, size: Size, mask: Path | None = None, labels: bool = False
+    path: Path, size: Size, mask: Path | None = None, kind: MaskKind = PLAIN
 ) -> np.ndarray:
     """Decode one image, multiply it by its mask, and reduce it. uint8 [H, W, 4]"""
     channels = load_premultiplied(path)
     if mask is not None:
-        channels *= read_mask(mask, labels, path)
+        channels *= read_mask(mask, kind, path)
     height, width = size
     return shrink(channels, width, height)
 

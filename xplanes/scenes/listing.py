@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -12,14 +13,9 @@ from torch import Tensor
 from xplanes.errors import MissingSplitError, SceneError, refuse_all
 from xplanes.scenes.entries import some
 from xplanes.scenes.formats import UNTURN, mask_misfit, orientation
-from xplanes.scenes.images import (
-    Size,
-    final_sizes,
-    native_sizes,
-    read_images,
-)
+from xplanes.scenes.images import PLAIN, Size, final_sizes, native_sizes, read_images
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
-from xplanes.scenes.masks import MaskUse, chosen_use, ignored_pixels, survey
+from xplanes.scenes.masks import MaskKind, MaskUse, chosen_use, ignored_pixels, survey
 from xplanes.scenes.views import Intrinsics, Views
 
 SHORTEST, LONGEST = 1e-3, 1e5
@@ -113,6 +109,9 @@ class Listing:
             None for an image without; empty where there are none. [V]
         cameras: Name of the physical camera that took each image; empty where that is not
             known. [V]
+        mask_meaning: What the source says that masks are: alpha, or white where pixels are to be
+            ignored; empty where it says nothing.
+        time_words: Where times come from, in words; empty where there are none.
     """
 
     paths: tuple[Path, ...]
@@ -123,6 +122,8 @@ class Listing:
     timed: bool
     masks: tuple[Path | None, ...] = ()
     cameras: tuple[str, ...] = ()
+    mask_meaning: Literal["", "alpha", "ignored"] = ""
+    time_words: str = ""
 
     def __len__(self) -> int:
         return len(self.files)
@@ -139,6 +140,8 @@ class Listing:
             self.timed,
             tuple(self.masks[i] for i in chosen) if self.masks else (),
             tuple(self.cameras[i] for i in chosen) if self.cameras else (),
+            self.mask_meaning,
+            self.time_words,
         )
 
     def spread(self, count: int | None, key: str, split: str) -> "Listing":
@@ -162,6 +165,19 @@ class Listing:
             )
         by_time = self.times.argsort(stable=True).tolist()
         return self.subset(sorted(by_time[rank] for rank in even_ranks(count, total)))
+
+
+def time_words(origin: str, files: Sequence[str], times: Sequence[Any]) -> str:
+    """Where times come from, with examples.
+
+    Args:
+        origin: What tells them.
+        files: Names of the images. [V]
+        times: Their times as they are told. [V]
+    """
+    shown = dict.fromkeys(even_ranks(min(len(files), 3), len(files)))
+    examples = ", ".join(f"{files[rank]} -> {times[rank]}" for rank in shown)
+    return f"{origin}, from {min(times)} to {max(times)}: {examples}"
 
 
 def even_ranks(count: int, total: int) -> list[int]:
@@ -256,7 +272,7 @@ def read_views(
     resolution: int | None,
     cache: Path | None = None,
     ignore: bool = False,
-    labels: bool | None = None,
+    kind: MaskKind | None = None,
 ) -> Views:
     """Read the images of a listing, with their masks, and reduce them to a width.
 
@@ -267,13 +283,23 @@ def read_views(
         listing: At least one image.
         resolution: Width in pixels; None keeps the sizes of the files.
         cache: Folder of images that are too large for memory; that of the user when None.
-        ignore: Whether pixels that masks leave out are ignored; they get alpha 0 otherwise.
-        labels: Whether masks hold numbers of things; None finds out.
+        ignore: Whether pixels that masks leave out are ignored; they get alpha 0 otherwise. Images
+            of which nothing remains are left out, with a warning.
+        kind: What masks mean; None finds out.
 
     Raises:
         SceneError: If a file cannot be decoded, the resolution cannot be met, or a perspective
-            lens maps no direction to a pixel.
+            lens maps no direction to a pixel; or if masks leave out all pixels of all images.
     """
+    if kind is None:
+        kind = survey(listing.masks) if any(listing.masks) else PLAIN
+    ignored = None
+    if ignore and any(listing.masks):
+        sizes = final_sizes(listing.paths, native_sizes(listing.paths), resolution)
+        ignored = ignored_pixels(listing.masks, listing.paths, sizes, kind)
+        rest = [i for i, size in enumerate(sizes) if not ignored[i, : size[0], : size[1]].all()]
+        if len(rest) < len(listing):
+            listing, ignored = _without_ignored(listing, rest), ignored[rest]
     native = native_sizes(listing.paths)
     sizes = final_sizes(listing.paths, native, resolution)
     names = [str(path) for path in listing.paths]
@@ -282,22 +308,38 @@ def read_views(
     for index, shown in enumerate(has_ray):
         if shown is not None:
             require_rays(names[index], listing.calibrations[index], shown)
-    masked = any(listing.masks)
-    if labels is None:
-        labels = masked and survey(listing.masks).labels
     masks = () if ignore else listing.masks
-    images = read_images(listing.paths, sizes, masks, has_ray, cache, labels)
-    ignored = ignored_pixels(listing.masks, listing.paths, sizes, labels) if ignore else None
+    images = read_images(listing.paths, sizes, masks, has_ray, cache, kind)
+    if ignored is not None:
+        ignored = ignored[:, : images.shape[1], : images.shape[2]]
     views = Views(
         images,
         listing.camera_to_world,
         listing.times,
         intrinsics,
         listing.files,
-        ignored=ignored if masked else None,
+        ignored=ignored,
     )
     _warn_of_empty(views, listing)
     return views
+
+
+def _without_ignored(listing: Listing, rest: Sequence[int]) -> Listing:
+    """The images at ``rest``; a warning names the others, of which masks leave out all pixels."""
+    gone = [file for index, file in enumerate(listing.files) if index not in {*rest}]
+    text = (
+        f"masks leave out all pixels of {len(gone)} of {len(listing)} images: {some(gone)} in "
+        f"{listing.paths[0].parent}"
+    )
+    if not rest:
+        raise SceneError(
+            f"{text}. Check the masks, or set data.mask_use=alpha if such images show empty space."
+        )
+    warnings.warn(
+        f"{text}. These are left out; set data.mask_use=alpha if they show empty space.",
+        stacklevel=5,
+    )
+    return listing.subset(rest)
 
 
 def read_splits(
@@ -305,7 +347,8 @@ def read_splits(
     resolution: int | None,
     cache: Path | None,
     mask_use: MaskUse,
-) -> tuple[dict[str, Views], Views | None]:
+    whole: Listing | None = None,
+) -> tuple[dict[str, Views], Views | None, dict[str, str]]:
     """Read the images of all splits.
 
     Args:
@@ -313,32 +356,38 @@ def read_splits(
         resolution: As for `read_views`.
         cache: As for `read_views`.
         mask_use: What the black parts of masks are.
+        whole: All images of the capture, whose masks mean the same in every split; those of
+            ``parts`` when None.
 
     Returns:
-        The views of each split, and `Scene.cut`.
+        The views of each split, `Scene.cut` and `Scene.notes`.
 
     Raises:
         SceneError: As `read_views`; or if LRMs alone are to have masks and there are none.
     """
-    cut = None
-    if mask_use == "lrm":
-        if not any(part.masks for part in parts.values()):
+    listings = [whole] if whole is not None else list(parts.values())
+    masks = [mask for listing in listings for mask in listing.masks]
+    notes = {"times": words} if (words := listings[0].time_words) else {}
+    if not any(masks):
+        if mask_use == "lrm":
             raise SceneError(
                 "data.mask_use=lrm: no image has a mask file. Add masks, or set it to auto."
             )
+        read = {split: read_views(part, resolution, cache) for split, part in parts.items()}
+        return read, None, notes
+    told = next((listing.mask_meaning for listing in listings if listing.mask_meaning), "")
+    kind = survey(masks, told == "ignored")
+    use, notes["masks"] = chosen_use(mask_use, kind, str(listings[0].paths[0].parent), told)
+    cut = None
+    if use == "lrm":
         if "train" in parts:
-            cut = read_views(parts["train"], resolution, cache)
+            cut = read_views(parts["train"], resolution, cache, kind=kind)
         parts = {split: replace(part, masks=()) for split, part in parts.items()}
-    masks = [mask for part in parts.values() for mask in part.masks]
-    if not any(masks):
-        return {split: read_views(part, resolution, cache) for split, part in parts.items()}, cut
-    kind = survey(masks)
-    use = chosen_use(mask_use, kind, str(next(iter(parts.values())).paths[0].parent))
     read = {
-        split: read_views(part, resolution, cache, use == "ignore", kind.labels)
+        split: read_views(part, resolution, cache, use == "ignore", kind)
         for split, part in parts.items()
     }
-    return read, cut
+    return read, cut, notes
 
 
 def require_shapes(listing: Listing) -> None:

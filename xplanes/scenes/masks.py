@@ -3,7 +3,7 @@
 import logging
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -44,6 +44,9 @@ WHITE = 0.94
 LOSSY = ("JPEG", "MPO", "WEBP", "AVIF", "JPEG2000")
 """Formats whose values are near those that were meant."""
 
+RUNS = 0.6
+"""Share of a mask's pixels whose neighbour has the same value, if these are labels of things."""
+
 NOISE = 8 / 255
 """Difference from black and from white below which lossy formats may have made it."""
 
@@ -62,11 +65,13 @@ class MaskKind:
         labels: Whether their values are numbers of things, all of which but 0 belong to the mask.
         edge: Share of the pixels at the images' edges that they leave out.
         share: Share of all pixels that they leave out.
+        inverted: Whether they leave out what is white.
     """
 
     labels: bool
-    edge: float
-    share: float
+    edge: float = 0.0
+    share: float = 0.0
+    inverted: bool = False
 
     @property
     def use(self) -> Literal["alpha", "ignore"]:
@@ -74,11 +79,12 @@ class MaskKind:
         return "alpha" if self.edge >= SILHOUETTE_EDGE else "ignore"
 
 
-def survey(masks: Sequence[Path | None]) -> MaskKind:
+def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
     """Look at some masks of a capture to find out what all of them mean.
 
     Args:
         masks: A file for each image, or None. [V]
+        inverted: Whether they leave out what is white.
 
     Raises:
         SceneError: If a mask cannot be decoded.
@@ -91,53 +97,67 @@ def survey(masks: Sequence[Path | None]) -> MaskKind:
             grey = _grey(picture)
             # Lossy formats have no labels, whose numbers must be exact.
             white = 65535 if picture.mode in SIXTEEN_BIT_MODES else 255
-            numbers |= {1} if picture.format in LOSSY else set(np.unique(grey / white).tolist())
-    labels = len(numbers) <= MOST_LABELS and max(numbers, default=0) <= WHITE
+            may_be = picture.format not in LOSSY and _has_regions(grey)
+            numbers |= set(np.unique(grey / white).tolist()) if may_be else {1}
+    labels = len(numbers) <= MOST_LABELS and max(numbers, default=0) <= WHITE and 0 in numbers
+    kind = MaskKind(labels, inverted=inverted)
     edges, shares = [], []
     for path in files:
-        out = 1 - read_mask(path, labels)
+        out = 1 - read_mask(path, kind)
         rim = np.concatenate([out[0], out[-1], out[1:-1, 0], out[1:-1, -1]])
         edges.append(float(rim.mean()))
         shares.append(float(out.mean()))
-    return MaskKind(labels, float(np.mean(edges)), float(np.mean(shares)))
+    return replace(kind, edge=float(np.mean(edges)), share=float(np.mean(shares)))
 
 
-def chosen_use(use: MaskUse, kind: MaskKind, where: str) -> MaskUse:
-    """The use of a capture's masks, said in words; a warning where they may be either.
+def _has_regions(grey: np.ndarray) -> bool:
+    """Whether pixels above 0 mostly have a neighbour of their own value: noise has not. [H, W]"""
+    above = grey > 0
+    across = (grey[:, 1:] == grey[:, :-1])[above[:, 1:]]
+    down = (grey[1:] == grey[:-1])[above[1:]]
+    return not above.any() or any(len(same) and same.mean() >= RUNS for same in (across, down))
+
+
+def chosen_use(use: MaskUse, kind: MaskKind, where: str, told: str = "") -> tuple[MaskUse, str]:
+    """The use of a capture's masks, and that in words; a warning where they may be either.
 
     Args:
         use: The setting ``data.mask_use``.
         kind: What `survey` found.
         where: Where the masks are, for messages.
+        told: What their source says that they are, "alpha" or "ignored"; empty for nothing.
     """
     if use == "lrm":
-        return use
-    found: MaskUse = kind.use if use == "auto" else use
+        return use, "for LRMs alone (data.mask_use=lrm)"
+    found: MaskUse = use
+    if use == "auto":
+        known: dict[str, MaskUse] = {"alpha": "alpha", "ignored": "ignore"}
+        found = known.get(told, kind.use)
     meaning = {
         "alpha": "silhouettes: what they leave out is empty",
         "ignore": "pixels to ignore: what they leave out is neither trained on nor scored",
     }
     other: MaskUse = "ignore" if found == "alpha" else "alpha"
-    text = f"{where}: masks leave out {kind.share:.1%} of the pixels. They are taken for"
-    if use == "auto" and UNCLEAR[0] < kind.edge < UNCLEAR[1]:
+    text = f"masks leave out {kind.share:.1%} of the pixels. They are taken for {meaning[found]}"
+    if use == "auto" and not told and UNCLEAR[0] < kind.edge < UNCLEAR[1]:
         warnings.warn(
-            f"{text} {meaning[found]}. Both readings are possible: set data.mask_use={found} to "
+            f"{where}: {text}. Both readings are possible: set data.mask_use={found} to "
             f"confirm it, or data.mask_use={other} if they are {meaning[other]}.",
             stacklevel=4,
         )
     else:
-        logger.info("%s %s (data.mask_use=%s)", text, meaning[found], found)
-    return found
+        logger.info("%s: %s (data.mask_use=%s)", where, text, found)
+    return found, f"{text.removeprefix('masks ')} (data.mask_use={found})"
 
 
-def read_mask(path: Path, labels: bool, image: Path | None = None) -> np.ndarray:
-    """A mask as factors from 0, where it is black, to 1. float32 [H, W]
+def read_mask(path: Path, kind: MaskKind, image: Path | None = None) -> np.ndarray:
+    """A mask as factors from 0, for what it leaves out, to 1. float32 [H, W]
 
     Transparent masks count by their alpha; in coloured ones all but black belongs to the mask.
 
     Args:
         path: The file.
-        labels: Whether its values are numbers of things, all of which but 0 belong to the mask.
+        kind: What the masks of its capture mean.
         image: The image whose size it must have; None for any size.
 
     Raises:
@@ -152,19 +172,17 @@ def read_mask(path: Path, labels: bool, image: Path | None = None) -> np.ndarray
         lossy = picture.format in LOSSY
         white = 65535 if picture.mode in SIXTEEN_BIT_MODES else 255
         values = _grey(picture).astype(np.float32)
-    if labels:
-        return (values > 0).astype(np.float32)
-    values = values / white
+    values = (values > 0).astype(np.float32) if kind.labels else values / white
     if lossy:
         values[values < NOISE], values[values > 1 - NOISE] = 0, 1
-    return values
+    return 1 - values if kind.inverted else values
 
 
 def ignored_pixels(
     masks: Sequence[Path | None],
     images: Sequence[Path],
     sizes: Sequence[tuple[int, int]],
-    labels: bool,
+    kind: MaskKind,
 ) -> Tensor:
     """Pixels of reduced images that masks leave out, in part at least, with padding. bool [V, H, W]
 
@@ -172,7 +190,7 @@ def ignored_pixels(
         masks: A file for each image, or None. [V]
         images: The images. [V]
         sizes: Their heights and widths. [V]
-        labels: As for `read_mask`.
+        kind: As for `read_mask`.
 
     Raises:
         SceneError: If a mask cannot be decoded, or has another size than its image.
@@ -181,7 +199,7 @@ def ignored_pixels(
     found = torch.zeros(len(masks), height, width, dtype=torch.bool)
     for index, (mask, image, (rows, columns)) in enumerate(zip(masks, images, sizes, strict=True)):
         if mask is not None:
-            shown = Image.fromarray(read_mask(mask, labels, image))
+            shown = Image.fromarray(read_mask(mask, kind, image))
             shown = np.asarray(shown.resize((columns, rows), Image.Resampling.BOX))
             found[index, :rows, :columns] = torch.from_numpy(shown < KEPT)
     return found

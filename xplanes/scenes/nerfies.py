@@ -37,6 +37,7 @@ from xplanes.scenes.listing import (
     read_splits,
     require_shapes,
     thinned,
+    time_words,
 )
 from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.source import SceneSettings
@@ -91,8 +92,10 @@ class NerfiesSettings(SceneSettings):
             "Leave data.eval_split out, or set it to val.",
         )
         parts = thinned(parts, self.views, self.eval_views, folder)
-        splits_read, cut = read_splits(parts, self.resolution, self.image_cache, self.mask_use)
-        return Scene(folder.resolve().name, splits_read, points=points, cut=cut)
+        read, cut, notes = read_splits(
+            parts, self.resolution, self.image_cache, self.mask_use, listing
+        )
+        return Scene(folder.resolve().name, read, points=points, cut=cut, notes=notes)
 
     def _listing(self, names: Sequence[str]) -> tuple[Listing, torch.Tensor | None]:
         """The images of these names, and the points of the capture."""
@@ -117,7 +120,7 @@ class NerfiesSettings(SceneSettings):
         ]
         if self.orient:
             poses, points = oriented(poses, points, paths)
-        times, takers = self._metadata(names)
+        times, takers, words = self._metadata(names)
         require_precision(folder, poses[:, :3, 3])
         refuse_repeats(labels, paths, poses, times)
         masks = ()
@@ -133,15 +136,16 @@ class NerfiesSettings(SceneSettings):
             timed=bool(times),
             masks=masks,
             cameras=takers,
+            time_words=words,
         )
         require_shapes(listing)
         return listing, None if points is None else torch.from_numpy(points).float()
 
-    def _metadata(self, names: Sequence[str]) -> tuple[list[float], tuple[str, ...]]:
-        """Times from 0 to 1, none where the scene is said to be static, and names of cameras."""
+    def _metadata(self, names: Sequence[str]) -> tuple[list[float], tuple[str, ...], str]:
+        """Times from 0 to 1, names of cameras, and where times come from; no times if static."""
         path = self.folder / "metadata.json"
         if self.static and not path.is_file():
-            return [], ()
+            return [], (), ""
         content = read_object(path, "the timestep of each image")
         entries = []
         for name in names:
@@ -155,7 +159,7 @@ class NerfiesSettings(SceneSettings):
         taken = [str(entry["camera_id"]) for entry in entries if "camera_id" in entry]
         cameras = tuple(taken) if len(taken) == len(names) else ()
         if self.static:
-            return [], cameras
+            return [], cameras, ""
         key = next((key for key in TIMES if all(key in entry for entry in entries)), None)
         if key is None:
             bare = next(
@@ -176,7 +180,7 @@ class NerfiesSettings(SceneSettings):
             "%s: %s from %s to %s is mapped to times from 0 to 1",
             *(path, key, min(times), max(times)),
         )
-        return unit_times(times), cameras
+        return unit_times(times), cameras, time_words(key, names, times)
 
 
 def _no_capture(folder: Path) -> SceneError:

@@ -100,8 +100,8 @@ def read_capture(
             raise _no_split(path, split, parts, eval_every)
         chosen[split] = listing.subset(parts[split])
     chosen = thinned(chosen, views, eval_views, folder)
-    read, cut = read_splits(chosen, resolution, cache, mask_use)
-    return Scene(folder.resolve().name, read, cut=cut)
+    read, cut, notes = read_splits(chosen, resolution, cache, mask_use, listing)
+    return Scene(folder.resolve().name, read, cut=cut, notes=notes)
 
 
 def _listed_splits(

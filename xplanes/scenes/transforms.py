@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ from xplanes.scenes.entries import (
 )
 from xplanes.scenes.images import read_header
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
-from xplanes.scenes.listing import Calibration, Listing, require_shapes
+from xplanes.scenes.listing import Calibration, Listing, require_shapes, time_words
 
 logger = logging.getLogger(__name__)
 
@@ -57,7 +57,7 @@ KNOWN = (
     *("frames", "file_path", "transform_matrix", "mask_path", "time", "timestamp"),
     *("camera_angle_x", "camera_angle_y", "camera_model", "is_fisheye", "distortion_params"),
     *("omega", "train_filenames", "val_filenames", "test_filenames", *PIXELS, *COEFFICIENTS),
-    *("sx1", "sy1", *OTHER_LENSES, "from_mitsuba", "from_na"),
+    *("sx1", "sy1", "x_fov", "y_fov", *OTHER_LENSES, "from_mitsuba", "from_na"),
 )
 """Keys that are read, or refused."""
 
@@ -97,9 +97,9 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
         SceneError: Anything is missing, out of range, repeated, or outside the scene's folder.
     """
     folder = path.parent.resolve()
-    named, paths, masks, matrices = _usable(path, content["frames"], folder)
+    named, paths, masks, matrices, meaning = _usable(path, content["frames"], folder)
     poses, labels = np.stack(matrices), [label for label, _ in named]
-    times = _times(path, named, any_unit)
+    times, words = _times(path, named, any_unit)
     require_precision(path, poses[:, :3, 3])
     refuse_repeats(labels, paths, poses, times)
     listing = Listing(
@@ -107,14 +107,11 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
         files=tuple(image.relative_to(folder).as_posix() for image in paths),
         camera_to_world=torch.from_numpy(poses).float(),
         times=torch.tensor(times or [0.0] * len(named), dtype=torch.float32),
-        calibrations=tuple(
-            _with_height(
-                read_calibration(str(path), content, label, frame), {**content, **frame}, image
-            )
-            for (label, frame), image in zip(named, paths, strict=True)
-        ),
+        calibrations=_calibrations(path, content, named, paths),
         timed=bool(times),
         masks=tuple(masks) if any(masks) else (),
+        mask_meaning=meaning,
+        time_words=words,
     )
     require_shapes(listing)
     _warn_of_unknown(path, content)
@@ -123,8 +120,14 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
 
 def _usable(
     path: Path, frames: Sequence[dict[str, Any]], folder: Path
-) -> tuple[list[tuple[str, dict[str, Any]]], list[Path], list[Path | None], list[np.ndarray]]:
-    """Frames that can be used, with their labels, images, masks and poses.
+) -> tuple[
+    list[tuple[str, dict[str, Any]]],
+    list[Path],
+    list[Path | None],
+    list[np.ndarray],
+    Literal["", "alpha", "ignored"],
+]:
+    """Frames that can be used, with their labels, images, masks and poses; what masks are.
 
     A warning tells of those without an image or with a pose that is not finite.
 
@@ -142,7 +145,7 @@ def _usable(
         try:
             image = image_path(label, folder, frame["file_path"])
             pose = checked_pose(label, frame["transform_matrix"])
-            mask = frame.get("mask_path")
+            mask = frame.get("mask_path") or None
             mask = None if mask is None else image_path(label, folder, mask, "mask_path")
         except BrokenFrameError as problem:
             left_out.append(str(problem))
@@ -161,7 +164,46 @@ def _usable(
             f"{len(left_out)} of {len(frames)} frames are left out:\n{first_of(left_out)}",
             stacklevel=5,
         )
-    return named, paths, masks, poses
+    meaning: Literal["", "alpha", "ignored"] = ""
+    if not any(masks):
+        masks, meaning = _masks_beside(paths)
+    return named, paths, masks, poses, meaning
+
+
+def _masks_beside(paths: Sequence[Path]) -> tuple[list[Path | None], Literal["alpha", "ignored"]]:
+    """Masks beside images, by the names that instant-ngp gives them, and what they are."""
+    found: list[Path | None] = [None] * len(paths)
+    for index, path in enumerate(paths):
+        mask = path.with_name(f"dynamic_mask_{path.stem}.png")
+        found[index] = mask if mask.is_file() else None
+    if any(found):
+        return found, "ignored"
+    for index, path in enumerate(paths):
+        names = (f"{path.stem}.alpha{path.suffix}", f"{path.name}.alpha{path.suffix}")
+        found[index] = next((m for name in names if (m := path.with_name(name)).is_file()), None)
+    return found, "alpha"
+
+
+def _calibrations(
+    path: Path,
+    content: Mapping[str, Any],
+    named: Sequence[tuple[str, dict[str, Any]]],
+    images: Sequence[Path],
+) -> tuple[Calibration, ...]:
+    """The cameras of all frames; a warning tells of pixels that are not square. [V]"""
+    told = [read_calibration(str(path), content, *each) for each in named]
+    found = tuple(
+        _with_height(camera, {**content, **frame}, image)
+        for camera, (_, frame), image in zip(told, named, images, strict=True)
+    )
+    if stretched := sum(new != old for new, old in zip(found, told, strict=True)):
+        warnings.warn(
+            f"{path}: camera_angle_x and camera_angle_y of {stretched} of {len(found)} frames give "
+            "pixels that are not square, and are followed. If pixels are square, take "
+            "camera_angle_y out: Blender's own angle_y belongs to the sensor, not to the image.",
+            stacklevel=5,
+        )
+    return found
 
 
 def _with_height(camera: Calibration, keys: Mapping[str, Any], image: Path) -> Calibration:
@@ -175,23 +217,41 @@ def _with_height(camera: Calibration, keys: Mapping[str, Any], image: Path) -> C
     across, down = camera.per_width * width, focal_length(angle, height)
     if abs(down / across - 1) < SQUARE:
         return camera
-    logger.info(
-        "%s: camera_angle_x and camera_angle_y give pixels that are %.3g times as high as wide",
-        *(image, across / down),
-    )
     return replace(camera, per_width=None, fl_x=across, fl_y=down, w=width, h=height)
 
 
 def _warn_of_unknown(path: Path, content: Mapping[str, Any]) -> None:
     """Warn of keys that are not read and may change what images or cameras mean."""
-    keys = {key for each in (content, *content["frames"]) for key in each}
-    given = {key for key in keys if any(each.get(key) for each in (content, *content["frames"]))}
+    entries = (content, *content["frames"])
+    given = {key for each in entries for key, value in each.items() if _says_something(value)}
     if unknown := sorted(given - {*KNOWN, *IGNORED}):
         warnings.warn(
             f"{path}: keys that are not read are {', '.join(map(short, unknown))}. Where one of "
             "them changes what the images or cameras mean, convert these and take the key out.",
             stacklevel=5,
         )
+
+
+def _says_something(value: Any) -> bool:
+    """Whether a value is more than null, false, zeros or nothing at all."""
+    return any(map(_says_something, value)) if isinstance(value, list) else bool(value)
+
+
+def _in_radians(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
+    """The keys with fields of view in radians: those of instant-ngp's x_fov are in degrees."""
+    found = dict(keys)
+    for axis in "xy":
+        angle, name = keys.get(f"{axis}_fov"), f"camera_angle_{axis}"
+        if is_positive(angle):
+            found.setdefault(name, math.radians(angle))
+        elif is_number(keys.get(name)) and math.pi < keys[name] < 180:
+            warnings.warn(
+                f"{path}: {name}={keys[name]:g} is read in degrees, as it is above pi: radians are "
+                "expected.",
+                stacklevel=5,
+            )
+            found[name] = math.radians(keys[name])
+    return found
 
 
 def read_frames(path: Path) -> dict[str, Any]:
@@ -213,16 +273,18 @@ def read_frames(path: Path) -> dict[str, Any]:
                     f'{path}: frame {index} has no "{key}". Every frame needs file_path and '
                     f"transform_matrix, and time in a dynamic scene."
                 )
-    return content
+    return _in_radians(path, content) | {"frames": [_in_radians(path, each) for each in frames]}
 
 
-def _times(path: Path, named: list[tuple[str, dict[str, Any]]], any_unit: bool) -> list[float]:
-    """Times of all frames; empty where no frame has one."""
+def _times(
+    path: Path, named: list[tuple[str, dict[str, Any]]], any_unit: bool
+) -> tuple[list[float], str]:
+    """Times of all frames, and where they come from; empty where no frame has one."""
     stamped = any_unit and not any("time" in frame for _, frame in named)
     key = "timestamp" if stamped else "time"
     timed = [label for label, frame in named if key in frame]
     if not timed:
-        return []
+        return [], ""
     kind = "in any unit" if any_unit else "in [0, 1]"
     if len(timed) < len(named):
         bare = next(label for label, frame in named if key not in frame)
@@ -238,11 +300,12 @@ def _times(path: Path, named: list[tuple[str, dict[str, Any]]], any_unit: bool) 
                 f"{'' if any_unit else '. Divide frame numbers by the last one'}."
             )
     times = [frame[key] for _, frame in named]
+    words = time_words(f'"{key}" of {path.name}', [frame["file_path"] for _, frame in named], times)
     first, last = min(times), max(times)
     if not any_unit or (not stamped and first >= 0 and last <= 1):
-        return [float(time) for time in times]
+        return [float(time) for time in times], words
     logger.info("%s: %s from %s to %s is mapped to times from 0 to 1", path, key, first, last)
-    return unit_times(times)
+    return unit_times(times), words
 
 
 def read_calibration(

@@ -1,6 +1,7 @@
 """Images of a scene with poses and times, in memory or in a file of tiles."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -481,7 +482,18 @@ def joined(first: Views, second: Views) -> Views:
         torch.cat([first.times, second.times]),
         first.intrinsics.joined(second.intrinsics),
         first.files + second.files,
+        ignored=None if first.ignored is second.ignored else _joined_ignored(first, second),
     )
+
+
+def _joined_ignored(first: Views, second: Views) -> Tensor:
+    """Ignored pixels of the views of both. bool [V, H, W]"""
+    height, width = max(first.height, second.height), max(first.width, second.width)
+    found = torch.zeros(len(first) + len(second), height, width, dtype=torch.bool)
+    for start, views in ((0, first), (len(first), second)):
+        if views.ignored is not None:
+            found[start : start + len(views), : views.height, : views.width] = views.ignored
+    return found
 
 
 def _tiled(views: Views) -> StoredImages:
@@ -512,6 +524,7 @@ class Scene:
             float32 [N, 3]
         cut: Training views masked to the foreground object, for LRMs, while ``splits`` show whole
             images; None if the alpha of ``splits`` holds the masks, or there are no masks.
+        notes: What was found out while it was read, in words, by what that is about.
     """
 
     name: str
@@ -521,6 +534,7 @@ class Scene:
     static_reason: str = ""
     points: Tensor | None = None
     cut: Views | None = None
+    notes: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def is_surrounded(self) -> bool:

@@ -288,8 +288,9 @@ def read_views(
         kind: What masks mean; None finds out.
 
     Raises:
+        MissingSplitError: If masks leave out all pixels of all images.
         SceneError: If a file cannot be decoded, the resolution cannot be met, or a perspective
-            lens maps no direction to a pixel; or if masks leave out all pixels of all images.
+            lens maps no direction to a pixel.
     """
     if kind is None:
         kind = survey(listing.masks) if any(listing.masks) else PLAIN
@@ -332,7 +333,7 @@ def _without_ignored(listing: Listing, rest: Sequence[int]) -> Listing:
         f"{listing.paths[0].parent}"
     )
     if not rest:
-        raise SceneError(
+        raise MissingSplitError(
             f"{text}. Check the masks, or set data.mask_use=alpha if such images show empty space."
         )
     warnings.warn(

@@ -6,6 +6,7 @@ import math
 import unicodedata
 import warnings
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -336,6 +337,7 @@ def test_scores_leave_ignored_pixels_out(capture):
 
 def test_masks_that_look_like_silhouettes_bound_the_scene(capture, caplog):
     masked(capture, disc())
+    Image.fromarray(np.roll(disc(), 1, axis=1)).save(capture.path / "masks/5.png")
     with caplog.at_level("INFO"):
         views = capture.read(eval_every=100).splits["train"]
     assert "They are taken for silhouettes" in caplog.text
@@ -410,6 +412,24 @@ def test_alpha_beside_images_is_read(capture, name):
     views = capture.read(eval_every=100).splits["train"]
     assert views.ignored is None
     assert not views.image(0)[band() == 0].any()
+
+
+def test_one_mask_of_all_images_is_no_silhouette(capture):
+    """Such as the circle that nerfstudio's own tool draws for fisheye images."""
+    masked(capture, disc())
+    with pytest.warns(UserWarning, match="silhouettes.*Both readings are possible.*=ignore if"):
+        assert capture.read().splits["train"].ignored is None
+    for frame in capture.frames:
+        del frame["mask_path"]
+    capture.content["mask_path"] = "masks/0.png"
+    views = capture.read().splits["train"]
+    assert torch.equal(views.shown(0), torch.from_numpy(disc() > 0))
+
+
+def test_masks_that_hide_the_middle_may_be_inverted(capture):
+    masked(capture, 255 - disc())
+    with pytest.warns(UserWarning, match="Both readings.*Silhouettes are white where the scene is"):
+        capture.read()
 
 
 def test_masks_that_may_mean_either_are_asked_about(capture):
@@ -567,6 +587,52 @@ def test_fields_of_view_in_degrees(capture, place):
     with pytest.warns(UserWarning, match=r"camera_angle_x=40\.1\d* is read in degrees"):
         focal = capture.read().splits["train"].intrinsics.focal[0]
     assert focal.tolist() == pytest.approx([FOCAL] * 2)
+
+
+def test_a_vertical_field_of_view_beside_a_focal_length(capture):
+    del capture.content["fl_y"]
+    capture.content |= {"w": 2 * SIZE, "h": 2 * SIZE, "fl_x": 2 * FOCAL, "cx": 30.0, "cy": 20.0}
+    capture.content["camera_angle_y"] = 2 * math.atan(math.tan(0.5 * ANGLE) / 1.25)
+    with pytest.warns(UserWarning, match="camera_angle_y of 10 of 10 frames gives pixels that are"):
+        intrinsics = capture.read().splits["train"].intrinsics
+    assert intrinsics.focal[0].tolist() == pytest.approx([FOCAL, 1.25 * FOCAL])
+    assert intrinsics.centre[0].tolist() == [15, 10]
+
+
+def test_poses_as_other_programs_write_them(capture):
+    expected = capture.read().splits["train"].camera_to_world
+    for index, frame in enumerate(capture.frames):
+        matrix = frame.pop("transform_matrix")
+        if index % 2:
+            frame["transform_matrix_start"] = frame["transform_matrix_end"] = matrix
+        else:
+            frame["transform_matrix"] = [value for row in matrix[:3] for value in row]
+    with pytest.warns(UserWarning, match="not read are 'transform_matrix_end'"):
+        found = capture.read().splits["train"].camera_to_world
+    assert torch.equal(found, expected)
+
+
+def test_all_damaged_images_are_named(capture):
+    for index in (3, 7):
+        path = capture.path / capture.frames[index]["file_path"]
+        path.write_bytes(path.read_bytes()[:90])
+    message = capture.refused("frame_00003.png cannot be decoded", eval_every=100)
+    assert "frame_00007.png cannot be decoded" in message
+
+
+def test_images_elsewhere_or_one_folder_deeper(capture):
+    expected = capture.read().splits["train"].files
+    images, elsewhere = capture.path / "images", capture.path.parent / "elsewhere"
+    images.rename(elsewhere)
+    for frame in capture.frames:
+        frame["file_path"] = str(elsewhere / Path(frame["file_path"]).name)
+    capture.refused(r"leaves the scene's folder .*Put a link to \S*elsewhere inside the folder")
+    images.mkdir()
+    elsewhere.rename(images / "images")
+    for frame in capture.frames:
+        frame["file_path"] = f"images/{Path(frame['file_path']).name}"
+    found = capture.read().splits["train"].files
+    assert found == tuple(f"images/{file}" for file in expected)
 
 
 def test_keys_that_say_nothing_are_not_named(capture):

@@ -66,6 +66,11 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         same = [path for path in found if _plain(path.name) == _plain(image.name)]
         if len(chosen := same or found) == 1:
             return chosen[0]
+    if Path(name).is_absolute() and Path(name).is_file():
+        raise BrokenFrameError(
+            f"{label}: {key} leaves the scene's folder {folder}. Put a link to {Path(name).parent} "
+            f"inside the folder and correct {key}."
+        )
     raise BrokenFrameError(
         f"{label}: no image {folder / name}, nor with {', '.join(SUFFIXES[1:4])}, ... added. "
         f"Add the file or take the frame out of the list."
@@ -80,7 +85,10 @@ def _stems(folder: Path) -> dict[str, list[Path]]:
 @lru_cache(maxsize=64)
 def _stems_at(folder: Path, changed: int) -> dict[str, list[Path]]:
     found: dict[str, list[Path]] = {}
-    for path in sorted(filter(is_image, folder.iterdir())):
+    inside = sorted(folder.iterdir())
+    if len(inside) == 1 and inside[0].is_dir():  # Unpacked one folder too deep.
+        inside = sorted(inside[0].iterdir())
+    for path in filter(is_image, inside):
         found.setdefault(_plain(path.stem), []).append(path)
     return found
 
@@ -249,6 +257,8 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
         pose = np.asarray(matrix, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         pose = np.empty(0)
+    if pose.shape in ((12,), (16,)):
+        pose = pose.reshape(-1, 4)
     if pose.shape == (3, 4):  # Some programs leave the last row out.
         pose = np.vstack([pose, [0, 0, 0, 1]])
     if pose.shape != (4, 4):

@@ -110,6 +110,35 @@ def read_images(
         StorageError: The cache cannot be written.
     """
     jobs = _jobs(paths, sizes, masks, has_ray, kind)
+    try:
+        return _decoded(paths, sizes, masks, has_ray, cache, kind, jobs)
+    except SceneError:
+        refuse_all(_problems(jobs))  # Not the first one alone.
+        raise
+
+
+def _problems(jobs: Sequence[store.Job]) -> list[str]:
+    """Why images cannot be decoded, of all that cannot."""
+    found = []
+    for job in jobs:
+        try:
+            for _ in job():
+                pass
+        except SceneError as problem:
+            found.append(str(problem))
+    return found
+
+
+def _decoded(
+    paths: Sequence[Path],
+    sizes: Sequence[Size],
+    masks: Sequence[Path | None],
+    has_ray: Sequence[Tensor | None],
+    cache: Path | None,
+    kind: MaskKind,
+    jobs: Sequence[store.Job],
+) -> Tensor | store.StoredImages:
+    """The images in memory, or in a file of the cache; arguments as those of `read_images`."""
     if not store.is_needed(sizes):
         return store.in_memory(sizes, jobs)
     cut = any(masks) or any(shown is not None for shown in has_ray)

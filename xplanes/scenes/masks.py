@@ -53,6 +53,9 @@ NOISE = 8 / 255
 SILHOUETTE_EDGE, UNCLEAR = 0.5, (0.4, 0.7)
 """Share of the images' edges from which on masks are silhouettes, and where it may be either."""
 
+HIDDEN = 0.8
+"""Share of the images' middle from which on masks may be silhouettes in black on white."""
+
 KEPT = 0.9
 """Share of a pixel that a mask must show for the pixel not to be ignored."""
 
@@ -66,17 +69,32 @@ class MaskKind:
         edge: Share of the pixels at the images' edges that they leave out.
         share: Share of all pixels that they leave out.
         inverted: Whether they leave out what is white.
+        middle: Share of the pixels in the images' middle that they leave out.
+        shared: Whether several images have one file: things have other silhouettes in each.
+        equal: Whether masks of several images are equal, although their files are not.
     """
 
     labels: bool
     edge: float = 0.0
     share: float = 0.0
     inverted: bool = False
+    middle: float = 0.0
+    shared: bool = False
+    equal: bool = False
 
     @property
     def use(self) -> Literal["alpha", "ignore"]:
         """What their black parts are: empty where they are silhouettes, else to be ignored."""
-        return "alpha" if self.edge >= SILHOUETTE_EDGE else "ignore"
+        return "alpha" if self.edge >= SILHOUETTE_EDGE and not self.shared else "ignore"
+
+    @property
+    def is_unclear(self) -> bool:
+        """Whether they may be either."""
+        if self.shared:
+            return False
+        if self.edge >= SILHOUETTE_EDGE:
+            return self.equal or self.edge < UNCLEAR[1]
+        return self.edge > UNCLEAR[0] or self.middle > HIDDEN
 
 
 def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
@@ -89,7 +107,9 @@ def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
     Raises:
         SceneError: If a mask cannot be decoded.
     """
-    files = list(dict.fromkeys(mask for mask in masks if mask is not None))
+    given = [mask for mask in masks if mask is not None]
+    files = list(dict.fromkeys(given))
+    shared = 1 < len(given) >= 2 * len(files)
     files = files[:: -(-len(files) // SURVEYED) or 1]
     numbers: set[float] = set()
     for path in files:
@@ -101,13 +121,21 @@ def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
             numbers |= set(np.unique(grey / white).tolist()) if may_be else {1}
     labels = len(numbers) <= MOST_LABELS and max(numbers, default=0) <= WHITE and 0 in numbers
     kind = MaskKind(labels, inverted=inverted)
-    edges, shares = [], []
+    edges, shares, middles = [], [], []
+    contents = set()
     for path in files:
         out = 1 - read_mask(path, kind)
+        contents.add(hash(out.tobytes()))
+        shares.append(float(out.mean()))
+        if out.all() and (edges or path != files[-1]):
+            continue  # Black all over, it says nothing of a shape.
         rim = np.concatenate([out[0], out[-1], out[1:-1, 0], out[1:-1, -1]])
         edges.append(float(rim.mean()))
-        shares.append(float(out.mean()))
-    return replace(kind, edge=float(np.mean(edges)), share=float(np.mean(shares)))
+        rows, columns = (slice(round(0.45 * n), round(0.55 * n) + 1) for n in out.shape)
+        middles.append(float(out[rows, columns].mean()))
+    edge, share, middle = (float(np.mean(values)) for values in (edges, shares, middles))
+    equal = len(files) > 2 and len(contents) == 1
+    return replace(kind, edge=edge, share=share, middle=middle, shared=shared, equal=equal)
 
 
 def _has_regions(grey: np.ndarray) -> bool:
@@ -139,10 +167,11 @@ def chosen_use(use: MaskUse, kind: MaskKind, where: str, told: str = "") -> tupl
     }
     other: MaskUse = "ignore" if found == "alpha" else "alpha"
     text = f"masks leave out {kind.share:.1%} of the pixels. They are taken for {meaning[found]}"
-    if use == "auto" and not told and UNCLEAR[0] < kind.edge < UNCLEAR[1]:
+    if use == "auto" and not told and kind.is_unclear:
+        hint = " Silhouettes are white where the scene is." if found == "ignore" else ""
         warnings.warn(
             f"{where}: {text}. Both readings are possible: set data.mask_use={found} to "
-            f"confirm it, or data.mask_use={other} if they are {meaning[other]}.",
+            f"confirm it, or data.mask_use={other} if they are {meaning[other]}.{hint}",
             stacklevel=4,
         )
     else:

@@ -97,7 +97,7 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
         SceneError: Anything is missing, out of range, repeated, or outside the scene's folder.
     """
     folder = path.parent.resolve()
-    named, paths, masks, matrices, meaning = _usable(path, content["frames"], folder)
+    named, paths, masks, matrices, meaning = _usable(path, content, folder)
     poses, labels = np.stack(matrices), [label for label, _ in named]
     times, words = _times(path, named, any_unit)
     require_precision(path, poses[:, :3, 3])
@@ -119,7 +119,7 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
 
 
 def _usable(
-    path: Path, frames: Sequence[dict[str, Any]], folder: Path
+    path: Path, content: Mapping[str, Any], folder: Path
 ) -> tuple[
     list[tuple[str, dict[str, Any]]],
     list[Path],
@@ -140,12 +140,13 @@ def _usable(
     masks: list[Path | None] = []
     poses: list[np.ndarray] = []
     left_out, wrong = [], []
+    frames = content["frames"]
     for index, frame in enumerate(frames):
         label = f"{path}: frame {index} ({frame['file_path']})"
         try:
             image = image_path(label, folder, frame["file_path"])
             pose = checked_pose(label, frame["transform_matrix"])
-            mask = frame.get("mask_path") or None
+            mask = frame.get("mask_path") or content.get("mask_path") or None
             mask = None if mask is None else image_path(label, folder, mask, "mask_path")
         except BrokenFrameError as problem:
             left_out.append(str(problem))
@@ -198,9 +199,9 @@ def _calibrations(
     )
     if stretched := sum(new != old for new, old in zip(found, told, strict=True)):
         warnings.warn(
-            f"{path}: camera_angle_x and camera_angle_y of {stretched} of {len(found)} frames give "
-            "pixels that are not square, and are followed. If pixels are square, take "
-            "camera_angle_y out: Blender's own angle_y belongs to the sensor, not to the image.",
+            f"{path}: camera_angle_y of {stretched} of {len(found)} frames gives pixels that are "
+            "not square, and is followed. If they are square, take it out: Blender's own angle_y "
+            "belongs to the sensor, not to the image.",
             stacklevel=5,
         )
     return found
@@ -209,15 +210,18 @@ def _calibrations(
 def _with_height(camera: Calibration, keys: Mapping[str, Any], image: Path) -> Calibration:
     """A camera whose pixels are not square where its two fields of view say so."""
     angle = keys.get("camera_angle_y")
-    if camera.per_width is None or camera.fl_y is not None or not is_positive(angle):
-        return camera
-    if angle >= math.pi:
+    if camera.fl_y is not None or not is_positive(angle) or angle >= math.pi:
         return camera
     (height, width), _ = read_header(image)
-    across, down = camera.per_width * width, focal_length(angle, height)
+    (across, _), _, _ = camera.scaled((height, width), (height, width))
+    down = focal_length(angle, height)
     if abs(down / across - 1) < SQUARE:
         return camera
-    return replace(camera, per_width=None, fl_x=across, fl_y=down, w=width, h=height)
+    # In pixels of the size that principal points are in.
+    wide = camera.w or width * (camera.h or height) / height
+    high = camera.h or height * wide / width
+    sides = {"fl_x": across * wide / width, "fl_y": down * high / height, "w": wide, "h": high}
+    return replace(camera, per_width=None, **sides)
 
 
 def _warn_of_unknown(path: Path, content: Mapping[str, Any]) -> None:
@@ -267,6 +271,8 @@ def read_frames(path: Path) -> dict[str, Any]:
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise SceneError(f"{path}: frame {index} is {short(frame)}, not an object with keys.")
+        if "transform_matrix_start" in frame:  # Of a camera that moves while it exposes.
+            frame.setdefault("transform_matrix", frame["transform_matrix_start"])
         for key in ("file_path", "transform_matrix"):
             if key not in frame:
                 raise SceneError(

@@ -345,6 +345,15 @@ def test_axes_that_diverge_leave_a_table_and_a_picture_and_end_in_an_error(inspe
     assert draw(capture).size == (WIDTH, HEIGHT)
 
 
+def test_the_table_says_what_was_found_out(inspected):
+    notes = {"times": "the numbers in their names, from 1 to 9: 1.png -> 1", "masks": "leave out"}
+    capture = inspected(replace(ball(), notes=notes))
+    assert facts(capture)["notes"] == notes
+    assert "times   the numbers in their names, from 1 to 9: 1.png -> 1\nmasks   leave out\n" in (
+        table(capture)
+    )
+
+
 def test_facts_are_those_of_the_scene(inspected):
     capture = inspected(ball())
     known = json.loads(json.dumps(facts(capture)))

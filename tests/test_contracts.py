@@ -621,7 +621,7 @@ def test_a_typing_error_names_what_was_meant():
         [],
         ["seed=0", "model=nine_planes", "model.resolution=32"],
         ["-m", "model=six_planes,nine_planes", "model.resolution=32,64"],
-        ["data=dnerf", "data.root=/tmp/a=b", "data.scene=lego"],
+        ["data=dnerf", "data.root=/tmp/a_b", "data.scene=lego"],
         ["data=demo", "data.train_views=3"],
         ["hydra.run.dir=/tmp/x", "hydra/launcher=joblib", "+extra=1", "++extra.more=2", "~resume"],
         ["model.decoder={width: 32}", "callbacks.evaluation.at=[0,1]"],

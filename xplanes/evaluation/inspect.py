@@ -40,6 +40,10 @@ NATIVE = "data.resolution=null"
 """The setting that takes images at their native size."""
 
 
+MANY_POSES = 20
+"""Poses of training cameras from which on a capture gains by `recipe=capture`; rigs have fewer."""
+
+
 @dataclass(frozen=True)
 class Choice:
     """What a capture is read with.
@@ -405,11 +409,18 @@ def table(capture: Capture) -> str:
 
 
 def next_command(capture: Capture) -> str:
-    """The command that trains on the capture, at the usual width where images are wider."""
+    """The command that trains on the capture, at the usual width where images are wider.
+
+    With ``recipe=capture`` where a camera that moves shows surroundings.
+    """
     overrides, width = capture.choice.overrides, capture.choice.usual_width
     sizes = [views.intrinsics.size for views in capture.scene.splits.values()]
     if width is not None and width < int(torch.cat(sizes)[:, 1].min()):
         overrides = [f"data.resolution={width}" if text == NATIVE else text for text in overrides]
+    train, chosen = capture.scene.splits["train"], [text.partition("=")[0] for text in overrides]
+    poses = {pose.contiguous().numpy().tobytes() for pose in train.camera_to_world}
+    if capture.scene.is_surrounded and len(poses) >= MANY_POSES and "recipe" not in chosen:
+        overrides = [*overrides, "recipe=capture"]
     return f"{train_command()} {shlex.join(overrides)}"
 
 

@@ -290,6 +290,10 @@ def test_times_are_the_last_numbers_in_names(tmp_path, caplog):
     capture = Capture(tmp_path / "room", ["c2_010.png", "c1_020.png", "c1_060.png"])
     assert capture.views().times.tolist() == pytest.approx([0.2, 1, 0])
     assert "the numbers in their names, from 10 to 60" in caplog.text
+    assert capture.read("train").notes["times"] == (
+        "the numbers in their names, from 10 to 60: c1_020.png -> 20, c1_060.png -> 60, "
+        "c2_010.png -> 10"
+    )
     assert capture.views(time_pattern=r"c(\d)").times.tolist() == [0, 0, 1]
     capture.refused(
         r"c1_020\.png has no number where data\.time_pattern=f\(", time_pattern=r"f(\d+)"

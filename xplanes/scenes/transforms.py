@@ -54,7 +54,8 @@ SQUARE = 0.01
 """Difference of focal lengths along x and y above which pixels are not square."""
 
 KNOWN = (
-    *("frames", "file_path", "transform_matrix", "mask_path", "time", "timestamp"),
+    *("frames", "file_path", "transform_matrix", "transform_matrix_start", "mask_path"),
+    *("time", "timestamp"),
     *("camera_angle_x", "camera_angle_y", "camera_model", "is_fisheye", "distortion_params"),
     *("omega", "train_filenames", "val_filenames", "test_filenames", *PIXELS, *COEFFICIENTS),
     *("sx1", "sy1", "x_fov", "y_fov", *OTHER_LENSES, "from_mitsuba", "from_na"),

@@ -194,10 +194,9 @@ class SamplerSettings(Settings, ABC):
             ConfigError: If it is not; the message names the remedy.
         """
         if not issubclass(field, self.kind):
-            takes = "radiance fields" if self.kind is RadianceField else "Gaussians"
             raise ConfigError(
-                f"model.sampler.name={self.name}: takes {takes}, and the model's are of another "
-                "kind; leave model/sampler out"
+                f"model.sampler.name={self.name}: takes a {self.kind.__name__}, and the model's is "
+                f"a {field.__name__}; leave model/sampler out"
             )
 
     def require(self, field: Any) -> None:

@@ -39,7 +39,7 @@ from xplanes.scenes.multicamera import recordings_of_cameras
 from xplanes.scenes.name_times import OTHER_TIMES, times_in_names
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene
-from xplanes.settings import Count
+from xplanes.settings import Count, Location
 
 logger = logging.getLogger(__name__)
 
@@ -51,17 +51,17 @@ USUAL = "images"
 class ColmapSettings(SceneSettings):
     """A capture registered with COLMAP."""
 
-    model: str | None  # Folder of the COLMAP model; null: sparse/0, sparse or colmap/sparse/0.
-    images: str  # Folder of the images that COLMAP was run on.
+    model: Location | None  # Folder of the COLMAP model; null: sparse/0, sparse or colmap/sparse/0.
+    images: Location  # Folder of the images that COLMAP was run on.
     # Folder of masks: NAME.png for each image NAME, black outside the foreground; null for none.
     # Masks that hid moving objects from COLMAP would hide them here, too.
-    masks: str | None
+    masks: Location | None
     # What masks leave out. alpha: is empty; ignore: is neither trained on nor scored; auto: alpha
     # where they look like silhouettes, else ignore; lrm: is cut from the LRM's input alone.
     mask_use: MaskUse
     # Times of the images: a CSV file with the columns file and time; rank: the order within each
     # camera's folder; null: the numbers in the file names.
-    times: str | None
+    times: Location | None
     # Regular expression whose group is the number in a file name, such as frame_(\d+); null: a date
     # with the time of day, seconds with a fraction, or else the number that differs most among the
     # names and is not a camera's, as in 034_cam1.

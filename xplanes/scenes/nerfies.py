@@ -41,7 +41,7 @@ from xplanes.scenes.listing import (
 from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene
-from xplanes.settings import Count
+from xplanes.settings import Count, Location
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ class NerfiesSettings(SceneSettings):
     protocol: str | None
     # Folder of masks, with the subfolders and file names of rgb, black outside the foreground; null
     # for none. DyCheck's co-visibility masks are unsuitable: they do not mark the foreground.
-    masks: str | None
+    masks: Location | None
     # What masks leave out. alpha: is empty; ignore: is neither trained on nor scored; auto: alpha
     # where they look like silhouettes, else ignore; lrm: is cut from the LRM's input alone.
     mask_use: MaskUse

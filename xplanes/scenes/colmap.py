@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import ClassVar
 
 import torch
 
@@ -50,6 +51,8 @@ USUAL = "images"
 @dataclass(frozen=True, kw_only=True)
 class ColmapSettings(SceneSettings):
     """A capture registered with COLMAP."""
+
+    files: ClassVar = "sparse/0 with cameras.bin and images.bin (or .txt), and images"
 
     model: Location | None  # Folder of the COLMAP model; null: sparse/0, sparse or colmap/sparse/0.
     images: Location  # Folder of the images that COLMAP was run on.

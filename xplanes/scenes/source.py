@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 
@@ -73,6 +73,9 @@ class SceneSettings(Settings, ABC):
     eval_views: Count | None  # Maximum views per scored split, spread over time; null for all.
     half_side: Positive | None  # Half the side of the scene's bounding cube; null estimates it.
     cache: Location | None  # Folder for images too large for memory; null: the user's cache.
+
+    files: ClassVar[str] = ""
+    """What a folder of this format holds, in words; empty for formats without such folders."""
 
     @property
     def folder(self) -> Path:

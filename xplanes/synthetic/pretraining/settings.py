@@ -102,9 +102,8 @@ class PretrainingSettings(Settings):
     """The whole configuration of a pretraining."""
 
     seed: Steps  # Seed of all random numbers.
-    init_from: (
-        Location | None
-    )  # Weights of a model with coarser planes; null: random initialisation.
+    # Weights of a model with coarser planes; null: random initialisation.
+    init_from: Location | None
     run: Location  # Folder of checkpoints and logs; an existing run is resumed.
     model: SizeSettings
     pool: PoolSettings

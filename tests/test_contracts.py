@@ -27,7 +27,7 @@ from tests.balls import ball_scene
 from tests.training.runs import changed, composed
 from xplanes.cli import build_parser
 from xplanes.components import MOVED, build
-from xplanes.config import CONF, compose_plain, to_plain
+from xplanes.config import CONF, NAMES, compose_plain, to_plain
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
 from xplanes.launch import prepare
@@ -41,8 +41,9 @@ from xplanes.models.initialisation import (
 )
 from xplanes.rendering.sampler import SamplerSettings
 from xplanes.scenes.source import SceneSettings
-from xplanes.settings import Range, Settings
+from xplanes.settings import Range, Settings, locations
 from xplanes.settings import leaves as values_of
+from xplanes.synthetic.pretraining.settings import PretrainingSettings
 from xplanes.training.fit import Trainer
 from xplanes.training.module import RadianceModule
 
@@ -309,6 +310,13 @@ def test_yaml_files_set_every_field_of_their_class_and_no_other():
         assert issubclass(cls, KINDS[group]), f"conf/{group}/{name}.yaml"
         assert not inspect.isabstract(cls), f"conf/{group}/{name}.yaml"
         assert yaml_names(content) - {"_target_"} == names_of(cls), f"conf/{group}/{name}.yaml"
+
+
+def test_the_command_line_knows_all_settings_that_are_files_or_folders():
+    classes = {(g, class_of(content_of(g, name))) for g, name in OPTIONS if g in KINDS}
+    found = {f"{group}.{key}" for group, cls in classes for key in locations(cls)}
+    found |= set(locations(PretrainingSettings))
+    assert found == {name for name in NAMES if name != "resume" and "hydra." not in name}
 
 
 def test_settings_have_no_defaults_beside_those_of_the_yaml_files():
@@ -621,7 +629,7 @@ def test_a_typing_error_names_what_was_meant():
         [],
         ["seed=0", "model=nine_planes", "model.resolution=32"],
         ["-m", "model=six_planes,nine_planes", "model.resolution=32,64"],
-        ["data=dnerf", "data.root=/tmp/a_b", "data.scene=lego"],
+        ["data=dnerf", "data.root=/tmp/a.b", "data.scene=lego"],
         ["data=demo", "data.train_views=3"],
         ["hydra.run.dir=/tmp/x", "hydra/launcher=joblib", "+extra=1", "++extra.more=2", "~resume"],
         ["model.decoder={width: 32}", "callbacks.evaluation.at=[0,1]"],

@@ -20,7 +20,7 @@ CHOICES = ("experiment", "entry", "recipe", "scale")
 NAMES = (
     *("data.root", "data.scene", "data.cache", "data.masks", "data.images", "data.model"),
     *("data.times", "lrm.weights", "lrm.config", "lrm.triplanes", "preparation.cache"),
-    *("resume", "hydra.run.dir", "hydra.sweep.dir"),
+    *("resume", "hydra.run.dir", "hydra.sweep.dir", "run", "pool.root", "init_from"),
 )
 """Settings whose values are names or paths, whatever they look like."""
 
@@ -151,7 +151,8 @@ def with_names(override: str, *, several: bool = False) -> str:
     key, equals, value = override.partition("=")
     if not equals or key.lstrip("+~") not in NAMES:
         return override
-    if value[:1] in ("'", '"', "[", "{") or "${" in value or value.lower() in ("", "null"):
+    is_quoted = value[:1] in ("'", '"') and value[:1] == value[-1:]
+    if is_quoted or "${" in value or value.lower() in ("", "null"):
         return override
     if "(" in value and re.fullmatch(r"(choice|range|interval|glob|sort|shuffle)\(.*\)", value):
         return override

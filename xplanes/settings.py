@@ -10,6 +10,7 @@ import types
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
+from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from xplanes.errors import ConfigError
@@ -46,6 +47,10 @@ class Range:
 
 ABOVE_0, FROM_0, SHARE = Range(0, open=True), Range(0), Range(0, 1)
 
+HOME = "~ is the user's folder"
+
+Location = Annotated[str, HOME]
+"""A file or folder; ``~`` at its beginning becomes the user's folder."""
 Count = Annotated[int, ABOVE_0]
 """A whole number above 0."""
 Positive = Annotated[float, ABOVE_0]
@@ -143,6 +148,8 @@ def _converted(name: str, value: Any, hint: Any) -> Any:
                 from xplanes.components import build
 
                 return build(value, kind, name)
+    if isinstance(value, str) and value.startswith("~") and _is_location(hint):
+        return str(Path(value).expanduser())
     if float in kinds and int not in kinds and type(value) is int:
         return float(value)
     if type(value) in (int, float) and not {int, float} & set(kinds):
@@ -154,6 +161,19 @@ def _converted(name: str, value: Any, hint: Any) -> Any:
         items = [get_args(kind)[0] for kind in kinds if get_origin(kind) in (list, Sequence)]
         return [_converted(name, item, items[0]) for item in value] if items else list(value)
     return value
+
+
+def _is_location(hint: Any) -> bool:
+    return any(HOME in getattr(part, "__metadata__", ()) for part in (hint, *get_args(hint)))
+
+
+def locations(cls: type[Settings], prefix: str = "") -> Iterator[str]:
+    """Dotted names of the settings of a class that are files or folders."""
+    for name, hint in _hints(cls):
+        if _is_location(hint):
+            yield f"{prefix}{name}"
+        elif isinstance(hint, type) and issubclass(hint, Settings):
+            yield from locations(hint, f"{prefix}{name}.")
 
 
 def _kinds(hint: Any) -> tuple[list[Any], list[Range]]:

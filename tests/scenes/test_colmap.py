@@ -272,7 +272,50 @@ def test_missing_and_unregistered_images(capture, caplog):
     assert "3 of 8 images in" in caplog.text
     assert "frame_005.png, frame_006.png, frame_007.png" in caplog.text
     (capture.path / "images/frame_002.png").unlink()
-    capture.refused(r"1 of 5 images that .*images\.bin lists are not in .*: frame_002\.png")
+    with pytest.warns(UserWarning, match=r"1 of 5 images are left out:\n.*frame_002\.png"):
+        assert len(capture.views()) == 4
+    for path in (capture.path / "images").iterdir():
+        path.rename(path.with_suffix(".JPG"))
+    with pytest.warns(UserWarning, match="left out"):
+        assert capture.views().files[0] == "images/frame_000.JPG"
+    shutil.rmtree(capture.path / "images")
+    (capture.path / "images").mkdir()
+    assert_refused(MissingSplitError, r"no image .*frame_000\.png.*", capture.read, "none")
+
+
+@pytest.mark.parametrize(
+    ("model", "images"),
+    [
+        ("dense/0/sparse", "dense/0/images"),
+        ("distorted/sparse/0", "input"),
+        (".", "images"),
+        ("colmap", "images"),
+        ("sparse/0", "."),
+        ("colmap_text", "rgb/4x"),
+    ],
+)
+def test_models_and_images_are_found_where_programs_leave_them(capture, model, images):
+    shutil.copytree(capture.path / "images", capture.path / "kept" / images)
+    shutil.copytree(capture.path / "sparse/0", capture.path / "kept" / model, dirs_exist_ok=True)
+    found = Capture.__new__(Capture)
+    found.path = capture.path / "kept"
+    assert ColmapSettings.recognises(found.path)
+    assert len(found.views()) == 8
+    assert found.views().files[0] == f"{images}/frame_000.png".removeprefix("./")
+
+
+def test_several_models_or_folders_of_images_are_told_of(capture):
+    for name in ("a", "b"):
+        shutil.copytree(capture.path / "sparse/0", capture.path / name / "sparse")
+    shutil.rmtree(capture.path / "sparse")
+    capture.refused(r"holds 2 COLMAP models: a/sparse, b/sparse\. Choose one with data\.model")
+    assert len(capture.views(model="a/sparse")) == 8
+    for name in ("a", "b"):
+        shutil.copytree(capture.path / "images", capture.path / name / "shots")
+    shutil.rmtree(capture.path / "images")
+    capture.refused(
+        r"Set data\.images.*: (a/shots or b/shots|b/shots or a/shots)", model="a/sparse"
+    )
 
 
 def test_images_of_another_shape(capture):
@@ -307,15 +350,17 @@ def test_times_are_the_last_numbers_in_names(tmp_path, caplog):
     with pytest.warns(UserWarning, match=words):
         assert bare.views().times.tolist() == [0, 0]
     assert bare.views(static=True).times.tolist() == [0, 0]
-    same = Capture(tmp_path / "same", ["a_1_4k.png", "a_2_4k.png"])
-    with pytest.warns(UserWarning, match=r"all 2 images, such as a_1_4k.png, give one number"):
+    same = Capture(tmp_path / "same", ["a_1.png", "b_1.png"])
+    with pytest.warns(UserWarning, match=r"all 2 images, such as a_1.png, give one number"):
         assert same.views().times.tolist() == [0, 0]
     hashes = [
         f"{hash_}.png" for hash_ in ("3f2a9c", "b07d1e", "9e4410", "c5a8f2", "77e0b3", "0d1f6a")
     ]
     with pytest.warns(UserWarning, match=r"differ in more than their numbers.*data\.static=true"):
         assert not Capture(tmp_path / "hashes", hashes).views().times.any()
-    assert same.views(time_pattern=r"_(\d+)_").times.tolist() == [0, 1]
+    scales = Capture(tmp_path / "scales", ["a_1_4k.png", "a_2_4k.png", "a_5_4k.png"])
+    assert scales.views(time_pattern=r"_(\d)_").times.tolist() == [0, 0.25, 1]
+    assert scales.views().times.tolist() == [0, 0.25, 1]
 
 
 def test_times_from_a_table(capture):

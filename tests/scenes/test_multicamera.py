@@ -5,6 +5,7 @@ import logging
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -437,3 +438,47 @@ def test_frames_that_an_edit_list_hides_are_not_counted(tmp_path: Path) -> None:
     assert count == 15
     shown = [int(frame.mean()) for frame in recordings.frames(cut, range(count))]
     assert shown == pytest.approx([8 * i for i in range(15, 30)], abs=2)
+
+
+def write_stamped(path: Path, frames: np.ndarray, stamps: list[int], **stream_options: int) -> None:
+    """A video whose frames are shown at these milliseconds."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"crf": "5"})
+        stream.height, stream.width = frames.shape[1:3]
+        stream.pix_fmt = "yuv444p"
+        for name, value in stream_options.items():
+            setattr(stream.codec_context, name, value)
+        for pixels, stamp in zip(frames, stamps, strict=True):
+            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+            frame.pts, frame.time_base = stamp, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def test_times_of_variable_frame_rates_are_those_of_the_files(tmp_path: Path) -> None:
+    folder = neural_3d_video(tmp_path / "scene", write_video, ".mkv")
+    stamps = [0, 33, 67, 233, 267, 300]
+    for camera in range(CAMERAS):
+        write_stamped(folder / f"cam0{camera}.mkv", rgb(camera), stamps)
+    times = read(folder).splits["train"].times
+    assert times[:FRAMES].tolist() == pytest.approx([stamp / 300 for stamp in stamps], abs=0.01)
+
+
+def test_a_camera_that_begins_later_is_told_of(tmp_path: Path) -> None:
+    folder = neural_3d_video(tmp_path / "scene", write_video, ".mkv")
+    for camera in range(CAMERAS):
+        late = 400 if camera == 2 else 0
+        stamps = [late + 33 * number for number in range(FRAMES)]
+        write_stamped(folder / f"cam0{camera}.mkv", rgb(camera), stamps)
+    with pytest.warns(UserWarning, match=r"cam02\.mkv begins 0\.4 s after .*cut the videos"):
+        assert read(folder).splits["train"].times[:FRAMES].tolist() == pytest.approx(
+            [number / (FRAMES - 1) for number in range(FRAMES)]
+        )
+
+
+def test_hdr_videos_are_told_of(tmp_path: Path) -> None:
+    for curve, word in ((18, "HLG"), (16, "PQ")):
+        path = tmp_path / f"{word}.mkv"
+        write_stamped(path, rgb(0), [33 * i for i in range(FRAMES)], color_trc=curve)
+        with pytest.warns(UserWarning, match=rf"is an HDR video \({word}\).*SDR"):
+            recordings.read_header(path)

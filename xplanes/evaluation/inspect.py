@@ -28,6 +28,7 @@ from xplanes.evaluation.tabulate import markdown
 from xplanes.models.base import ModelSettings
 from xplanes.process import train_command
 from xplanes.scenes.cameras import cast_rays, image_plane
+from xplanes.scenes.entries import some
 from xplanes.scenes.frame import Frame, pixels_across
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.source import SceneSettings
@@ -164,9 +165,12 @@ def _recognised(folder: Path, changed: Sequence[str]) -> str:
         if path.is_dir() and any(cls.recognises(path) for cls in known)
     )
     scenes = f" Scenes inside it: {', '.join(inside)}." if inside else ""
+    there = [f"{path.name}{'/' * path.is_dir()}" for path in folder.iterdir()]
+    wanted = "; ".join(f"{name}: {cls.files}" for cls, name in known.items() if cls.files)
     raise SceneError(
-        f"{folder} is no scene of a known format.{scenes} docs/your_own_data.md lists the files of "
-        "each format; data=NAME chooses one"
+        f"{folder} is no scene of a known format.{scenes} It holds "
+        f"{some(sorted(there)) or 'nothing'}. What the formats need: {wanted}. data=NAME chooses "
+        "one"
     )
 
 

@@ -14,7 +14,7 @@ from xplanes.errors import ConfigError
 from xplanes.models.base import InitialValues, LossTerm, ModelSettings
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene
-from xplanes.settings import Count, Positive, Range, Settings
+from xplanes.settings import Count, Location, Positive, Range, Settings
 
 STAGES = ("fixed_view", "lrm", "decomposition", "convert", "fill")
 
@@ -136,7 +136,7 @@ class RandomSettings(InitialiserSettings):
 class PreparationSettings(Settings):
     """Steps before training, unless the initialisation is random."""
 
-    cache: str | None  # Folder of cached stages; null disables the cache.
+    cache: Location | None  # Folder of cached stages; null disables the cache.
     frames: Count | None  # Timesteps of the fixed-view video; null: the views' distinct times.
     # Fixed-view video. video: the scene's; train: rendered by a trained field; auto: the scene's if
     # usable.

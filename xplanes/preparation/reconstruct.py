@@ -23,7 +23,7 @@ from xplanes.preparation.encode import encode
 from xplanes.preparation.fixed_view import FixedView, fixed_view
 from xplanes.preparation.sequence import TriplaneSequence
 from xplanes.preparation.stages import contact_sheet
-from xplanes.settings import Count
+from xplanes.settings import Count, Location
 
 logger = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ class Reconstruction:
 class ImageLRMSettings(InitialiserSettings, ABC):
     """Settings of an LRM and of its input images."""
 
-    weights: str | None  # Local file of weights; null: downloaded or bundled weights.
+    weights: Location | None  # Local file of weights; null: downloaded or bundled weights.
     # For focal lengths other than the LRM's. scale: sizes match at the scene's depth; pad: exact.
     matching: Literal["scale", "pad"]
     crop: bool  # Crop images to the object size in the LRM's training.

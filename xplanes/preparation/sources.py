@@ -26,7 +26,7 @@ from xplanes.preparation.reconstruct import ImageLRMSettings, LoadedLRM, loaded,
 from xplanes.preparation.sequence import TriplaneSequence, load_triplanes
 from xplanes.preparation.stages import Parts, convert_stage, decompose_stage
 from xplanes.scenes.views import Views
-from xplanes.settings import Count
+from xplanes.settings import Count, Location
 
 logger = logging.getLogger(__name__)
 
@@ -42,7 +42,7 @@ class BundledLRMSettings(ImageLRMSettings):
         if self.weights is None:
             model, path = load_bundled(self.bundled)
         else:
-            own = Path(self.weights).expanduser()
+            own = Path(self.weights)
             if own.suffix != ".safetensors" or not own.is_file():
                 raise LRMError(
                     f"{own} is no file that ends in .safetensors: name one that xplanes "
@@ -65,7 +65,7 @@ class PublishedLRMSettings(ImageLRMSettings):
     revision: str  # Branch, tag or commit of the repository.
     licence: str  # Licence of the weights.
     megabytes: Count  # Size of the file in MB.
-    config: str | None  # A config.json or config.yaml for weights of another model size.
+    config: Location | None  # A config.json or config.yaml for weights of another model size.
 
     @property
     def source(self) -> WeightSource:
@@ -77,8 +77,8 @@ class PublishedLRMSettings(ImageLRMSettings):
             revision=self.revision,
             licence=self.licence,
             megabytes=self.megabytes,
-            weights=None if self.weights is None else Path(self.weights).expanduser(),
-            config=None if self.config is None else Path(self.config).expanduser(),
+            weights=None if self.weights is None else Path(self.weights),
+            config=None if self.config is None else Path(self.config),
         )
 
     def load_model(self, say: Callable[[str], None]) -> LoadedLRM:
@@ -121,14 +121,14 @@ class LRMInitialiser(Initialiser):
 class TriplaneFileSettings(InitialiserSettings):
     """A precomputed triplane sequence from a file."""
 
-    triplanes: str | None  # File written by save_triplanes.
+    triplanes: Location | None  # File written by save_triplanes.
 
     def load(self, say: Callable[[str], None] = print) -> "FileInitialiser":
         if self.triplanes is None:
             raise ConfigError("lrm=file needs lrm.triplanes=FILE, a file written by save_triplanes")
-        if not Path(self.triplanes).expanduser().is_file():
+        if not Path(self.triplanes).is_file():
             raise ConfigError(f"lrm.triplanes={self.triplanes}: there is no such file")
-        return FileInitialiser(Path(self.triplanes).expanduser())
+        return FileInitialiser(Path(self.triplanes))
 
 
 class FileInitialiser(Initialiser):
@@ -162,7 +162,7 @@ def cache_of(method: Method, place: Place) -> StageCache:
             f"{place.devices}: the processes share the initialisation through the cache; name a "
             "folder"
         )
-    cache = StageCache(None if folder is None else Path(folder).expanduser())
+    cache = StageCache(None if folder is None else Path(folder))
     if place.devices > 1 and not cache.writable:
         raise ConfigError(
             f"preparation.cache={folder} cannot be written, and the {place.devices} processes "

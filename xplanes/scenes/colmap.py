@@ -2,20 +2,21 @@
 
 import csv
 import logging
+import os
 import re
-import warnings
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import ClassVar
 
 import torch
 
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.files import natural
-from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, read_model
+from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, models_inside, read_model
 from xplanes.scenes.entries import (
-    image_path,
+    found_images,
     is_number,
     mask_files,
     oriented,
@@ -37,30 +38,37 @@ from xplanes.scenes.listing import (
 )
 from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.multicamera import recordings_of_cameras
+from xplanes.scenes.name_times import OTHER_TIMES, times_in_names
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene
-from xplanes.settings import Count
+from xplanes.settings import Count, Location
 
 logger = logging.getLogger(__name__)
+
+USUAL = "images"
+"""Folder of images where nobody names another."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapSettings(SceneSettings):
     """A capture registered with COLMAP."""
 
-    model: str | None  # Folder of the COLMAP model; null: sparse/0, sparse or colmap/sparse/0.
-    images: str  # Folder of the images that COLMAP was run on.
+    files: ClassVar = "sparse/0 with cameras.bin and images.bin (or .txt), and images"
+
+    model: Location | None  # Folder of the COLMAP model; null: sparse/0, sparse or colmap/sparse/0.
+    images: Location  # Folder of the images that COLMAP was run on.
     # Folder of masks: NAME.png for each image NAME, black outside the foreground; null for none.
     # Masks that hid moving objects from COLMAP would hide them here, too.
-    masks: str | None
+    masks: Location | None
     # What masks leave out. alpha: is empty; ignore: is neither trained on nor scored; auto: alpha
     # where they look like silhouettes, else ignore; lrm: is cut from the LRM's input alone.
     mask_use: MaskUse
     # Times of the images: a CSV file with the columns file and time; rank: the order within each
     # camera's folder; null: the numbers in the file names.
-    times: str | None
-    # Regular expression whose group is the number in a file name, such as frame_(\d+); null: the
-    # last number that is not a camera's, as in 034_cam1; all of a name such as 1305031102.175304.
+    times: Location | None
+    # Regular expression whose group is the number in a file name, such as frame_(\d+); null: a date
+    # with the time of day, seconds with a fraction, or else the number that differs most among the
+    # names and is not a camera's, as in 034_cam1.
     time_pattern: str | None
     test_cameras: list[str]  # Subfolders of the image folder that form the test split.
     # Hold out every n-th image as val, in order of time and file name; never the first or last.
@@ -70,7 +78,13 @@ class ColmapSettings(SceneSettings):
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         # A model beside videos of several cameras is their calibration.
-        return find_model(folder, MODELS[:2]) is not None and len(recordings_of_cameras(folder)) < 2
+        if len(recordings_of_cameras(folder)) > 1:
+            return False
+        if find_model(folder, MODELS[:2]) is not None:
+            return True
+        # What transforms.json was made of is not what is to be read.
+        others = any(folder.glob("transforms*.json")) or (folder / "dataset.json").is_file()
+        return not others and len(models_inside(folder)) == 1
 
     def check(self) -> None:
         if self.time_pattern is None:
@@ -118,25 +132,20 @@ class ColmapSettings(SceneSettings):
 
     def _listing(self, model: SparseModel) -> tuple[Listing, torch.Tensor | None]:
         """All images of the capture, and the model's points."""
-        images = self.folder / self.images
-        if not images.is_dir():
-            raise SceneError(
-                f"{images} is not a folder. Set data.images to the folder, relative to that of the "
-                "scene, that COLMAP was run on."
-            )
+        images = _image_folder(self.folder, self.images, model)
         root = images.resolve()
-        _require_files(model, images)
         labels = [f"{model.source}: {name}" for name in model.names]
-        paths = [
-            image_path(label, root, name, "NAME")
-            for label, name in zip(labels, model.names, strict=True)
-        ]
+        found = found_images(labels, root, model.names, "NAME")
+        kept = [place for place, path in enumerate(found) if path is not None]
+        model, paths = model.subset(kept), [path for path in found if path is not None]
+        labels = [labels[place] for place in kept]
         present = {
             path.relative_to(root).as_posix()
             for path in root.rglob("*")
             if is_image(path) and path.is_file()
         }
-        _warn_of_unregistered(sorted(present - set(model.names)), len(present), images)
+        used = {path.relative_to(root).as_posix() for path in paths}
+        _warn_of_unregistered(sorted(present - used), len(present), images)
         times, words = self._times(model.names, labels, present)
         poses, points = model.camera_to_world, model.points
         if self.orient:
@@ -146,7 +155,10 @@ class ColmapSettings(SceneSettings):
         folders = [_camera(name) for name in model.names]
         listing = Listing(
             paths=tuple(paths),
-            files=tuple((PurePosixPath(self.images) / name).as_posix() for name in model.names),
+            files=tuple(
+                (images.relative_to(self.folder) / path.relative_to(root)).as_posix()
+                for path in paths
+            ),
             camera_to_world=torch.from_numpy(poses).float(),
             times=torch.tensor(times or [0.0] * len(paths), dtype=torch.float32),
             calibrations=model.calibrations,
@@ -172,7 +184,8 @@ class ColmapSettings(SceneSettings):
         if self.static:
             return [], ""
         if self.times is None:
-            found = _numbers(names, labels, self.time_pattern)
+            pattern = self.time_pattern
+            found = times_in_names(names) if pattern is None else _matched(names, labels, pattern)
             if not found:
                 return [], ""
             origin = "the numbers in their names"
@@ -230,6 +243,16 @@ def _model_folder(folder: Path, name: str | None) -> Path:
                 *(path.parent, len(others) + 1, path),
             )
         return path
+    found = models_inside(folder) if name is None else []
+    if len(found) == 1:
+        logger.info("The model is read from %s (data.model)", found[0])
+        return found[0]
+    if found:
+        inside = [path.relative_to(folder).as_posix() for path in found]
+        raise SceneError(
+            f"{folder} holds {len(found)} COLMAP models: {some(inside)}. Choose one with "
+            "data.model."
+        )
     if not folder.is_dir():
         raise SceneError(
             f"The folder {folder.absolute()} does not exist. Set data.root and data.scene to a "
@@ -247,14 +270,35 @@ def _camera(name: str) -> str:
     return "" if folder == "." else folder
 
 
-def _require_files(model: SparseModel, images: Path) -> None:
-    missing = [name for name in model.names if not (images / name).is_file()]
-    if missing:
-        raise SceneError(
-            f"{len(missing)} of {len(model.names)} images that {model.source} lists are not in "
-            f"{images}: {some(missing)}. Put them there, or set data.images to the folder that "
-            "COLMAP was run on."
-        )
+def _image_folder(folder: Path, name: str, model: SparseModel) -> Path:
+    """The folder of the images of a model.
+
+    The one of that name beside the model or above it; else the only one in the scene's folder that
+    has the images, such as input.
+
+    Raises:
+        SceneError: If there is none.
+    """
+    places = [place for place in model.source.parents if place.is_relative_to(folder)]
+    for place in places:
+        if (place / name).is_dir():
+            return place / name
+    if (folder / name).is_dir():
+        return folder / name
+    holding = [
+        place
+        for place in (Path(place) for place, *_ in os.walk(folder) if name == USUAL)
+        if all((place / image).is_file() for image in model.names[:3])
+    ]
+    if len(holding) == 1:
+        logger.info("Images are read from %s (data.images)", holding[0])
+        return holding[0]
+    names = [place.relative_to(folder).as_posix() for place in holding]
+    raise SceneError(
+        f"{folder / name} is not a folder. Set data.images to the folder, relative to that of the "
+        "scene, that COLMAP was run on"
+        + (f": {' or '.join(names)}." if names else f", with images such as {model.names[0]}.")
+    )
 
 
 def _warn_of_unregistered(names: Sequence[str], count: int, images: Path) -> None:
@@ -276,62 +320,24 @@ def _number(text: str) -> float | None:
     return None
 
 
-def _time_in(stem: str) -> str | None:
-    """The number in a name that tells its time: the whole name, or the last one in it.
-
-    A number of the camera at the end is none of time, as in 034_cam1.
-    """
-    if re.fullmatch(r"\d+\.\d+", stem):
-        return stem
-    without = re.sub(r"(?i)[_\-. ]*(cam|camera)[_\- ]*\d+$", "", stem)
-    return (re.findall(r"\d+", without) or re.findall(r"\d+", stem) or [None])[-1]
-
-
-def _numbers(names: Sequence[str], labels: Sequence[str], pattern: str | None) -> list[float]:
-    """The number in each name; none, with a warning, where they tell no times."""
-    if pattern is None and (why := _no_series(names)):
-        warnings.warn(f"{why}: all images are taken for one timestep. {_OTHER_TIMES}", stacklevel=5)
-        return []
+def _matched(names: Sequence[str], labels: Sequence[str], pattern: str) -> list[float]:
+    """The number in each name that is a pattern's group."""
     found: list[float] = []
     for name, label in zip(names, labels, strict=True):
-        if pattern is None:
-            text = _time_in(PurePosixPath(name).stem)
-        else:
-            match = re.search(pattern, name)
-            text = None if match is None else match[1]
-        number = None if text is None else _number(text)
+        match = re.search(pattern, name)
+        number = None if match is None else _number(match[1])
         if number is None:
-            wanted = f"no number where data.time_pattern={pattern} has its group"
-            raise SceneError(f"{label} has {wanted}. {_OTHER_TIMES}")
+            raise SceneError(
+                f"{label} has no number where data.time_pattern={pattern} has its group. "
+                f"{OTHER_TIMES}"
+            )
         found.append(number)
     if len(names) > 1 and len(set(found)) == 1:
         raise SceneError(
             f"The names of all {len(names)} images, such as {names[0]}, give the number {found[0]} "
-            f"for their time. {_OTHER_TIMES}"
+            f"for their time. {OTHER_TIMES}"
         )
     return found
-
-
-def _no_series(names: Sequence[str]) -> str | None:
-    """Why names are not those of a series of images, such as hashes; None if they are."""
-    stems = [PurePosixPath(name).stem for name in names]
-    bare = [name for name, stem in zip(names, stems, strict=True) if _time_in(stem) is None]
-    if bare:
-        return f"The names of {len(bare)} of {len(names)} images have no number, such as {bare[0]}"
-    # All names of a series are equal but for their numbers.
-    kinds = {re.sub(r"\d+", "#", stem) for stem in stems}
-    if len(kinds) > max(4, len(names) // 2):
-        return f"The names of the images, such as {some(names)}, differ in more than their numbers"
-    numbers = {_time_in(stem) for stem in stems}
-    if len(names) > 1 and len(numbers) == 1:
-        return f"The names of all {len(names)} images, such as {names[0]}, give one number"
-    return None
-
-
-_OTHER_TIMES = (
-    r"Set data.time_pattern to a regular expression for the names, such as frame_(\d+), data.times "
-    "to a CSV file with the columns file and time, or, for a static scene, data.static=true."
-)
 
 
 def _ranks(names: Sequence[str], present: set[str]) -> list[float]:

@@ -9,7 +9,7 @@ import mmap
 import os
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
@@ -40,6 +40,9 @@ LENSES: dict[str, tuple[int, LensModel, str]] = {
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "sparse_/0", "sparse_", "colmap/sparse")
 """Where sparse models are looked for. That in colmap/ is what transforms.json was made of."""
+
+DEEPEST = 3
+"""Levels of folders in which models are searched for, as in dense/0/sparse."""
 
 UNIT_TOLERANCE = 1e-2
 """By how much the length of a quaternion may differ from 1."""
@@ -72,6 +75,15 @@ class SparseModel:
     calibrations: tuple[Calibration, ...]
     points: np.ndarray | None
 
+    def subset(self, places: Sequence[int]) -> "SparseModel":
+        """The images at ``places``, in that order, and all points."""
+        return replace(
+            self,
+            names=tuple(self.names[place] for place in places),
+            camera_to_world=self.camera_to_world[list(places)],
+            calibrations=tuple(self.calibrations[place] for place in places),
+        )
+
 
 def find_model(folder: Path, names: Sequence[str] = MODELS) -> Path | None:
     """The first of some folders inside ``folder`` that holds a sparse model."""
@@ -79,6 +91,17 @@ def find_model(folder: Path, names: Sequence[str] = MODELS) -> Path | None:
         if any((folder / name / f"cameras.{end}").is_file() for end in ("bin", "txt")):
             return folder / name
     return None
+
+
+def models_inside(folder: Path) -> list[Path]:
+    """All folders with sparse models, down to `DEEPEST` levels inside ``folder``."""
+    found = []
+    for place, folders, files in os.walk(folder):
+        if any({f"cameras{end}", f"images{end}"} <= {*files} for end in (".bin", ".txt")):
+            found.append(Path(place))
+        depth = len(Path(place).relative_to(folder).parts)
+        folders[:] = [] if depth >= DEEPEST else sorted(folders)
+    return found
 
 
 def read_model(folder: Path) -> SparseModel:

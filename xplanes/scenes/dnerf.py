@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from xplanes.errors import MissingSplitError, SceneError
 from xplanes.scenes.listing import Listing, read_splits, read_views, thinned
@@ -22,6 +23,8 @@ GET_DATA = (
 @dataclass(frozen=True, kw_only=True)
 class BlenderSettings(SceneSettings):
     """A scene on disk in the format of D-NeRF or Blender."""
+
+    files: ClassVar = "transforms_train.json"
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:

@@ -16,7 +16,7 @@ from typing import Any, TypeGuard
 import numpy as np
 import torch
 
-from xplanes.errors import BrokenFrameError, SceneError
+from xplanes.errors import BrokenFrameError, MissingSplitError, SceneError, first_of
 from xplanes.files import stand_in
 from xplanes.scenes.cameras import upright
 from xplanes.scenes.formats import ENDINGS, is_image, orientation
@@ -75,6 +75,33 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         f"{label}: no image {folder / name}, nor with {', '.join(SUFFIXES[1:4])}, ... added. "
         f"Add the file or take the frame out of the list."
     )
+
+
+def found_images(
+    labels: Sequence[str], folder: Path, names: Sequence[str], key: str
+) -> list[Path | None]:
+    """The image of each name, as `image_path` finds it; None, with a warning, where there is none.
+
+    Raises:
+        MissingSplitError: If there is none at all.
+        SceneError: If a name leads out of the folder.
+    """
+    found: list[Path | None] = []
+    missing: list[str] = []
+    for label, name in zip(labels, names, strict=True):
+        try:
+            found.append(image_path(label, folder, name, key))
+        except BrokenFrameError as problem:
+            found.append(None)
+            missing.append(str(problem))
+    if len(missing) == len(found):
+        raise MissingSplitError(first_of(missing))
+    if missing:
+        warnings.warn(
+            f"{len(missing)} of {len(found)} images are left out:\n{first_of(missing)}",
+            stacklevel=4,
+        )
+    return found
 
 
 def _stems(folder: Path) -> dict[str, list[Path]]:

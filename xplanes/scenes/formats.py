@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 
 from PIL import Image
+from PIL.TiffImagePlugin import TiffImageFile
 
 from xplanes.errors import SceneError
 from xplanes.files import stand_in
@@ -50,6 +51,13 @@ UNTURN = {
 }
 """How ImageMagick turns back what was turned as an EXIF orientation says."""
 
+TURNED_BACK = {
+    **{2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180},
+    **{4: Image.Transpose.FLIP_TOP_BOTTOM, 5: Image.Transpose.TRANSPOSE},
+    **{6: Image.Transpose.ROTATE_90, 7: Image.Transpose.TRANSVERSE, 8: Image.Transpose.ROTATE_270},
+}
+"""How Pillow turns back what was turned as an EXIF orientation says."""
+
 UNREADABLE = (
     OSError,
     SyntaxError,
@@ -71,7 +79,7 @@ def orientation(path: Path) -> int:
     Pixels are read as they are stored, whatever it says.
     """
     try:
-        with open_image(path) as picture:
+        with _opened(path) as picture:
             # Of a PNG without it, Pillow would decode all pixels to look for it.
             if picture.format != "TIFF" and not {"exif", "Raw profile type exif"} & {*picture.info}:
                 return 1
@@ -108,15 +116,28 @@ def _formats() -> tuple[str, ...]:
     return tuple(name for name in FORMATS if name in Image.OPEN)
 
 
+def _opened(path: Path) -> Image.Image:
+    if path.suffix.lower() in RAW:
+        raise OSError("it holds what the sensor measured")
+    return Image.open(path, formats=_formats())
+
+
 def open_image(path: Path) -> Image.Image:
-    """An image file, its header read.
+    """An image file with its pixels as they are stored; in general, only its header is read.
 
     Raises:
         OSError: If it is none, and others of `UNREADABLE`.
     """
-    if path.suffix.lower() in RAW:
-        raise OSError("it holds what the sensor measured")
-    return Image.open(path, formats=_formats())
+    picture = _opened(path)
+    if not isinstance(picture, TiffImageFile):
+        return picture
+    # Of TIFF files alone, Pillow turns the pixels as EXIF says.
+    if (turn := TURNED_BACK.get(picture.tag_v2.get(ORIENTATION, 1))) is None:
+        return picture
+    with picture:
+        stored = picture.transpose(turn)
+    stored.format = picture.format
+    return stored
 
 
 def unreadable(path: Path, problem: BaseException) -> SceneError:

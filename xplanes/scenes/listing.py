@@ -306,9 +306,7 @@ def read_views(
     names = [str(path) for path in listing.paths]
     intrinsics = final_intrinsics(names, listing.calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(listing))]
-    for index, shown in enumerate(has_ray):
-        if shown is not None:
-            require_rays(names[index], listing.calibrations[index], shown)
+    require_rays(names, listing.calibrations, has_ray)
     masks = () if ignore else listing.masks
     images = read_images(listing.paths, sizes, masks, has_ray, cache, kind)
     if ignored is not None:
@@ -512,35 +510,45 @@ def _require_real(
         )
 
 
-def require_rays(label: str, lens: Calibration, shown: Tensor) -> None:
+def require_rays(
+    labels: Sequence[str], lenses: Sequence[Calibration], has_ray: Sequence[Tensor | None]
+) -> None:
     """Refuse images most of which show nothing, as where their lens folds back inside them.
 
-    A warning tells of pixels that a perspective lens maps no direction to: they are left out.
+    A warning tells of pixels that perspective lenses map no direction to: they are left out.
 
     Args:
-        label: The image, for messages.
-        lens: What is told about its camera.
-        shown: Pixels that the lens maps a direction to. bool [h, w]
+        labels: The images, for messages. [V]
+        lenses: What is told about their cameras. [V]
+        has_ray: Pixels that the lens maps a direction to, None for all. bool [h, w] each, [V]
 
     Raises:
-        SceneError: If the image is such a one.
+        SceneError: If there are such images; it names all of them.
     """
-    share = float((~shown).float().mean())
-    if lens.model != LensModel.PERSPECTIVE and share < 1:
-        return
-    if share <= MOST_FOLDED:
+    problems: list[str] = []
+    folded: list[tuple[float, str]] = []
+    for label, lens, shown in zip(labels, lenses, has_ray, strict=True):
+        if shown is None:
+            continue
+        share = float((~shown).float().mean())
+        fault = f"{label}: its {lens.words} folds back inside the image: no direction belongs to "
+        if lens.model != LensModel.PERSPECTIVE and share < 1:
+            continue
+        if share <= MOST_FOLDED:
+            folded.append((share, f"{fault}{share:.1%} of the pixels, which are left out"))
+            continue
+        row, column = (~shown).nonzero()[0].tolist()
+        problems.append(
+            f"{fault}{share:.1%} of the pixels, such as that in row {row}, column {column}. "
+            "Calibrate again with fewer coefficients, correct them, or undistort the images."
+        )
+    refuse_all(problems)
+    if folded:
+        others = len(folded) - 1
         warnings.warn(
-            f"{label}: its {lens.words} folds back inside the image: the {share:.1%} of the pixels "
-            "that no direction belongs to are left out.",
+            max(folded)[1] + (f"; so are fewer of {others} other images." if others else "."),
             stacklevel=4,
         )
-        return
-    row, column = (~shown).nonzero()[0].tolist()
-    raise SceneError(
-        f"{label}: its {lens.words} folds back inside the image: no direction "
-        f"belongs to {share:.1%} of the pixels, such as that in row {row}, column {column}. "
-        "Calibrate again with fewer coefficients, correct them, or undistort the images."
-    )
 
 
 def _warn_of_empty(views: Views, listing: Listing) -> None:

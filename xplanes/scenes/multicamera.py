@@ -8,11 +8,12 @@ name.
 
 import logging
 import re
+import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -29,6 +30,7 @@ from xplanes.scenes.entries import (
     require_fetched,
     require_precision,
     some,
+    unit_times,
 )
 from xplanes.scenes.formats import ENDINGS, is_image
 from xplanes.scenes.images import (
@@ -61,6 +63,9 @@ TRANSFORMS = "transforms.json"
 SAME_RATE = 1e-3
 """Share by which frame rates of synchronised cameras differ at most."""
 
+LATE = 1.5
+"""Times between frames that are so much longer than most are not of a constant rate."""
+
 SAME_POSE = 1e-4
 """Largest difference between poses of a fixed camera."""
 
@@ -68,6 +73,10 @@ SAME_POSE = 1e-4
 @dataclass(frozen=True, kw_only=True)
 class MultiCameraSettings(SceneSettings):
     """Synchronised videos of several fixed cameras."""
+
+    files: ClassVar = (
+        "videos or folders cam00, cam01, ... with poses_bounds.npy or a model of COLMAP"
+    )
 
     frames: list[int] | None  # First frame, last frame and stride; null for all frames.
     # Names of the held-out cameras: scored, not trained on. null: cam00, or else the most central.
@@ -142,6 +151,7 @@ class Recording:
         count: Number of frames.
         rate: Frames per second; None for images and where the video does not tell.
         images: The image files in the order of time; empty for a video. [count]
+        times: Seconds at which a video shows its frames; empty where that is not known. [count]
     """
 
     camera: Camera
@@ -149,6 +159,17 @@ class Recording:
     count: int
     rate: float | None
     images: tuple[Path, ...] = ()
+    times: tuple[float, ...] = ()
+
+    @property
+    def step(self) -> float:
+        """Median seconds between frames; 0 where that is not known."""
+        return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
+
+    @property
+    def varies(self) -> bool:
+        """Whether a video leaves frames out, or has a variable rate."""
+        return self.step > 0 and float(np.diff(self.times).max()) > LATE * self.step
 
 
 def read_multicamera(
@@ -200,7 +221,9 @@ def read_multicamera(
             )
     watched = _video_camera(cameras, parts, video_camera)
     recordings = [_recording(camera) for camera in cameras]
-    _require_one_rate(recordings)
+    if not _are_stamped(recordings):
+        _require_one_rate(recordings)
+    _warn_of_starts(recordings)
     _require_same_frames(recordings)
     numbers = _frame_numbers(folder, recordings, frames)
     whole = _read_views(recordings, numbers, resolution, cache)
@@ -451,7 +474,7 @@ def _recording(camera: Camera) -> Recording:
     if camera.source.is_file():
         video = videos.read_header(camera.source)
         rate = None if video.rate is None else float(video.rate)
-        return Recording(camera, video.size, video.count, rate)
+        return Recording(camera, video.size, video.count, rate, times=video.times)
     images = _images_in(camera.source)
     folders = [path for path in camera.source.iterdir() if path.is_dir() and path.name[0] != "."]
     if not images and len(folders) == 1:  # Such as images/
@@ -475,6 +498,26 @@ def _images_in(folder: Path) -> list[Path]:
     """Images of a folder, in the order of the numbers in their names."""
     found = (path for path in folder.iterdir() if is_image(path))
     return sorted(found, key=lambda path: natural(path.name))
+
+
+def _are_stamped(recordings: Sequence[Recording]) -> bool:
+    """Whether times are those of the files, as where frames of videos are unevenly spaced."""
+    uneven = [recording.camera.source.name for recording in recordings if recording.varies]
+    return bool(uneven) and all(recording.times for recording in recordings)
+
+
+def _warn_of_starts(recordings: Sequence[Recording]) -> None:
+    """Warn of videos that begin at different times."""
+    begun = [(r.times[0], r.camera.source, r.step) for r in recordings if r.times]
+    if not begun or _are_stamped(recordings):
+        return
+    (early, first, step), (late, last, _) = min(begun), max(begun)
+    if late - early > 0.5 * step > 0:
+        warnings.warn(
+            f"{last} begins {late - early:.3g} s after {first}: frames of one number are taken to "
+            "be of one time. If they are not, cut the videos to one beginning.",
+            stacklevel=4,
+        )
 
 
 def _require_one_rate(recordings: Sequence[Recording]) -> None:
@@ -561,9 +604,7 @@ def _read_views(
     labels = [recording.camera.label for recording in recordings]
     intrinsics = final_intrinsics(labels, calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(recordings))]
-    for recording, shown in zip(recordings, has_ray, strict=True):
-        if shown is not None:
-            require_rays(recording.camera.label, recording.camera.calibration, shown)
+    require_rays(labels, calibrations, has_ray)
     jobs = [
         _job(recording, numbers, sizes[index], has_ray[index], index * count)
         for index, recording in enumerate(recordings)
@@ -588,10 +629,15 @@ def _read_views(
     poses = torch.from_numpy(np.stack([recording.camera.pose for recording in recordings])).float()
     camera = torch.arange(len(recordings)).repeat_interleave(count)
     times = torch.linspace(0, 1, count) if count > 1 else torch.zeros(1)
+    times = times.repeat(len(recordings))
+    if _are_stamped(recordings):
+        seconds = [recording.times[number] for recording in recordings for number in numbers]
+        times = torch.tensor(unit_times(seconds))
+        logger.info("Frames of some videos are unevenly spaced: times are those of the files")
     return Views(
         pixels,
         poses[camera],
-        times.repeat(len(recordings)),
+        times,
         intrinsics.subset(camera),
         tuple(
             f"{recording.camera.name}/{number:06d}"

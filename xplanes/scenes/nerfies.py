@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -42,7 +42,7 @@ from xplanes.scenes.listing import (
 from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene
-from xplanes.settings import Count
+from xplanes.settings import Count, Location
 
 logger = logging.getLogger(__name__)
 
@@ -56,12 +56,14 @@ DOWNLOAD = "Download or unpack the capture again."
 class NerfiesSettings(SceneSettings):
     """A capture in the format of Nerfies, HyperNeRF or DyCheck."""
 
+    files: ClassVar = "dataset.json, camera/ and rgb/"
+
     # Name of DyCheck's splits to use, such as mono or intl; null: those in splits/train.json if it
     # exists, otherwise those in dataset.json.
     protocol: str | None
     # Folder of masks, with the subfolders and file names of rgb, black outside the foreground; null
     # for none. DyCheck's co-visibility masks are unsuitable: they do not mark the foreground.
-    masks: str | None
+    masks: Location | None
     # What masks leave out. alpha: is empty; ignore: is neither trained on nor scored; auto: alpha
     # where they look like silhouettes, else ignore; lrm: is cut from the LRM's input alone.
     mask_use: MaskUse
@@ -79,7 +81,11 @@ class NerfiesSettings(SceneSettings):
             raise _no_capture(folder)
         chosen, source = _splits(folder, self.protocol)
         names = list(dict.fromkeys(name for part in chosen.values() for name in part))
-        listing, points = self._listing(names)
+        pictures = _picture_folder(folder, names, self.resolution)
+        lost = _missing(folder / "rgb" / pictures, names, SUFFIXES[1:])
+        names = [name for name in names if name not in set(lost)]
+        chosen = {split: [n for n in part if n not in set(lost)] for split, part in chosen.items()}
+        listing, points = self._listing(names, pictures)
         places = {name: place for place, name in enumerate(names)}
         if chosen.get("val"):
             found = {split: [places[name] for name in part] for split, part in chosen.items()}
@@ -97,8 +103,8 @@ class NerfiesSettings(SceneSettings):
         )
         return Scene(folder.resolve().name, read, points=points, cut=cut, notes=notes)
 
-    def _listing(self, names: Sequence[str]) -> tuple[Listing, torch.Tensor | None]:
-        """The images of these names, and the points of the capture."""
+    def _listing(self, names: Sequence[str], pictures: str) -> tuple[Listing, torch.Tensor | None]:
+        """The images of these names in a folder of rgb, and the points of the capture."""
         folder = self.folder
         root = folder.resolve()
         scale, centre = _scene(folder / "scene.json")
@@ -112,7 +118,6 @@ class NerfiesSettings(SceneSettings):
         points = _points(folder / "points.npy")
         if points is not None:
             points = (points - centre) * scale
-        pictures = _picture_folder(folder, names, self.resolution)
         labels = [f"{folder / 'dataset.json'}: {name}" for name in names]
         paths = [
             image_path(label, root, f"rgb/{pictures}/{name}", "ids")
@@ -241,6 +246,8 @@ def _names(path: Path, content: Mapping[str, Any], key: str) -> list[str]:
         )
     assert isinstance(names, list)
     texts = [str(name) for name in names]
+    if outside := [name for name in texts if ".." in name.split("/")]:
+        raise SceneError(f"{path}: {key} leaves the scene's folder: {some(outside)}.")
     if len(set(texts)) < len(texts):
         twice = next(name for name in texts if texts.count(name) > 1)
         raise SceneError(f"{path}: {key} lists {twice} twice. Remove one of the two.")
@@ -325,34 +332,41 @@ def _camera(path: Path) -> tuple[np.ndarray, Calibration]:
 def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) -> str:
     """The folder in rgb of the smallest images that are at least as wide as asked for.
 
-    The largest images, where none are, or none were asked for.
+    The largest images, where none are, or none were asked for. Where images of that scale are
+    missing, another that lacks fewer takes its place, the next larger first; a warning says so, and
+    names the images that it lacks.
     """
-    widths = {}
+    widths: dict[str, int] = {}
+    lost: dict[str, list[str]] = {}
     for path in (folder / "rgb").glob("*x"):
-        first = [path / f"{names[0]}{end}" for end in SUFFIXES[1:]]
-        if path.name[:-1].isdecimal() and any(file.is_file() for file in first):
-            widths[path.name] = native_sizes([file for file in first if file.is_file()])[0][1]
+        if not path.name[:-1].isdecimal():
+            continue
+        missing = _missing(path, names, SUFFIXES[1:])
+        there = next((name for name in names if name not in set(missing)), None)
+        if there is not None:
+            files = [path / f"{there}{end}" for end in SUFFIXES[1:]]
+            widths[path.name] = native_sizes([next(filter(Path.is_file, files))])[0][1]
+            lost[path.name] = missing
     if not widths:
         raise SceneError(
             f"{folder / 'rgb'} has no folder, such as 1x or 4x, with an image of {names[0]}. "
             f"{DOWNLOAD}"
         )
     enough = {name: width for name, width in widths.items() if width >= (resolution or math.inf)}
-    chosen = min(enough, key=enough.__getitem__) if enough else max(widths, key=widths.__getitem__)
-    # Where images of that scale are missing, another that is whole will do, the next larger first.
-    others = sorted(
-        widths, key=lambda name: (widths[name] < widths[chosen], abs(widths[name] - widths[chosen]))
-    )
-    whole = [name for name in others if not _missing(folder / "rgb" / name, names, SUFFIXES[1:])]
-    if whole and whole[0] != chosen:
-        lost = _missing(folder / "rgb" / chosen, names, SUFFIXES[1:])
+    wanted = min(enough, key=enough.__getitem__) if enough else max(widths, key=widths.__getitem__)
+
+    def rank(name: str) -> tuple[int, bool, int]:
+        wider = widths[name] - widths[wanted]
+        return len(lost[name]), wider < 0, abs(wider)
+
+    chosen = min(widths, key=rank)
+    if lost[wanted]:
+        rest = f", without {some(lost[chosen])}" if lost[chosen] else ""
         warnings.warn(
-            f"{len(lost)} of {len(names)} images are not in {folder / 'rgb' / chosen}: "
-            f"{some(lost)}. Those of rgb/{whole[0]} are read.",
-            stacklevel=5,
+            f"{len(lost[wanted])} of {len(names)} images are not in {folder / 'rgb' / wanted}: "
+            f"{some(lost[wanted])}. Those of rgb/{chosen} are read{rest}.",
+            stacklevel=4,
         )
-        return whole[0]
-    _require_files(folder / "rgb" / chosen, names, SUFFIXES[1:])
     return chosen
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from xplanes.errors import BrokenFrameError, MissingSplitError, SceneError
 from xplanes.scenes.entries import image_path, short
@@ -23,6 +23,8 @@ OTHER_AXES = ("from_mitsuba", "from_na")
 @dataclass(frozen=True, kw_only=True)
 class NerfstudioSettings(SceneSettings):
     """A capture in the format of nerfstudio or instant-ngp."""
+
+    files: ClassVar = "transforms.json"
 
     # Hold out every n-th frame as val, in order of time and file name; never the first or last.
     # Splits listed in the capture (train_filenames, ...) take precedence.

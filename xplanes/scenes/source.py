@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 
 from xplanes.errors import MissingSplitError, SceneError
 from xplanes.scenes.views import Scene, Views, joined
-from xplanes.settings import Count, Positive, Settings
+from xplanes.settings import Count, Location, Positive, Settings
 
 SAME = 2
 """Largest difference of a static pixel between frames, in steps of 1/255."""
@@ -63,8 +63,8 @@ class SceneSettings(Settings, ABC):
     """Base class of the settings in the group ``data``, with one subclass for each format."""
 
     name: str  # Name of the format in run directories and tables.
-    root: str  # Folder that holds the scenes.
-    scene: str  # Folder of the scene, or name of the demo scene.
+    root: Location  # Folder that holds the scenes.
+    scene: Location  # Folder of the scene, or name of the demo scene.
     resolution: Count | None  # Width of the images in pixels; null keeps the native size.
     views: Count | None  # Training views, spread over time; null for all.
     train_on_video: bool  # Also train on the frames of the fixed camera.
@@ -72,17 +72,20 @@ class SceneSettings(Settings, ABC):
     eval_split: Literal["test", "val"] | None  # Split to score; null: val, then test at the end.
     eval_views: Count | None  # Maximum views per scored split, spread over time; null for all.
     half_side: Positive | None  # Half the side of the scene's bounding cube; null estimates it.
-    cache: str | None  # Folder for images too large for memory; null: the user's cache.
+    cache: Location | None  # Folder for images too large for memory; null: the user's cache.
+
+    files: ClassVar[str] = ""
+    """What a folder of this format holds, in words; empty for formats without such folders."""
 
     @property
     def folder(self) -> Path:
         """The scene's folder."""
-        return Path(self.root).expanduser() / Path(self.scene).expanduser()
+        return Path(self.root) / self.scene
 
     @property
     def image_cache(self) -> Path | None:
         """Folder for decoded images; None for the user's cache folder."""
-        return None if self.cache is None else Path(self.cache).expanduser()
+        return None if self.cache is None else Path(self.cache)
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:

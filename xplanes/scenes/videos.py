@@ -31,16 +31,18 @@ class Video:
         size: Height and width of its frames.
         count: Number of the frames that it shows.
         rate: Frames per second; None where the file does not tell.
+        times: When they are shown, in seconds; empty where the file does not tell.
     """
 
     path: Path
     size: Size
     count: int
     rate: Fraction | None
+    times: tuple[float, ...]
 
 
 def read_header(path: Path) -> Video:
-    """Size, number and rate of a video's frames. Nothing is decoded.
+    """Size, number, rate and times of a video's frames. Nothing is decoded.
 
     Raises:
         SceneError: If the file is no video.
@@ -50,12 +52,15 @@ def read_header(path: Path) -> Video:
     try:
         with av.open(str(path)) as container:
             stream = _stream(path, container)
-            # Not every container tells, and those of MP4 tell of frames that its edit list hides.
-            # Counting packets decodes none.
-            count = 0 if "mp4" in container.format.name else stream.frames
-            count = count or sum(
-                packet.size > 0 and not packet.is_discard for packet in container.demux(stream)
-            )
+            # Not of those that an edit list hides, which containers count, too.
+            stamps = [
+                packet.pts
+                for packet in container.demux(stream)
+                if packet.size > 0 and not packet.is_discard
+            ]
+            known = sorted(stamp for stamp in stamps if stamp is not None)
+            whole = len(known) == len(stamps) and stream.time_base is not None
+            times = tuple(float(stamp * stream.time_base) for stamp in known) if whole else ()
             if (curve := stream.codec_context.color_trc) in HDR:
                 warnings.warn(
                     f"{path} is an HDR video ({HDR[curve]}): its colours look pale where they are "
@@ -63,7 +68,7 @@ def read_header(path: Path) -> Video:
                     stacklevel=4,
                 )
             size = (stream.codec_context.height, stream.codec_context.width)
-            return Video(path, size, count, stream.average_rate)
+            return Video(path, size, len(stamps), stream.average_rate, times)
     except av.FFmpegError as problem:
         raise _unreadable(path, problem) from problem
 

@@ -1,6 +1,7 @@
 """What a checkpoint says of the field, so that it can be built without its data."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -8,6 +9,7 @@ import torch
 from xplanes import __version__
 from xplanes.components import build, plugins
 from xplanes.errors import ConfigError
+from xplanes.files import stand_in
 from xplanes.models.base import ModelSettings
 from xplanes.models.initialisation import Method
 from xplanes.rendering.sampler import Site
@@ -34,6 +36,19 @@ def require_version(path: Any) -> None:
             f"{path} was made by xplanes {made}, whose settings are not those of {__version__}: "
             "load it with that version, or start a new run"
         )
+
+
+def require_fetched(path: Any) -> None:
+    """Refuse what stands for a checkpoint that was not fetched, such as a pointer of Git LFS.
+
+    Args:
+        path: The file; what is no local file is left to others.
+
+    Raises:
+        ConfigError: Saying what it is and how to fetch the file.
+    """
+    if isinstance(path, str | Path) and (other := stand_in(Path(path))) is not None:
+        raise ConfigError(f"{path} {other}")
 
 
 def site_content(parts: Parts) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from xplanes.training.diagnosis import TrainingError, diagnosis
 from xplanes.training.finite import broken_flag, leave_out, unusable_gradients
 from xplanes.training.loading import (
     parts_from,
+    require_fetched,
     require_frame,
     require_version,
     require_whole_floats,
@@ -123,6 +124,7 @@ class RadianceModule(ViewScoring):
         Raises:
             ConfigError: If the checkpoint needs a plug-in that is not named, or does not fit.
         """
+        require_fetched(checkpoint_path)
         try:
             return super().load_from_checkpoint(
                 checkpoint_path, *args, weights_only=weights_only, **kwargs

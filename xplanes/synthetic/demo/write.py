@@ -309,7 +309,7 @@ class ProceduralSettings(SceneSettings, ABC):
     @property
     def folder(self) -> Path:
         return type(self).ensure(
-            Path(self.root).expanduser(),
+            Path(self.root),
             self.scene,
             resolution=self.resolution or 128,
             seed=self.seed,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from xplanes.errors import ConfigError
-from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
+from xplanes.settings import Count, Location, Positive, Settings, Share, Steps, Weight
 
 NARROWEST = 12
 """Channels of a head at least: half of them hold a sine and a cosine along each of three axes."""
@@ -47,7 +47,7 @@ class SizeSettings(Settings):
 class PoolSettings(Settings):
     """Objects that are generated once and stored on disk."""
 
-    root: str  # Folder of the pool.
+    root: Location  # Folder of the pool.
     objects: Count  # Training objects, a multiple of 256.
     views: Count  # Images per object, at least 2: scores use views that the model did not see.
 
@@ -102,8 +102,9 @@ class PretrainingSettings(Settings):
     """The whole configuration of a pretraining."""
 
     seed: Steps  # Seed of all random numbers.
-    init_from: str | None  # Weights of a model with coarser planes; null: random initialisation.
-    run: str  # Folder of checkpoints and logs; an existing run is resumed.
+    # Weights of a model with coarser planes; null: random initialisation.
+    init_from: Location | None
+    run: Location  # Folder of checkpoints and logs; an existing run is resumed.
     model: SizeSettings
     pool: PoolSettings
     batch: BatchSettings

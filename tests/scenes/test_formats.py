@@ -1,0 +1,183 @@
+"""Image files of every kind: those that are read, and what is said of the others."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image, features
+
+from tests.captures import HEIGHT, WIDTH, picture, poses, save, settings, write_colmap
+from tests.refusals import assert_refused
+from xplanes import RadianceModule
+from xplanes.errors import ConfigError, LRMError, SceneError
+from xplanes.lrm.checkpoint import read_weights
+from xplanes.preparation.sequence import load_triplanes
+from xplanes.scenes.colmap import ColmapSettings
+from xplanes.scenes.colmap_model import read_model
+from xplanes.scenes.entries import read_object
+from xplanes.scenes.formats import orientation
+from xplanes.scenes.images import load_images, native_sizes
+from xplanes.training.checkpoints import load_checkpoint
+
+POINTER = (
+    "version https://git-lfs.github.com/spec/v1\n"
+    "oid sha256:4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393\nsize 12345\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("ending", "options"),
+    [
+        ("webp", {"lossless": True}),
+        ("tif", {"compression": "tiff_lzw"}),
+        ("bmp", {}),
+        ("avif", {"quality": 100, "subsampling": "4:4:4"}),
+        ("jp2", {"irreversible": False}),
+        ("ppm", {}),
+        ("tga", {}),
+        ("qoi", {}),
+        ("jfif", {"format": "JPEG", "quality": 100, "subsampling": 0}),
+        ("jpg", {"format": "MPO", "quality": 100, "subsampling": 0}),
+    ],
+)
+def test_further_formats_are_read(tmp_path: Path, ending: str, options: dict) -> None:
+    if ending in ("avif", "webp") and not features.check(ending):
+        pytest.skip(f"Pillow was built without {ending}")
+    path = tmp_path / f"a.{ending}"
+    smooth = Image.fromarray(picture(3, 4, 6)).resize((48, 32), Image.Resampling.BICUBIC)
+    smooth.save(path, **options)
+    (found,) = load_images([path], None)
+    assert np.abs(found[..., :3].short().numpy() - np.asarray(smooth)).max() <= 12
+    assert bool((found[..., 3] == 255).all())
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.heic", b"\0\0\0\x18ftypheic\0\0\0\0", r"is in HEIC, .*mogrify -format png \*\.heic"),
+        ("a.jpg", b"\0\0\0\x18ftypmif1\0\0\0\0", "is in HEIC"),
+        ("a.jxl", b"\0\0\0\x0cJXL \r\n\x87\n" + bytes(20), "is in JPEG XL"),
+        ("a.exr", b"v/1\x01\x02\0\0\0" + bytes(20), "is in OpenEXR"),
+        ("a.hdr", b"#?RADIANCE\n", "is in Radiance HDR"),
+        ("a.dng", b"II*\0" + bytes(20), "is in a camera's raw format"),
+        ("a.psd", b"8BPS" + bytes(20), "is in Photoshop"),
+        ("a.png", b"\0\0\0\x18ftypisom" + bytes(20), "is in MP4"),
+        ("a.jpg", POINTER.encode(), "is a pointer of Git LFS.*: run git lfs pull"),
+        ("a.jpg", b"/annex/objects/SHA256E-s1--ab.jpg\n", "is a pointer of git-annex"),
+        ("a.jpg", b"\n<!DOCTYPE html><html>", "is a web page"),
+        ("a.jpg", b"", "cannot be decoded as an image.*truncated or damaged"),
+    ],
+)  # fmt: skip
+def test_other_files_are_named_for_what_they_are(tmp_path, name, content, words) -> None:
+    (tmp_path / name).write_bytes(content)
+    assert_refused(SceneError, words, partial(native_sizes, [tmp_path / name]), name)
+
+
+def test_all_files_that_cannot_be_read_are_named_at_once(tmp_path: Path) -> None:
+    paths = [tmp_path / f"{i}.jpg" for i in range(7)]
+    for path in paths[1:]:
+        path.write_text(POINTER)
+    save(paths[0], picture(0))
+    said = assert_refused(SceneError, "1.jpg is a pointer", partial(native_sizes, paths), paths)
+    assert "5.jpg is a pointer" in said
+    assert said.endswith("... and 1 more problems like these.")
+
+
+def test_pointers_of_git_lfs_are_named_wherever_a_file_is_read(tmp_path: Path) -> None:
+    words = "is a pointer of Git LFS.*git lfs pull"
+    readers = {
+        "model.safetensors": (LRMError, read_weights),
+        "model.ckpt": (LRMError, read_weights),
+        "last.ckpt": (ConfigError, load_checkpoint),
+        "best.ckpt": (ConfigError, RadianceModule.load_from_checkpoint),
+        "planes.safetensors": (ConfigError, load_triplanes),
+        "transforms.json": (SceneError, partial(read_object, content="frames")),
+    }
+    for name, (kind, read) in readers.items():
+        (tmp_path / name).write_text(POINTER)
+        assert_refused(kind, words, partial(read, tmp_path / name), name)
+    for end in ("bin", "txt"):
+        for name in ("cameras", "images", "points3D"):
+            model = tmp_path / end / name
+            camera = {1: ("PINHOLE", WIDTH, HEIGHT, (36.0, 36.0, 20.0, 15.0))}
+            write_colmap(
+                model, camera, [("a.png", poses(1)[0], 1, 1)], [[0, 0, 0]], text=end == "txt"
+            )
+            (model / f"{name}.{end}").write_text(POINTER)
+            assert_refused(SceneError, words, partial(read_model, model), (name, end))
+
+
+STORED = {
+    **{1: None, 2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180},
+    **{4: Image.Transpose.FLIP_TOP_BOTTOM, 5: Image.Transpose.TRANSPOSE},
+    **{6: Image.Transpose.ROTATE_90, 7: Image.Transpose.TRANSVERSE, 8: Image.Transpose.ROTATE_270},
+}
+"""How an upright picture is stored under each orientation of EXIF."""
+
+
+@pytest.mark.parametrize("ending", ["jpg", "png", "webp", "tif"])
+@pytest.mark.parametrize("tag", STORED)
+def test_what_is_up_follows_exif(tmp_path: Path, tag: int, ending: str) -> None:
+    """Where the top of the upright picture is in the stored one, the world's z axis points."""
+    upright = np.zeros((24, 32, 3), np.uint8)
+    upright[:6] = 255
+    stored = Image.fromarray(upright)
+    if (turn := STORED[tag]) is not None:
+        stored = stored.transpose(turn)
+    exif = Image.Exif()
+    exif[0x0112] = tag
+    names = [f"{i}.{ending}" for i in range(4)]
+    (tmp_path / "room/images").mkdir(parents=True)
+    for name in names:
+        stored.save(tmp_path / "room/images" / name, exif=exif, quality=95)
+        assert orientation(tmp_path / "room/images" / name) == tag
+    bright = np.argwhere(np.asarray(stored)[..., 0] > 128).mean(axis=0)
+    row, column = bright - [(stored.height - 1) / 2, (stored.width - 1) / 2]
+    width, height = stored.size
+    camera = {1: ("SIMPLE_PINHOLE", width, height, (30.0, width / 2, height / 2))}
+    # Cameras that look horizontally around an axis, rolled so that the upright picture is upright.
+    turns = poses(4)
+    level = np.stack([turns[:, :3, 0], np.tile([0.0, 0, 1], (4, 1))], axis=1)
+    for pose, (right, up) in zip(turns, level, strict=True):
+        back = np.cross(right, up)
+        aim = np.array([column, -row]) / np.hypot(row, column)
+        pose[:3, :3] = np.stack(
+            [right * aim[1] + up * aim[0], up * aim[1] - right * aim[0], back], axis=1
+        )
+    lying = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    turns[:, :3] = lying @ turns[:, :3]
+    images = [(name, pose, 1, 0) for name, pose in zip(names, turns, strict=True)]
+    write_colmap(tmp_path / "room/sparse/0", camera, images)
+    read = settings(ColmapSettings, "colmap", tmp_path / "room", static=True, eval_every=100)
+    views = read.load(["train"]).splits["train"]
+    assert views.images.shape[1:3] == (height, width), "pixels stay"
+    for pose in views.camera_to_world:
+        top = aim[0] * pose[:3, 0] + aim[1] * pose[:3, 1]
+        torch.testing.assert_close(top, torch.tensor([0.0, 0, 1]), atol=1e-5, rtol=0)
+
+
+def test_masks_and_cameras_of_turned_photos_say_exif(tmp_path: Path) -> None:
+    folder, exif = tmp_path / "room", Image.Exif()
+    exif[0x0112] = 6
+    (folder / "images").mkdir(parents=True)
+    names = [f"{i}.jpg" for i in range(4)]
+    for index, name in enumerate(names):
+        Image.fromarray(picture(index)).save(folder / "images" / name, exif=exif)
+        save(folder / "masks" / f"{name}.png", picture(index, WIDTH, HEIGHT))
+    lens = (36.0, WIDTH / 2, HEIGHT / 2)
+    images = [(name, pose, 1, 0) for name, pose in zip(names, poses(4), strict=True)]
+    write_colmap(folder / "sparse/0", {1: ("SIMPLE_PINHOLE", WIDTH, HEIGHT, lens)}, images)
+    read = partial(settings, ColmapSettings, "colmap", folder, static=True)
+    said = assert_refused(
+        SceneError,
+        r"EXIF orientation says that it is shown turned.*magick mogrify -rotate 270",
+        partial(read(masks="masks").load, ["train"]),
+        "masks",
+    )
+    assert all(f"{name}.png has 30x40 pixels" in said for name in names)
+    write_colmap(folder / "sparse/0", {1: ("SIMPLE_PINHOLE", HEIGHT, WIDTH, lens)}, images)
+    words = r"EXIF orientation.*calibrated with the turned image.*-auto-orient"
+    said = assert_refused(SceneError, words, partial(read().load, ["train"]), "cameras")
+    assert all(f"{name} has 40x30 pixels" in said for name in names)

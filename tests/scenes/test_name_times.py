@@ -1,0 +1,62 @@
+"""Times from the names of images, as cameras, telephones and programs write them."""
+
+import warnings
+
+import pytest
+
+from xplanes.scenes.entries import unit_times
+from xplanes.scenes.name_times import times_in_names
+
+
+@pytest.mark.parametrize(
+    ("names", "times"),
+    [
+        ("f_9 f_10 f_13", [0, 0.25, 1]),
+        ("1305031102.175304 1305031102.975304 1305031103.175304", [0, 0.8, 1]),
+        ("rgb_12.5 rgb_13.0 rgb_14.5", [0, 0.25, 1]),
+        ("1305031102_900000000 1305031103_100000000", [0, 1]),
+        ("IMG_20260102_115958 IMG_20260102_115959 IMG_20260102_120002", [0, 0.25, 1]),
+        ("PXL_20260102_115959500 PXL_20260102_120000000 PXL_20260102_120001500", [0, 0.25, 1]),
+        ("2026-01-31.23.59.59 2026-02-01.00.00.00 2026-02-01.00.00.03", [0, 0.25, 1]),
+        ("034_cam0 036_cam1 042_cam0", [0, 0.25, 1]),
+        ("0034_0 0036_1 0042_0", [0, 0.25, 1]),
+        ("034_view2_rgb8 036_view1_rgb8 042_view9_rgb8", [0, 0.25, 1]),
+        ("c2_010 c1_011 c1_014", [0, 0.25, 1]),
+        ("cam1/007 cam1/008 cam2/007 cam2/011", [0, 0.25, 0, 1]),
+        ("t_001/cam1 t_002/cam1 t_005/cam2", [0, 0.25, 1]),
+        ("rig1/camera1/i0001 rig1/camera2/i0002 rig1/camera1/i0005", [0, 0.25, 1]),
+        ("clip_1_1080p clip_2_1080p clip_5_1080p", [0, 0.25, 1]),
+        ("12345678_200001 12345678_200002 12345678_200005", [0, 0.25, 1]),
+        ("cam1 cam2 cam5", [0, 0.25, 1]),
+    ],
+)
+def test_names_tell_times(names: str, times: list[float]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = times_in_names([f"{name}.png" for name in names.split()])
+    assert unit_times(found) == pytest.approx(times)
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["00_58.png", "00_59.png", "01_00.png", "01_01.png", "01_02.png"], r"01_00\.png -> 0\)"),
+        ([f"a_{i // 4}_{'xy'[i % 2]}{'pq'[i % 4 // 2]}.png" for i in range(16)], "only 4, for 16"),
+    ],
+)
+def test_times_that_are_hardly_those_of_the_images_are_shown(names, words) -> None:
+    with pytest.warns(UserWarning, match=words):
+        assert len(times_in_names(names)) == len(names)
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["left.png", "right.png"], "have no number, such as left"),
+        ([f"{name}.png" for name in "3f2a9c b07d1e 9e4410 c5a8f2 77e0b3 0d1f6a".split()], "differ"),
+        (["a_1.png", "b_1.png"], "give one number"),
+    ],
+)
+def test_names_without_an_order_are_one_timestep(names, words) -> None:
+    with pytest.warns(UserWarning, match=f"{words}(.|\n)*one timestep.*data.static=true"):
+        assert times_in_names(names) == []

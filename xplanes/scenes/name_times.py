@@ -1,0 +1,145 @@
+"""Times of images from the numbers in their names."""
+
+import re
+import warnings
+from collections import defaultdict
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import PurePosixPath
+
+from xplanes.files import natural
+from xplanes.scenes.entries import some
+
+OTHER_TIMES = (
+    r"Set data.time_pattern to a regular expression for the names, such as frame_(\d+), data.times "
+    "to a CSV file with the columns file and time, or, for a static scene, data.static=true."
+)
+
+FEW = 0.5
+"""Share of the images of a folder below which different times are suspiciously few."""
+
+CAMERA = re.compile(
+    r"(?i)(?<![a-z])(cam|camera|view|lens|sensor|rig)s?[_\- ]*\d+(?![a-z\d])"
+    r"|(?<![^_\-. ])[cv]\d+(?=$|[_\-. ])"
+)
+"""A number that is a camera's, as in 034_cam1."""
+
+CLOCK = re.compile(r"(?<![A-Za-z\d])\d+\.\d+$|(?<!\d)(\d{10})[_-](\d{9}|\d{6})$")
+"""Seconds and their fraction at the end of a name, as in 1305031102.175304."""
+
+DATE = re.compile(
+    r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_.T ]+(?:at )?"
+    r"(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)(\d*)"
+)
+"""Date and time of day, with parts of a second, as in PXL_20260102_115959250."""
+
+Number = int | float
+
+
+def times_in_names(names: Sequence[str]) -> list[Number]:
+    """Times of images, in any unit, from their names; none, with a warning, where these tell none.
+
+    They are dates and times of day, seconds with a fraction, or else the number that differs most
+    among the names and is no camera's. A warning shows names and times where their orders disagree,
+    or there are far fewer times than images.
+
+    Args:
+        names: Names of the images, with their folders. [V]
+    """
+    stems = [PurePosixPath(name).stem for name in names]
+    for read in (_date, _clock):
+        times = [read(stem) for stem in stems]
+        found = [time for time in times if time is not None]
+        if len(found) == len(names) and not _few(names, found):
+            return _checked(names, found)
+    # In folders of timesteps, file names are those of cameras.
+    paths = [PurePosixPath(name).with_suffix("").as_posix() for name in names]
+    bare = [[CAMERA.sub("", text) for text in texts] for texts in (stems, paths)]
+    for texts in (*bare, stems):
+        found = _most_different(texts)
+        if len(set(found)) > 1 or (found and len(names) == 1):
+            break
+    if why := _no_series(names, stems, found):
+        warnings.warn(f"{why}: all images are taken for one timestep. {OTHER_TIMES}", stacklevel=6)
+        return []
+    return _checked(names, found)
+
+
+def _date(stem: str) -> float | None:
+    """Seconds of the date and time of day in a name."""
+    if (match := DATE.search(stem)) is None:
+        return None
+    *parts, fraction = match.groups()
+    try:
+        seconds = datetime(*map(int, parts), tzinfo=UTC).timestamp()
+    except ValueError:
+        return None
+    return seconds + float(f"0.{fraction or 0}")
+
+
+def _clock(stem: str) -> float | None:
+    """Seconds with a fraction at the end of a name."""
+    if (match := CLOCK.search(stem)) is None:
+        return None
+    return float(f"{match[1]}.{match[2]}" if match[1] else match[0])
+
+
+def _most_different(texts: Sequence[str]) -> list[Number]:
+    """The number in each name at the place where numbers differ most, the last of such places.
+
+    None where a name has no number.
+    """
+    rows = [re.findall(r"\d+", text) for text in texts]
+    if not all(rows):
+        return []
+    least = min(map(len, rows))
+    if least < max(map(len, rows)):
+        return [int(row[-1]) for row in rows]
+    place = max(range(least), key=lambda column: (len({row[column] for row in rows}), column))
+    return [int(row[place]) for row in rows]
+
+
+def _no_series(names: Sequence[str], stems: Sequence[str], found: Sequence[Number]) -> str | None:
+    """Why names are not those of a series of images, such as hashes; None if they are."""
+    bare = [name for name in names if not re.search(r"\d", name)]
+    if bare:
+        return f"The names of {len(bare)} of {len(names)} images have no number, such as {bare[0]}"
+    # All names of a series are equal but for their numbers.
+    kinds = {re.sub(r"\d+", "#", stem) for stem in stems}
+    if len(kinds) > max(4, len(names) // 2):
+        return f"The names of the images, such as {some(names)}, differ in more than their numbers"
+    if len(names) > 1 and len(set(found)) <= 1:
+        return f"The names of all {len(names)} images, such as {names[0]}, give one number"
+    return None
+
+
+def _folders(names: Sequence[str]) -> list[list[int]]:
+    """Places of the images of each folder, in the order of their names without cameras."""
+    folders: dict[str, list[int]] = defaultdict(list)
+    for place in sorted(range(len(names)), key=lambda i: natural(CAMERA.sub("", names[i]))):
+        folders[PurePosixPath(names[place]).parent.as_posix()].append(place)
+    return list(folders.values())
+
+
+def _few(names: Sequence[str], times: Sequence[Number]) -> bool:
+    """Whether there are far fewer times than images in a folder."""
+    return len(set(times)) < FEW * max(map(len, _folders(names)))
+
+
+def _checked(names: Sequence[str], times: list[Number]) -> list[Number]:
+    """The times, with a warning where they hardly are those of the images."""
+    why, shown = "", list(range(min(3, len(names))))
+    for places in _folders(names):
+        back = [pair for pair in pairwise(places) if times[pair[1]] < times[pair[0]]]
+        if back:
+            why, shown = "do not have the order of the names", [*back[0]]
+            break
+    if not why and _few(names, times):
+        why = f"are only {len(set(times))}, for {len(names)} images"
+    if why:
+        pairs = ", ".join(f"{names[place]} -> {times[place]}" for place in shown)
+        warnings.warn(
+            f"The times from the numbers in the names {why} ({pairs}). {OTHER_TIMES}", stacklevel=6
+        )
+    return times

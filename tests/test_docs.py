@@ -158,7 +158,7 @@ def test_keys_in_the_text_of_the_pages_exist() -> None:
     for page, key in named:
         if key.rpartition(".")[2].isupper() or "NAME" in key:
             continue
-        assert key in known, f"{page}: {key}{near_names(f'{key!r} is no Key')}"
+        assert key in known, f"{page}: {key} {near_names([f'{key}=0'])}"
 
 
 CODE = re.compile(r"`(xplanes(?:\.\w+)+)`")

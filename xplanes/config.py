@@ -14,9 +14,6 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / 
 """The configuration files: inside an installed package, beside it in a checkout."""
 
 
-CHOICES = ("experiment", "entry", "recipe", "scale")
-"""Groups whose files set keys of other groups."""
-
 NAMES = (
     *("data.root", "data.scene", "data.cache", "data.masks", "data.images", "data.model"),
     *("data.times", "lrm.weights", "lrm.config", "lrm.triplanes", "preparation.cache"),
@@ -29,9 +26,6 @@ _PLAIN = re.compile(r"(?!\.\d)[A-Za-z_./][A-Za-z0-9_./-]*")
 
 _WORDS = ("null", "none", "true", "false", "inf", "nan")
 """Text that means something else without quotes."""
-
-_UNKNOWN_OPTION = re.compile(r"Could not find '(\S+)/(\S+)'\s+Available options.*:\n((?:\t.*\n)+)")
-"""Hydra's message: group, what was asked for, and what there is."""
 
 
 def compose_plain(name: str | None, overrides: Sequence[str], conf: Path = CONF) -> dict[str, Any]:
@@ -87,8 +81,8 @@ def _hydra(conf: Path, name: str | None, overrides: Sequence[str]) -> Iterator[N
         with _initialized(conf):
             yield
     except HydraException as error:
-        near = near_names(str(error), conf, name, overrides)
-        raise ConfigError(f"{error}{near}") from error
+        near = near_names(overrides, conf, name)
+        raise ConfigError("\n".join(filter(None, (str(error), near)))) from error
 
 
 @contextmanager
@@ -166,36 +160,54 @@ def _at_home(path: str) -> str:
     return str(Path(path).expanduser()) if path.startswith("~") else path
 
 
-def near_names(
-    message: str,
-    conf: Path = CONF,
-    name: str | None = "train",
-    overrides: Sequence[str] | None = None,
-) -> str:
-    """What Hydra's message about an unknown key or option may have meant; or nothing.
+def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "train") -> str:
+    """What the first override of an unknown option or key may have meant; or nothing.
 
     Args:
-        message: Hydra's.
+        overrides: ``key=value`` each.
         conf: The configuration folder.
         name: File of the configuration in ``conf``, without ending.
-        overrides: What was chosen, if that is known: keys of other options are not suggested.
     """
-    if found := _UNKNOWN_OPTION.search(message):
-        group, option, options = found[1], found[2], found[3].split()
-        near = difflib.get_close_matches(option, options, n=1, cutoff=0.5)
-        return f"\nDid you mean {group}={near[0]}?" if near else ""
-    key = next((word.strip("'\"") for word in message.split() if word.startswith("'")), "")
-    marker = "Could not override '"
-    if marker in message:
-        key = message.split(marker, 1)[1].split("'", 1)[0]
-    if not key or not ("." in key or "Key" in message or "override" in message):
+    from hydra import compose
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+
+    try:
+        parsed = OverridesParser.create().parse_overrides(list(overrides))
+        chosen = [each.input_line for each in parsed if each.key_or_group == "hydra.searchpath"]
+        keys = []
+        with _initialized(conf):
+            loader = GlobalHydra.instance().config_loader()
+            search = list(chosen)
+            for each in parsed:
+                group = each.key_or_group
+                options = loader.get_group_options(group, config_name=name, overrides=search)
+                if not options:
+                    known = each.is_add() or each.is_force_add() or group.startswith("hydra.")
+                    keys += [] if known else [group]
+                    continue
+                swept = each.is_sweep_override()
+                values = list(each.sweep_string_iterator()) if swept else [each.value()]
+                for option in values:
+                    if isinstance(option, str) and option not in options:
+                        near = difflib.get_close_matches(option, options, n=1, cutoff=0.5)
+                        return f"Did you mean {group}={near[0]}?" if near else ""
+                line = each.input_line
+                chosen.append(f"{line.partition('=')[0]}={values[0]}" if swept else line)
+            config = OmegaConf.to_container(compose(name, chosen, return_hydra_config=True))
+    except HydraException:
         return ""
-    known = _keys(conf, name)
-    if (options := known.pop(key, set())) and "Could not override" in message:
-        return f"\n{key} belongs to {' and '.join(sorted(options))}, not to what is chosen"
-    here = None if overrides is None else _composed_keys(conf, name, overrides)
-    if here:
-        known = {key: options for key, options in known.items() if key in here or not options}
+    assert isinstance(config, dict)
+    hydra = config.pop("hydra")
+    groups = [str(group).partition("@")[0] for group in hydra["runtime"]["choices"]]
+    known = {*_names(config), *(group for group in groups if not group.startswith("hydra/"))}
+    key = next((key for key in keys if key not in known), None)
+    if key is None:
+        return ""
+    if options := _options_with(key, groups, conf):
+        return f"{key} belongs to {' and '.join(options)}, not to what is chosen"
     prefix, _, last = key.rpartition(".")
     beside = [each for each in known if each.rpartition(".")[0] == prefix]
     alike = [each for each in known if each.rpartition(".")[2] == last]
@@ -204,71 +216,24 @@ def near_names(
         or difflib.get_close_matches(key, alike, n=3, cutoff=0)
         or difflib.get_close_matches(key, sorted(known), n=3, cutoff=0.6)
     )
-    return f"\nDid you mean {' or '.join(near)}?" if near else ""
+    return f"Did you mean {' or '.join(near)}?" if near else ""
 
 
-def _composed_keys(conf: Path, name: str | None, overrides: Sequence[str]) -> set[str]:
-    """Dotted names of the settings that the chosen options bring; none if they do not exist."""
-    from hydra import compose
-    from hydra.errors import HydraException
-    from omegaconf import OmegaConf
-
-    def chooses(override: str) -> bool:
-        key = override.lstrip("+~").partition("=")[0].partition("@")[0]
-        return key == "hydra.searchpath" or (conf / key).is_dir()
-
-    try:
-        with _initialized(conf):
-            config = compose(name, [override for override in overrides if chooses(override)])
-    except HydraException:
-        return set()
-    found: set[str] = set()
-    waiting = [("", OmegaConf.to_container(config))]
-    while waiting:
-        prefix, node = waiting.pop()
-        if prefix:
-            found.add(prefix)
-        if isinstance(node, dict):
-            waiting += [(f"{prefix}.{key}" if prefix else str(key), node[key]) for key in node]
-    return found
+def _names(node: Any, prefix: str = "") -> Iterator[str]:
+    """Dotted names of settings and of the nodes above them."""
+    for key, value in node.items() if isinstance(node, dict) else ():
+        yield f"{prefix}{key}"
+        yield from _names(value, f"{prefix}{key}.")
 
 
-def _keys(conf: Path, name: str | None) -> dict[str, set[str]]:
-    """Dotted names of the settings that a configuration may have, each with its options' names.
-
-    Groups are among them, without options.
-    """
+def _options_with(key: str, groups: Sequence[str], conf: Path) -> list[str]:
+    """Options of some groups whose files set a key."""
     import yaml
 
-    found: dict[str, set[str]] = {}
-
-    def add(node: Any, prefix: str, option: str) -> None:
-        if isinstance(node, dict):
-            for key, value in node.items():
-                if key not in ("defaults", "hydra", "_target_"):
-                    add(value, f"{prefix}.{key}" if prefix else str(key), option)
-        elif prefix:
-            found.setdefault(prefix, set()).update([option] if option else [])
-
-    roots = {path.stem: yaml.safe_load(path.read_text("utf-8")) for path in conf.glob("*.yaml")}
-    others = {
-        key
-        for root, content in roots.items()
-        if name in roots and root != name
-        for entry in content.get("defaults", [])
-        if isinstance(entry, dict)
-        for key in entry
-    }
-    for path in conf.rglob("*.yaml"):
-        groups = path.relative_to(conf).parts[:-1]
-        if (groups and groups[0] in others) or (not groups and name in roots and path.stem != name):
-            continue
-        if groups and groups[0] in CHOICES:
-            found.setdefault(groups[0], set())
-            continue
-        text = path.read_text(encoding="utf-8")
-        prefix = "" if "_global_" in text.split("\n", 1)[0] else ".".join(groups)
-        add(yaml.safe_load(text), prefix, f"{'/'.join(groups)}={path.stem}" if groups else "")
-        if groups:
-            found.setdefault("/".join(groups), set())
-    return found
+    return sorted(
+        f"{group}={path.stem}"
+        for group in groups
+        if key.startswith(prefix := f"{group.replace('/', '.')}.")
+        for path in (conf / group).glob("*.yaml")
+        if key.removeprefix(prefix) in _names(yaml.safe_load(path.read_text(encoding="utf-8")))
+    )

@@ -3,8 +3,6 @@
 Must stay quick: it imports neither torch nor lightning before the job begins.
 """
 
-import contextlib
-import io
 import re
 import shlex
 import sys
@@ -59,14 +57,13 @@ def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
         return _job(config)
 
     sys.argv = [program, *prepared]
-    printed = _Copied(sys.stderr)
     try:
-        with contextlib.redirect_stderr(printed):
-            hydra.main(config_path=str(CONF), config_name="train", version_base="1.3")(job)()
+        hydra.main(config_path=str(CONF), config_name="train", version_base="1.3")(job)()
     except SystemExit as end:
         if isinstance(end.code, int) and end.code and not begun:  # A text is our own message.
             chosen = [text for text in prepared if _split(text)[0]]
-            print(near_names(printed.copy.getvalue(), overrides=chosen).strip(), file=sys.stderr)
+            if near := near_names(chosen):
+                print(near, file=sys.stderr)
         raise
 
 
@@ -100,26 +97,6 @@ def _resolved(config: DictConfig) -> dict[str, Any] | None:
         if "${hydra:" in OmegaConf.to_yaml(config):
             return None
         raise
-
-
-class _Copied(io.TextIOBase):
-    """A stream whose text is kept as well."""
-
-    def __init__(self, stream: Any) -> None:
-        self.stream, self.copy = stream, io.StringIO()
-
-    def write(self, text: str) -> int:
-        self.copy.write(text)
-        return self.stream.write(text)
-
-    def flush(self) -> None:
-        self.stream.flush()
-
-    def isatty(self) -> bool:
-        return self.stream.isatty()
-
-    def fileno(self) -> int:
-        return self.stream.fileno()
 
 
 def _job(config: DictConfig) -> float:

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from xplanes.evaluation.evaluate import evaluate, score_table, write_scores
-from xplanes.evaluation.perceptual import UnavailableError, lpips
+from xplanes.evaluation.evaluate import UnavailableError, evaluate, lpips, score_table, write_scores
 from xplanes.evaluation.runs import load_run
 
 

@@ -47,7 +47,6 @@ def test_source_camera_becomes_the_models_where_focal_lengths_agree():
         alignment = align(pose, focal=focal, height=400, width=400, target=target, view=view)
         compare(transformed(alignment.frame, pose), view.camera_to_world(), atol=2e-6, case=case)
         assert alignment.frame.scale == pytest.approx(view.distance / 3.3, rel=1e-6), case
-        assert alignment.density_factor == alignment.frame.scale, case
         assert alignment.mismatch.largest < 1e-3, case
         origin = alignment.field_frame.points(target[None])
         compare(origin, torch.zeros(1, 3), atol=1e-6, case=case)
@@ -70,8 +69,9 @@ def test_sizes_agree_at_the_target_where_focal_lengths_differ():
         for length in (offset.norm(), right):
             predicted = view.focal * length / view.distance
             assert float(predicted) == pytest.approx(source, rel=1e-4), name
-        optical_depth = alignment.field_density_factor * alignment.field_frame.scale
-        assert optical_depth == pytest.approx(alignment.density_factor, rel=1e-6), name
+        assert alignment.half_side * alignment.field_frame.scale == pytest.approx(
+            alignment.frame.scale, rel=1e-6
+        ), name
 
 
 def test_mismatch_of_dnerf_cameras():
@@ -242,7 +242,7 @@ def world_query(model, triplane, alignment):
         features = field.features(inside, torch.zeros(len(inside)))
         colour, density = field.decoder(features)
         raw = field.decoder.logits(features)[:, :1]
-        density = density[:, None] / alignment.field_density_factor
+        density = density[:, None] / alignment.half_side
         return [values.view(*points.shape[:-1], -1) for values in (colour, density, raw)]
 
     return query

@@ -12,8 +12,8 @@ from xplanes.config import compose_plain
 from xplanes.models.base import ModelSettings
 from xplanes.rendering.sampler import time_rows
 from xplanes.scenes.batches import STILL_SHARE, RayBatches
-from xplanes.scenes.changes import CHANGE, changing
 from xplanes.scenes.frame import scene_frame
+from xplanes.scenes.silhouettes import CHANGE, changing
 
 FRAMES, CAMERAS, SIZE = 7, 3, 30
 

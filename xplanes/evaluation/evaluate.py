@@ -1,16 +1,31 @@
 """Scores of a trained run, view by view."""
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from xplanes.evaluation.perceptual import Metric, UnavailableError, lpips
-from xplanes.evaluation.progress import progress
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
 from xplanes.evaluation.runs import TrainedRun
-from xplanes.files import write_json
+from xplanes.files import is_there, write_json
+from xplanes.optional import require
 from xplanes.training.scores import ViewImages, ViewScore, mean, score_view
 
 DEFAULT_NETWORK = "vgg"
+WEIGHTS = {
+    "vgg": ("VGG16_Weights", "528 MB"),
+    "alex": ("AlexNet_Weights", "233 MB"),
+}
+"""Name in torchvision and size of the backbone's weights, by the network's name."""
+
+SMALLEST = 32
+"""Pixels a side below which the networks have nothing left to compare."""
+
+Metric = Callable[[Tensor, Tensor], float]
+"""From a prediction and the truth, in [0, 1], to a distance. [H, W, 3], [H, W, 3]"""
 
 
 def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
@@ -29,7 +44,7 @@ def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
     tag, metric, missing = _lpips(trained, network)
     began = time.perf_counter()
     rows = []
-    for index in progress(range(len(views)), len(views), "views"):
+    for index in tqdm(range(len(views)), "views", leave=False, delay=2, disable=None):
         score, images = score_view(
             module.field,
             module.renderer,
@@ -98,3 +113,54 @@ def _numbers(row: dict[str, Any], names: list[str]) -> str:
         f"{row[name]:>12.{2 if name.startswith('psnr') else 4}f}" if name in row else " " * 12
         for name in names
     )
+
+
+class UnavailableError(Exception):
+    """LPIPS cannot be computed; the message is the reason."""
+
+
+def lpips(network: str, side: int, device: str, *, download: bool) -> Metric:
+    """The LPIPS distance; lower is better.
+
+    Args:
+        network: ``vgg`` or ``alex``: their numbers cannot be compared.
+        side: Pixels of the shorter side of the images.
+        device: Where to compute.
+        download: Fetch the backbone's weights if they are not on this machine.
+
+    Raises:
+        UnavailableError: If anything is missing; the message says what.
+    """
+    if side < SMALLEST:
+        raise UnavailableError(f"images of {side} pixels are below {SMALLEST}")
+    try:
+        models = require("torchvision.models", extra="lpips")
+    except ImportError as error:
+        raise UnavailableError(str(error)) from error
+    name, size = WEIGHTS[network]
+    url = getattr(models, name).DEFAULT.url
+    file = Path(torch.hub.get_dir()) / "checkpoints" / Path(url).name
+    if not is_there(file) and not download:
+        raise UnavailableError(f"{file} is missing: --lpips {network} downloads its {size}")
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+    try:
+        if is_there(file):
+            # torchvision would read the file as a pickle, which may run code.
+            torch.load(file, map_location="cpu", weights_only=True)
+        metric = LearnedPerceptualImagePatchSimilarity(
+            net_type=network,  # type: ignore[arg-type]
+            normalize=True,
+        ).to(device)
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise UnavailableError(
+            f"its weights cannot be loaded ({reason}): put {url} at {file}"
+        ) from error
+
+    @torch.no_grad()
+    def measure(prediction: Tensor, truth: Tensor) -> float:
+        images = [t.clamp(0, 1).float().permute(2, 0, 1)[None] for t in (prediction, truth)]
+        return float(metric(*(image.to(device) for image in images)))
+
+    return measure

@@ -11,10 +11,10 @@ import torch
 import torch.nn.functional as F
 from safetensors.torch import save_file
 from torch import Tensor
+from tqdm import tqdm
 
 from xplanes.errors import ConfigError
 from xplanes.evaluation.camera_path import nerfstudio_content, path_of, transforms_content
-from xplanes.evaluation.progress import progress
 from xplanes.evaluation.render import FPS
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.fields.base import SurfaceField, ViewDependentField
@@ -204,7 +204,7 @@ def export(
     files = [folder / name for name in names]
     written = _write_each(trained, options, threshold, times, files)
     try:
-        for _ in progress(written, len(times), "times"):
+        for _ in tqdm(written, "times", len(times), leave=False, delay=2, disable=None):
             pass
     except ConfigError:
         for path in files:  # So that the way out, another threshold, may write here.

@@ -1,40 +1,29 @@
 """Published figures beside a sweep's own: read from a table that names their sources."""
 
-import csv
 import math
 from collections.abc import Sequence
-from importlib import resources
+from pathlib import Path
 
 from xplanes.errors import ConfigError
 from xplanes.evaluation.sweep import RunRow
-from xplanes.evaluation.tabulate import differing, markdown, mean_rank
+from xplanes.evaluation.tabulate import differing, markdown, mean, mean_rank
+from xplanes.files import read_rows
 
-FILE = "published.csv"
 KEYS = {"model": "model.name", "lrm": "lrm.name", "sampler": "model.sampler.name"}
 """Settings that runs are told apart by, and their columns in the file."""
 
 MEANT = ("data.scene", "seed", "entry")
 """Settings that the means go over."""
 
-HEADER = [
-    "runs",
-    "psnr",
-    "ssim",
-    "minutes",
-    "published",
-    "published ssim",
-    "published minutes",
-    "over",
-    "source",
-]
+OWN = ["runs", "psnr", "ssim", "minutes"]
+PUBLISHED = ["published", "published ssim", "published minutes", "over", "source"]
 
 Entry = dict[str, str]
 
 
 def read_published() -> list[Entry]:
     """The published figures: D-NeRF's data, test split, 400 pixels."""
-    with resources.files("xplanes.evaluation").joinpath(FILE).open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+    return read_rows(Path(__file__).with_name("published.csv"))
 
 
 def check_published(names: object) -> list[str]:
@@ -74,21 +63,17 @@ def beside(rows: Sequence[RunRow]) -> str | None:
 
 def _ranks(rows: Sequence[RunRow], entry: Entry) -> str:
     own = mean_rank(rows)
-    count = sum(bool(row.parts) for row in rows)
-    found = (
-        f"{own:.2f} over these {count} runs" if math.isfinite(own) else "not known of these runs"
-    )
-    return (
-        f"Mean rank of the low-rank part: {found}; published: {entry['rank']} ({entry['source']})."
-    )
+    over = f"{own:.2f} over these {sum(bool(row.parts) for row in rows)} runs"
+    found = over if math.isfinite(own) else "not known of these runs"
+    published = f"{entry['rank']} ({entry['source']})"
+    return f"Mean rank of the low-rank part: {found}; published: {published}."
 
 
 def _scores(rows: Sequence[RunRow], entries: Sequence[Entry], *, whole: bool) -> str | None:
     groups: dict[tuple[str, ...], list[RunRow]] = {}
     others = [name for name in differing(rows) if name not in (*KEYS.values(), *MEANT)]
     for row in rows:
-        done = row.status == "finished" and {"psnr", "ssim"} <= row.scores.keys()
-        if done and (whole or row.settings.get("data.name") == "dnerf"):
+        if row.done and (whole or row.settings.get("data.name") == "dnerf"):
             rest = " ".join(f"{n}={row.settings[n]}" for n in others if n in row.settings)
             key = (*(str(row.settings.get(name)) for name in KEYS.values()), rest)
             groups.setdefault(key, []).append(row)
@@ -104,8 +89,10 @@ def _scores(rows: Sequence[RunRow], entries: Sequence[Entry], *, whole: bool) ->
             if "train_seconds" in row.scores
         ]
         own = [
-            *(*label, str(len(runs)), _mean(runs, "psnr", ".2f"), _mean(runs, "ssim", ".4f")),
-            format(math.fsum(minutes) / len(minutes), ".1f") if minutes else "",
+            *(*label, str(len(runs))),
+            f"{mean([run.scores['psnr'] for run in runs]):.2f}",
+            f"{mean([run.scores['ssim'] for run in runs]):.4f}",
+            f"{mean(minutes):.1f}" if minutes else "",
         ]
         for entry in matched[key] or [{}]:
             lines.append([*own, *_published(entry)])
@@ -114,7 +101,7 @@ def _scores(rows: Sequence[RunRow], entries: Sequence[Entry], *, whole: bool) ->
     scenes, split = _values(used, "data.scene"), ", ".join(sorted({row.split for row in used}))
     pixels, views = _values(used, "data.resolution", "native"), _values(used, "data.views", "all")
     scored = _values(used, "data.eval_views", "all")
-    header = [*KEYS, *(["settings"] if others else []), *HEADER]
+    header = [*KEYS, *(["settings"] if others else []), *OWN, *PUBLISHED]
     text = (
         f"Means of these runs ({scenes}; {split} split, {pixels} px, views: {views}, scored: "
         f"{scored}) beside published figures (test split, 400 px, all views), comparable only "
@@ -123,7 +110,7 @@ def _scores(rows: Sequence[RunRow], entries: Sequence[Entry], *, whole: bool) ->
     )
     rest = [e for e in entries if not any(e in found for found in matched.values())]
     if whole and rest:
-        header = ["method", "lrm", "resolution", *HEADER[4:]]
+        header = ["method", "lrm", "resolution", *PUBLISHED]
         lines = [[e["method"], e["lrm"], e["resolution"], *_published(e)] for e in rest]
         text += (
             "\n\nPublished with them, of D-NeRF's scenes; none of these runs has their settings:"
@@ -149,10 +136,6 @@ def _agrees(row: RunRow, entry: Entry) -> bool:
         not entry[column] or entry[column] == str(settings.get(name))
         for column, name in named.items()
     )
-
-
-def _mean(runs: Sequence[RunRow], name: str, form: str) -> str:
-    return format(math.fsum(row.scores[name] for row in runs) / len(runs), form)
 
 
 def _values(rows: Sequence[RunRow], name: str, unset: str = "none") -> str:

@@ -12,10 +12,10 @@ import torch
 import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
+from tqdm import tqdm
 
 from xplanes.errors import ConfigError
 from xplanes.evaluation.camera_path import CameraPath, read_camera_path
-from xplanes.evaluation.progress import progress
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.files import replacing, require_writable
 from xplanes.optional import require
@@ -374,7 +374,7 @@ def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = N
         what=options.what,
         shown=pixels_with_rays(trained.scene.splits, options.path, size),
     )
-    counted = progress(frames, options.count, "frames")
+    counted = tqdm(frames, "frames", options.count, leave=False, delay=2, disable=None)
     return write_video(target, counted, fps=options.rate, folder=folder)
 
 

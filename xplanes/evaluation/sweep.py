@@ -4,15 +4,18 @@ Must stay quick, and a damaged file must not hide the other runs: every problem 
 status.
 """
 
+import itertools
+import json
+import os
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
-from xplanes.files import natural, read_json
+from xplanes.files import natural
 from xplanes.files import read_rows as read_csv
 
 SCORES = {
@@ -26,22 +29,7 @@ SCORES = {
     "samples_per_ray": ("samples_per_ray",),
     "parameters": ("parameters",),
 }
-"""Where metrics.json holds each column's number."""
-
-MEASURES = (
-    "psnr",
-    "ssim",
-    "psnr_thing",
-    "floaters",
-    "start_psnr",
-    "seconds_to_20",
-    "steps",
-    "prepare_seconds",
-    "train_seconds",
-    "samples_per_ray",
-    "parameters",
-)
-"""Columns of a table; `start_psnr` and `seconds_to_20` come from curve.csv."""
+"""Where metrics.json holds each score; `start_psnr` and `seconds_to_20` come from curve.csv."""
 
 GOAL = 20.0
 """PSNR that ``seconds_to_20`` stands for."""
@@ -49,15 +37,8 @@ GOAL = 20.0
 STATES = ("running", "finished", "failed", "interrupted")
 
 
-@dataclass(frozen=True)
-class Point:
-    """A line of curve.csv.
-
-    Attributes:
-        seconds: Preparation and training clock.
-        step: Optimiser steps.
-        psnr: Mean over the scored views.
-    """
+class Point(NamedTuple):
+    """A line of curve.csv: seconds of preparation and training, steps, mean PSNR of the views."""
 
     seconds: float
     step: int
@@ -72,7 +53,7 @@ class RunRow:
         name: Folder of the run relative to the sweep's.
         settings: Settings by dotted name.
         overridden: Names of those that the command line set.
-        scores: Numbers by the names of `MEASURES`, as far as they are known.
+        scores: Numbers by the names of `SCORES` and those from the curve, as far as known.
         status: How it ended, with the reason where it is not ``finished``.
         curve: PSNR on the way.
         split: The split that `scores` are of; empty where they do not say.
@@ -90,6 +71,16 @@ class RunRow:
     parts: dict[str, dict[str, Any]] = field(default_factory=dict)
     machine: str = ""
 
+    @property
+    def missing(self) -> bool:
+        """Whether the job left no run: only its overrides are known."""
+        return self.status.startswith("missing")
+
+    @property
+    def done(self) -> bool:
+        """Whether it finished and has the scores that means are taken of."""
+        return self.status == "finished" and {"psnr", "ssim"} <= self.scores.keys()
+
 
 def read_rows(folder: Path) -> list[RunRow]:
     """All runs in a folder, however deep, and the jobs of sweeps that left no run."""
@@ -102,8 +93,7 @@ def read_rows(folder: Path) -> list[RunRow]:
 
 
 def _name(path: Path, folder: Path) -> str:
-    relative = path.relative_to(folder)
-    return str(relative) if relative.parts else path.resolve().name
+    return str(path.relative_to(folder)) if path != folder else path.resolve().name
 
 
 def _groups(folder: Path) -> Iterator[tuple[Path, list[Path]]]:
@@ -111,15 +101,12 @@ def _groups(folder: Path) -> Iterator[tuple[Path, list[Path]]]:
     if _is_job(folder):
         yield folder, [folder]
         return
-    inside = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()]
-    inside = [path for path in inside if not path.name.startswith(".")]
-    inside.sort(key=lambda path: natural(path.name))
-    runs = [path for path in inside if _is_job(path)]
-    if runs or (folder / "multirun.yaml").is_file():
-        yield folder, runs
-    for path in inside:
-        if path not in runs:
-            yield from _groups(path)
+    for place, names, files in os.walk(folder):
+        inside = [Path(place, name) for name in sorted(names, key=natural) if name[0] != "."]
+        runs = [path for path in inside if _is_job(path) and not path.is_symlink()]
+        names[:] = [path.name for path in inside if path not in runs]
+        if runs or "multirun.yaml" in files:
+            yield Path(place), runs
 
 
 def _is_job(folder: Path) -> bool:
@@ -130,16 +117,14 @@ def _is_job(folder: Path) -> bool:
 def read_run(run: Path, name: str) -> RunRow:
     """One run directory as a row."""
     problems: list[str] = []
-    config = _read_yaml(run, ("config.yaml", ".hydra/config.yaml"), problems)
-    record = _read_json(run / "run.json", problems)
-    metrics = _read_json(run / "metrics.json", problems)
-    scores = _scores(metrics) if metrics else {}
+    has_config = (run / "config.yaml").exists()
+    config = _mapping(run / ("config.yaml" if has_config else ".hydra/config.yaml"), problems)
+    record = _mapping(run / "run.json", problems)
+    metrics = _mapping(run / "metrics.json", problems)
+    scores = _scores(metrics or {})
     curve = _curve(run, scores.get("prepare_seconds", 0.0), problems) if metrics else ()
-    scores |= _curve_scores(curve)
     if metrics and "psnr" not in scores:
         problems.append("metrics.json lacks scores")
-    if not isinstance(config, dict) and (run / "config.yaml").is_file() and not problems:
-        problems.append("config.yaml is damaged")
     if record is not None and record.get("status") not in STATES:
         problems.append("run.json is damaged")
         record = None
@@ -147,28 +132,38 @@ def read_run(run: Path, name: str) -> RunRow:
     if problems:
         ended = record is not None and record["status"] != "finished"
         status = f"{status if ended else 'damaged'}; {', '.join(problems)}"
+    settings, parts = flatten(config or {}), (metrics or {}).get("decomposition")
+    parts = parts if isinstance(parts, dict) else {}
+    record = record or {}
     return RunRow(
         name=name,
-        settings=_resolved(flatten(config)) if isinstance(config, dict) else {},
+        # Jobs that never began still refer to other settings.
+        settings={key: value for key, value in settings.items() if "${" not in str(value)},
         overridden=frozenset(_key(line) for line in run_overrides(run)),
-        scores=scores,
+        scores=scores | _curve_scores(curve),
         status=status,
         curve=curve,
         split=str((metrics or {}).get("split", "")),
-        parts=_parts(metrics or {}),
-        machine=_machine(record or {}),
+        parts={n: parts[n] for n in ("xy", "xz", "yz") if isinstance(parts.get(n), dict)},
+        machine=f"{record['device']}, {record.get('cpus')} CPU cores"
+        if record.get("device")
+        else "",
     )
 
 
-def _parts(metrics: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    found = metrics.get("decomposition")
-    found = found if isinstance(found, dict) else {}
-    return {name: found[name] for name in ("xy", "xz", "yz") if isinstance(found.get(name), dict)}
-
-
-def _machine(record: dict[str, Any]) -> str:
-    device, cpus = record.get("device"), record.get("cpus")
-    return "" if device is None else f"{device}, {cpus} CPU cores"
+def _mapping(path: Path, problems: list[str]) -> dict[str, Any] | None:
+    """A YAML or JSON file; None where there is none, or a problem noted where it is damaged."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        content = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, yaml.YAMLError):
+        content = None
+    if isinstance(content, dict):
+        return content
+    problems.append(f"{path.name} is damaged")
+    return None
 
 
 def _curve(run: Path, prepare: float, problems: list[str]) -> tuple[Point, ...]:
@@ -189,7 +184,7 @@ def _curve_scores(curve: tuple[Point, ...]) -> dict[str, float]:
         found["start_psnr"] = curve[0].psnr
     if curve and curve[0].psnr >= GOAL:
         return found | {"seconds_to_20": curve[0].seconds}
-    for before, after in zip(curve, curve[1:], strict=False):
+    for before, after in itertools.pairwise(curve):
         if before.psnr < GOAL <= after.psnr:
             share = (GOAL - before.psnr) / (after.psnr - before.psnr)
             found["seconds_to_20"] = before.seconds + share * (after.seconds - before.seconds)
@@ -214,15 +209,14 @@ def _scores(metrics: dict[str, Any]) -> dict[str, float]:
         value: Any = metrics
         for key in path:
             value = value.get(key) if isinstance(value, dict) else None
-        if isinstance(value, dict) and value:
-            parts = list(value.values())
-            value = sum(parts) if all(_is_number(part) for part in parts) else None
-        if _is_number(value):
-            found[name] = value
+        parts = list(value.values()) if isinstance(value, dict) else [value]
+        if parts and all(is_number(part) for part in parts):
+            found[name] = sum(parts) if isinstance(value, dict) else value
     return found
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Whether a setting or score is a number, which true and false are not."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -235,16 +229,14 @@ def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _resolved(settings: dict[str, Any]) -> dict[str, Any]:
-    """Without references to other settings, which jobs that never began still have."""
-    return {name: value for name, value in settings.items() if "${" not in str(value)}
-
-
 def run_overrides(run: Path) -> list[str]:
     """What the command line set, from Hydra's record of it or our own."""
-    content = _read_yaml(run, (".hydra/overrides.yaml",), [])
-    if isinstance(content, list):
-        return [str(line) for line in content]
+    try:
+        content = yaml.safe_load((run / ".hydra" / "overrides.yaml").read_text(encoding="utf-8"))
+        if isinstance(content, list):
+            return [str(line) for line in content]
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        pass
     try:
         return (run / "overrides.txt").read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):
@@ -265,18 +257,15 @@ def _value(override: str) -> Any:
 
 def _missing_jobs(sweep: Path, folder: Path, done: list[list[str]]) -> list[RunRow]:
     """Rows for the jobs in multirun.yaml whose overrides belong to no run."""
-    content = _read_yaml(sweep, ("multirun.yaml",), [])
-    if not isinstance(content, dict):
-        return []
     left = Counter(_settings_of(lines) for lines in done)
     rows = []
-    for number, job in enumerate(_jobs(content)):
+    for number, job in enumerate(_jobs(_mapping(sweep / "multirun.yaml", []) or {})):
         key = _settings_of(job)
         if left[key]:
             left[key] -= 1
             continue
         settings = {_key(line): _value(line) for line in job}
-        name = str(Path(_name(sweep, folder) if sweep != folder else "") / f"job {number}")
+        name = str(sweep.relative_to(folder) / f"job {number}")
         rows.append(RunRow(name, settings, frozenset(settings), status="missing: no run"))
     return rows
 
@@ -287,9 +276,8 @@ def _settings_of(overrides: Iterable[str]) -> tuple[str, ...]:
     return tuple(sorted(text for text in overrides if _key(text).split(".")[0] not in mine))
 
 
-def _jobs(multirun: dict[str, Any]) -> list[list[str]]:
+def _jobs(multirun: dict[str, Any]) -> list[tuple[str, ...]]:
     """Overrides of each job of a sweep over a grid; none for other sweepers."""
-    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
@@ -299,30 +287,12 @@ def _jobs(multirun: dict[str, Any]) -> list[list[str]]:
             return []
         params = [f"{key}={value}" for key, value in (settings["sweeper"]["params"] or {}).items()]
         lines = [*params, *settings["overrides"]["task"]]
-        parsed = OverridesParser.create().parse_overrides(lines)
-        return BasicSweeper.split_arguments(parsed, None)[0]
+        choices: dict[str, list[str]] = {}
+        for each in OverridesParser.create().parse_overrides(lines):
+            swept = each.is_discrete_sweep()
+            values = each.sweep_string_iterator() if swept else [each.get_value_element_as_str()]
+            key = each.get_key_element()
+            choices[key] = [f"{key}={value}" for value in values]
+        return list(itertools.product(*choices.values()))
     except (KeyError, TypeError, AttributeError, HydraException):
         return []
-
-
-def _read_yaml(folder: Path, names: tuple[str, ...], problems: list[str]) -> Any:
-    """The first of the files that exists; None, and a problem noted, if it is damaged."""
-    for name in names:
-        try:
-            return yaml.safe_load((folder / name).read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            continue
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            problems.append(f"{name} is damaged ({type(error).__name__})")
-            return None
-    return None
-
-
-def _read_json(path: Path, problems: list[str]) -> dict[str, Any] | None:
-    try:
-        return read_json(path)
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError):
-        problems.append(f"{path.name} is damaged")
-        return None

@@ -19,13 +19,14 @@ from xplanes.evaluation.sheet import write_sheet
 from xplanes.evaluation.sweep import RunRow, read_rows
 from xplanes.evaluation.tabulate import (
     SEED,
+    Line,
     align,
     decomposition_table,
     differing,
-    markdown,
     run_table,
     seed_groups,
     seed_table,
+    shown,
 )
 from xplanes.files import write_json, write_rows, write_text
 
@@ -51,20 +52,19 @@ def write_tables(folder: Path, out: Path | None = None) -> str:
         raise ConfigError(f"{folder}: no runs in it (folders with run.json)")
     out = out or folder
     names = differing(rows)
-    text = [f"# {folder.resolve().name}", f"{counts(rows)} {protocol(rows)}".strip()]
-    text.append(markdown(*run_table(rows, names)))
-    write_rows(out / "table.csv", *run_table(rows, names, exact=True))
-    seeds = seed_groups(rows)
-    if seeds:
-        over = [name for name in names if name != SEED]
-        text += ["Mean and standard deviation over seeds:", markdown(*seed_table(seeds, over))]
-        write_rows(out / "table_seeds.csv", *seed_table(seeds, over, exact=True))
-    else:
-        (out / "table_seeds.csv").unlink(missing_ok=True)
+    lines = run_table(rows, names)
+    text = [f"# {folder.resolve().name}", f"{_counts(rows)} {_protocol(rows)}".strip()]
+    text.append(shown(lines))
+    _write(out / "table.csv", lines)
+    (out / "table_seeds.csv").unlink(missing_ok=True)
+    if seeds := seed_groups(rows):
+        means = seed_table(seeds, [name for name in names if name != SEED])
+        text += ["Mean and standard deviation over seeds:", shown(means)]
+        _write(out / "table_seeds.csv", means)
     if (published := beside(rows)) is not None:
         text.append(published)
-    if (parts := decomposition_table(rows, names)) is not None:
-        text += ["Decomposition of the LRM's triplanes (means over xy, xz, yz):", markdown(*parts)]
+    if parts := decomposition_table(rows, names):
+        text += ["Decomposition of the LRM's triplanes (means over xy, xz, yz):", shown(parts)]
     if len(rows) > 1 and plot_curves(rows, names, out / "curves.png"):
         text.append("![PSNR against seconds and steps](curves.png)")
     if plot_against(rows, names, out / "against.png"):
@@ -74,7 +74,11 @@ def write_tables(folder: Path, out: Path | None = None) -> str:
     return whole
 
 
-def counts(rows: Sequence[RunRow]) -> str:
+def _write(path: Path, lines: Sequence[Line]) -> None:
+    write_rows(path, lines[0], (line.values() for line in lines))
+
+
+def _counts(rows: Sequence[RunRow]) -> str:
     """How many runs ended how, and what their scores are of."""
     kinds = [row.status.split(":")[0].split(",")[0].split(";")[0] for row in rows]
     tally = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
@@ -95,10 +99,10 @@ PROTOCOL = {
 """Settings that say how runs were made and scored."""
 
 
-def protocol(rows: Sequence[RunRow]) -> str:
+def _protocol(rows: Sequence[RunRow]) -> str:
     """How the runs were made and scored, as far as it is known: size, budget, machine."""
     unset = {"data.views": "all", "data.eval_views": "all", "trainer.max_seconds": "no limit"}
-    known = [row for row in rows if row.settings and not row.status.startswith("missing")]
+    known = [row for row in rows if row.settings and not row.missing]
     parts = []
     for words, name in PROTOCOL.items():
         values = [row.settings[name] for row in known if name in row.settings]

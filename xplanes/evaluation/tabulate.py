@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from xplanes.evaluation.sweep import MEASURES, RunRow
+from xplanes.evaluation.sweep import RunRow
 
 SEED = "seed"
 UNLISTED = (
@@ -23,26 +23,26 @@ UNLISTED = (
 SPREAD = ("psnr", "ssim", "psnr_thing")
 """Scores whose standard deviation over seeds is shown."""
 
-LABELS = {
-    "psnr_thing": "psnr object",
-    "start_psnr": "step 0",
-    "seconds_to_20": "s to 20 dB",
-    "prepare_seconds": "prepare s",
-    "train_seconds": "train s",
-    "samples_per_ray": "samples/ray",
-    "parameters": "params",
+COLUMNS = {
+    "psnr": ("psnr", ".2f"),
+    "ssim": ("ssim", ".4f"),
+    "psnr_thing": ("psnr object", ".2f"),
+    "floaters": ("floaters", ".4f"),
+    "start_psnr": ("step 0", ".2f"),
+    "seconds_to_20": ("s to 20 dB", ".1f"),
+    "steps": ("steps", ".0f"),
+    "prepare_seconds": ("prepare s", ".1f"),
+    "train_seconds": ("train s", ".1f"),
+    "samples_per_ray": ("samples/ray", ".1f"),
+    "parameters": ("params", ",.0f"),
 }
-FORMATS = {
-    "psnr": ".2f",
-    "psnr_thing": ".2f",
-    "start_psnr": ".2f",
-    "ssim": ".4f",
-    "floaters": ".4f",
-    "steps": ".0f",
-    "parameters": ",.0f",
-}
+"""Scores of a table, in their order, each with its heading and format in markdown."""
+
 LONGEST = 120
 """Letters of a status in markdown; the CSV has all of it."""
+
+Line = dict[str, Any]
+"""A line of a table by column name: settings as text, scores as numbers."""
 
 
 def align(rows: list[RunRow]) -> list[RunRow]:
@@ -62,14 +62,14 @@ def align(rows: list[RunRow]) -> list[RunRow]:
 def differing(rows: Sequence[RunRow]) -> list[str]:
     """Settings in which runs differ, less those that follow from a group or the model."""
     known = [row for row in rows if row.settings]
-    whole = [row for row in known if not row.status.startswith("missing")]
+    whole = [row for row in known if not row.missing]
     overridden = {name for row in rows for name in row.overridden}
     found = []
     for name in dict.fromkeys(name for row in known for name in row.settings):
         # Jobs without a run know only what was overridden.
         among = known if name in overridden or name.endswith(".name") else whole
-        values = {_text(row.settings.get(name)) for row in among if _has(row, name)}
-        if len(values) < 2 or _unlisted(name):
+        having = [row for row in among if name in row.settings or not row.missing]
+        if len({_text(row.settings.get(name)) for row in having}) < 2 or _unlisted(name):
             continue
         parts = name.split(".")
         groups = [f"{'.'.join(parts[:end])}.name" for end in range(1, len(parts))]
@@ -80,10 +80,6 @@ def differing(rows: Sequence[RunRow]) -> list[str]:
     return found
 
 
-def _has(row: RunRow, name: str) -> bool:
-    return name in row.settings or not row.status.startswith("missing")
-
-
 def _follows(rows: Sequence[RunRow], name: str, group: str) -> bool:
     """Whether the group's name decides the setting, where there is one."""
     having = [row.settings for row in rows if name in row.settings]
@@ -91,33 +87,33 @@ def _follows(rows: Sequence[RunRow], name: str, group: str) -> bool:
     return len(pairs) == len({choice for choice, _ in pairs})
 
 
-def run_table(
-    rows: Sequence[RunRow], names: Sequence[str], *, exact: bool = False
-) -> tuple[list[str], list[list[str]]]:
-    """Header and one line per run; ``exact`` keeps all digits, for CSV."""
-    measures = _measures(rows)
-    header = ["run", *(_label(n, exact) for n in names), *(_label(n, exact) for n in measures)]
-    lines = [
-        [
-            row.name,
-            *(_text(row.settings[n]) if n in row.settings else "" for n in names),
-            *(_number(row.scores.get(n), n, exact) for n in measures),
-            row.status,
-        ]
-        for row in rows
-    ]
-    return [*header, "status"], lines
-
-
-def _measures(rows: Iterable[RunRow]) -> list[str]:
-    """Columns of a table: that of the foreground object is there if any run scores it alone."""
-    known = any("psnr_thing" in row.scores for row in rows)
-    return [name for name in MEASURES if known or name != "psnr_thing"]
-
-
 def _unlisted(key: str) -> bool:
     """Whether a setting says nothing about a result: where and what a run writes."""
     return key in UNLISTED or key.startswith("logger.") or key.endswith(".dirpath")
+
+
+def run_table(rows: Sequence[RunRow], names: Sequence[str]) -> list[Line]:
+    """One line per run."""
+    measures = _measures(rows)
+    return [
+        {
+            "run": row.name,
+            **_settings(row, names),
+            **{name: row.scores.get(name) for name in measures},
+            "status": row.status,
+        }
+        for row in rows
+    ]
+
+
+def _measures(rows: Iterable[RunRow]) -> list[str]:
+    """Scores of a table: that of the foreground object is there if any run scores it alone."""
+    known = any("psnr_thing" in row.scores for row in rows)
+    return [name for name in COLUMNS if known or name != "psnr_thing"]
+
+
+def _settings(row: RunRow, names: Sequence[str]) -> Line:
+    return {name: _text(row.settings[name]) if name in row.settings else "" for name in names}
 
 
 def seed_groups(rows: Sequence[RunRow]) -> list[list[RunRow]]:
@@ -127,7 +123,7 @@ def seed_groups(rows: Sequence[RunRow]) -> list[list[RunRow]]:
     """
     groups: dict[str, dict[str, RunRow]] = {}
     for row in rows:
-        if row.status == "finished" and row.settings and {"psnr", "ssim"} <= row.scores.keys():
+        if row.done and row.settings:
             rest = {k: v for k, v in row.settings.items() if k != SEED and not _unlisted(k)}
             group = groups.setdefault(json.dumps(rest, sort_keys=True, default=str), {})
             group.setdefault(_text(row.settings.get(SEED)), row)
@@ -135,76 +131,76 @@ def seed_groups(rows: Sequence[RunRow]) -> list[list[RunRow]]:
     return [list(group.values()) for group in groups.values()] if several else []
 
 
-def seed_table(
-    groups: Sequence[Sequence[RunRow]], names: Sequence[str], *, exact: bool = False
-) -> tuple[list[str], list[list[str]]]:
-    """Header and one line per setting; quality with its standard deviation, the rest as means."""
-    measures = _measures(row for group in groups for row in group)
-    header = [*(_label(n, exact) for n in names), "seeds"]
-    for name in measures:
-        label = _label(name, exact)
-        spread = name in SPREAD
-        header += [label, f"{name}_std"] if spread and exact else [label]
+def seed_table(groups: Sequence[Sequence[RunRow]], names: Sequence[str]) -> list[Line]:
+    """One line per setting: means over seeds, and the standard deviation of quality."""
     lines = []
     for group in groups:
-        settings = group[0].settings
-        line = [_text(settings[n]) if n in settings else "" for n in names] + [str(len(group))]
-        for name in measures:
+        line = _settings(group[0], names) | {"seeds": len(group)}
+        for name in _measures(row for group in groups for row in group):
             values = [row.scores[name] for row in group if name in row.scores]
             # The mean of those that got there would be best where most did not.
-            mean = math.fsum(values) / len(values) if len(values) == len(group) else None
-            shown = _number(mean, name, exact)
-            if name not in SPREAD:
-                line.append(shown)
-                continue
-            std = _number(_deviation(values), name, exact)
-            line += [shown, std] if exact else [f"{shown} ± {std}" if std else shown]
+            line[name] = mean(values) if len(values) == len(group) else None
+            if name in SPREAD:
+                line[f"{name}_std"] = _deviation(values)
         lines.append(line)
-    return header, lines
+    return lines
 
 
-def decomposition_table(
-    rows: Sequence[RunRow], names: Sequence[str]
-) -> tuple[list[str], list[list[str]]] | None:
-    """Header and one line per run with a decomposition; None if there is no such run.
+def decomposition_table(rows: Sequence[RunRow], names: Sequence[str]) -> list[Line]:
+    """One line per run with a decomposition.
 
     Ranks are those of xy, xz and yz; drift and energies are means over the three.
     """
-    chosen = [row for row in rows if row.parts]
-    if not chosen:
-        return None
-    lines = []
-    for row in chosen:
-        parts = list(row.parts.values())
-        numbers = [
-            f"{_mean_of(parts, 'drift'):.3f}",
-            *(f"{100 * _mean_of(parts, f'{name}_energy'):.2f}" for name in ("low_rank", "sparse")),
-        ]
-        ranks = "/".join(str(part.get("rank")) for part in parts)
-        settings = [_text(row.settings[n]) if n in row.settings else "" for n in names]
-        converged = _text(all(part.get("converged") for part in parts))
-        lines.append([row.name, *settings, ranks, *numbers, converged])
-    header = ["run", *(_label(name, False) for name in names), "rank", "drift"]
-    return [*header, "energy of L, %", "energy of S, %", "converged"], lines
+    return [
+        {
+            "run": row.name,
+            **_settings(row, names),
+            "rank": "/".join(str(part.get("rank")) for part in row.parts.values()),
+            "drift": f"{_mean_part([row], 'drift'):.3f}",
+            "energy of L, %": f"{100 * _mean_part([row], 'low_rank_energy'):.2f}",
+            "energy of S, %": f"{100 * _mean_part([row], 'sparse_energy'):.2f}",
+            "converged": _text(all(part.get("converged") for part in row.parts.values())),
+        }
+        for row in rows
+        if row.parts
+    ]
 
 
-def _mean_of(parts: Sequence[dict[str, Any]], name: str) -> float:
-    values = [part.get(name) for part in parts]
-    known = [float(value) for value in values if isinstance(value, int | float)]
-    return math.fsum(known) / len(known) if known else math.nan
+def _mean_part(rows: Sequence[RunRow], name: str) -> float:
+    values = [part.get(name) for row in rows for part in row.parts.values()]
+    return mean([float(value) for value in values if isinstance(value, int | float)])
 
 
 def mean_rank(rows: Sequence[RunRow]) -> float:
     """Mean rank of the low-rank parts of all runs and orientations; NaN without any."""
-    return _mean_of([part for row in rows for part in row.parts.values()], "rank")
+    return _mean_part(rows, "rank")
+
+
+def mean(values: Sequence[float]) -> float:
+    """Arithmetic mean; NaN of no values."""
+    return math.fsum(values) / len(values) if values else math.nan
 
 
 def _deviation(values: Sequence[float]) -> float | None:
     """Standard deviation of the population that the values are a sample of; None for one value."""
     if len(values) < 2:
         return None
-    mean = math.fsum(values) / len(values)
-    return math.sqrt(math.fsum((value - mean) ** 2 for value in values) / (len(values) - 1))
+    middle = mean(values)
+    return math.sqrt(math.fsum((value - middle) ** 2 for value in values) / (len(values) - 1))
+
+
+def shown(lines: Sequence[Line]) -> str:
+    """A table in markdown, scores rounded and with their standard deviation, if they have one."""
+    names = [name for name in lines[0] if not name.endswith("_std")]
+    header = [COLUMNS[n][0] if n in COLUMNS else n.removesuffix(".name") for n in names]
+    return markdown(header, [[_shown(line, name) for name in names] for line in lines])
+
+
+def _shown(line: Line, name: str) -> str:
+    if name not in COLUMNS:
+        return str(line[name])
+    numbers = (line[name], line.get(f"{name}_std"))
+    return " ± ".join(format(n, COLUMNS[name][1]) for n in numbers if n is not None)
 
 
 def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
@@ -225,17 +221,5 @@ def _cell(text: str) -> str:
     return text.replace("|", "\\|")
 
 
-def _label(name: str, exact: bool) -> str:
-    return name if exact else LABELS.get(name, name.removesuffix(".name"))
-
-
 def _text(value: Any) -> str:
-    if isinstance(value, str):
-        return value
-    return json.dumps(value, default=str)
-
-
-def _number(value: float | None, name: str, exact: bool) -> str:
-    if value is None:
-        return ""
-    return repr(value) if exact else format(value, FORMATS.get(name, ".1f"))
+    return value if isinstance(value, str) else json.dumps(value, default=str)

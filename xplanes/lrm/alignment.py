@@ -87,19 +87,9 @@ class Alignment:
     mismatch: Mismatch
 
     @property
-    def density_factor(self) -> float:
-        """Factor from density in the model's frame to density in world units."""
-        return self.frame.scale
-
-    @property
     def field_frame(self) -> Frame:
         """Frame that maps the model's cube in the world to the field's cube [-1, 1]^3."""
         return Frame(self.frame.scale / self.half_side, self.frame.rotation, self.frame.centre)
-
-    @property
-    def field_density_factor(self) -> float:
-        """Factor from density in the model's frame to density in the field's cube."""
-        return self.half_side
 
 
 def align(

@@ -9,10 +9,9 @@ from torch import Tensor
 
 from xplanes.backend import memory_left
 from xplanes.errors import ConfigError
-from xplanes.scenes.changes import changing
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.pools import PixelPools, TilePool, in_cells, pixels_of, tile_pools
-from xplanes.scenes.silhouettes import foreground, plain
+from xplanes.scenes.silhouettes import changing, foreground, plain
 from xplanes.scenes.store import CELL, TILE, StoredImages, unpacked
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Settings, Share

@@ -245,6 +245,24 @@ def test_the_header_estimates_time_and_the_end_says_what_memory_it_took(
     assert printed.index("estimate") < printed.index("step 3/3")
 
 
+@pytest.mark.parametrize("split", ["test", "val"])
+def test_tensorboard_has_each_point_once(scenes: Path, tmp_path: Path, split: str) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    changes = ("logger=tensorboard", "trainer.max_steps=6", "trainer.log_every_n_steps=2")
+    run(small_config(scenes, *changes, f"data.eval_split={split}"), tmp_path, [], resume=False)
+    events = EventAccumulator(str(tmp_path / "tb"))
+    events.Reload()
+    scalars = {
+        tag: [point.step for point in events.Scalars(tag)] for tag in events.Tags()["scalars"]
+    }
+    assert {f"{split}/psnr", "time/train_s", "train/loss"} <= set(scalars)
+    for tag, steps in scalars.items():
+        assert len(set(steps)) == len(steps), tag
+    parts = events.summary_metadata
+    assert {"_hparams_/experiment", "_hparams_/session_start_info"} <= set(parts)
+
+
 def test_tensorboard_drops_what_a_run_that_was_cut_off_has_left(tmp_path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

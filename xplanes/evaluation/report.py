@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
+from torch.utils.tensorboard.summary import hparams
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from xplanes import __version__, backend
@@ -188,7 +189,11 @@ def log_hparams(trainer: Trainer, experiment: Experiment, metrics: dict[str, Any
     for logger in trainer.loggers:
         if isinstance(logger, TensorBoardLogger):
             with SummaryWriter(logger.log_dir) as writer:
-                writer.add_hparams(parameters, scores, run_name=".", global_step=metrics["step"])
+                assert writer.file_writer is not None
+                for summary in hparams(parameters, scores):
+                    writer.file_writer.add_summary(summary)
+                for name in scores.keys() - trainer.logged_metrics.keys():  # Others are there.
+                    writer.add_scalar(name, scores[name], metrics["step"])
         else:
             logger.log_hyperparams(parameters)
             logger.log_metrics(scores, metrics["step"])

@@ -176,12 +176,13 @@ def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "
 
     try:
         parsed = OverridesParser.create().parse_overrides(list(overrides))
-        chosen = [each.input_line for each in parsed if each.key_or_group == "hydra.searchpath"]
+        lines = list(zip(overrides, parsed, strict=True))
+        chosen = [line for line, each in lines if each.key_or_group == "hydra.searchpath"]
         keys = []
         with _initialized(conf):
             loader = GlobalHydra.instance().config_loader()
             search = list(chosen)
-            for each in parsed:
+            for line, each in lines:
                 group = each.key_or_group
                 options = loader.get_group_options(group, config_name=name, overrides=search)
                 if not options:
@@ -194,7 +195,6 @@ def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "
                     if isinstance(option, str) and option not in options:
                         near = difflib.get_close_matches(option, options, n=1, cutoff=0.5)
                         return f"Did you mean {group}={near[0]}?" if near else ""
-                line = each.input_line
                 chosen.append(f"{line.partition('=')[0]}={values[0]}" if swept else line)
             config = OmegaConf.to_container(compose(name, chosen, return_hydra_config=True))
     except HydraException:

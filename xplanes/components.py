@@ -5,13 +5,14 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar, cast, get_args, get_origin
 
 from xplanes.config import to_plain
 from xplanes.errors import ConfigError
-from xplanes.settings import Settings, check_arguments
+from xplanes.settings import Settings, check_arguments, hints_of, kinds_of
 
 T = TypeVar("T")
+S = TypeVar("S", bound=Settings)
 
 TRUSTED = ("xplanes", "lightning", "torchmetrics")
 """Packages whose classes any configuration may name."""
@@ -101,9 +102,8 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
                 )
     try:
         if issubclass(cls, Settings):
-            cls.require_names([*arguments, *more])
-            # Their values are plain and build themselves: what `instantiate` would do takes longer.
-            return cast(T, cls(**arguments, **more))
+            # What `instantiate` would do takes longer.
+            return cast(T, read_settings(cls, {**arguments, **more}))
         if cls.__module__.startswith("xplanes."):
             check_arguments(cls.__init__, arguments)
         # Arguments may be called as those of `instantiate` are, such as config.
@@ -121,6 +121,30 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
                 f"{key}.{name}={arguments[name]}: {cls.__name__} has no such argument; leave it out"
             ) from error
         raise ConfigError(f"{key}: {cause or error}") from error
+
+
+def read_settings(cls: type[S], values: Mapping[str, Any]) -> S:
+    """Settings of plain values, those nested in them included.
+
+    Raises:
+        ConfigError: For a name that does not exist or is missing, or a value out of range.
+    """
+    cls.require_names(values)
+    hints = dict(hints_of(cls))
+    return cls(**{name: _nested(name, value, hints[name]) for name, value in values.items()})
+
+
+def _nested(key: str, value: Any, hint: Any) -> Any:
+    """A plain value with the settings that its type asks for built."""
+    kinds, _ = kinds_of(hint)
+    if isinstance(value, Mapping):
+        for kind in kinds:
+            if isinstance(kind, type) and issubclass(kind, Settings):
+                return build(value, kind, key)
+    if isinstance(value, list | tuple):
+        items = [get_args(kind)[0] for kind in kinds if get_origin(kind) in (list, Sequence)]
+        return [_nested(key, item, items[0]) for item in value] if items else value
+    return value
 
 
 def class_of(target: Any, kind: type, key: str) -> type:

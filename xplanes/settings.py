@@ -67,12 +67,13 @@ Share = Annotated[float, SHARE]
 class Settings:
     """Base of all settings. Subclasses are frozen dataclasses with keyword arguments.
 
-    Plain values of nested settings are read, and all values checked, when an object is made.
+    All values are checked when an object is made; `xplanes.components.build` makes one, with the
+    settings nested in it, of plain values.
     """
 
     def __post_init__(self) -> None:
-        for entry, hint in _hints(type(self)):
-            value = _converted(entry, getattr(self, entry), hint)
+        for entry, hint in hints_of(type(self)):
+            value = _converted(getattr(self, entry), hint)
             object.__setattr__(self, entry, value)
             _check(entry, value, hint)
         self.check()
@@ -134,20 +135,15 @@ def check_arguments(function: Callable[..., Any], arguments: Mapping[str, Any]) 
 
 
 @cache
-def _hints(cls: type) -> tuple[tuple[str, Any], ...]:
+def hints_of(cls: type) -> tuple[tuple[str, Any], ...]:
+    """Names of a class's settings, each with its type."""
     hints = get_type_hints(cls, include_extras=True)
     return tuple((entry.name, hints[entry.name]) for entry in fields(cls))
 
 
-def _converted(name: str, value: Any, hint: Any) -> Any:
-    """A plain value in the form of a type: settings built, numbers as floats or as text."""
-    kinds, _ = _kinds(hint)
-    if isinstance(value, Mapping):
-        for kind in kinds:
-            if isinstance(kind, type) and issubclass(kind, Settings):
-                from xplanes.components import build
-
-                return build(value, kind, name)
+def _converted(value: Any, hint: Any) -> Any:
+    """A plain value in the form of a type: numbers as floats or as text, sequences as lists."""
+    kinds, _ = kinds_of(hint)
     if isinstance(value, str) and value.startswith("~") and _is_location(hint):
         return str(Path(value).expanduser())
     if float in kinds and int not in kinds and type(value) is int:
@@ -159,7 +155,7 @@ def _converted(name: str, value: Any, hint: Any) -> Any:
             return str(value)
     if isinstance(value, list | tuple):
         items = [get_args(kind)[0] for kind in kinds if get_origin(kind) in (list, Sequence)]
-        return [_converted(name, item, items[0]) for item in value] if items else list(value)
+        return [_converted(item, items[0]) for item in value] if items else list(value)
     return value
 
 
@@ -169,25 +165,25 @@ def _is_location(hint: Any) -> bool:
 
 def locations(cls: type[Settings], prefix: str = "") -> Iterator[str]:
     """Dotted names of the settings of a class that are files or folders."""
-    for name, hint in _hints(cls):
+    for name, hint in hints_of(cls):
         if _is_location(hint):
             yield f"{prefix}{name}"
         elif isinstance(hint, type) and issubclass(hint, Settings):
             yield from locations(hint, f"{prefix}{name}.")
 
 
-def _kinds(hint: Any) -> tuple[list[Any], list[Range]]:
+def kinds_of(hint: Any) -> tuple[list[Any], list[Range]]:
     """Alternatives of a type hint, and the ranges that it carries."""
     ranges: list[Range] = []
     if get_origin(hint) is Annotated:
         inner, *extras = get_args(hint)
         ranges = [extra for extra in extras if isinstance(extra, Range)]
-        kinds, more = _kinds(inner)
+        kinds, more = kinds_of(inner)
         return kinds, ranges + more
     if get_origin(hint) in (Union, types.UnionType):
         kinds = []
         for part in get_args(hint):
-            found, more = _kinds(part)
+            found, more = kinds_of(part)
             kinds += found
             ranges += more
         return kinds, ranges
@@ -195,7 +191,7 @@ def _kinds(hint: Any) -> tuple[list[Any], list[Range]]:
 
 
 def _check(name: str, value: Any, hint: Any) -> None:
-    kinds, ranges = _kinds(hint)
+    kinds, ranges = kinds_of(hint)
     if value is None and type(None) in kinds:
         return
     if isinstance(value, float) and not math.isfinite(value):

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from xplanes.components import read_settings
 from xplanes.errors import ConfigError
 from xplanes.settings import Count, Location, Positive, Settings, Share, Steps, Weight
 
@@ -124,8 +125,7 @@ def parse_pretraining(plain: Mapping[str, Any]) -> PretrainingSettings:
     Raises:
         ConfigError: If settings are out of range or contradict one another.
     """
-    PretrainingSettings.require_names(plain)
-    return PretrainingSettings(**plain)
+    return read_settings(PretrainingSettings, plain)
 
 
 def published_sizes(model: SizeSettings, focal: float) -> dict[str, Any]:

@@ -148,8 +148,8 @@ def _converted(name: str, value: Any, hint: Any) -> Any:
                 from xplanes.components import build
 
                 return build(value, kind, name)
-    if isinstance(value, str) and value.startswith("~") and _is_location(hint):
-        return str(Path(value).expanduser())
+    if isinstance(value, str) and _is_location(hint):
+        return at_home(value)
     if float in kinds and int not in kinds and type(value) is int:
         return float(value)
     if type(value) in (int, float) and not {int, float} & set(kinds):
@@ -161,6 +161,16 @@ def _converted(name: str, value: Any, hint: Any) -> Any:
         items = [get_args(kind)[0] for kind in kinds if get_origin(kind) in (list, Sequence)]
         return [_converted(name, item, items[0]) for item in value] if items else list(value)
     return value
+
+
+def at_home(path: str) -> str:
+    """A path with ``~`` at its beginning as the user's folder; unchanged if there is no such."""
+    if not path.startswith("~"):
+        return path
+    try:
+        return str(Path(path).expanduser())
+    except RuntimeError:
+        return path
 
 
 def _is_location(hint: Any) -> bool:

@@ -310,8 +310,8 @@ def _from_poses_bounds(folder: Path) -> list[Camera]:
     if len(sources) != len(rows):
         names = ", ".join(source.name for source in sources) or "none"
         raise SceneError(
-            f"{path} has {len(rows)} cameras, but {folder} holds {len(sources)} (cam*, or numbers): "
-            f"{names}. Add the videos that are missing, or take the others' rows out."
+            f"{path} has {len(rows)} cameras, but {folder} holds {len(sources)} (cam*, or numbers)"
+            f": {names}. Add the videos that are missing, or take the others' rows out."
         )
     cameras = []
     for index, (source, row) in enumerate(zip(sources, rows, strict=True)):
@@ -487,7 +487,7 @@ def _recording(camera: Camera) -> Recording:
     images = _images_in(camera.source)
     if not images:
         raise SceneError(
-            f"{camera.source} holds no images ({', '.join(ENDINGS)}), nor does one folder in it. Add "
+            f"{camera.source} holds no images ({', '.join(ENDINGS)}), nor does a folder in it. Add "
             f"the frames of the camera, or take it out of the calibration ({camera.label})."
         )
     sizes = native_sizes(images)

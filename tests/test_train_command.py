@@ -296,6 +296,7 @@ def test_home_is_expanded(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("USERPROFILE", str(tmp_path))
     assert with_names("data.root=~/my captures") == f"data.root='{tmp_path}/my captures'"
+    assert with_names("resume=~nobody-has-this-name") == "resume='~nobody-has-this-name'"
     assert with_names("resume=~/runs/a") == f"resume={tmp_path}/runs/a"
     assert with_names("data.scene=~/a,~/b", several=True) == f"data.scene={tmp_path}/a,{tmp_path}/b"
     data = SceneDataModule.compose("data=blender", "data.root='~/a'", "data.scene=b")

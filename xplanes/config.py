@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from xplanes.errors import ConfigError
+from xplanes.settings import at_home
 
 _PACKAGE = Path(__file__).resolve().parent
 CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
@@ -153,11 +154,7 @@ def with_names(override: str, *, several: bool = False) -> str:
     if "," in value and not several and key.lstrip("+~") == "data.scene":
         return override  # Hydra says that a list of scenes needs --multirun.
     parts = value.split(",") if several else [value]
-    return f"{key}={','.join(quoted(_at_home(part)) for part in parts)}"
-
-
-def _at_home(path: str) -> str:
-    return str(Path(path).expanduser()) if path.startswith("~") else path
+    return f"{key}={','.join(quoted(at_home(part)) for part in parts)}"
 
 
 def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "train") -> str:

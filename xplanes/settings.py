@@ -144,8 +144,8 @@ def hints_of(cls: type) -> tuple[tuple[str, Any], ...]:
 def _converted(value: Any, hint: Any) -> Any:
     """A plain value in the form of a type: numbers as floats or as text, sequences as lists."""
     kinds, _ = kinds_of(hint)
-    if isinstance(value, str) and value.startswith("~") and _is_location(hint):
-        return str(Path(value).expanduser())
+    if isinstance(value, str) and _is_location(hint):
+        return at_home(value)
     if float in kinds and int not in kinds and type(value) is int:
         return float(value)
     if type(value) in (int, float) and not {int, float} & set(kinds):
@@ -157,6 +157,16 @@ def _converted(value: Any, hint: Any) -> Any:
         items = [get_args(kind)[0] for kind in kinds if get_origin(kind) in (list, Sequence)]
         return [_converted(item, items[0]) for item in value] if items else list(value)
     return value
+
+
+def at_home(path: str) -> str:
+    """A path with ``~`` at its beginning as the user's folder; unchanged if there is no such."""
+    if not path.startswith("~"):
+        return path
+    try:
+        return str(Path(path).expanduser())
+    except RuntimeError:
+        return path
 
 
 def _is_location(hint: Any) -> bool:

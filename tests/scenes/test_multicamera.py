@@ -166,6 +166,25 @@ def test_folders_of_images_keep_every_pixel(tmp_path: Path) -> None:
         assert torch.equal(again.splits["train"].in_memory(), scene.splits["train"].in_memory())
 
 
+@pytest.mark.parametrize("inner", ["images", "4x", "rgb/full"])
+@pytest.mark.parametrize("name", ["cam{:02d}", "{:04d}", "view_{}"])
+def test_folders_of_cameras_may_have_other_names_and_levels(tmp_path, inner, name) -> None:
+    plain = neural_3d_video(tmp_path / "plain", write_images, "")
+    folder = tmp_path / "deeper"
+    folder.mkdir()
+    np.save(folder / "poses_bounds.npy", np.load(plain / "poses_bounds.npy"))
+    for camera in range(CAMERAS):
+        place = folder / name.format(camera)
+        write_images(place / inner, rgb(camera))
+        if "images" in inner:
+            write_images(place / "masks", rgb(camera))
+    assert choose([str(folder)]).scene.name == "multicamera"
+    scene = read(folder, test_cameras=[name.format(0)])
+    require_rays_of(scene.splits["test"], list(range(FRAMES)))
+    pixels = scene.splits["test"].in_memory()[..., :3]
+    assert np.array_equal(pixels.numpy(), rgb(0))
+
+
 def test_transforms_may_name_videos(videos: Path, tmp_path: Path) -> None:
     for video in videos.glob("*.mp4"):
         (tmp_path / video.name).write_bytes(video.read_bytes())

@@ -60,6 +60,12 @@ logger = logging.getLogger(__name__)
 POSES = "poses_bounds.npy"
 TRANSFORMS = "transforms.json"
 
+NUMBERED = re.compile(r"(?i)((view|camera|c|v)[_-]?\d+|\d\d+)")
+"""Names of cameras that are not called cam*."""
+
+IMAGES = ("images", "image", "rgb", "frames")
+"""Folders of a camera that hold its images, where there are others beside them."""
+
 SAME_RATE = 1e-3
 """Share by which frame rates of synchronised cameras differ at most."""
 
@@ -100,7 +106,7 @@ class MultiCameraSettings(SceneSettings):
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         if (folder / POSES).is_file():
-            return any(folder.glob("cam*"))
+            return bool(recordings_of_cameras(folder))
         return find_model(folder, MODELS[:2]) is not None and len(recordings_of_cameras(folder)) > 1
 
     def load(self, splits: Sequence[str]) -> Scene:
@@ -273,8 +279,11 @@ def read_cameras(folder: Path) -> list[Camera]:
 
 
 def recordings_of_cameras(folder: Path) -> list[Path]:
-    """Videos and folders of the name cam*, which several cameras have, by name."""
-    return sorted(path for path in folder.glob("cam*") if _is_recording(path))
+    """Videos and folders of the names cam*, or else of numbers such as 00 or view_01, by name."""
+    found = sorted(path for path in folder.glob("cam*") if _is_recording(path))
+    numbered = [path for path in folder.iterdir() if NUMBERED.fullmatch(path.stem)]
+    numbered.sort(key=lambda path: natural(path.name))
+    return found or [path for path in numbered if _is_recording(path)]
 
 
 def _is_recording(path: Path) -> bool:
@@ -301,8 +310,8 @@ def _from_poses_bounds(folder: Path) -> list[Camera]:
     if len(sources) != len(rows):
         names = ", ".join(source.name for source in sources) or "none"
         raise SceneError(
-            f"{path} has {len(rows)} cameras, but {folder} holds {len(sources)} of the name cam*: "
-            f"{names}. Add the videos that are missing, or take the others' rows out."
+            f"{path} has {len(rows)} cameras, but {folder} holds {len(sources)} (cam*, or numbers)"
+            f": {names}. Add the videos that are missing, or take the others' rows out."
         )
     cameras = []
     for index, (source, row) in enumerate(zip(sources, rows, strict=True)):
@@ -476,13 +485,10 @@ def _recording(camera: Camera) -> Recording:
         rate = None if video.rate is None else float(video.rate)
         return Recording(camera, video.size, video.count, rate, times=video.times)
     images = _images_in(camera.source)
-    folders = [path for path in camera.source.iterdir() if path.is_dir() and path.name[0] != "."]
-    if not images and len(folders) == 1:  # Such as images/
-        images = _images_in(folders[0])
     if not images:
         raise SceneError(
-            f"{camera.source} holds no images ({', '.join(ENDINGS)}). Add the frames of the "
-            f"camera, or take it out of the calibration ({camera.label})."
+            f"{camera.source} holds no images ({', '.join(ENDINGS)}), nor does a folder in it. Add "
+            f"the frames of the camera, or take it out of the calibration ({camera.label})."
         )
     sizes = native_sizes(images)
     for path, size in zip(images, sizes, strict=True):
@@ -495,9 +501,14 @@ def _recording(camera: Camera) -> Recording:
 
 
 def _images_in(folder: Path) -> list[Path]:
-    """Images of a folder, in the order of the numbers in their names."""
-    found = (path for path in folder.iterdir() if is_image(path))
-    return sorted(found, key=lambda path: natural(path.name))
+    """Images of a folder, or of the one in it, in the order of the numbers in their names."""
+    inside = sorted(folder.iterdir(), key=lambda path: natural(path.name))
+    if found := [path for path in inside if is_image(path)]:
+        return found
+    folders = [path for path in inside if path.is_dir() and path.name[0] != "."]
+    named = [path for path in folders if path.name.lower() in IMAGES]
+    folders = named if len(folders) > 1 else folders
+    return _images_in(folders[0]) if len(folders) == 1 else []
 
 
 def _are_stamped(recordings: Sequence[Recording]) -> bool:

@@ -147,12 +147,18 @@ def test_text_and_binary_models_are_the_same(tmp_path):
     for text in (False, True):
         write_colmap(tmp_path / str(text), cameras, images, POINTS, text=text)
         found.append(read_model(tmp_path / str(text)))
+    for encoding in ("utf-8-sig", "utf-16"):  # As editors and shells of Windows write it.
+        for path in (tmp_path / "True").iterdir():
+            (tmp_path / encoding).mkdir(exist_ok=True)
+            text = path.read_text(encoding="utf-8").replace("\n", "\r\n")
+            (tmp_path / encoding / path.name).write_text(text, encoding=encoding, newline="")
+        found.append(read_model(tmp_path / encoding))
     for model in found:
         assert model.names == ("a.png", "b c/ d.png", "é.png")
         assert np.abs(model.camera_to_world - poses(3)[[1, 0, 2]]).max() < 1e-14
         assert [camera.w for camera in model.calibrations] == [20, 40, 40]
         assert model.points.tolist() == POINTS
-    assert found[0].calibrations == found[1].calibrations
+    assert all(model.calibrations == found[0].calibrations for model in found)
 
 
 # Views

@@ -1,6 +1,7 @@
 """Captures that COLMAP has registered: a sparse model and its images."""
 
 import csv
+import io
 import logging
 import os
 import re
@@ -16,6 +17,7 @@ from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.files import natural
 from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, models_inside, read_model
 from xplanes.scenes.entries import (
+    decoded,
     found_images,
     is_number,
     mask_files,
@@ -363,8 +365,7 @@ def _ranks(names: Sequence[str], present: set[str]) -> list[float]:
 def _listed_times(path: Path, names: Sequence[str]) -> list[float]:
     """The time of each image from a CSV file."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
+        rows = list(csv.DictReader(io.StringIO(decoded(path.read_bytes()), newline="")))
     except (OSError, UnicodeDecodeError, csv.Error) as problem:
         raise SceneError(
             f"data.times={path} cannot be read as CSV ({problem}). Write one line for each image, "

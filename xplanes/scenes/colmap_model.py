@@ -17,7 +17,7 @@ from typing import TypeVar
 import numpy as np
 
 from xplanes.errors import SceneError
-from xplanes.scenes.entries import require_fetched, short
+from xplanes.scenes.entries import decoded, require_fetched, short
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
 from xplanes.scenes.listing import Calibration
 
@@ -265,7 +265,7 @@ def _text_lines(path: Path) -> Iterator[tuple[str, str]]:
     """Lines that are no comments, each with its label."""
     require_fetched(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = decoded(path.read_bytes())
     except (OSError, UnicodeDecodeError) as problem:
         raise SceneError(f"{path} cannot be read as text ({problem}). {_AGAIN}") from problem
     for number, line in enumerate(text.split("\n"), start=1):

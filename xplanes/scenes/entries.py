@@ -223,7 +223,7 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
     """
     require_fetched(path)
     try:
-        found = json.loads(_decoded(path.read_bytes()))
+        found = json.loads(decoded(path.read_bytes()))
     except (OSError, ValueError, RecursionError) as problem:
         way_out = "Export or download it again"
         if isinstance(problem, UnicodeDecodeError):
@@ -239,7 +239,7 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
     return found
 
 
-def _decoded(content: bytes) -> str:
+def decoded(content: bytes) -> str:
     """Text in UTF-8, or in UTF-16 or UTF-32 where a byte order mark says so.
 
     Some editors begin files with a mark; PowerShell writes UTF-16.

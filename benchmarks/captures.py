@@ -10,7 +10,7 @@ object. Scenes with silhouettes have the former alone. `MEANINGS` describes the 
 baselines `kplanes` and `tineuvox_s` have a background field too, and as many rays per step as
 X-Planes; K-Planes has one scale, few samples and a short warm-up, as it learns nothing in a minute
 of a CPU otherwise. Each run is a process of its own with one thread, and seconds are its CPU time
-(cpu_clock.py); ``--together`` so many run side by side.
+(cpu_clock.py); ``--together`` runs this number side by side.
 """
 
 import argparse

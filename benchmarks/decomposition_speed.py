@@ -6,7 +6,7 @@
 Writes results/decomposition_speed.md, .png and two .csv beside this file; what is not measured this
 time keeps its rows. Parts: reference (first, once per matrix: long, float64), then svd (the paper's
 ADMM with a full singular value decomposition), gram (the same with the Gram matrix), and the
-package's adaptive and admm: errors after so many iterations, tolerance 1e-5. Then clock:
+package's adaptive and admm: errors after a number of iterations, tolerance 1e-5. Then clock:
 all methods in turn, several rounds, the least time of each, because other work on the machine only
 ever adds to it.
 """

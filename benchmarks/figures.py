@@ -10,7 +10,7 @@ from xplanes.files import replacing
 def panels(
     count: int, width: float, height: float, *, rows: int = 1, **shared: bool
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels in rows, each with a grid; sizes in inches."""
+    """A figure with rows of panels, each with a grid; sizes in inches."""
     figure = Figure(figsize=(width, height), layout="constrained")
     axes = list(figure.subplots(rows, count // rows, squeeze=False, **shared).flat)
     for one in axes:

@@ -7,8 +7,8 @@ Writes docs/results/gaussians.md, gaussians.csv and gaussians.png. Seconds are t
 has computed on one thread, so that others do not count, and those for building the model, with its
 initialisation, are among them: training and its schedules get what is left. Scenes of 400 pixels
 get --large. Models are compared on test scenes of the suite and on lego with one seed (pareto.py
-has demo scenes), initialisations on two demo scenes with --seeds. ``--together`` so many run side
-by side; what the work folder holds is not repeated.
+has demo scenes), initialisations on two demo scenes with --seeds. ``--together`` sets how many run
+side by side; what the work folder holds is not repeated.
 """
 
 import os
@@ -83,7 +83,7 @@ class Case(NamedTuple):
 def measure(
     overrides: list[str], seconds: float, seed: int = 0, *, steps: int = -1
 ) -> dict[str, Any]:
-    """Train once, for so many steps at most, and score all views of the split."""
+    """Train once, for at most this number of steps, and score all views of the split."""
     forget_peak()
     config = compose_plain("train", [*overrides, f"seed={seed}"])
     data, module = SceneDataModule(config["data"], seed=seed), RadianceModule(config)

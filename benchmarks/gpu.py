@@ -220,7 +220,7 @@ def product_case(sizes: Sizes) -> Case:
 
 
 def compositing_case(sizes: Sizes, samples: int) -> Case:
-    """Rays of so many samples on average, some of none."""
+    """Rays with a given number of samples on average, some without any."""
     device = sizes.device
     starts = torch.randint(sizes.points, (sizes.points // samples,), device=device).sort()[0]
     starts[0] = 0

@@ -8,7 +8,7 @@ initialisation and from the bundled `tiny`: with all views for --seconds, demo s
 of them for --few-seconds. The preparation of `tiny` is part of its time: training gets what is
 left, and its schedule ends there (total_time.py). Demo scenes bring a video of a fixed camera,
 whose frames the LRM sees and random initialisation does not; lego and the suite's scenes have none,
-so a field is trained to film them, and both see the same images. Each run is a process of its own
+so a field is trained to render them, and both see the same images. Each run is a process of its own
 with one thread, and seconds are those of its CPU time (cpu_clock.py); ``--together`` so many run
 side by side. On demo scenes both are also trained with the frames of the video among the training
 views.

@@ -78,7 +78,7 @@ def spread(values: list[float], digits: int) -> str:
 
 
 def scored(run: Measured, seconds: float) -> float:
-    """PSNR at the moment nearest to so many seconds."""
+    """PSNR at the evaluation nearest to a number of seconds."""
     row = min(run.curve, key=lambda row: abs(float(row["seconds"]) - seconds))
     return float(row["psnr"])
 

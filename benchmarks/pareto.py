@@ -5,8 +5,8 @@
 
 Writes docs/results/pareto.md, pareto.csv, pareto_points.csv and pareto.png. Every run is a process
 of its own with one thread, and seconds are those of its CPU time (cpu_clock.py); the preparation
-is part of them, and schedules end with them (total_time.py). ``--together`` so many run side by
-side, and those kept in the work folder are not repeated.
+is part of them, and schedules end with them (total_time.py). ``--together`` sets how many run side
+by side, and those kept in the work folder are not repeated.
 """
 
 import os

@@ -4,7 +4,7 @@
         [--together 1] [--only SAVING ...] [--name skips] [--work FOLDER]
 
 Writes docs/results/NAME.md, NAME.csv and NAME.png. Each run is a process of its own with one
-thread, and seconds are its CPU time (cpu_clock.py); ``--together`` so many run side by side.
+thread, and seconds are its CPU time (cpu_clock.py); ``--together`` sets how many run side by side.
 """
 
 import argparse

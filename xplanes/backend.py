@@ -275,7 +275,7 @@ def _settle_threads() -> None:
 
 
 def use_threads(count: int) -> None:
-    """Let torch and the compiled loops, if they are loaded, share work among so many threads."""
+    """Let torch and the compiled loops, if they are loaded, share work among ``count`` threads."""
     if numba := sys.modules.get("numba"):
         numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
     if torch.get_num_threads() != count:  # Setting it, torch makes a pool of threads again.

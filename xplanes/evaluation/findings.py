@@ -18,7 +18,7 @@ from xplanes.scenes.store import count_in_squares
 from xplanes.scenes.views import Scene, Views
 
 GAP_SPACINGS, GAP_SPAN = 12.0, 0.05
-"""A stretch without times is a gap from so many median spacings on that are so much of the span."""
+"""Least length of a gap in time: in median spacings, and as a share of the whole span."""
 
 SHORT_SPAN = 0.2
 """Share of [0, 1] that times cover at least, unless they were scaled wrongly."""
@@ -30,7 +30,7 @@ SMALL, LARGE = 0.03, 3.0
 """Bounds of half the cube's side, in median distances of the cameras."""
 
 COARSE = 8.0
-"""Image pixels on a texel from which on planes resolve far less than the images show."""
+"""Image pixels per texel above which planes resolve far less than the images show."""
 
 CUT = 0.02
 """Share of the foreground that may lie outside of the cube."""
@@ -45,7 +45,7 @@ EMPTY = 1e-3
 """Share of opaque pixels below which an image shows next to nothing."""
 
 FULL = 0.98
-"""Share of opaque pixels from which on a mask is none."""
+"""Share of opaque pixels above which a mask masks nothing."""
 
 MOST_VIEWS = 300
 """Views of a split whose pixels are looked at, spread evenly."""

@@ -42,7 +42,7 @@ NATIVE = "data.resolution=null"
 
 
 MANY_POSES = 20
-"""Poses of training cameras from which on a capture gains by `recipe=capture`; rigs have fewer."""
+"""Least number of different training poses at which `recipe=capture` helps; rigs have fewer."""
 
 
 @dataclass(frozen=True)

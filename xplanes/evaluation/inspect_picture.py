@@ -19,7 +19,7 @@ from xplanes.scenes.views import Views
 
 WIDTH, HEIGHT, MARGIN = 1600, 960, 24
 SCALE = 2
-"""The picture is drawn so many times as large, then reduced: lines and letters become smooth."""
+"""Factor by which the picture is drawn larger and then reduced: lines and letters become smooth."""
 
 INK, FAINT, PAPER, PANEL = "#1f2933", "#9aa5b1", "#ffffff", "#f5f7fa"
 SPLITS = {"train": "#2b6cb0", "val": "#d97706", "test": "#2f855a"}

@@ -36,8 +36,8 @@ MOVING_SECONDS = 0.08
 FEWEST = 16
 """Rows of a picture at least."""
 REFRESH_SECONDS, SHARE = 0.5, 3
-"""A picture at rest is drawn again, of a field that trains, when so many seconds and so many times
-its own duration have passed since it was begun."""
+"""A still picture of a field in training is drawn again once this number of seconds, and this
+multiple of the time that it took, have passed since it was begun."""
 AWAY = 1.4
 """The first camera's distance from the scene, as a share of the training cameras'."""
 FRUSTUM = 0.1
@@ -178,7 +178,7 @@ class Viewer:
         self._wake.clear()
 
     def catch_up(self, seconds: float = math.inf) -> None:
-        """Draw what browsers wait for; no further picture is begun after so many seconds."""
+        """Draw what browsers wait for; no further picture is begun after a number of seconds."""
         end = time.monotonic() + seconds
         while True:
             self._play()
@@ -204,7 +204,7 @@ class Viewer:
             self.server.stop()
 
     def shot(self, camera: Any, height: int) -> Shot:
-        """What a viser camera sees now, in so many rows."""
+        """What a viser camera sees now, in a given number of rows."""
         pose = camera_pose(torch.from_numpy(camera.wxyz), torch.from_numpy(camera.position))
         return Shot(
             pose,
@@ -374,7 +374,7 @@ class _Browser:
         return 0
 
     def _affordable(self, seconds: float) -> int:
-        """Rows of a picture that is drawn in so many seconds."""
+        """Rows of a picture that can be drawn in a given time."""
         full = int(self.viewer.size.value)
         pixels = min(self.rate * seconds / max(self.client.camera.aspect, 0.1), full * full)
         return max(FEWEST, min(full, int(math.sqrt(pixels))))

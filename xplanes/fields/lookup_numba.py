@@ -104,7 +104,7 @@ def add_to_space(points, gradient, plane, own, tasks, space):
 
 @njit(parallel=True, **COMPILE)
 def scatter_space(points, gradient, tasks, space):
-    """One task owns every so many rows of one plane, so that no two write to one place.
+    """One task owns every n-th row of one plane, so that no two write to one place.
 
     A row takes the points in their order, whatever the number of tasks: the sums are the same.
     """

@@ -64,7 +64,7 @@ def corner(first_row, width, row, column, LINE: tl.constexpr, SIDE: tl.constexpr
 @triton.jit
 def reach(texel, weight, channel, CHANNELS: tl.constexpr):
     """Offsets and mask of a texel's channels. [points, channels]"""
-    # A plane may hold more than 2^31 numbers, though never so many texels.
+    # A plane may hold more than 2^31 numbers, though never more texels than that.
     offset = texel.to(tl.int64)[:, None] * CHANNELS + channel[None, :]
     return offset, (weight != 0)[:, None] & (channel < CHANNELS)[None, :]
 
@@ -281,7 +281,7 @@ def backward(
 
 
 def tiles(count: int, channels: int) -> tuple[tuple[int, int], dict[str, int]]:
-    """Grid and block sizes for so many points and channels."""
+    """Grid and block sizes for a number of points and channels."""
     block = min(triton.next_power_of_2(channels), WIDEST)
     tile = NARROW_TILE if channels % 4 else WIDE_TILE
     points = max(tile // block, 1)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 ROWS = 256
-"""On the CPU products have a multiple of so many rows, and of more where there are many rows.
+"""On the CPU the rows of products are padded to a multiple of this; to a larger one for many rows.
 
 There each number of rows has a kernel that is compiled at its first use and kept, and every batch
 has another number of samples.

@@ -139,7 +139,7 @@ def backward(
 
 
 def launch(kernel, rays, inputs, results, opaque):
-    """Launches `forward` or `backward` for so many rays."""
+    """Launches `forward` or `backward` for a number of rays."""
     if rays:
         with torch.cuda.device_of(inputs[0]):
             kernel[(rays,)](*inputs, *results, rays, opaque, BLOCK=BLOCK, num_warps=1)

@@ -333,7 +333,7 @@ class OccupancySampler(Sampler):
         return {"sparsity": float(self._sparsity(field, state))} if self.settings.sparsity else {}
 
     def _sparsity(self, field: Any, state: TrainingState, steps: int = 1) -> Tensor:
-        """Mean opacity of random points in occupied cells, weighted for so many steps. []"""
+        """Mean opacity of random points in occupied cells, weighted for a number of steps. []"""
         stream, device = Stream.SPARSITY + state.rank, self.device
         uniform = counted_uniform(state.seed, state.step, stream, (SPARSE_POINTS, 5), device)
         points, times = self.grid.occupied_points(uniform.float())
@@ -375,7 +375,7 @@ class OccupancySampler(Sampler):
             self._training = replace(self._training, room=room)
 
     def _room(self, samples: float) -> int:
-        """Places for batches of so many samples on average: some hold more."""
+        """Places for batches with this number of samples on average; some batches have more."""
         # A ray must find room, and few sizes let memory be used again.
         return STEP_OF_ROOM * math.ceil(max(SPARE * samples, 2 * self._along) / STEP_OF_ROOM)
 

@@ -155,7 +155,7 @@ def _all_samples(
     step: float,
     steps: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Distance and cell of so many samples of each ray, and whether they lie in the cube. [R, S]"""
+    """Distances and cells of each ray's samples, and whether they lie in the cube. [R, S]"""
     offset = torch.arange(steps, device=near.device, dtype=near.dtype) + jitter[:, None]
     distances = near[:, None] + offset * step
     half = 0.5 * grid.resolution

@@ -102,7 +102,7 @@ class BatchSettings(Settings, ABC):
 
     @abstractmethod
     def fitting(self, rays: int, samples: int) -> int:
-        """Rays of the next batch, after one of so many rays that took so many samples."""
+        """Rays of the next batch, given the rays and samples of the last one."""
 
 
 @dataclass(frozen=True, kw_only=True)

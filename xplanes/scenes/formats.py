@@ -73,6 +73,16 @@ def is_image(path: Path) -> bool:
     return path.suffix.lower() in (*ENDINGS, *OTHERS) and not path.name.startswith(".")
 
 
+def read_header(path: Path) -> tuple[tuple[int, int], bool]:
+    """Height and width of an image file, and whether it may have alpha."""
+    try:
+        with open_image(path) as picture:
+            alpha = "A" in picture.getbands() or "transparency" in picture.info
+            return (picture.height, picture.width), alpha
+    except UNREADABLE as problem:
+        raise unreadable(path, problem) from problem
+
+
 def orientation(path: Path) -> int:
     """How EXIF says that an image is to be turned when it is shown, from 1 (not at all) to 8.
 

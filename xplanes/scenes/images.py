@@ -10,7 +10,13 @@ from torch import Tensor
 
 from xplanes.errors import SceneError, refuse_all
 from xplanes.scenes import store
-from xplanes.scenes.formats import SIXTEEN_BIT_MODES, UNREADABLE, open_image, unreadable
+from xplanes.scenes.formats import (
+    SIXTEEN_BIT_MODES,
+    UNREADABLE,
+    open_image,
+    read_header,
+    unreadable,
+)
 from xplanes.scenes.masks import MaskKind, read_mask
 
 Size = tuple[int, int]
@@ -289,13 +295,3 @@ def _straight_channels(path: Path, picture: Image.Image) -> np.ndarray:
     for channel, values in zip(channels, picture.convert("RGBA").split(), strict=True):
         channel[:] = np.asarray(values)
     return channels
-
-
-def read_header(path: Path) -> tuple[Size, bool]:
-    """Height and width of an image file, and whether it may have alpha."""
-    try:
-        with open_image(path) as picture:
-            alpha = "A" in picture.getbands() or "transparency" in picture.info
-            return (picture.height, picture.width), alpha
-    except UNREADABLE as problem:
-        raise unreadable(path, problem) from problem

@@ -153,7 +153,7 @@ class Listing:
             split: What they are taken from, for messages.
 
         Raises:
-            SceneError: If there are not so many.
+            SceneError: If there are fewer.
         """
         if count is None:
             return self
@@ -254,7 +254,7 @@ def thinned(
         source: Folder of the scene, for messages.
 
     Raises:
-        SceneError: If the train split has not so many.
+        SceneError: If the train split has fewer.
     """
     found = {}
     for split, listing in listings.items():
@@ -295,14 +295,14 @@ def read_views(
     if kind is None:
         kind = survey(listing.masks) if any(listing.masks) else PLAIN
     ignored = None
+    native = native_sizes(listing.paths)
+    sizes = final_sizes(listing.paths, native, resolution)
     if ignore and any(listing.masks):
-        sizes = final_sizes(listing.paths, native_sizes(listing.paths), resolution)
         ignored = ignored_pixels(listing.masks, listing.paths, sizes, kind)
         rest = [i for i, size in enumerate(sizes) if not ignored[i, : size[0], : size[1]].all()]
         if len(rest) < len(listing):
             listing, ignored = _without_ignored(listing, rest), ignored[rest]
-    native = native_sizes(listing.paths)
-    sizes = final_sizes(listing.paths, native, resolution)
+            native, sizes = ([each[i] for i in rest] for each in (native, sizes))
     names = [str(path) for path in listing.paths]
     intrinsics = final_intrinsics(names, listing.calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(listing))]

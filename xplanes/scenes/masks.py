@@ -18,6 +18,7 @@ from xplanes.scenes.formats import (
     UNREADABLE,
     mask_misfit,
     open_image,
+    read_header,
     unreadable,
 )
 
@@ -31,6 +32,9 @@ auto: empty space where masks look like silhouettes, else pixels to ignore.
 
 SURVEYED = 32
 """Masks of a capture that are looked at to find out what its masks mean."""
+
+LOOK = 512
+"""Rows and columns of each of them that are looked at."""
 
 COLOURED = 16
 """Difference of channels above which a mask is coloured; what JPEG makes of grey stays below."""
@@ -51,10 +55,10 @@ NOISE = 8 / 255
 """Difference from black and from white below which lossy formats may have made it."""
 
 SILHOUETTE_EDGE, UNCLEAR = 0.5, (0.4, 0.7)
-"""Share of the images' edges from which on masks are silhouettes, and where it may be either."""
+"""Least share of the images' edges that silhouettes leave out, and shares that may mean either."""
 
 HIDDEN = 0.8
-"""Share of the images' middle from which on masks may be silhouettes in black on white."""
+"""Share of the images' middle above which masks may be silhouettes in black on white."""
 
 KEPT = 0.9
 """Share of a pixel that a mask must show for the pixel not to be ignored."""
@@ -112,22 +116,23 @@ def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
     shared = 1 < len(given) >= 2 * len(files)
     files = files[:: -(-len(files) // SURVEYED) or 1]
     numbers: set[float] = set()
+    stored = []
     for path in files:
-        with _picture(path) as picture:
-            grey = _grey(picture)
-            # Lossy formats have no labels, whose numbers must be exact.
-            white = 65535 if picture.mode in SIXTEEN_BIT_MODES else 255
-            may_be = picture.format not in LOSSY and _has_regions(grey)
-            numbers |= set(np.unique(grey / white).tolist()) if may_be else {1}
+        grey, lossy = _stored(path)
+        # Lossy formats have no labels, whose numbers must be exact.
+        may_be = not lossy and _has_regions(grey)
+        numbers |= set(np.unique(grey).tolist()) if may_be else {1}
+        stride = -(-max(grey.shape) // LOOK)
+        stored.append((grey[::stride, ::stride], lossy))
     labels = len(numbers) <= MOST_LABELS and max(numbers, default=0) <= WHITE and 0 in numbers
     kind = MaskKind(labels, inverted=inverted)
     edges, shares, middles = [], [], []
     contents = set()
-    for path in files:
-        out = 1 - read_mask(path, kind)
+    for place, (grey, lossy) in enumerate(stored):
+        out = 1 - _factors(grey, lossy, kind)
         contents.add(hash(out.tobytes()))
         shares.append(float(out.mean()))
-        if out.all() and (edges or path != files[-1]):
+        if out.all() and (edges or place < len(stored) - 1):
             continue  # Black all over, it says nothing of a shape.
         rim = np.concatenate([out[0], out[-1], out[1:-1, 0], out[1:-1, -1]])
         edges.append(float(rim.mean()))
@@ -192,16 +197,15 @@ def read_mask(path: Path, kind: MaskKind, image: Path | None = None) -> np.ndarr
     Raises:
         SceneError: If it cannot be decoded, or has another size.
     """
-    with _picture(path) as picture:
-        if image is not None:
-            with _picture(image) as other:
-                size, wanted = picture.size[::-1], other.size[::-1]
-            if size != wanted:
-                raise SceneError(mask_misfit(path, size, image, wanted))
-        lossy = picture.format in LOSSY
-        white = 65535 if picture.mode in SIXTEEN_BIT_MODES else 255
-        values = _grey(picture).astype(np.float32)
-    values = (values > 0).astype(np.float32) if kind.labels else values / white
+    grey, lossy = _stored(path)
+    if image is not None and grey.shape != (wanted := read_header(image)[0]):
+        raise SceneError(mask_misfit(path, grey.shape, image, wanted))
+    return _factors(grey, lossy, kind)
+
+
+def _factors(grey: np.ndarray, lossy: bool, kind: MaskKind) -> np.ndarray:
+    """What `read_mask` makes of the values of a mask. float32 [H, W]"""
+    values = (grey > 0).astype(np.float32) if kind.labels else grey.copy()
     if lossy:
         values[values < NOISE], values[values > 1 - NOISE] = 0, 1
     return 1 - values if kind.inverted else values
@@ -234,13 +238,14 @@ def ignored_pixels(
     return found
 
 
-def _picture(path: Path) -> Image.Image:
+def _stored(path: Path) -> tuple[np.ndarray, bool]:
+    """The values of a mask file from 0 to 1, and whether its format is lossy. float32 [H, W]"""
     try:
-        picture = open_image(path)
-        picture.load()
+        with open_image(path) as picture:
+            white = 65535 if picture.mode in SIXTEEN_BIT_MODES else 255
+            return _grey(picture).astype(np.float32) / white, picture.format in LOSSY
     except UNREADABLE as problem:
         raise unreadable(path, problem) from problem
-    return picture
 
 
 def _grey(picture: Image.Image) -> np.ndarray:

@@ -32,14 +32,13 @@ from xplanes.scenes.entries import (
     some,
     unit_times,
 )
-from xplanes.scenes.formats import ENDINGS, is_image
+from xplanes.scenes.formats import ENDINGS, is_image, read_header
 from xplanes.scenes.images import (
     Size,
     cleared,
     digests,
     final_sizes,
     native_sizes,
-    read_header,
     read_image,
     shrink,
 )

@@ -71,7 +71,7 @@ def read_capture(
         folder: Folder of transforms.json.
         resolution: Width of the images in pixels; None keeps the native sizes.
         splits: Names of the splits to read: train, val, test.
-        eval_every: Where the file lists no splits, one frame in so many goes to val.
+        eval_every: Where the file lists no splits, one frame in ``eval_every`` goes to val.
         mask_use: What the black parts of masks are.
         views: Number of views to keep of the train split, spread evenly over time;
             None keeps all.

@@ -19,7 +19,7 @@ SAME = 2
 
 
 HELD_OUT = 8
-"""Where a scene has no validation split, one training view in so many is held out."""
+"""Where a scene has no validation split, one in this number of training views is held out."""
 
 
 def may_hold_out(train: Views) -> bool:

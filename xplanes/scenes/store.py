@@ -482,7 +482,7 @@ def _run(jobs: Sequence[Job], keep: Callable[[int, np.ndarray], None]) -> None:
 
 
 def _with_channels(pixels: np.ndarray, channels: int) -> np.ndarray:
-    """Pixels with so many channels: alpha is cut off, or 255. uint8 [h, w, C]"""
+    """Pixels with 3 or 4 channels: alpha is cut off, or 255. uint8 [h, w, C]"""
     if pixels.shape[-1] >= channels:
         return pixels[..., :channels]
     whole = np.full((*pixels.shape[:2], channels), 255, np.uint8)

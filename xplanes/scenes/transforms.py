@@ -30,7 +30,7 @@ from xplanes.scenes.entries import (
     short,
     unit_times,
 )
-from xplanes.scenes.images import read_header
+from xplanes.scenes.formats import read_header
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
 from xplanes.scenes.listing import Calibration, Listing, require_shapes, time_words
 

@@ -16,7 +16,7 @@ EVERY = 32
 
 
 def due(batches: int) -> bool:
-    """Whether the sums are read after so many batches: 1, 2, 4, 8, 16, then every `EVERY`."""
+    """Whether sums are read after this number of batches: 1, 2, 4, 8, 16, then every `EVERY`."""
     return batches % EVERY == 0 or (batches & (batches - 1)) == 0
 
 

@@ -141,7 +141,7 @@ def score_view(
 
 
 def gathered(scores: Sequence[ViewScore], trainer: Trainer) -> list[ViewScore]:
-    """The scores of all processes, each of which scores every so many-th view, in order.
+    """The scores of all processes, each of which scores every n-th view, in order.
 
     A process without a view of its own has scored one of another's, which counts once.
     """

@@ -36,7 +36,7 @@ ROUNDS = 40
 """Times that rays are drawn, at most."""
 
 OPAQUE = 0.5
-"""Opacity of a ray from which on there is a surface, and first opacity of the Gaussians on it."""
+"""Least opacity of a ray at which there is a surface, and first opacity of the Gaussians on it."""
 
 CANDIDATES = 2
 """Points that are looked for, of which one is kept: the denser half."""

@@ -178,20 +178,6 @@ def test_a_run_that_shows_nothing_says_so(
         assert len(list(csv.DictReader(file))) == 2
 
 
-@pytest.mark.parametrize(("share", "said"), [(0.3, True), (0.1, False), (math.nan, False)])
-def test_a_run_full_of_floaters_says_so(
-    scenes: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    share: float,
-    said: bool,
-) -> None:
-    monkeypatch.setattr("xplanes.training.scores.floaters", lambda *_: share)
-    run(small_config(scenes, "trainer.max_steps=1"), tmp_path / "run", [], resume=False)
-    assert ("30% of the background is not empty" in capsys.readouterr().out) == said
-
-
 def test_blank_images_are_the_background() -> None:
     from tests.balls import ball_scene
 

@@ -105,17 +105,3 @@ def test_it_adds_to_what_is_there_and_leaves_the_planes_alone():
     torch.testing.assert_close(second - 1, first, atol=1e-6, rtol=0)
     assert parameter.grad is None
     assert torch.equal(parameter, planes)
-
-
-def test_it_works_where_gradients_are_switched_off():
-    product, planes, _ = case()
-    gradient = torch.zeros_like(planes)
-    with torch.no_grad():
-        product.add_gradient(gradient, planes, 1.0, step_generator(0, 0, 7))
-    assert gradient.abs().max() > 0
-
-
-def test_the_value_is_the_same_at_each_call_and_exact_over_all_frames():
-    product, planes, sparse = case(count=FRAMES)
-    whole = sparse_product_loss(planes, sparse, torch.arange(FRAMES), rows=PLANE_SETS["six"])
-    assert product.value(planes) == product.value(planes) == pytest.approx(float(whole))

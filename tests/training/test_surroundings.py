@@ -5,7 +5,6 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import lightning
 import pytest
 import torch
 
@@ -170,31 +169,8 @@ def test_a_checkpoint_brings_the_background_back(trained):
     assert torch.equal(picture(again.eval())["colour"], picture(module)["colour"])
 
 
-class SaveHalfway(lightning.Callback):
-    """Writes a checkpoint after half of the steps."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def on_train_batch_end(self, trainer, *rest):
-        if trainer.global_step == STEPS // 2:
-            trainer.save_checkpoint(self.path)
-
-
-def test_a_resumed_training_ends_with_the_same_numbers(trained, tmp_path):
-    straight = built("world")
-    fitted(straight, "world", tmp_path, STEPS)
-    half = built("world")
-    fitted(half, "world", tmp_path, STEPS, callbacks=[SaveHalfway(tmp_path / "half.ckpt")])
-    resumed = built("world")
-    fitted(resumed, "world", tmp_path, STEPS, checkpoint=tmp_path / "half.ckpt")
-    for name, value in straight.state_dict().items():
-        assert torch.equal(value, resumed.state_dict()[name]), name
-
-
 BASELINES = {
     "kplanes": (*KPLANES, *PROPOSAL),
-    "kplanes_explicit": (*KPLANES, *PROPOSAL),
     "tineuvox_s": (*TINEUVOX, "model.background.samples=4"),
 }
 

@@ -162,15 +162,6 @@ def test_a_capture_in_order_gets_no_warning(inspected, name):
     assert "no warnings" in table(capture)
 
 
-def test_a_demo_scene_is_in_order_by_its_name_and_as_a_folder(tmp_path):
-    small = ["data.resolution=24", "data.train_views=12", "data.val_views=3", "data.test_views=3"]
-    capture = inspect(choose(["data=demo", f"data.root={tmp_path}", "data.scene=balls", *small]))
-    assert capture.findings == ()
-    again = inspect(choose([str(next(tmp_path.glob("balls_*")))]))  # As a folder.
-    assert again.choice.scene.name == "blender"
-    assert facts(again)["splits"] == facts(capture)["splits"]
-
-
 def gap():
     return with_train(
         ball(), times=torch.cat([torch.linspace(0, 0.25, 8), torch.linspace(0.75, 1, 8)])
@@ -336,10 +327,8 @@ def test_cameras_that_look_at_no_one_thing_are_told_of():
         assert [each.kind for each in found] == expected
 
 
-def test_axes_that_diverge_leave_a_table_and_a_picture_and_end_in_an_error(inspected):
-    make, *_ = WRONG["other axes"]
-    capture = inspected(make())
-    assert capture.frame is None
+def test_axes_that_diverge_leave_a_table_and_a_picture(inspected):
+    capture = inspected(WRONG["other axes"][0]())
     assert "negate the second and third column" in capture.problem
     assert facts(capture)["cube"] is None
     assert draw(capture).size == (WIDTH, HEIGHT)
@@ -405,21 +394,6 @@ def test_distortion_is_how_far_the_oracle_moves_a_corner():
         moved.append(math.dist(corner, straight))
     assert distortion(bent) == pytest.approx(max(moved), rel=1e-6)
     assert "fisheye k1 k2" in lens_words(fisheye(ball()).splits["train"])
-
-
-def test_the_picture_shows_the_cameras(inspected):
-    capture = inspected(ball())
-    picture = np.asarray(draw(capture))
-    assert picture.shape == (HEIGHT, WIDTH, 3)
-    assert 0.2 < (picture == 255).all(axis=-1).mean() < 0.9
-    again = np.asarray(draw(inspected(ball())))
-    assert np.array_equal(picture, again)
-    others = np.asarray(draw(inspected(ball(poses=surrounding(COUNT, 4.0, seed=9)))))
-    plans = np.s_[100:580, 24:1088]
-    assert (picture[plans] != others[plans]).any(axis=-1).mean() > 0.01
-    # The strips of time are the same: no camera stands still.
-    strips = np.s_[80:370, 1120:1570]
-    assert np.array_equal(picture[strips], others[strips])
 
 
 def test_points_give_opaque_scenes_their_cube_and_are_drawn(inspected):

@@ -136,17 +136,6 @@ def test_a_webp_is_the_default(trained: TrainedRun):
         assert picture.info["duration"] == 100
 
 
-def test_a_video_of_portrait_images_shows_their_full_height(trained: TrainedRun, tmp_path: Path):
-    train = trained.scene.splits["train"]
-    half, focal = train.images[:, :, : train.width // 2], float(train.intrinsics.focal[0, 0])
-    upright = replace(train, images=half, intrinsics=focal)
-    scene = replace(trained.scene, splits=trained.scene.splits | {"train": upright})
-    options = VideoOptions(frames=1, time="0.5")
-    narrow = render_video(replace(trained, scene=scene), options, str(tmp_path / "narrow.png"))
-    whole = render_video(trained, options, str(tmp_path / "whole.png"))
-    assert narrow.read_bytes() == whole.read_bytes()
-
-
 def test_a_folder_takes_a_png_per_frame_and_no_others(trained: TrainedRun, tmp_path: Path):
     options = VideoOptions(frames=2, size=16)
     folder = render_video(trained, options, f"{tmp_path}/frames/")

@@ -18,7 +18,7 @@ from xplanes.scenes.datamodule import UNIFORM
 from xplanes.scenes.frame import backwards, cube_frame, scene_frame
 from xplanes.scenes.lenses import COEFFICIENTS, WIDEST, Lenses, LensModel
 from xplanes.scenes.silhouettes import may_hold
-from xplanes.scenes.views import Intrinsics, Views, camera_rays, joined
+from xplanes.scenes.views import Intrinsics, Views, camera_rays
 
 HEIGHT, WIDTH = 30, 44
 FOCAL, CENTRE = (35.0, 37.0), (20.5, 16.25)
@@ -334,12 +334,3 @@ def test_a_distorted_video_is_refused_where_pinholes_are_needed():
         check_camera(views)
     weak = replace(views.intrinsics.lenses, coefficients=views.intrinsics.lenses.coefficients / 50)
     check_camera(replace(views, intrinsics=replace(views.intrinsics, lenses=weak)))
-
-
-def test_views_with_and_without_lenses_are_joined():
-    first = seen_ball(["fisheye"], surrounding(1, 4.0), 0.5)
-    second = ball_views(2, 0.5, size=20)
-    both = joined(first, second)
-    for index, (views, own) in enumerate([(first, 0), (second, 0), (second, 1)]):
-        for mine, theirs in zip(both.image_rays(index), views.image_rays(own), strict=True):
-            torch.testing.assert_close(mine, theirs, atol=2e-7, rtol=0)

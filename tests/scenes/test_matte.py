@@ -188,12 +188,8 @@ def blurred(images):
 
 
 MATTES = {
-    "noise on 0.01%": noisy(1e-4),
-    "noise on 1%": noisy(0.01),
-    "stronger noise on 1%": noisy(0.01, alpha=12),
+    "strong noise on 1%": noisy(0.01, alpha=12),
     "noise everywhere": noisy(1.0, alpha=8),
-    "specks": speckled,
-    "soft edges": blurred,
     "all of it": lambda images: noisy(0.01)(speckled(blurred(images))),
 }
 

@@ -166,8 +166,9 @@ def test_folders_of_images_keep_every_pixel(tmp_path: Path) -> None:
         assert torch.equal(again.splits["train"].in_memory(), scene.splits["train"].in_memory())
 
 
-@pytest.mark.parametrize("inner", ["images", "4x", "rgb/full"])
-@pytest.mark.parametrize("name", ["cam{:02d}", "{:04d}", "view_{}"])
+@pytest.mark.parametrize(
+    ("inner", "name"), [("images", "{:04d}"), ("4x", "view_{}"), ("rgb/full", "cam{:02d}")]
+)
 def test_folders_of_cameras_may_have_other_names_and_levels(tmp_path, inner, name) -> None:
     plain = neural_3d_video(tmp_path / "plain", write_images, "")
     folder = tmp_path / "deeper"

@@ -119,26 +119,6 @@ def test_samples_equal_the_loops_of_the_oracle():
         assert (counts[2] > 0) == (occlusion > 0), case
 
 
-def test_loops_and_twin_agree_on_many_rays():
-    for skip, occlusion in OPTIONS:
-        case = f"skip={skip}, occlusion={occlusion}"
-        grid, rays = grid_of(17, 5), rays_of(3000)
-        ours = march(*rays, grid, step=STEP, skip_empty=skip, occlusion=occlusion)
-        theirs = twin(rays, grid, skip_empty=skip, occlusion=occlusion)
-        for name in ("ray", "starts", "cells"):
-            assert torch.equal(getattr(ours, name), getattr(theirs, name)), (case, name)
-        for name in ("points", "distances"):
-            torch.testing.assert_close(
-                getattr(ours, name),
-                getattr(theirs, name),
-                atol=1e-12,
-                rtol=0,
-                msg=f"{case}, {name}",
-            )
-        for name in ("candidates", "empty", "occluded"):
-            assert getattr(ours, name) == getattr(theirs, name), (case, name)
-
-
 def test_in_float32_only_samples_on_borders_differ():
     grid, rays = grid_of(17, 5, filled=1.1), rays_of(3000, torch.float32)
     ours, theirs = march(*rays, grid, step=STEP), twin(rays, grid)
@@ -239,13 +219,6 @@ def test_no_rays_or_no_hits():
             assert found.starts.tolist() == [0] * len(rays[0]), case
 
 
-def test_an_empty_grid_leaves_nothing():
-    grid, rays = grid_of(filled=-1), rays_of(20)
-    for found in (march(*rays, grid, step=STEP), twin(rays, grid)):
-        assert len(found) == 0
-        assert found.empty == found.candidates > 0
-
-
 def test_the_first_opaque_cell_hides_what_lies_behind_but_not_itself():
     grid = OccupancyGrid(4, 1, step=STEP)
     grid.least.view(4, 4, 4)[2] = 1e4  # a slab at 0 <= z < 0.5
@@ -289,14 +262,6 @@ def test_time_decides_which_bin_is_looked_into():
     )
     for found in (march(*rays, grid, step=STEP), twin(rays, grid)):
         assert sorted(set(found.ray.tolist())) == [0, 1, 3, 8]
-
-
-def test_without_the_loops_the_twin_is_used(monkeypatch):
-    grid, rays = grid_of(), rays_of(50, torch.float32)
-    monkeypatch.setenv("XPLANES_CPU_LOOPS", "0")
-    ours, theirs = march(*rays, grid, step=STEP, occlusion=0.1), twin(rays, grid, occlusion=0.1)
-    for name in ("ray", "starts", "points", "distances", "cells"):
-        assert torch.equal(getattr(ours, name), getattr(theirs, name))
 
 
 @settings(max_examples=40, deadline=None)
@@ -356,31 +321,6 @@ def test_rays_without_room_are_left_out_whole():
         assert torch.equal(found.distances[found.live], whole.distances[kept]), room
         assert torch.equal(found.ray[found.live], whole.ray[kept]), room
         assert found.occluded == whole.occluded, room
-
-
-def test_no_samples_take_no_place():
-    grid = grid_of(filled=0.0)
-    found = into(rays_of(5), grid, 40)
-    assert found.count == 0
-    assert not found.live.any()
-    assert found.shown.all()
-    assert (found.starts == 0).all()
-
-
-@needs_triton
-@pytest.mark.parametrize(("skip_empty", "occlusion"), OPTIONS)
-def test_the_kernel_places_the_samples_of_the_oracle(skip_empty, occlusion):
-    grid, rays = grid_of(), rays_of(12)
-    given = {"skip_empty": skip_empty, "occlusion": occlusion}
-    kept, counts = by_oracle(rays, grid, **given)
-    found = by_kernel(rays, grid, **given)
-    assert found.ray.tolist() == [row[0] for row in kept]
-    assert found.cells.tolist() == [row[2] for row in kept]
-    np.testing.assert_allclose(found.distances, [row[1] for row in kept], atol=1e-12)
-    np.testing.assert_allclose(found.points, [row[3:] for row in kept], atol=1e-12)
-    assert (found.candidates, found.empty, found.occluded) == counts
-    assert torch.equal(found.starts, twin(rays, grid, **given).starts)
-    assert found.live is found.number is found.shown is None
 
 
 def same_places(found, expected):

@@ -74,23 +74,6 @@ def test_depth_in_fog_is_the_mean_free_path_cut_at_the_far_side():
         assert seen.depth.tolist() == pytest.approx([near + mean] * 4, rel=1e-5), density
 
 
-def test_any_ray_through_fog_is_right_to_half_a_step():
-    renderer, rays = renderer_of(256, occlusion=0.0), rays_of(200)
-    seen = renderer.render(fog(1.0), *rays, WHITE)
-    from xplanes.rendering.box import ray_box
-
-    near, far = ray_box(*rays[:2])
-    wrong = (-(1 - seen.opacity).log() - (far - near)).abs()
-    assert wrong.max() <= 0.5 * renderer.step + 1e-9
-
-
-def test_the_derivative_by_density_is_that_of_the_closed_form():
-    density = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
-    seen = renderer_of(occlusion=0.0).render(fog(density), *diagonal_rays(), WHITE)
-    (slope,) = torch.autograd.grad(seen.opacity[0], density)
-    assert float(slope) == pytest.approx(DIAGONAL * math.exp(-0.7 * DIAGONAL))
-
-
 def test_dropping_what_lies_behind_costs_less_than_its_threshold():
     rays = rays_of(300)
     renderer = renderer_of(128, occlusion=0.0)
@@ -180,28 +163,6 @@ def test_low_precision_fields_are_merged_in_float32():
     assert float(seen.opacity[0]) == pytest.approx(-math.expm1(-DIAGONAL), rel=0.01)
 
 
-def test_rays_that_miss_see_the_background():
-    origins = torch.tensor([[0.0, 0, 5], [0, 3, 0]]).double()
-    directions = torch.tensor([[0.0, 0, 1], [1, 0, 0]]).double()
-    seen = renderer_of().render(fog(9.0), origins, directions, torch.zeros(2).double(), COLOUR)
-    assert torch.equal(seen.colour, COLOUR.expand(2, 3))
-    assert len(seen.samples) == 0
-
-
-def test_an_image_does_not_depend_on_its_chunks():
-    renderer = renderer_of()
-    origins, directions, _ = rays_of(100, torch.float32)
-
-    def field(points, times):
-        return points.abs(), points.square().sum(dim=-1) * 4
-
-    whole = renderer.image(field, origins, directions, 0.3, WHITE.float())
-    parts = renderer.image(field, origins, directions, 0.3, WHITE.float(), chunk=7)
-    for name, value in whole.items():
-        assert torch.equal(value, parts[name]), name
-        assert not value.requires_grad
-
-
 def clouds(points, times):
     """From air to what stops all light within a few samples."""
     return points.abs(), (40 * points.prod(dim=-1)).exp()
@@ -276,16 +237,6 @@ def test_an_image_takes_a_snapshot_of_the_field_at_its_time():
     image = renderer_of().image(Clock(), origins, directions, 0.3, WHITE.float(), chunk=7)
     assert taken == [0.3]
     assert (image["opacity"] > 0).any()
-
-
-def test_an_image_without_rays_is_empty():
-    none = torch.zeros(0, 3)
-    image = renderer_of().image(fog(1.0), none, none, 0.0, WHITE.float())
-    assert {name: tuple(value.shape) for name, value in image.items()} == {
-        "colour": (0, 3),
-        "opacity": (0,),
-        "depth": (0,),
-    }
 
 
 def test_jitter_moves_samples_within_their_steps():

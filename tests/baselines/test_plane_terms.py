@@ -62,11 +62,3 @@ def test_density_fields_learn_at_the_published_steps():
         fresh = UpdateSchedule(every, warmup)
         assert fresh.learns(late), case
         assert fresh.learns(expected[3]), case
-
-
-def test_updates_grow_rare():
-    schedule = UpdateSchedule(5, 5000)
-    gaps = torch.tensor([s for s in range(9000) if schedule.learns(s)]).diff()
-    assert gaps[:9].unique().tolist() == [1]
-    assert gaps[20:100].unique().tolist() == [2]
-    assert gaps[-100:].unique().tolist() == [6]

@@ -2,12 +2,10 @@
 
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 
-from tests.fields.test_lookup import named, scattered, stacks
-from tests.oracles import plane_features as oracle
+from tests.fields.test_lookup import scattered, stacks
 from xplanes import backend
 from xplanes.errors import DeviceError
 from xplanes.fields import lookup
@@ -83,34 +81,6 @@ def test_values_and_gradients_are_the_twins():
     space, time = stacks("three", torch.float32, size=3, channels=131)
     found = both("three", space, time, *scattered(2, torch.float32, reach=0.9))
     compare(found, 2e-5, "131 channels")
-
-
-def test_values_are_those_of_equation_15():
-    for plane_set in ["six", "nine", "three"]:
-        space, time = stacks(plane_set)
-        points, times = places(torch.float64)
-        expected = oracle(named(plane_set, space, time), plane_set, points, times)
-        found = both(plane_set, space, time, points, times)
-        np.testing.assert_allclose(found[0][0], expected, atol=1e-12, err_msg=str(plane_set))
-        compare(found, 1e-12, plane_set)
-
-
-def test_gradients_are_differences():
-    space, time = (plane.to(DEVICE) for plane in stacks("nine", channels=2))
-    points, times = (where.to(DEVICE) for where in scattered(9))
-
-    def total(space, time):
-        value = plane_features_gpu(space, time, points, times, PLANE_SETS["nine"])
-        return (value * torch.arange(value.numel(), device=DEVICE).view_as(value).cos()).sum()
-
-    leaves = [space.clone().requires_grad_(), time.clone().requires_grad_()]
-    slopes = torch.autograd.grad(total(*leaves), leaves)
-    ways = [torch.randn_like(leaf) for leaf in leaves]
-    # Values are quadratic in the planes, so central differences are exact at any distance.
-    rise = total(*(p + w for p, w in zip((space, time), ways, strict=True)))
-    rise = rise - total(*(p - w for p, w in zip((space, time), ways, strict=True)))
-    slope = sum((s * w).sum() for s, w in zip(slopes, ways, strict=True))
-    torch.testing.assert_close(rise / 2, slope)
 
 
 def test_any_number_of_points():

@@ -267,31 +267,6 @@ def test_kplanes_render(tmp_path: Path, small_fields):
     assert made.views.images.shape == (4, 12, 12, 4)
 
 
-@pytest.mark.slow
-def test_the_field_that_renders_has_the_users_cube(tmp_path: Path, monkeypatch):
-    frames = []
-    monkeypatch.setattr(
-        module, "trained_field", lambda method, place, *_, **__: frames.append(place)
-    )
-    monkeypatch.setattr(module, "_render", lambda *_: torch.zeros(4, 24, 24, 4, dtype=torch.uint8))
-    scene = Scene("ball", {"train": ball_views(6, 0.6)})
-    frame = scene_frame(scene.splits["train"], 0.9)
-    place = Place(scene, frame, torch.device("cpu"), say=lambda _: None, half_side=0.9)
-    fixed_view(settings(tmp_path), place, OPENLRM_VIEW, 24, StageCache(tmp_path))
-    assert [1 / place.frame.scale for place in frames] == [pytest.approx(0.9)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("place", [{}, {"scale": 3.0}, {"scale": 0.1}, {"shift": AWAY}])
-def test_kplanes_render_in_their_own_cube_or_the_scenes(tmp_path: Path, small_fields, place):
-    options = ("preparation.fixed_view_model=kplanes", "preparation.fixed_view_steps=200")
-    scene = Scene("ball", {"train": elsewhere(count=12, size=24, **place)})
-    made, _ = video_of(settings(tmp_path, *options), scene, tmp_path / "cache")
-    alpha = made.views.images[..., 3].float() / 255
-    # Coarse planes blur it.
-    assert alpha[:, 9:15, 9:15].mean() > 1.5 * alpha[:, :3, :3].mean() > 0
-
-
 def test_frames_are_picked_evenly():
     video = ball_views(33, 0.5)
     for count in (1, 4, 9):

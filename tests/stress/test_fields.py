@@ -9,9 +9,8 @@ from hypothesis import settings as options
 from hypothesis import strategies as st
 
 from tests.stress.models import settings, trained
-from tests.stress.references import worst
+from tests.stress.references import spread, worst
 from tests.stress.scenes import write_scene
-from tests.stress.test_lookup import spread
 from xplanes.fields import Decoder, XPlanes
 from xplanes.fields.xplanes import SPACE_PLANES, TIME_PLANES
 from xplanes.preparation.sequence import TriplaneSequence, save_triplanes

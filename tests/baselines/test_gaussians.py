@@ -17,7 +17,6 @@ from xplanes.baselines.gaussians.field import (
     Gaussians,
     HexPlaneGaussians,
     PointCloud,
-    neighbour_distance,
 )
 from xplanes.baselines.gaussians.harmonics import spherical_harmonics
 from xplanes.baselines.gaussians.hull import hull_points
@@ -166,25 +165,6 @@ def test_halves_are_drawn_from_the_gaussian_that_is_split():
     assert (torch.corrcoef(along.T) - torch.eye(3)).abs().max() < 0.05
 
 
-def test_optimiser_goes_on_as_if_rows_had_not_moved():
-    """The same gradients, one optimiser before and one after rows were reordered."""
-    plain, moved = gaussians(20), gaussians(20)
-    torch.manual_seed(3)
-    first = stepped(plain)
-    torch.manual_seed(3)
-    second = stepped(moved)
-    order = torch.randperm(20)
-    select_rows(moved, second, order, torch.zeros(20, dtype=torch.bool))
-    for _ in range(3):
-        for name in plain.PARAMETERS:
-            gradient = torch.randn_like(getattr(plain, name))
-            getattr(plain, name).grad, getattr(moved, name).grad = gradient, gradient[order]
-        first.step()
-        second.step()
-    for name in plain.PARAMETERS:
-        assert torch.equal(getattr(plain, name)[order], getattr(moved, name)), name
-
-
 def test_no_more_than_the_most_and_those_with_the_largest_gradients():
     field = gaussians(30)
     field.seen.fill_(1)
@@ -322,14 +302,6 @@ def test_points_on_the_hull_of_a_ball():
     anywhere = hull_points(opaque, FRAME, 500)
     assert float(anywhere.points.abs().max()) > 0.9
     assert (anywhere.colours == 0.5).all()
-
-
-def test_first_scales_are_the_distances_to_neighbours():
-    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
-    distance = (points[:, None].double() - points.double()).norm(dim=-1).sort(dim=1).values
-    expected = distance[:, 1:4].square().mean(dim=1).sqrt().float()
-    torch.testing.assert_close(neighbour_distance(points), expected, rtol=1e-3, atol=1e-5)
-    assert neighbour_distance(points[:1]) == 0.1
 
 
 def test_learning_rates_decay_in_each_stage():

@@ -115,14 +115,6 @@ def test_padding_acts_as_columns_of_ones():
     assert bias.abs().max() > 0
 
 
-def test_linear_network_is_one_matrix():
-    network = PaddedMLP([16, 16, 3], activation=False).double()
-    values = torch.randn(4, 16).double()
-    torch.testing.assert_close(
-        network(values), values @ network.weights[0].T @ network.weights[1].T
-    )
-
-
 def test_truncated_exponential_has_the_gradient_of_a_limited_logit():
     logits = torch.tensor([-20.0, 0.0, 3.0, 40.0], dtype=torch.float64, requires_grad=True)
     values = truncated_exponential(logits)
@@ -192,20 +184,3 @@ def test_every_parameter_gets_a_gradient_and_shapes_fit():
         assert (density > 0).all(), case
         (colour.sum() + density.sum()).backward()
         assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in field.parameters()), case
-
-
-def test_colour_depends_on_the_direction_and_density_does_not():
-    field = KPlanes(products(), HybridDecoder(4, 16))
-    points, times = torch.rand(5, 3), torch.rand(5)
-    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(5, 3)
-    first, second = field(points, times, up), field(points, times, -up)
-    assert not torch.equal(first[0], second[0])
-    assert torch.equal(first[1], second[1])
-
-
-def test_explicit_colour_is_linear_in_the_features_before_the_sigmoid():
-    decoder = ExplicitDecoder(8, 16).double()
-    features = torch.randn(3, 8).double()
-    directions = torch.nn.functional.normalize(torch.randn(3, 3).double(), dim=1)
-    logits = decoder.colour(features, directions).logit()
-    torch.testing.assert_close(decoder.colour(2 * features, directions).logit(), 2 * logits)

@@ -13,7 +13,6 @@ from tests.baselines.runs import (
     PROPOSAL,
     baseline_config,
 )
-from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
 from xplanes.models.initialisation import Method
@@ -82,13 +81,6 @@ def test_settings_that_do_not_go_together_are_refused(scenes):
     ):
         extra = ["trainer.strategy=ddp"] if "devices" in override else []
         check_refused(scenes, words, "model=kplanes", override, *extra)
-
-
-def test_learning_rates_of_xplanes_are_refused():
-    with pytest.raises(ConfigError, match=r"model\.plane_lr belongs to .*model=six_planes"):
-        compose_plain("train", ["model=kplanes", "model.plane_lr=0.1"])
-    for model, key in (("six_planes", "plane_lr"), ("kplanes", "learning_rate")):
-        assert compose_plain("train", [f"model={model}", f"model.{key}=0.1"])["model"][key] == 0.1
 
 
 def test_cameras_out_of_range_are_refused(scenes):

@@ -13,7 +13,6 @@ from xplanes.baselines.gaussians import rasteriser_cuda
 from xplanes.baselines.gaussians.camera import Camera
 from xplanes.baselines.gaussians.harmonics import spherical_harmonics
 from xplanes.baselines.gaussians.rasteriser import GaussianError, rasterise
-from xplanes.baselines.gaussians.rasteriser_numba import _power
 from xplanes.optional import MissingExtraError
 from xplanes.scenes.cameras import camera_around, project
 
@@ -190,17 +189,6 @@ def test_points_needles_discs_and_giants(kind, scale):
             assert leaf.grad.isfinite().all()
 
 
-def test_a_giant_in_every_tile_hides_what_is_behind(kind):
-    camera = camera_of(40, 70)
-    front, behind = single(camera, (50, 50, 1e-3), 1.0), gaussians(30)
-    given = [torch.cat(pair) for pair in zip(front, behind, strict=True)]
-    given[0][1:] += in_front(camera, distance=4.0)
-    image, _ = drawn(kind, given, camera)
-    expected = oracle.splat(given, camera)
-    close(image.colour, expected[0], TOLERANCE[kind])
-    assert (image.opacity > 0.99).all()
-
-
 def test_thousands_of_layers_stop_at_the_cut_off(kind):
     camera, layers = camera_of(20, 20), 3000
     given = [t.repeat(layers, *[1] * (t.ndim - 1)) for t in single(camera, (2, 2, 2), 0.006)]
@@ -274,30 +262,6 @@ def test_no_gaussians_show_the_background(kind):
     assert leaves[0].grad is None or leaves[0].grad.shape == (0, 3)
 
 
-def test_quaternions_of_any_length_and_none(kind):
-    camera = camera_of()
-    turned = (0.3, 0.8, -0.2, 0.5)
-    scale = (0.4, 0.1, 0.05)
-    images = {}
-    for length in (1.0, 1e-6, 1e6):
-        quaternion = tuple(length * part for part in turned)
-        images[length], _ = drawn(kind, single(camera, scale, quaternion=quaternion), camera)
-        torch.testing.assert_close(images[length].colour, images[1.0].colour)
-    plain, _ = drawn(kind, single(camera, scale), camera)
-    for quaternion in ((0, 0, 0, 0), (0, 1e-30, 0, 0), (1e-38, 0, 0, 0)):
-        image, leaves = drawn(kind, single(camera, scale, quaternion=quaternion), camera)
-        torch.testing.assert_close(image.colour, plain.colour)
-        back(image, upstream(image))
-        assert leaves[1].grad.isfinite().all()
-
-
-def test_half_precision_is_drawn_in_float32(kind):
-    given = gaussians(20)
-    image = rasterise(*(t.half() for t in given), camera_of())
-    expected = oracle.splat([t.half().double() for t in given], camera_of())
-    close(image.colour, expected[0], TOLERANCE["float32"])
-
-
 def test_radii_are_three_deviations_of_the_longest_axis(kind):
     given, camera = gaussians(20, size=0.05, spread=0.3), camera_of()
     image, _ = drawn(kind, given, camera)
@@ -353,14 +317,6 @@ def test_cameras_that_cannot_be_are_refused():
         dataclasses.replace(camera_of(), world_to_camera=torch.zeros(3, 4))
     with pytest.raises(ValueError, match=r"^camera\.world_to_camera is not finite"):
         dataclasses.replace(camera_of(), world_to_camera=torch.full((4, 4), float("nan")))
-
-
-def test_powers_of_two():
-    x = np.linspace(-90, 0, 100_001).astype(np.float32)
-    found = np.array([_power(value) for value in x])
-    assert np.abs(found / 2.0 ** x.astype(np.float64) - 1).max() < 2e-7
-    assert _power(np.float32(0)) == 1
-    assert _power(np.float32(-1e30)) < 1e-30
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

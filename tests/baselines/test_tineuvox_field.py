@@ -26,26 +26,6 @@ def inside(count):
     return BOX[0] + (BOX[1] - BOX[0]) * torch.rand(count, 3)
 
 
-def test_size_is_the_published_one():
-    for resolution, channels, width in [(100, 4, 64), (160, 6, 256)]:
-        case = f"resolution={resolution}, channels={channels}, width={width}"
-        cube = torch.tensor([[-5.0] * 3, [5.0] * 3])
-        made = TiNeuVox(cube, resolution, channels, width)
-        megabytes = 2 * sum(p.numel() for p in made.parameters()) / 1e6
-        assert megabytes == pytest.approx({100: 8, 160: 48}[resolution], rel=0.05), case
-        networks = sum(p.numel() for p in made.parameters()) - made.grid.numel()
-        time_features, lookup = 5 * channels, 15 * channels
-        expected = (
-            (17 * width + width + width * time_features + time_features)
-            + ((63 + time_features) * width + width + width * width + width + 3 * width + 3)
-            + ((lookup + time_features + 63) * width + width)
-            + (width + 1)
-            + (width * width + width)
-            + ((width + 27) * (width // 2) + width // 2 + 3 * (width // 2) + 3)
-        )
-        assert networks == expected, case
-
-
 def test_grid_is_read_as_loops_read_it():
     made = field().double()
     points = inside(20).double()
@@ -54,13 +34,6 @@ def test_grid_is_read_as_loops_read_it():
     expected = np.stack([oracles.trilinear(filled, BOX.numpy(), p) for p in points.numpy()])
     np.testing.assert_allclose(made.read(points).detach().numpy(), expected, atol=1e-12)
     assert (made.read(BOX[1:].double() + 1) == 0).all()
-
-
-def test_cells_are_cubes_and_as_many_as_asked_for():
-    made = field(resolution=20)
-    cells = math.prod(made.grid.shape[2:])
-    assert 0.8 * 8000 < cells <= 8000
-    assert made.cell == pytest.approx(float((BOX[1] - BOX[0]).prod() / 8000) ** (1 / 3))
 
 
 def test_growing_keeps_what_the_grid_shows_at_its_corners():

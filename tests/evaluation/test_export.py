@@ -328,21 +328,6 @@ def test_the_documented_reader_sees_the_background_of_the_field(tmp_path: Path, 
     assert float(expected.std()) > 0.05
 
 
-def test_exports_without_the_background_say_so(tmp_path: Path):
-    field: Any = Ball()
-    said: list[str] = []
-    for name, background in (("without", None), ("with", Background(4, 8, width=8))):
-        field.background = background
-        trained, folder = set_up(tmp_path, field), tmp_path / name
-        options = ExportOptions(what="points", times="0.5", resolution=24, count=9)
-        export(trained, options, folder, say=said.append)
-        listed = json.loads((folder / "export.json").read_text())
-        assert ("left_out" in listed) == (background is not None)
-    assert [text for text in said if "left out" in text] == [
-        "left out    what lies behind the field's cube, which has no surface; --what planes has it"
-    ]
-
-
 def test_the_training_cameras_are_a_path_that_is_rendered_again(trained_run: Path, tmp_path: Path):
     out = tmp_path / "path"
     assert main(["export", str(trained_run), "--what", "path", "--out", str(out)]) == 0
@@ -436,11 +421,3 @@ def test_a_missing_extra_is_named(monkeypatch):
     with pytest.raises(MissingExtraError, match=r'-e "\.\[export\]"'):
         ExportOptions().check()
     ExportOptions(what="planes").check()
-
-
-def test_a_static_scene_has_one_timestep(tmp_path: Path):
-    field = Ball()
-    field.moves = False
-    trained = set_up(tmp_path, field)
-    folder = export(trained, ExportOptions(resolution=16), say=quiet)
-    assert json.loads((folder / "export.json").read_text())["times"] == [0]

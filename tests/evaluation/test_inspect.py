@@ -32,7 +32,7 @@ from xplanes.evaluation.inspect import (
     next_command,
     table,
 )
-from xplanes.evaluation.inspect_picture import CUBE, HEIGHT, POINT, SCALE, WIDTH, _sample, draw
+from xplanes.evaluation.inspect_picture import HEIGHT, POINT, WIDTH, draw
 from xplanes.models.base import ModelSettings
 from xplanes.scenes.cameras import look_at
 from xplanes.scenes.frame import scene_frame
@@ -414,31 +414,6 @@ def test_points_give_opaque_scenes_their_cube_and_are_drawn(inspected):
     dots = (np.abs(plans - ink).max(axis=-1) < 40).sum()
     # Twice 300 dots, of which some lie on one another, and none of those outside of the panels.
     assert 250 < dots < 2500
-
-
-def test_the_edges_of_the_cube_are_where_the_lens_shows_them():
-    views = fisheye(ball()).splits["train"]
-    frame = scene_frame(views)
-    index, side = 5, 256
-    image = np.asarray(_sample(views, index, (side, side), frame)).astype(int)
-    ink = [int(CUBE[i : i + 2], 16) for i in (1, 3, 5)]
-    drawn = np.abs(image - ink).max(axis=-1) < 40
-    assert 0.005 < drawn.mean() < 0.1
-    world_to_camera = views.camera_to_world[index].double().inverse()
-    k, focal = {"k1": 0.05, "k2": -0.01}, views.intrinsics.focal[index].tolist()
-    found = 0
-    for corner in torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3):
-        for axis in range(3):
-            place = corner.clone()
-            place[axis] *= 0.5  # A quarter of the way along an edge.
-            world = frame.to_world(place).double()
-            local = world_to_camera[:3, :3] @ world + world_to_camera[:3, 3]
-            x, y = pixel("fisheye", local.tolist(), k, focal, [SIZE / 2] * 2)
-            column, row = (round(value * SCALE * side / SIZE) for value in (x, y))
-            if 3 <= column < SCALE * side - 3 and 3 <= row < SCALE * side - 3:
-                assert drawn[row - 2 : row + 3, column - 2 : column + 3].any()
-                found += 1
-    assert found > 6
 
 
 def write_nerfstudio(folder: Path, views: Views, **more):

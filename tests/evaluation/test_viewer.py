@@ -24,17 +24,14 @@ from xplanes.cli import main
 from xplanes.errors import ConfigError
 from xplanes.evaluation import live
 from xplanes.evaluation import viewer as module
-from xplanes.evaluation.drawing import draw
 from xplanes.evaluation.live import LiveViewer
 from xplanes.evaluation.render import orbit_poses
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.evaluation.viewer import HOST, Viewer, camera_pose, check_address
 from xplanes.optional import MissingExtraError
-from xplanes.rendering.pictures import to_bytes
 from xplanes.run import run
 from xplanes.training.clock import TrainingClock, find_callback
 from xplanes.training.fit import Trainer
-from xplanes.training.scores import render_view
 
 pytest.importorskip("viser")
 
@@ -120,29 +117,6 @@ def test_cameras_come_back_as_ours(trained: TrainedRun):
     for pose in orbit_poses(trained.views, trained.frame, 5, elevation=35):
         back = camera_pose(quaternion(pose), pose[:3, 3])
         assert torch.allclose(back, pose, atol=1e-5)
-
-
-def test_an_image_from_a_view_is_that_view(trained: TrainedRun, viewer: Viewer):
-    views, frame = trained.scene.splits["train"], trained.frame
-    camera = Client(first_pose(trained)).camera
-    camera.fov = 2 * float(torch.atan(0.5 * views.height / views.intrinsics.focal[0, 1]))
-    camera.aspect = 1.0
-    viewer.time.value = float(views.times[0])
-    field, renderer = trained.module.field, trained.module.renderer
-    white = torch.ones(3)
-    picture = draw(
-        field,
-        renderer,
-        viewer.shot(camera, views.height),
-        views=views,
-        frame=frame,
-        background=white,
-    )
-    assert picture is not None
-    expected = render_view(field, renderer, frame, views, 0, white)
-    found = to_bytes(picture.colours).int() - to_bytes(expected["colour"]).int()
-    assert found.abs().max() <= 1
-    assert float(expected["colour"].std()) > 0.05
 
 
 def test_pictures_are_small_while_something_changes_and_full_at_rest(
@@ -258,11 +232,6 @@ def test_addresses_that_cannot_be_served_are_refused(trained_run: Path, monkeypa
     with pytest.raises(MissingExtraError, match=r'-e "\.\[viewer\]"'):
         LiveViewer()
     LiveViewer(enabled=False)
-
-
-def test_several_devices_are_refused():
-    with pytest.raises(ConfigError, match=r"viewer=true with trainer\.devices=2"):
-        LiveViewer(port=0).setup(SimpleNamespace(world_size=2), None, "fit")  # type: ignore[arg-type]
 
 
 class Watched(Viewer):

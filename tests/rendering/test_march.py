@@ -375,15 +375,6 @@ def test_the_kernel_finds_no_samples_on_impossible_rays():
     assert torch.equal(found.cells, expected.cells)
 
 
-@needs_triton
-def test_no_rays_and_no_samples_in_the_kernel():
-    for rays, room in ((rays_of(0), None), (rays_of(0), 5), (rays_of(3), None), (rays_of(3), 5)):
-        found = by_kernel(rays, grid_of(filled=-1), room=room)
-        assert found.count == 0
-        assert len(found.points) == (room or 0)
-        assert found.starts.tolist() == [0] * len(rays[0])
-
-
 @pytest.fixture
 def as_on_a_gpu(monkeypatch):
     """Tensors of this machine are taken for ones on a GPU."""
@@ -413,18 +404,3 @@ def test_the_kernel_is_used_once_it_has_proved_itself(as_on_a_gpu, monkeypatch, 
     assert rooms[1:] == [None, 90]
     assert rooms[0] not in (None, 90)  # The trial.
     assert not caplog.records
-
-
-@needs_triton
-def test_a_kernel_that_places_samples_elsewhere_is_not_used(as_on_a_gpu, monkeypatch, caplog):
-    def broken(*given, **options):
-        found = march_gpu(*given, **options)
-        return dataclasses.replace(found, points=found.points + 0.01)
-
-    monkeypatch.setattr(marching, "march_gpu", broken)
-    grid, rays = grid_of(), rays_of(5, torch.float32)
-    for _ in range(2):
-        found, expected = march(*rays, grid, step=STEP), twin(rays, grid)
-        assert torch.equal(found.points, expected.points)
-    assert [record.message for record in caplog.records] == [caplog.records[0].message]
-    assert "marching" in caplog.text

@@ -13,7 +13,7 @@ from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.scenes.cameras import focal_length, look_at
 from xplanes.scenes.dnerf import SceneError, read_scene
-from xplanes.scenes.images import load_images, load_premultiplied, shrink
+from xplanes.scenes.images import load_images, load_premultiplied
 from xplanes.scenes.lenses import COEFFICIENTS
 from xplanes.scenes.source import SceneSettings
 
@@ -118,18 +118,6 @@ def test_reduced_images_average_the_premultiplied_area_that_a_pixel_covers(scene
             found = views.images[i].numpy()
             assert np.abs(found - box_average(enlarged, 12)).max() <= 1, resolution
             assert (found[..., :3] <= found[..., 3:]).all(), resolution
-
-
-def test_edges_neither_ring_nor_spill():
-    straight = np.zeros((4, 48, 48), np.float32)
-    straight[:, 16:32, 16:32] = 255
-    for resolution in (7, 12, 24, 36, 47):
-        pixels = shrink(straight, resolution, resolution)
-        scale = resolution / 48
-        middle = slice(math.ceil(16 * scale), math.floor(32 * scale))
-        assert (pixels[middle, middle] == 255).all(), resolution
-        assert (pixels[: math.floor(16 * scale)] == 0).all(), resolution
-        assert (pixels[:, math.ceil(32 * scale) :] == 0).all(), resolution
 
 
 def test_hidden_colour_does_not_bleed(tmp_path):

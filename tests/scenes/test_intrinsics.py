@@ -14,7 +14,6 @@ from tests.balls import ball_views, inside_ball, surrounding
 from tests.refusals import assert_refused
 from xplanes.baselines.tineuvox.model import frusta_box
 from xplanes.errors import SceneError
-from xplanes.evaluation.render import VideoOptions, lens
 from xplanes.metrics import psnr
 from xplanes.preparation.fixed_view import check_camera
 from xplanes.rendering.base import RayRenderer
@@ -23,12 +22,11 @@ from xplanes.rendering.filling import fill
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.batches import RayBatches, RaySettings
 from xplanes.scenes.cameras import focal_length
-from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.dnerf import read_scene
 from xplanes.scenes.frame import cube_frame, optical_centre, scene_frame
 from xplanes.scenes.silhouettes import foreground, may_hold
 from xplanes.scenes.source import frames_are_equal
-from xplanes.scenes.views import Intrinsics, Scene, Views, camera_rays, joined
+from xplanes.scenes.views import Intrinsics, Views, joined
 from xplanes.training.scores import score_view
 
 RADIUS = 0.5
@@ -326,24 +324,6 @@ def test_cameras_together_see_what_each_sees():
             assert bool(there) == bool(expected), (index, point)
 
 
-def test_carving_by_different_cameras_keeps_the_ball_and_empties_the_rest():
-    centre = (0.15, -0.1, 0.05)
-    # Views of neighbouring times are joined where there are enough of them.
-    for times in (torch.zeros(24), torch.linspace(0, 1, 60)):
-        views = mixed(len(times), times=times, centre=centre)
-        frame, grid = cube_frame(1.4, torch.zeros(3)), OccupancyGrid(24, 4, step=0.05)
-        carve(grid, views, frame)
-        x, y, z = (
-            ((frame.points(inside_ball(4000, RADIUS) + torch.tensor(centre)) + 1) / 2 * 24)
-            .floor()
-            .long()
-            .unbind(dim=-1)
-        )
-        for cells in (grid.allowed, grid.occupied):
-            assert cells.view(4, 24, 24, 24)[:, z, y, x].all()
-        assert grid.occupied.float().mean() < (0.2 if views.is_static else 0.35)
-
-
 def test_images_without_alpha_carve_nothing_though_padding_has_none():
     views = mixed(6)
     assert not views.is_opaque
@@ -351,13 +331,6 @@ def test_images_without_alpha_carve_nothing_though_padding_has_none():
     grid = OccupancyGrid(12, 2, step=0.05)
     carve(grid, opaque(views), cube_frame(1.4, torch.zeros(3)))
     assert grid.allowed.all()
-
-
-def test_without_alpha_the_cube_is_what_the_widest_camera_sees():
-    poses = surrounding(12, 3.0)
-    cameras = [(10, 10, 12.0, 12.0, 5.0, 5.0), (20, 24, 24.0, 21.0, 12.0, 10.0)] * 6
-    half = 1 / scene_frame(opaque(rendered(cameras, poses))).scale
-    assert half == pytest.approx(1.5)  # half of 24 pixels at a focal length of 24, 3 away
 
 
 def test_images_cropped_around_a_thing_look_at_it():
@@ -402,16 +375,6 @@ def test_views_are_scored_at_their_own_size():
             assert score.ssim == pytest.approx(1), index
 
 
-def test_the_data_module_serves_views_at_their_own_size():
-    views = mixed(6)
-    data = SceneDataModule.of(Scene("ball", {"train": views, "test": mixed(3)}))
-    assert len(data.train_dataloader()) == views.pixels // 1024
-    for index, batch in enumerate(data.test_dataloader()):
-        height, width = views.size(index)
-        assert batch["target"].shape == (height, width, 3)
-        assert [len(rays) for rays in batch["camera"].rays()] == [height * width] * 2
-
-
 def test_frames_with_different_intrinsics_are_not_static():
     views = rendered([WIDE] * 3, surrounding(1, 4.0).repeat(3, 1, 1))
     assert frames_are_equal(views)
@@ -421,36 +384,6 @@ def test_frames_with_different_intrinsics_are_not_static():
 
 
 # Pictures of them
-
-
-def test_a_video_has_the_field_of_view_of_the_training_views():
-    square = ball_views(3, RADIUS, size=20, angle=0.7)
-    assert square.intrinsics.focal_at(50) == pytest.approx(focal_length(0.7, 50))
-    assert square.intrinsics.fov_y == pytest.approx(0.7)
-    assert lens({"train": square}, "orbit", (50, 50)) == (
-        square.intrinsics.focal_at(50),
-        None,
-        None,
-    )
-    views = mixed(5)  # three of them wide
-    assert views.intrinsics.focal_at(88) == pytest.approx((41.0 + 36.5) / 2 * 2)
-    assert views.intrinsics.fov_y == pytest.approx(2 * math.atan(15 / 36.5))
-
-
-def test_an_image_from_a_view_shows_it_whole():
-    views = mixed(4)
-    for index in (0, 1):
-        height, width = views.size(index)
-        path = f"view:{views.files[index]}"
-        for factor in (1, 3):
-            size = VideoOptions(path, size=factor * max(height, width)).shape({"train": views})
-            assert size == (factor * height, factor * width)
-            focal, centre, own = lens({"train": views}, path, size)
-            assert own is None
-            _, found = camera_rays(views.camera_to_world[index], focal, *size, centre)
-            found = found.view(*size, 3)[factor // 2 :: factor, factor // 2 :: factor]
-            found = found.reshape(-1, 3)
-            torch.testing.assert_close(found, views.image_rays(index)[1], atol=1e-6, rtol=0)
 
 
 def test_a_video_that_models_cannot_take_is_refused():

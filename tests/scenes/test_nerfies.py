@@ -88,24 +88,6 @@ def test_the_smallest_images_that_are_large_enough(capture):
     refused(capture, "resolution", resolution=40)
 
 
-def test_the_world_is_turned_upright(capture):
-    np.save(capture.path / "points.npy", np.array([[1.0, 2.0, 3.0]]))
-    plain, turned = read(capture, "train"), read(capture, "train", orient=True)
-    assert plain.points.numpy() == pytest.approx((np.array([[1, 2, 3]]) - CENTRE) * SCALE)
-    before, after = (scene.splits["train"].camera_to_world for scene in (plain, turned))
-    torch.testing.assert_close(
-        before[0].inverse() @ before, after[0].inverse() @ after, atol=1e-5, rtol=0
-    )
-    seen = [
-        (scene.points[0] - poses[0, :3, 3]) @ poses[0, :3, :3]
-        for scene, poses in ((plain, before), (turned, after))
-    ]
-    torch.testing.assert_close(*seen, atol=1e-5, rtol=0)
-    whole = read(capture, "train", "val", orient=True).splits
-    up = torch.cat([whole[name].camera_to_world[:, :3, 1] for name in whole]).mean(dim=0)
-    assert up[:2].abs().max() < 1e-6
-
-
 def test_both_names_of_tangential_distortion(capture):
     first = read(capture, "train").splits["train"].image_rays(0)[1]
     for name in capture.ids:

@@ -4,7 +4,6 @@ import json
 import logging
 import math
 import unicodedata
-import warnings
 from functools import partial
 from pathlib import Path
 
@@ -245,20 +244,6 @@ def test_masks_of_labels_colours_and_alpha_mean_what_they_show(capture, kind):
     views = capture.read(eval_every=100, mask_use="alpha").splits["train"]
     expected = capture.views.image(0) * torch.ones(SIZE, SIZE).tril()[..., None]
     assert torch.equal(views.image(0), expected.byte())
-
-
-def test_soft_masks_stay_soft(capture):
-    values = np.linspace(0, 255, SIZE * SIZE).reshape(SIZE, SIZE).astype(np.uint8)
-    Image.fromarray(values).convert("RGB").save(capture.path / "mask.jpg", quality=100)
-    for frame in capture.frames:
-        frame["mask_path"] = "mask.jpg"
-    read = capture.read(eval_every=100, mask_use="alpha").splits["train"]
-    alpha = read.image(0)[..., 3].float()
-    expected = torch.from_numpy(values) * (capture.views.image(0)[..., 3] > 0)
-    off = (alpha - expected).abs()
-    # Nearly black and white are black and white in a lossy format.
-    assert float(off.max()) <= 11
-    assert float(off[(expected > 11) & (expected < 244)].max()) <= 3
 
 
 def masked(capture, values, ending="png", of=lambda index: True, **options):
@@ -596,13 +581,6 @@ def test_images_elsewhere_or_one_folder_deeper(capture):
         frame["file_path"] = f"images/{Path(frame['file_path']).name}"
     found = capture.read().splits["train"].files
     assert found == tuple(f"images/{file}" for file in expected)
-
-
-def test_keys_that_say_nothing_are_not_named(capture):
-    capture.content |= {"rolling_shutter": [0, 0.0, [0]], "black_transparent": False, "sharpen": 0}
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        capture.read()
 
 
 def test_where_times_come_from_is_told(capture):

@@ -81,12 +81,6 @@ def test_filling_the_grid_counts_once_and_as_preparation(train, tmp_path: Path, 
     assert sum(named.values()) + filling == pytest.approx(total, abs=0.01)
 
 
-def test_a_scene_of_one_timestep_needs_one_triplane(train, tmp_path: Path):
-    train(tmp_path / "run", "lrm=tiny", "data.views=1", "trainer.max_steps=1")
-    assert told(tmp_path / "run")["lrm"]["frames"] == 1
-    assert told(tmp_path / "run")["decomposition"] == {}
-
-
 def test_a_scene_without_motion_trains_as_a_static_one(train, tmp_path: Path):
     folder = tmp_path / "run"
     train(folder, "lrm=tiny", "data.scene=still_life", "trainer.max_steps=1")

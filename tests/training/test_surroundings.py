@@ -1,7 +1,6 @@
 """Scenes in a world: a background joins where images show one, and nothing changes elsewhere."""
 
 import functools
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -146,20 +145,6 @@ def test_training_learns_what_lies_behind(trained):
     clear = found["opacity"] < 1e-4
     if clear.any():
         torch.testing.assert_close(found["colour"][clear], behind[clear], atol=1e-3, rtol=0)
-
-
-def test_the_sparsity_prior_leaves_a_world_alone():
-    for kind, kept in (("alpha", True), ("world", False)):
-        module = built(kind)
-        assert bool(module.sampler.regularisers(module.field, module.state)) is kept
-
-
-def test_nothing_is_known_of_opacity(trained):
-    module, _, _ = trained
-    assert "foreground" not in module.last
-    assert "background" not in module.last
-    assert module.restarts == 0
-    assert math.isfinite(module.last["loss"])
 
 
 def test_a_checkpoint_brings_the_background_back(trained):

@@ -25,6 +25,7 @@ from lightning.pytorch.loggers import Logger
 
 from tests.balls import ball_scene
 from tests.training.runs import changed, composed
+from tests.warm import forked
 from xplanes.cli import build_parser
 from xplanes.components import MOVED, build
 from xplanes.config import CONF, NAMES, compose_plain, to_plain
@@ -842,27 +843,22 @@ def test_no_module_needs_itself_to_be_imported():
     assert len(done) == len(modules)
 
 
-HEAVY = {"torch", "numpy", "lightning", "hydra", "numba", "torchmetrics", "PIL"}
+HEAVY = ("torch", "numpy", "lightning", "hydra", "numba", "torchmetrics", "PIL")
+QUICK = {
+    "import xplanes.settings": HEAVY,
+    "import xplanes.config": HEAVY,
+    "import xplanes.launch": ("torch", "lightning", "numba"),
+    "from xplanes.cli import build_parser; print(build_parser().format_help())": HEAVY,
+    "from xplanes.cli import main; main(['inspect', 'nowhere'])": ("lightning", "xplanes.run"),
+}
+"""What must answer at once, and what it must not load."""
 
 
-@pytest.mark.parametrize(
-    ("module", "banned"),
-    [
-        ("xplanes", HEAVY),
-        ("xplanes.cli", HEAVY),
-        ("xplanes.settings", HEAVY),
-        ("xplanes.config", HEAVY),
-        ("xplanes.launch", {"torch", "lightning", "numba"}),
-    ],
-)
-def test_what_must_load_at_once_loads_nothing_heavy(module, banned):
-    script = f"import sys, {module}; print(*{{name.split('.')[0] for name in sys.modules}})"
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT
-    )
-    loaded = set(done.stdout.split())
-    assert "xplanes" in loaded
-    assert not loaded & banned
+def test_what_must_answer_at_once_loads_nothing_heavy(tmp_path):
+    codes = [f"{code}; print('heavy', {{*{no}}} & {{*sys.modules}})" for code, no in QUICK.items()]
+    for (code, printed), told in zip(forked("", codes, tmp_path), QUICK, strict=True):
+        assert code == 0, (told, printed)
+        assert printed.endswith("heavy set()\n"), (told, printed)
 
 
 def test_errors_that_users_see_have_one_base():

@@ -1,8 +1,6 @@
 """The command line is Hydra's own: every option of its manual, and its own errors."""
 
 import json
-import subprocess
-import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,13 +10,12 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tests.training.runs import SMALL, small_config
+from tests.warm import forked
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.launch import prepare
 from xplanes.run import run
 from xplanes.training.logs import forget_later
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.mark.parametrize(
@@ -59,38 +56,21 @@ COMMANDS = {
 """Command lines that end before a job begins, and what they print."""
 
 QUICK = """
-import json, os, sys
-import hydra
 from xplanes.cli import main
-for number, arguments in enumerate(json.loads(sys.argv[1])):
-    child = os.fork()
-    if child:
-        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-        continue
-    file = os.open(str(number), os.O_WRONLY | os.O_CREAT)
-    os.dup2(file, 1)
-    os.dup2(file, 2)
-    code = 0
-    try:
-        main(["train", *arguments])
-    except SystemExit as end:
-        code = end.code
-    sys.stdout.flush()
-    os._exit(9 if {"torch", "lightning", "numba", "numpy"} & set(sys.modules) else code or 0)
+try:
+    main(["train", *{}])
+finally:
+    if {{"torch", "lightning", "numba", "numpy"}} & set(sys.modules):
+        sys.exit(9)
 """
 
 
 def test_command_lines_without_a_job_are_hydras_and_load_nothing_heavy(tmp_path: Path) -> None:
-    given = [sys.executable, "-c", QUICK, json.dumps(list(COMMANDS))]
-    environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"}
-    done = subprocess.run(given, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    codes = [int(line) for line in done.stdout.split()]
-    assert len(codes) == len(COMMANDS), done.stderr
-    for number, (arguments, words) in enumerate(COMMANDS.items()):
-        printed = (tmp_path / str(number)).read_text()
+    found = forked("import hydra", [QUICK.format(list(given)) for given in COMMANDS], tmp_path)
+    for (code, printed), (arguments, words) in zip(found, COMMANDS.items(), strict=True):
         refused = words.startswith("Did you mean")
-        assert printed.endswith(words) if refused else words in printed, arguments
-        assert codes[number] == int(refused), (arguments, printed)
+        assert printed.endswith(words) if refused else words in printed, (arguments, printed)
+        assert code == int(refused), (arguments, printed)
 
 
 @pytest.mark.parametrize(

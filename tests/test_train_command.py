@@ -251,9 +251,8 @@ def test_names_of_scenes_may_look_like_numbers() -> None:
 
 
 HARD = (
-    *("/home/josé/x", "李明", "a b", "take (1)", "a=b", "it's", 'say "x"', "a,b", "50%", "x:y"),
-    *("[x]", "{x}", "[1] chair", "'a' b", "a#b", "a\\\\b", "ends\\\\", "é'", "$x", "!x", "&"),
-    *(";", "null-x", "True"),
+    *("/home/josé/x", "take (1)", "a=b", "it's", 'say "x"', "a,b", "50%", "[1] chair", "{x}"),
+    *("'a' b", "a#b", "a\\\\b", "ends\\\\", "$x", "True"),
 )
 """Names that a file system allows and a grammar may not."""
 

@@ -8,7 +8,7 @@ import torch
 
 from tests.baselines.oracles import product_features
 from xplanes.baselines.kplanes.field import DensityField, ExplicitDecoder, HybridDecoder, KPlanes
-from xplanes.fields.networks import PaddedMLP, octaves, spherical_harmonics, truncated_exponential
+from xplanes.fields.networks import PaddedMLP, spherical_harmonics, truncated_exponential
 from xplanes.fields.products import (
     PlaneProducts,
     plane_product,
@@ -78,30 +78,6 @@ def test_compiled_loops_equal_the_oracle_and_their_readable_twin(dtype, time):
             torch.testing.assert_close(fast, plain, **tolerance)
 
 
-def test_initial_planes_are_as_published():
-    planes = PlaneProducts(4, 8, [1], 5, low=0.1, high=0.5)
-    for name, plane in planes.planes():
-        if "t" in name:
-            assert (plane == 1).all()
-            assert plane.shape == (1, 4, 5, 8)
-        else:
-            low, high = plane.detach().aminmax()
-            assert 0.1 <= float(low) < 0.15 < 0.45 < float(high) <= 0.5
-
-
-def test_parameters_number_as_published_for_lego():
-    with torch.device("meta"):  # Shapes alone.
-        planes = PlaneProducts(32, 64, [1, 2, 4, 8], 25, low=0.1, high=0.5)
-        proposals = [
-            DensityField(PlaneProducts(8, size, [1], 50, low=0.1, high=0.15)) for size in (64, 128)
-        ]
-        hybrid, explicit = HybridDecoder(128), count(ExplicitDecoder(128))
-    assert count(KPlanes(planes, hybrid), *proposals) == 36_467_008
-    # One linear map to density; 3 inputs and 13 ones, four hidden layers, three bases of 128.
-    assert explicit == 128 + 16 * 128 + 3 * 128 * 128 + 128 * 384
-    assert count(planes) == 35_727_360
-
-
 def test_padding_acts_as_columns_of_ones():
     torch.manual_seed(0)
     network = PaddedMLP([5, 16, 2]).double()
@@ -147,15 +123,6 @@ def test_spherical_harmonics_are_orthonormal_and_of_their_degree():
     pole = spherical_harmonics(torch.tensor([[0.0, 0.0, 1.0]]))[0]
     assert pole.nonzero()[:, 0].tolist() == [0, 2, 6, 12]
     assert (pole[[0, 2, 6, 12]] > 0).all()
-
-
-def test_octaves_hold_values_sines_and_cosines():
-    values = torch.tensor([[0.5, -2.0]])
-    expected = [0.5, -2.0]
-    for factor in (1, 2, 4):
-        expected += [math.sin(factor * x) for x in (0.5, -2.0)]
-        expected += [math.cos(factor * x) for x in (0.5, -2.0)]
-    torch.testing.assert_close(octaves(values, 3), torch.tensor([expected]))
 
 
 def test_densities_are_exponentials_of_a_shifted_logit_in_units_of_the_frame():

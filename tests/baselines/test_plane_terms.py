@@ -45,12 +45,6 @@ def test_gradients_equal_autograd():
             torch.testing.assert_close(plane.grad, wanted, msg=lambda m, c=variation: f"{c}: {m}")
 
 
-def test_weights_of_zero_leave_no_gradient():
-    planes = products(5)
-    PlaneTerms(0.0, "coded", 0.0, 0.0).add_gradients(planes)
-    assert all(plane.grad is None for _, plane in planes.planes())
-
-
 def test_density_fields_learn_at_the_published_steps():
     for every, warmup, steps in [(5, 5000, 9000), (3, 50, 200), (1, 1, 40)]:
         case = f"every={every}, warmup={warmup}, steps={steps}"

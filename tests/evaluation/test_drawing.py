@@ -17,7 +17,6 @@ from xplanes.baselines.proposal import ProposalRenderer
 from xplanes.baselines.tensor4d.neus import NeusRenderer
 from xplanes.baselines.tineuvox.fixed_step import FixedStepRenderer
 from xplanes.evaluation.drawing import Picture, Shot, camera_outlines, draw, in_box
-from xplanes.fields.background import Background
 from xplanes.fields.base import ViewDependentField
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.grid_renderer import GridRenderer
@@ -197,20 +196,6 @@ def test_bounds_of_the_training_cameras_do_not_cut_the_scene_off():
     seen = expected.depth.isfinite() & found.depth.isfinite()
     torch.testing.assert_close(found.depth[seen], expected.depth[seen], atol=0.1, rtol=0)
     assert float((cut - expected.depth)[seen].abs().min()) > 0.3
-
-
-def test_a_background_stays_where_the_scene_is_cropped():
-    field: Any = Balls(FRONT)
-    torch.manual_seed(0)
-    field.background = Background(4, 8, width=8, samples=4)
-    empty: Any = Balls(torch.full((3,), 9.0))
-    empty.background = field.background
-    cropped = drawn(field, grid_renderer(), shot(box=crop(0.2, 1.0))).colours
-    expected = drawn(empty, grid_renderer(), shot()).colours
-    torch.testing.assert_close(cropped, expected, atol=1e-5, rtol=0)
-    assert float(expected.std()) > 0.01
-    whole = drawn(field, grid_renderer(), shot()).colours
-    assert not torch.allclose(whole, expected, atol=0.1)
 
 
 @pytest.mark.parametrize("hidden", [False, True])

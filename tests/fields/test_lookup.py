@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.oracles import plane_features as oracle
 from xplanes.fields import lookup_numba as cpu
-from xplanes.fields.lookup import plane_features, plane_features_reference, time_plane_axes
+from xplanes.fields.lookup import plane_features, plane_features_reference
 from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES
 
 SETS = ("three", "six", "nine")
@@ -177,23 +177,6 @@ def test_planes_of_one_texel_or_one_row():
             )
 
 
-def test_points_of_another_precision_are_taken_in_the_planes():
-    space, time = stacks("six", torch.float32)
-    points, times = scattered(20, torch.float64)
-    for function in (plane_features, plane_features_reference):
-        value = function(space, time, points, times, PLANE_SETS["six"])
-        assert value.dtype == torch.float32
-
-
-def test_half_precision_planes_take_the_torch_path():
-    space, time = stacks("six", torch.bfloat16)
-    points, times = scattered(20, torch.float32, reach=0.9)
-    value = plane_features(space, time, points, times, PLANE_SETS["six"])
-    full = plane_features(space.float(), time.float(), points, times, PLANE_SETS["six"])
-    assert value.dtype == torch.bfloat16
-    torch.testing.assert_close(value.float(), full, atol=0.4, rtol=0.1)
-
-
 MANY_THREADS = """
 import torch
 from tests.fields.test_lookup import both, scattered, stacks
@@ -232,13 +215,6 @@ def test_tasks_that_share_a_plane_add_up_all_of_it(monkeypatch, tasks):
         loops, twin = both(plane_set, space, time, *scattered(300))
         for a, b in zip(loops, twin, strict=True):
             torch.testing.assert_close(a, b, atol=1e-12, rtol=1e-10)
-
-
-def test_axes_of_time_planes_are_those_of_their_names():
-    for plane_set, axes in [("three", []), ("six", [0, 1, 2]), ("nine", [0, 1, 0, 2, 1, 2])]:
-        case = f"plane_set={plane_set}, axes={axes}"
-        assert time_plane_axes(PLANE_SETS[plane_set]) == axes, case
-        assert ["xyz".index(name[0]) for name in TIME_PLANES[plane_set]] == axes, case
 
 
 @settings(max_examples=40, deadline=None)

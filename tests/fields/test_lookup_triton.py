@@ -95,12 +95,6 @@ def test_any_number_of_points():
             )
 
 
-def test_planes_of_one_texel_or_one_row():
-    for rows in [1, 2]:
-        space, time = stacks("six", size=rows, time_rows=rows, time_size=rows)
-        compare(both("six", space, time, *scattered(20)), 1e-12, rows)
-
-
 def test_half_precision_planes_are_added_up_in_float32():
     for dtype in [torch.bfloat16, torch.float16]:
         space, time = stacks("six", dtype, channels=4)

@@ -583,14 +583,6 @@ def test_images_elsewhere_or_one_folder_deeper(capture):
     assert found == tuple(f"images/{file}" for file in expected)
 
 
-def test_where_times_come_from_is_told(capture):
-    capture.timed([7 + 2 * i for i in range(10)], "timestamp")
-    assert capture.read().notes["times"] == (
-        '"timestamp" of transforms.json, from 7 to 25: images/frame_00000.png -> 7, '
-        "images/frame_00004.png -> 15, images/frame_00009.png -> 25"
-    )
-
-
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-32"])
 def test_a_file_in_another_encoding_is_read(capture, encoding):
     (capture.path / "images").rename(capture.path / "bildér")

@@ -1,7 +1,6 @@
 """Runs initialised from a triplane file: outputs, resuming, loading."""
 
 import json
-import weakref
 from pathlib import Path
 
 import pytest
@@ -216,27 +215,6 @@ def test_regularisers_towards_the_initialisation_fade(place: Path) -> None:
     for gradient, all_of_it in zip(left, whole, strict=True):
         torch.testing.assert_close(gradient, 0.75 * all_of_it)
     assert not any(gradient.any() for gradient in gradients(96, "288") + gradients(104, "288"))
-
-
-def test_nothing_keeps_the_sparse_part_once_l_r_has_faded_out(
-    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    held: list[weakref.ref[torch.Tensor]] = []
-    alive: dict[int, bool] = {}
-    regularise = XPlanesModel.regularise
-
-    def watched(self: XPlanesModel, state: TrainingState) -> None:
-        if not held:
-            assert self.sparse is not None
-            held.append(weakref.ref(self.sparse))
-        regularise(self, state)
-        alive[state.step] = held[0]() is not None
-
-    monkeypatch.setattr(XPlanesModel, "regularise", watched)
-    fading = ["model.loss.every=1", "data.views=3", "model.loss.initial_steps=18"]
-    run(settings(place, UNSCORED, *fading), tmp_path / "run", [], resume=False)
-    assert all(alive[step] == (step < 6) for step in alive)
-    assert max(alive) > 6
 
 
 def test_a_field_that_starts_again_keeps_l_r_while_it_is_of_use(place: Path) -> None:

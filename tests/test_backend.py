@@ -43,9 +43,10 @@ except ModuleNotFoundError as error:
 
 def test_loops_share_the_threads_of_torch_and_may_be_absent(tmp_path: Path) -> None:
     """With one thread, with two, and where numba does not load."""
-    (tmp_path / "numba").mkdir()
-    (tmp_path / "numba" / "__init__.py").write_text("raise ImportError('Numba needs NumPy 0.1')")
-    codes = [COUNT.format(count=1), COUNT.format(count=2), FALLBACK.format(place=str(tmp_path))]
+    broken = tmp_path / "broken"
+    (broken / "numba").mkdir(parents=True)
+    (broken / "numba" / "__init__.py").write_text("raise ImportError('Numba needs NumPy 0.1')")
+    codes = [COUNT.format(count=1), COUNT.format(count=2), FALLBACK.format(place=str(broken))]
     *counted, (code, printed) = forked("import torch", codes, tmp_path)
     for count, (_, line) in zip((1, 2), counted, strict=True):
         torchs, loops, cores = map(int, line.split())

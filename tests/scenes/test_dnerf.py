@@ -196,27 +196,6 @@ def test_video_is_read_when_there_is_one(scene):
     assert video.times.tolist() == [0, 0.5, 1]
 
 
-def test_a_resolution_is_a_width(scene):
-    for i in range(5):
-        Image.fromarray(picture(i)[: 6 if i < 4 else 9]).save(scene.path / "train" / f"r_{i}.png")
-    scene.contents["train"] |= {"fl_x": 30.0, "fl_y": 24.0, "cx": 5.0, "cy": 2.0}
-    scene.write()
-    views = scene.read().splits["train"]
-    assert views.intrinsics.size.tolist() == [[6, 12]] * 4 + [[9, 12]]
-    views = scene.read(resolution=4).splits["train"]
-    assert views.intrinsics.size.tolist() == [[2, 4]] * 4 + [[3, 4]]
-    for i in range(5):
-        expected = box_average(picture(i)[: 6 if i < 4 else 9], 3)
-        assert np.abs(views.image(i).numpy() - expected).max() <= 1
-    # 5 of 12 columns, but 2 of 6 rows and 4 of 9: each axis has its own ratio.
-    views = scene.read(resolution=5).splits["train"]
-    assert views.intrinsics.size.tolist() == [[2, 5]] * 4 + [[4, 5]]
-    expected = torch.tensor([[12.5, 8.0]] * 4 + [[12.5, 24 * 4 / 9]], dtype=torch.float64)
-    torch.testing.assert_close(views.intrinsics.focal, expected)
-    expected = torch.tensor([[25 / 12, 2 / 3]] * 4 + [[25 / 12, 8 / 9]], dtype=torch.float64)
-    torch.testing.assert_close(views.intrinsics.centre, expected)
-
-
 def test_an_empty_image_is_only_a_warning(scene):
     Image.new("RGBA", (12, 12)).save(scene.path / "train" / "r_3.png")
     with pytest.warns(UserWarning, match=r"1 of 5 images show nothing.*r_3\.png"):
@@ -249,13 +228,6 @@ def test_few_views_spread_over_time(scene):
     assert sorted(scene.read(views=3).splits["train"].times.tolist()) == [0, 0.5, 1]
 
 
-def test_fewer_views_are_scored(scene):
-    scene.add("val", 3)
-    result = scene.read(splits=["train", "val"], eval_views=2)
-    assert len(result.splits["train"]) == 5
-    assert result.splits["val"].files == ("val/r_0.png", "val/r_2.png")
-
-
 def test_more_views_than_there_are(scene):
     for count in (0, -1, 6):
         message = scene.error(str(count), views=count)
@@ -264,6 +236,8 @@ def test_more_views_than_there_are(scene):
     # Of scored views that is the most: splits differ in how many they have.
     scene.add("val", 3)
     assert len(scene.read(splits=["train", "val"], eval_views=6).splits["val"]) == 3
+    val = scene.read(splits=["train", "val"], eval_views=2).splits["val"]
+    assert val.files == ("val/r_0.png", "val/r_2.png")
 
 
 # What is refused

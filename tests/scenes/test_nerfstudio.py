@@ -202,19 +202,6 @@ def test_times_from_0_to_1_stay(capture, caplog):
     capture.refused("time is 'soon'; it must be a number in any unit")
 
 
-def test_images_of_several_sizes_and_widths(capture):
-    for index in (1, 4):
-        path = capture.path / capture.frames[index]["file_path"]
-        with Image.open(path) as picture:
-            picture.resize((48, 36)).save(path)
-    assert "another aspect ratio" in capture.refused("cut or turned", resolution=12)
-    for index in (1, 4):
-        capture.frames[index] |= {"h": 18, "cy": 9.0}
-    views = capture.read(resolution=12, eval_every=100).splits["train"]
-    assert [views.size(index) for index in range(3)] == [(12, 12), (9, 12), (12, 12)]
-    assert views.intrinsics.focal[1].tolist() == pytest.approx([FOCAL / 2, FOCAL / 2])
-
-
 def label_masks():
     """Masks as programs write them; all mean the lower triangle."""
     inside = np.tri(SIZE, dtype=np.uint8)

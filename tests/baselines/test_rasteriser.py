@@ -14,7 +14,7 @@ from xplanes.baselines.gaussians.camera import Camera
 from xplanes.baselines.gaussians.harmonics import spherical_harmonics
 from xplanes.baselines.gaussians.rasteriser import GaussianError, rasterise
 from xplanes.optional import MissingExtraError
-from xplanes.scenes.cameras import camera_around, project
+from xplanes.scenes.cameras import camera_around
 
 NAMES = ("means", "quaternions", "scales", "opacities", "colours")
 KINDS = ("loops", "float32", "float64")
@@ -241,17 +241,6 @@ def test_what_is_not_seen_changes_nothing(kind, change):
         assert (leaf.grad[1:] == 0).all()
 
 
-def test_projections_that_overflow_leave_the_rest_alone(kind):
-    camera = camera_of()
-    seen = single(camera)
-    far = single(camera, (3e38, 3e38, 1e-30), 1.0)
-    image, leaves = drawn(kind, [torch.cat(p) for p in zip(seen, far, strict=True)], camera)
-    back(image, upstream(image))
-    assert image.colour.isfinite().all()
-    for leaf in leaves:
-        assert leaf.grad.isfinite().all()
-
-
 def test_no_gaussians_show_the_background(kind):
     given = [t[:0] for t in single(camera_of())]
     image, leaves = drawn(kind, given, camera_of(), background=torch.tensor([0.25, 0.5, 1.0]))
@@ -284,18 +273,6 @@ def test_shapes_and_values_that_cannot_be_are_named():
         given[NAMES.index(name)][2] = value
         with pytest.raises(GaussianError, match=rf"^{name} of Gaussian 2 are .*{value}"):
             rasterise(*given, camera_of())
-
-
-def test_cameras_see_points_where_views_do():
-    pose, focal, centre = camera_around(70, 10, 3.0), (40.0, 44.0), (21.0, 13.0)
-    camera = Camera.from_pose(pose, focal=focal, centre=centre, width=40, height=30)
-    given = gaussians(10, spread=0.3)
-    image = rasterise(*given, camera)
-    pair = (torch.tensor(focal).double(), torch.tensor(centre).double())
-    x, y, _ = project(pose, given[0], focal=pair[0], centre=pair[1])
-    seen = image.radii > 0
-    assert seen.sum() > 5
-    torch.testing.assert_close(image.means2d[seen], torch.stack([x, y], dim=1)[seen])
 
 
 def test_cameras_that_cannot_be_are_refused():

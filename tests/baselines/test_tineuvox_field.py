@@ -47,14 +47,6 @@ def test_growing_keeps_what_the_grid_shows_at_its_corners():
         torch.testing.assert_close(after[0, :, -x, -y, -z], before[0, :, -x, -y, -z])
 
 
-def test_grown_grid_is_loaded_into_a_fresh_field():
-    grown, fresh = field(halvings=2), field(halvings=2)
-    grown.resize(8**3)
-    fresh.load_state_dict(grown.state_dict())
-    assert torch.equal(fresh.grid, grown.grid)
-    assert int(fresh.voxels) == 8**3
-
-
 def test_initial_opacity_of_a_cell():
     for alpha in [1e-2, 1e-3]:
         made = field(alpha=alpha, unit=2.0)
@@ -64,17 +56,6 @@ def test_initial_opacity_of_a_cell():
         density = made.geometry(torch.zeros(1, 3), torch.zeros(1))[0]
         # Published: 1 - exp(-softplus(shift)) over a full cell, half a cell is one step.
         assert 1 - math.exp(-density.item() * made.cell) == pytest.approx(alpha, rel=1e-4), alpha
-
-
-def test_every_parameter_gets_a_gradient_and_shapes_fit():
-    for moves in [True, False]:
-        made = field(moves=moves)
-        directions = torch.nn.functional.normalize(torch.randn(300, 3), dim=1)
-        colour, density = made(inside(300), torch.rand(300), directions)
-        assert (colour.shape, density.shape) == ((300, 3), (300,)), moves
-        (colour.sum() + density.sum()).backward()
-        assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in made.parameters()), moves
-        assert made.moves == moves, moves
 
 
 def test_samples_lie_in_the_box_at_equal_steps():

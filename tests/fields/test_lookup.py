@@ -100,25 +100,6 @@ def test_only_the_planes_that_ask_get_gradients():
         leaf.requires_grad_(False).grad = None
 
 
-def test_borders_and_beyond():
-    for coordinate, dtype in itertools.product(
-        [-1.0, 1.0, -0.8, 0.8, -1.2, 1.2, -1.2000001, 5.0, 1e30], [torch.float32, torch.float64]
-    ):
-        case = f"coordinate={coordinate}, dtype={dtype}"
-        # Five texels of width 0.4: centres at -0.8 .. 0.8, the last influence ends at 1.2.
-        space, time = stacks("six", dtype)
-        points = torch.zeros(6, 3, dtype=dtype)
-        points[:3] += coordinate * torch.eye(3, dtype=dtype)
-        points[3:] -= coordinate * torch.eye(3, dtype=dtype)
-        times = torch.linspace(0, 1, 6, dtype=dtype)
-        expected = oracle(named("six", space, time), "six", points, times)
-        for value, *gradients in both("six", space, time, points, times):
-            np.testing.assert_allclose(
-                value.numpy(), expected, atol=4 * TOLERANCE[dtype], err_msg=case
-            )
-            assert all(g.isfinite().all() for g in gradients), case
-
-
 def test_texel_centres_return_the_texels():
     space, time = stacks("six", size=5, time_rows=4, time_size=5)
     centre = -0.8 + 0.4 * torch.arange(5, dtype=torch.float64)
@@ -149,18 +130,6 @@ def test_infinite_points_are_outside_and_nan_stays_nan():
             assert value[2, :2].isnan().all(), dtype
             assert value[2, 2].isfinite().all(), dtype
             assert value[5].isnan().all(), dtype
-
-
-def test_no_point_and_one_point():
-    for plane_set, count in itertools.product(SETS, [0, 1]):
-        case = f"plane_set={plane_set}, count={count}"
-        space, time = stacks(plane_set)
-        points, times = scattered(count)
-        compiled, reference = both(plane_set, space, time, points, times)
-        assert compiled[0].shape == (count, 3, 3), case
-        for ours, theirs in zip(compiled, reference, strict=True):
-            torch.testing.assert_close(ours, theirs, msg=lambda m, c=case: f"{c}: {m}")
-            assert count or (ours == 0).all(), case
 
 
 def test_planes_of_one_texel_or_one_row():

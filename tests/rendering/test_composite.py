@@ -116,28 +116,6 @@ def doubled(inputs):
 DENSITIES = [0.0, 1e-30, 1e-8, 1e-3, 1.0, 30.0, 79.9, 80.1, 1e3, 1e8, 3e38, math.inf]
 
 
-@pytest.mark.parametrize("loops", ["1", "0"])
-def test_no_density_makes_a_nan(loops, monkeypatch):
-    monkeypatch.setenv("XPLANES_CPU_LOOPS", loops)
-    for dtype, value in itertools.product((torch.bfloat16, *FLOATS), DENSITIES):
-        case = f"{dtype}, density {value}"
-        depth, colour, distances, ray, starts = rays_of(dtype=dtype)
-        depth[1::2] = value
-        depth.requires_grad_()
-        colour.requires_grad_()
-        total, weights = composite(depth, colour, distances, ray, starts)
-        expected = torch.float64 if dtype == torch.float64 else torch.float32
-        assert total.dtype == expected, case
-        assert total.isfinite().all(), case
-        assert (weights >= 0).all(), case
-        sums = torch.zeros(len(starts), dtype=weights.dtype).index_add(0, ray, weights)
-        assert (sums <= 1 + 1e-6).all(), case
-        total.sum().backward()
-        for leaf in (depth, colour):
-            assert leaf.grad.isfinite().all(), case
-            assert leaf.grad.dtype == dtype, case
-
-
 @pytest.mark.parametrize("dtype", FLOATS)
 def test_loops_and_twin_agree_at_every_density(dtype):
     for value in (*DENSITIES, -1e-9, -1.0, -math.inf):
@@ -172,16 +150,6 @@ def test_no_rays_and_rays_without_samples_see_nothing():
         total, weights = merge(*rays_of(()))
         assert total.shape == (0, 5), merge.__name__
         assert weights.shape == (0,), merge.__name__
-
-
-def test_an_opaque_sample_hides_all_behind_it():
-    for merge in ALL:
-        inputs = list(rays_of((6,)))
-        inputs[0] = torch.tensor([0.0, 0.0, math.inf, 5.0, 1e8, 1.0]).double()
-        total, weights = merge(*inputs)
-        assert weights.tolist() == pytest.approx([0, 0, 1, 0, 0, 0], abs=1e-30), merge.__name__
-        torch.testing.assert_close(total[0, :3], inputs[1][2])
-        assert float(total[0, 4]) == pytest.approx(float(inputs[2][2])), merge.__name__
 
 
 def test_weights_carry_no_gradient_and_only_what_asks_gets_one():

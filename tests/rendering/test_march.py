@@ -169,25 +169,6 @@ def test_counters_add_up_and_samples_are_in_order():
             assert not skip or grid.occupied[found.cells].all(), case
 
 
-def test_cells_are_those_that_hold_the_points_at_their_times():
-    grid, rays = grid_of(5, 4, filled=1.1), rays_of(300)
-    found = march(*rays, grid, step=STEP)
-    x, y, z = ((found.points + 1) * 2.5).floor().clamp(0, 4).long().unbind(dim=-1)
-    time_bin = (rays[2][found.ray] * 4).floor().long()
-    assert torch.equal(found.cells, ((time_bin * 5 + z) * 5 + y) * 5 + x)
-    assert len(time_bin.unique()) == 4
-
-
-def test_samples_lie_at_jitter_plus_whole_steps_from_the_entrance():
-    grid = grid_of(filled=1.1)
-    ray = torch.tensor([[0.0, 0, 3]]).double(), torch.tensor([[0.0, 0, -1]]).double()
-    for jitter in (0.0, 0.25, 1.0):
-        rays = (*ray, torch.zeros(1).double(), torch.tensor([jitter]).double())
-        for found in (march(*rays, grid, step=0.5), twin(rays, grid, step=0.5)):
-            expected = [2 + (n + jitter) * 0.5 for n in range(4) if (n + jitter) * 0.5 < 2]
-            assert found.distances.tolist() == expected
-
-
 def test_rays_that_miss_have_no_samples_and_do_not_shift_the_others():
     grid, rays = grid_of(filled=1.1), list(rays_of(9))
     rays[0][::3] = torch.tensor([0.0, 0, 5]).double()
@@ -219,24 +200,6 @@ def test_no_rays_or_no_hits():
             assert found.starts.tolist() == [0] * len(rays[0]), case
 
 
-def test_the_first_opaque_cell_hides_what_lies_behind_but_not_itself():
-    grid = OccupancyGrid(4, 1, step=STEP)
-    grid.least.view(4, 4, 4)[2] = 1e4  # a slab at 0 <= z < 0.5
-    rays = (
-        torch.tensor([[0.1, 0.1, 3.0]]).double(),
-        torch.tensor([[0.0, 0.0, -1.0]]).double(),
-        torch.zeros(1).double(),
-        torch.full((1,), 0.5).double(),
-    )
-    for found in (
-        march(*rays, grid, step=0.1, occlusion=0.001),
-        twin(rays, grid, step=0.1, occlusion=0.001),
-    ):
-        assert found.candidates == 20
-        assert len(found) == 6  # five in front, one in the slab
-        assert found.points[-1, 2] == pytest.approx(0.45)
-
-
 def test_huge_densities_on_one_ray_do_not_disturb_the_next():
     for huge in [1e8, 1e20, 1e30, 3e38, math.inf]:
         grid, rays = grid_of(8, 1, filled=1.1, dense=3.0), rays_of(400)
@@ -248,20 +211,6 @@ def test_huge_densities_on_one_ray_do_not_disturb_the_next():
         kept, counts = by_oracle(rays, grid, occlusion=0.2)
         assert ours.cells.tolist() == [row[2] for row in kept], huge
         assert (ours.candidates, ours.empty, ours.occluded) == counts, huge
-
-
-def test_time_decides_which_bin_is_looked_into():
-    grid = OccupancyGrid(2, 4, step=STEP)
-    grid.occupied.view(4, 8)[:] = torch.tensor([[True], [False], [True], [False]])
-    times = torch.tensor([0.0, 0.2499, 0.25, 0.5, 0.75, 0.9999, 1.0, 1.5, -0.1])
-    rays = (
-        torch.tensor([[0.1, 0.1, 3.0]]).expand(9, 3),
-        torch.tensor([[0.0, 0.0, -1.0]]).expand(9, 3),
-        times,
-        torch.full((9,), 0.5),
-    )
-    for found in (march(*rays, grid, step=STEP), twin(rays, grid)):
-        assert sorted(set(found.ray.tolist())) == [0, 1, 3, 8]
 
 
 @settings(max_examples=40, deadline=None)

@@ -119,25 +119,6 @@ def test_each_ray_has_its_own_time_and_background():
     assert (clear.depth == 0).all()
 
 
-@pytest.mark.parametrize("loops", ["1", "0"])
-def test_no_density_makes_a_nan(loops, monkeypatch):
-    monkeypatch.setenv("XPLANES_CPU_LOOPS", loops)
-    for density, dtype in itertools.product(
-        [1e-30, 1e8, 1e20, 3e38, math.inf], [torch.float32, torch.float64]
-    ):
-        case = f"density={density}, dtype={dtype}"
-        renderer, rays = renderer_of(), rays_of(40, dtype)
-        level = torch.tensor(density, dtype=dtype, requires_grad=True)
-        for _ in range(2):
-            seen = renderer.render(fog(level), *rays, WHITE.to(dtype))
-            for value in (seen.colour, seen.opacity, seen.depth):
-                assert value.isfinite().all(), case
-            (slope,) = torch.autograd.grad(seen.colour.sum(), level)
-            assert slope.isfinite(), case
-            # The second time the grid knows of it.
-            renderer.grid.observe(seen.samples.cells, seen.density)
-
-
 def test_a_nan_of_the_field_stays_on_its_ray(monkeypatch):
     rays = rays_of(10)
 
@@ -149,18 +130,6 @@ def test_a_nan_of_the_field_stays_on_its_ray(monkeypatch):
         monkeypatch.setenv("XPLANES_CPU_LOOPS", loops)
         seen = renderer_of().render(field, *rays, WHITE)
         assert seen.colour.isnan().any(dim=-1).nonzero().flatten().tolist() == [4], loops
-
-
-def test_low_precision_fields_are_merged_in_float32():
-    rays = diagonal_rays(torch.float32)
-
-    def rough(points, times):
-        colour, density = fog(1.0)(points, times)
-        return colour.bfloat16(), density.bfloat16()
-
-    seen = renderer_of(occlusion=0.0).render(rough, *rays, WHITE.float())
-    assert seen.colour.dtype == torch.float32
-    assert float(seen.opacity[0]) == pytest.approx(-math.expm1(-DIAGONAL), rel=0.01)
 
 
 def clouds(points, times):
@@ -209,20 +178,6 @@ def test_an_image_does_not_ask_for_what_surfaces_hide(monkeypatch):
         renderer.image(wall, origins, directions, 0.0, WHITE.float())
         along = 64 * 2 / renderer.step
         assert sum(asked) == pytest.approx(share * along, rel=0.01)
-
-
-def test_images_of_fields_in_low_precision_and_with_a_nan():
-    origins, directions, _ = diagonal_rays(torch.float32)
-
-    def half(points, times):
-        bad = (points * directions[1]).sum(dim=-1).abs() > 1.5
-        density = torch.where(bad, math.nan, 2.0)
-        return points.abs().bfloat16(), density.bfloat16()
-
-    image = renderer_of().image(half, origins, directions, 0.0, WHITE.float())
-    assert image["colour"].dtype == torch.float32
-    assert image["opacity"].isnan().tolist() == [False, True, False, False]
-    assert image["opacity"][0] == pytest.approx(1 - math.exp(-2 * DIAGONAL), abs=1e-3)
 
 
 def test_an_image_takes_a_snapshot_of_the_field_at_its_time():

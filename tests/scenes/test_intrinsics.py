@@ -14,20 +14,17 @@ from tests.balls import ball_views, inside_ball, surrounding
 from tests.refusals import assert_refused
 from xplanes.baselines.tineuvox.model import frusta_box
 from xplanes.errors import SceneError
-from xplanes.metrics import psnr
 from xplanes.preparation.fixed_view import check_camera
-from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.carving import carve
 from xplanes.rendering.filling import fill
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.batches import RayBatches, RaySettings
 from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.dnerf import read_scene
-from xplanes.scenes.frame import cube_frame, optical_centre, scene_frame
+from xplanes.scenes.frame import cube_frame, scene_frame
 from xplanes.scenes.silhouettes import foreground, may_hold
 from xplanes.scenes.source import frames_are_equal
 from xplanes.scenes.views import Intrinsics, Views, joined
-from xplanes.training.scores import score_view
 
 RADIUS = 0.5
 COLOUR = [200, 100, 50, 255]
@@ -211,18 +208,6 @@ def test_rays_are_those_of_the_formula():
         assert np.abs(found[1].numpy() - directions).max() < 1e-6, index
 
 
-def test_a_cropped_image_keeps_its_rays():
-    whole = rendered([WIDE], surrounding(1, 4.0))
-    height, width, *focal, centre_x, centre_y = WIDE
-    cut = rendered(
-        [(height - 9, width - 15, *focal, centre_x - 11, centre_y - 5)], surrounding(1, 4.0)
-    )
-    left = torch.zeros(height, width, dtype=torch.bool)
-    left[5 : height - 4, 11 : width - 4] = True
-    torch.testing.assert_close(cut.image_rays(0)[1], whole.image_rays(0)[1][left.flatten()])
-    assert torch.equal(cut.image(0), whole.image(0)[5 : height - 4, 11 : width - 4])
-
-
 def test_batches_draw_all_pixels_and_no_padding():
     views = mixed(4)
     generator = torch.Generator().manual_seed(0)
@@ -322,57 +307,6 @@ def test_cameras_together_see_what_each_sees():
             seen = 0 <= row < height and 0 <= column < width
             expected = not seen or views.image(index)[int(row), int(column), 3] > 0
             assert bool(there) == bool(expected), (index, point)
-
-
-def test_images_without_alpha_carve_nothing_though_padding_has_none():
-    views = mixed(6)
-    assert not views.is_opaque
-    assert opaque(views).is_opaque
-    grid = OccupancyGrid(12, 2, step=0.05)
-    carve(grid, opaque(views), cube_frame(1.4, torch.zeros(3)))
-    assert grid.allowed.all()
-
-
-def test_images_cropped_around_a_thing_look_at_it():
-    """Each optical axis passes the thing; the middle of each image shows it."""
-    place = torch.tensor([0.6, -0.5, 0.4])
-    cameras, poses = [], surrounding(20, 4.0)
-    for pose in poses:
-        row, column = pixel_of(place, pose, 90.0, 90.0, 50.0, 50.0)
-        top, left = round(row) - 16, round(column) - 16
-        cameras.append((32, 32, 90.0, 90.0, 50.0 - left, 50.0 - top))
-    views = rendered(cameras, poses, centre=tuple(place.tolist()))
-    assert (optical_centre(views) - place).norm() < 0.03
-    frame = scene_frame(views)
-    assert frame.points(inside_ball(3000, RADIUS) + place).abs().max() <= 1
-    assert 1 / frame.scale < RADIUS + 0.35
-
-
-class Ball(RayRenderer):
-    """Stands for a renderer of a field that shows the ball."""
-
-    @property
-    def device(self):
-        return torch.device("cpu")
-
-    def render(self, *_arguments, **_options):
-        raise NotImplementedError
-
-    def image(self, field, origins, directions, time, background):
-        along = -(origins * directions).sum(dim=1, keepdim=True)
-        hit = (origins + along * directions).norm(dim=1) < RADIUS
-        colour = torch.where(hit[:, None], torch.tensor(COLOUR[:3]) / 255, background)
-        return {"colour": colour, "opacity": hit.float(), "depth": along[:, 0] * hit}
-
-
-def test_views_are_scored_at_their_own_size():
-    views, world = mixed(4), cube_frame(1.0, torch.zeros(3))
-    for index in range(4):
-        for those in (views, soiled(views, 255)):
-            score, images = score_view(None, Ball(), world, those, index, torch.ones(3))
-            assert images.truth.shape[:2] == images.depth.shape == views.size(index)
-            assert score.psnr == psnr(images.truth, images.truth) == 100, index
-            assert score.ssim == pytest.approx(1), index
 
 
 def test_frames_with_different_intrinsics_are_not_static():

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.balls import ball_views, inside_ball, surrounding
+from tests.balls import inside_ball, surrounding
 from tests.lens_oracle import direction, pixel
 from xplanes.errors import SceneError
-from xplanes.evaluation.render import lens as lens_of_picture
 from xplanes.preparation.fixed_view import check_camera
 from xplanes.scenes.batches import RayBatches
 from xplanes.scenes.cameras import ball_extent, cast_rays, look_at, project
@@ -18,7 +17,7 @@ from xplanes.scenes.datamodule import UNIFORM
 from xplanes.scenes.frame import cube_frame
 from xplanes.scenes.lenses import COEFFICIENTS, WIDEST, Lenses, LensModel
 from xplanes.scenes.silhouettes import may_hold
-from xplanes.scenes.views import Intrinsics, Views, camera_rays
+from xplanes.scenes.views import Intrinsics, Views
 
 HEIGHT, WIDTH = 30, 44
 FOCAL, CENTRE = (35.0, 37.0), (20.5, 16.25)
@@ -125,23 +124,6 @@ def test_lenses_of_one_batch_do_not_mix():
     for index, name in enumerate(names):
         alone = cast(name, rows[index : index + 1], columns[index : index + 1])[1][0]
         torch.testing.assert_close(found[index], alone, atol=1e-12, rtol=0)
-
-
-def test_lenses_that_distort_nothing_cost_nothing():
-    square = ball_views(3, 0.5, size=20)
-    plain = replace(square.intrinsics, lenses=Lenses.pinholes(3))
-    assert plain.lenses is None
-    weak = intrinsics_of("barrel", "barrel")
-    weak = replace(weak, lenses=replace(weak.lenses, coefficients=weak.lenses.coefficients * 1e-12))
-    assert weak.lenses is not None
-    rays = [
-        camera_rays(torch.eye(4), weak.focal[0], HEIGHT, WIDTH, weak.centre[0], lens)[1]
-        for lens in (weak.lens(0), None)
-    ]
-    torch.testing.assert_close(rays[0], rays[1], atol=2e-7, rtol=0)
-    assert torch.tensor([weak.fov_y]) == pytest.approx(
-        2 * math.atan(0.5 * HEIGHT / FOCAL[1]), rel=0.01
-    )
 
 
 def test_intrinsics_keep_their_lenses():
@@ -290,17 +272,6 @@ def test_pinholes_that_stand_for_lenses_see_as_wide():
         assert 2 * math.atan(22 / focal) == pytest.approx(angle, abs=1e-5), name
     wide = intrinsics_of("equidistant", focal=(9.0, 9.0))
     assert wide.fov_y == pytest.approx(WIDEST)
-
-
-def test_a_picture_from_a_view_has_its_lens():
-    views = seen_ball(["barrel", "fisheye"], surrounding(2, 4.0), 0.5, skew=0.5)
-    for index in (0, 1):
-        size = (2 * HEIGHT, 2 * WIDTH)
-        focal, centre, lens = lens_of_picture({"train": views}, f"view:{index}", size)
-        _, found = camera_rays(views.camera_to_world[index], focal, *size, centre, lens)
-        # The middle of four pixels is the centre of one of the view.
-        found = found.view(HEIGHT, 2, WIDTH, 2, 3).mean(dim=(1, 3)).reshape(-1, 3)
-        torch.testing.assert_close(found, views.image_rays(index)[1], atol=1e-3, rtol=0)
 
 
 def test_a_distorted_video_is_refused_where_pinholes_are_needed():

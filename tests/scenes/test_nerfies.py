@@ -146,18 +146,6 @@ def test_splits(capture):
         read(capture, "test")
 
 
-def test_masks_are_used_when_they_are_named(capture):
-    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
-    mask[:, :10] = 0
-    for name in capture.ids:
-        save(capture.path / "masks" / "1x" / f"{name}.png", mask)
-    assert read(capture).splits["train"].image(0)[..., 3].min() == 255
-    image = read(capture, masks="masks", mask_use="alpha").splits["val"].image(1)
-    assert not image[:, :10].any()
-    assert np.array_equal(image[:, 10:, :3], picture(3)[:, 10:])
-    refused(capture, r"data\.masks: .*other does not exist", masks="other")
-
-
 def test_captures_that_are_not_whole(capture):
     (capture.path / "rgb/1x/000004.png").unlink()
     with pytest.warns(UserWarning, match=r"1 of 6 images are not in .*rgb/1x: 000004. Those of"):

@@ -213,13 +213,3 @@ def test_samples_of_contracted_space_are_even_in_distance_then_in_its_inverse():
     torch.testing.assert_close(distances[near], 2 * places[near])
     step = (1 / distances[far]).diff()
     torch.testing.assert_close(step, step[:1].expand_as(step))
-
-
-def test_samplers_of_proposals_see_the_background_too():
-    small = ("lrm=none", "model.resolution=16", "model.channels=8", "model.background.samples=4")
-    module = RadianceModule.compose("model/sampler=proposal", *small)
-    module.build(scene("world"))
-    batch = SceneDataModule.of(scene("world")).batches_for(module, 0).draw(0)
-    rendering = module.sampler.render(module.field, batch, module.state)
-    rendering.colour.sum().backward()
-    assert module.field.background.planes.grad.abs().sum() > 0

@@ -62,12 +62,6 @@ def test_in_float64_nothing_but_rounding_is_left():
             )
 
 
-def test_no_point():
-    ours, theirs = both(STATIC, torch.float32, channels=4, count=0)
-    assert ours[0].shape == theirs[0].shape == (0, 4)
-    assert all((gradient == 0).all() for gradient in ours[1:])
-
-
 def test_points_that_fill_up_a_block_spread_no_nan():
     planes = [torch.full((1, 4, 3, 3), torch.nan, device=DEVICE) for _ in STATIC]
     for plane in planes:

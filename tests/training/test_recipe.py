@@ -317,10 +317,7 @@ def test_a_run_logs_every_term_in_its_loss(model: str, scenes: Path, tmp_path: P
 
 
 SCENES = {
-    "ordinary": (),
-    "the user's cube": ("data.half_side=1.2",),
     "off centre": ("data=suite", "data.scene=off_centre"),
-    "ten times as large": ("data=suite", "data.scene=scale"),
 }
 NAMED = tuple(text for text in TINY if text != "lrm=none")
 

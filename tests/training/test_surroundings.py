@@ -1,11 +1,9 @@
 """Scenes in a world: a background joins where images show one, and nothing changes elsewhere."""
 
 import functools
-import math
 from dataclasses import replace
 from pathlib import Path
 
-import lightning
 import pytest
 import torch
 
@@ -149,20 +147,6 @@ def test_training_learns_what_lies_behind(trained):
         torch.testing.assert_close(found["colour"][clear], behind[clear], atol=1e-3, rtol=0)
 
 
-def test_the_sparsity_prior_leaves_a_world_alone():
-    for kind, kept in (("alpha", True), ("world", False)):
-        module = built(kind)
-        assert bool(module.sampler.regularisers(module.field, module.state)) is kept
-
-
-def test_nothing_is_known_of_opacity(trained):
-    module, _, _ = trained
-    assert "foreground" not in module.last
-    assert "background" not in module.last
-    assert module.restarts == 0
-    assert math.isfinite(module.last["loss"])
-
-
 def test_a_checkpoint_brings_the_background_back(trained):
     module, _, path = trained
     again = RadianceModule.load_from_checkpoint(path)
@@ -170,31 +154,8 @@ def test_a_checkpoint_brings_the_background_back(trained):
     assert torch.equal(picture(again.eval())["colour"], picture(module)["colour"])
 
 
-class SaveHalfway(lightning.Callback):
-    """Writes a checkpoint after half of the steps."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def on_train_batch_end(self, trainer, *rest):
-        if trainer.global_step == STEPS // 2:
-            trainer.save_checkpoint(self.path)
-
-
-def test_a_resumed_training_ends_with_the_same_numbers(trained, tmp_path):
-    straight = built("world")
-    fitted(straight, "world", tmp_path, STEPS)
-    half = built("world")
-    fitted(half, "world", tmp_path, STEPS, callbacks=[SaveHalfway(tmp_path / "half.ckpt")])
-    resumed = built("world")
-    fitted(resumed, "world", tmp_path, STEPS, checkpoint=tmp_path / "half.ckpt")
-    for name, value in straight.state_dict().items():
-        assert torch.equal(value, resumed.state_dict()[name]), name
-
-
 BASELINES = {
     "kplanes": (*KPLANES, *PROPOSAL),
-    "kplanes_explicit": (*KPLANES, *PROPOSAL),
     "tineuvox_s": (*TINEUVOX, "model.background.samples=4"),
 }
 
@@ -252,13 +213,3 @@ def test_samples_of_contracted_space_are_even_in_distance_then_in_its_inverse():
     torch.testing.assert_close(distances[near], 2 * places[near])
     step = (1 / distances[far]).diff()
     torch.testing.assert_close(step, step[:1].expand_as(step))
-
-
-def test_samplers_of_proposals_see_the_background_too():
-    small = ("lrm=none", "model.resolution=16", "model.channels=8", "model.background.samples=4")
-    module = RadianceModule.compose("model/sampler=proposal", *small)
-    module.build(scene("world"))
-    batch = SceneDataModule.of(scene("world")).batches_for(module, 0).draw(0)
-    rendering = module.sampler.render(module.field, batch, module.state)
-    rendering.colour.sum().backward()
-    assert module.field.background.planes.grad.abs().sum() > 0

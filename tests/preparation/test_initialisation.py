@@ -267,7 +267,7 @@ def test_the_video_of_a_run_shows_the_field_in_its_own_frame(
         return original(field, renderer, frame, *others, **options)
 
     monkeypatch.setattr(render, "render_path", note)
-    monkeypatch.setattr(render, "VIDEO_FRAMES", 2)
+    monkeypatch.setattr(render, "FRAMES", 2)
     plain = small_config(
         scenes,
         "lrm=file",

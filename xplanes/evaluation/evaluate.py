@@ -12,7 +12,7 @@ from tqdm import tqdm
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.files import is_there, write_json
 from xplanes.optional import require
-from xplanes.training.scores import ViewImages, ViewScore, mean, score_view
+from xplanes.training.scores import mean, score_view
 
 DEFAULT_NETWORK = "vgg"
 WEIGHTS = {
@@ -40,20 +40,16 @@ def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
         What `write_scores` writes: the keys of metrics.json as far as they are scores, and
         ``not_computed``, from a score's name to the reason.
     """
-    views, module = trained.views, trained.module
+    views, parts = trained.views, (trained.module.field, trained.module.renderer, trained.frame)
     tag, metric, missing = _lpips(trained, network)
     began = time.perf_counter()
-    rows = []
+    rows: list[dict[str, Any]] = []
     for index in tqdm(range(len(views)), "views", leave=False, delay=2, disable=None):
-        score, images = score_view(
-            module.field,
-            module.renderer,
-            trained.frame,
-            views,
-            index,
-            trained.scene.background,
-        )
-        rows.append(_row(score, images, tag, metric))
+        score, images = score_view(*parts, views, index, trained.scene.background)
+        row = {"file": score.file, "time": score.time, **score.scores}
+        if metric is not None:
+            row[tag] = metric(images["colour"], images["truth"])
+        rows.append(row)
     names = dict.fromkeys(name for row in rows for name in row if name not in ("file", "time"))
     return {
         "split": trained.split,
@@ -78,11 +74,6 @@ def _lpips(trained: TrainedRun, network: str | None) -> tuple[str, Metric | None
         return tag, lpips(name, side, device, download=network is not None), {}
     except UnavailableError as reason:
         return tag, None, {tag: str(reason)}
-
-
-def _row(score: ViewScore, images: ViewImages, tag: str, metric: Metric | None) -> dict[str, Any]:
-    row = {"file": score.file, "time": score.time, **score.scores}
-    return row if metric is None else {**row, tag: metric(images.colour, images.truth)}
 
 
 def write_scores(run: Path, scores: dict[str, Any]) -> Path:

@@ -4,6 +4,7 @@ import functools
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,6 +15,7 @@ from xplanes import __version__
 from xplanes.components import plugins
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
+from xplanes.files import stand_in
 from xplanes.models.base import Model
 from xplanes.models.initialisation import Initialisation, Method
 from xplanes.rendering.base import Renderer, Rendering
@@ -22,21 +24,25 @@ from xplanes.scenes.batches import Batch, BatchSettings
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene
 from xplanes.streams import TrainingState
-from xplanes.training.building import Parts, build_parts
-from xplanes.training.diagnosis import TrainingError, diagnosis
-from xplanes.training.finite import broken_flag, leave_out, unusable_gradients
-from xplanes.training.loading import (
+from xplanes.training.building import (
+    Parts,
+    build_parts,
     parts_from,
-    require_fetched,
     require_frame,
-    require_version,
     require_whole_floats,
     site_content,
+)
+from xplanes.training.diagnosis import (
+    TrainingError,
+    broken_flag,
+    diagnosis,
+    leave_out,
+    unusable_gradients,
 )
 from xplanes.training.logs import log_terms, logs_now
 from xplanes.training.losses import loss_terms
 from xplanes.training.meters import Tally, batch_values, due, mean_opacities
-from xplanes.training.scoring import ViewScoring
+from xplanes.training.scores import ViewScoring
 
 PATIENCE = 20
 """Updates in a row with a loss or gradient that is not finite after which training gives up."""
@@ -124,13 +130,15 @@ class RadianceModule(ViewScoring):
         Raises:
             ConfigError: If the checkpoint needs a plug-in that is not named, or does not fit.
         """
-        require_fetched(checkpoint_path)
+        local = isinstance(checkpoint_path, str | Path)
+        if local and (other := stand_in(Path(checkpoint_path))) is not None:
+            raise ConfigError(f"{checkpoint_path} {other}")
         try:
             return super().load_from_checkpoint(
                 checkpoint_path, *args, weights_only=weights_only, **kwargs
             )
         except ConfigError as error:
-            require_version(checkpoint_path)
+            _require_version(checkpoint_path)
             words, ask, _ = str(error).partition("plugins=[MODULE]")
             if not ask:
                 raise
@@ -450,3 +458,24 @@ def _read(config: Mapping[str, Any], modules: Sequence[str]) -> Method:
             return Method.read(config)
         except KeyError as error:
             raise ConfigError(f"the configuration lacks the group {error}") from error
+
+
+def _require_version(path: Any) -> None:
+    """Refuse a checkpoint of a version whose settings were others.
+
+    Args:
+        path: The file; what is no local file, or cannot be read, is left to others.
+
+    Raises:
+        ConfigError: With the version.
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        made = str(content.get("xplanes", "0.2 or older"))
+    except Exception:  # Whoever loads it says what is wrong.
+        return
+    if made.split(".")[:2] != __version__.split(".")[:2]:
+        raise ConfigError(
+            f"{path} was made by xplanes {made}, whose settings are not those of {__version__}: "
+            "load it with that version, or start a new run"
+        )

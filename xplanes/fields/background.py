@@ -41,23 +41,6 @@ def contract(points: Tensor) -> Tensor:
     return torch.where(outside, (RADIUS - 1 / length / largest) * unit, points)
 
 
-def contract_cube(points: Tensor) -> Tensor:
-    """Draw all of space into the cube [-2, 2]^3; the cube [-1, 1]^3 stays as it is.
-
-    As `contract`, with the largest coordinate in place of the length.
-
-    Args:
-        points: Positions in the field's frame, finite. [..., 3]
-
-    Returns:
-        [..., 3]
-
-    Source: K-Planes, released code; Mip-NeRF 360, Eq. 10.
-    """
-    largest = points.abs().amax(dim=-1, keepdim=True).clamp_min(1)
-    return (RADIUS - 1 / largest) * (points / largest)
-
-
 def expand(points: Tensor) -> Tensor:
     """The inverse of `contract`.
 

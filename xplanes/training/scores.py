@@ -225,18 +225,13 @@ class ViewScoring(LightningModule):
         self._tag = batch["tag"]
         return image
 
-    def test_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
-        return self.validation_step(batch, batch_idx)
+    test_step = validation_step
 
     def on_validation_epoch_start(self) -> None:
         self.agree()
         self.scores = []
 
-    def on_test_epoch_start(self) -> None:
-        self.on_validation_epoch_start()
-
-    def on_test_epoch_end(self) -> None:
-        self.on_validation_epoch_end()
+    on_test_epoch_start = on_validation_epoch_start
 
     def on_validation_epoch_end(self) -> None:
         self.scores = gathered(self.scores, self.trainer)
@@ -248,6 +243,8 @@ class ViewScoring(LightningModule):
             means["step"] = float(self.trainer.global_step)
         # All processes have the means of all views; Lightning warns where it need not.
         self.log_dict(means, batch_size=1, sync_dist=self.trainer.world_size > 1)
+
+    on_test_epoch_end = on_validation_epoch_end
 
     def agree(self) -> None:
         """Go on with the first process's sampler, for each has seen the samples of its own rays.

@@ -41,7 +41,14 @@ def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
         ``not_computed``, from a score's name to the reason.
     """
     views, parts = trained.views, (trained.module.field, trained.module.renderer, trained.frame)
-    tag, metric, missing = _lpips(trained, network)
+    name = network or DEFAULT_NETWORK
+    tag, metric, missing = f"lpips_{name}", None, {}
+    if network != "none":
+        side, device = int(views.intrinsics.size.min()), str(trained.module.device)
+        try:
+            metric = lpips(name, side, device, download=network is not None)
+        except UnavailableError as reason:
+            missing = {tag: str(reason)}
     began = time.perf_counter()
     rows: list[dict[str, Any]] = []
     for index in tqdm(range(len(views)), "views", leave=False, delay=2, disable=None):
@@ -60,20 +67,6 @@ def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
         "not_computed": missing,
         "seconds": time.perf_counter() - began,
     }
-
-
-def _lpips(trained: TrainedRun, network: str | None) -> tuple[str, Metric | None, dict[str, str]]:
-    """The tag of LPIPS, the metric if it can be had, and else the reason under the tag."""
-    if network == "none":
-        return "", None, {}
-    name = network or DEFAULT_NETWORK
-    tag = f"lpips_{name}"
-    side = int(trained.views.intrinsics.size.min())
-    device = str(trained.module.device)
-    try:
-        return tag, lpips(name, side, device, download=network is not None), {}
-    except UnavailableError as reason:
-        return tag, None, {tag: str(reason)}
 
 
 def write_scores(run: Path, scores: dict[str, Any]) -> Path:

@@ -1,4 +1,4 @@
-"""What may be wrong with a capture: each finding in words, with its numbers and the way out."""
+"""What may be wrong with a capture: findings, each with its numbers and the way out."""
 
 import hashlib
 import math

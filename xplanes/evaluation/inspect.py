@@ -358,20 +358,8 @@ def _split_facts(views: Views, images: Sequence[ImageFacts]) -> dict[str, Any]:
 def table(capture: Capture) -> str:
     """What was read, as text."""
     known = facts(capture)
-    rows = {
-        "views": lambda each: str(each["views"]),
-        "pixels": _size_words,
-        "cameras": _camera_words,
-        "lens": lambda each: each["lens"],
-        "distortion": _distortion_words,
-        "field of view": lambda each: "{:.0f} x {:.0f} degrees".format(*each["field_of_view"]),
-        "times": _time_words,
-        "longest gap": _gap_words,
-        "opaque pixels": _cover_words,
-        "memory": lambda each: f"{each['bytes'] / 2**20:.1f} MB",
-    }
-    splits = known["splits"]
-    lines = [[name, *(words(each) for each in splits.values())] for name, words in rows.items()]
+    splits = {split: _split_rows(each) for split, each in known["splits"].items()}
+    lines = [[name, *(rows[name] for rows in splits.values())] for name in splits["train"]]
     text = [
         f"scene   {known['scene']}, read from {known['folder']} as {known['format']}",
         "",
@@ -402,6 +390,31 @@ def table(capture: Capture) -> str:
     return "\n".join(text)
 
 
+def _split_rows(each: Mapping[str, Any]) -> dict[str, str]:
+    """The rows of the table for one split."""
+    sizes = [f"{width}x{height}" for height, width in each["sizes"]]
+    distortion, gap = each["distortion_pixels"], each["largest_gap"]
+    first, last = each["times"]
+    low, middle, high = each["opaque"]
+    opaque = "all" if low >= 0.9995 else f"{low:.0%} to {high:.0%}, median {middle:.0%}"
+    if each["looked_at"] < each["views"]:
+        opaque += f", {each['looked_at']} views"
+    return {
+        "views": str(each["views"]),
+        "pixels": sizes[0] if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}",
+        "cameras": f"{each['cameras']} {'fixed' if each['cameras_fixed'] else 'moving'}",
+        "lens": each["lens"],
+        "distortion": f"{distortion:.1f} px at a corner" if distortion else "none",
+        "field of view": "{:.0f} x {:.0f} degrees".format(*each["field_of_view"]),
+        "times": f"all {first:g}"
+        if first == last
+        else f"{each['timesteps']} from {first:.3g} to {last:.3g}",
+        "longest gap": "none" if gap is None else f"{gap:.3g}, median {each['median_spacing']:.3g}",
+        "opaque pixels": opaque,
+        "memory": f"{each['bytes'] / 2**20:.1f} MB",
+    }
+
+
 def next_command(capture: Capture) -> str:
     """The command that trains on the capture, at the usual width where images are wider.
 
@@ -416,38 +429,6 @@ def next_command(capture: Capture) -> str:
     if capture.scene.is_surrounded and len(poses) >= MANY_POSES and "recipe" not in chosen:
         overrides = [*overrides, "recipe=capture"]
     return f"{train_command()} {shlex.join(overrides)}"
-
-
-def _camera_words(each: Mapping[str, Any]) -> str:
-    return f"{each['cameras']} {'fixed' if each['cameras_fixed'] else 'moving'}"
-
-
-def _size_words(each: Mapping[str, Any]) -> str:
-    words = [f"{width}x{height}" for height, width in each["sizes"]]
-    return words[0] if len(words) == 1 else f"{words[0]} to {words[-1]}"
-
-
-def _distortion_words(each: Mapping[str, Any]) -> str:
-    pixels = each["distortion_pixels"]
-    return f"{pixels:.1f} px at a corner" if pixels else "none"
-
-
-def _gap_words(each: Mapping[str, Any]) -> str:
-    gap = each["largest_gap"]
-    return "none" if gap is None else f"{gap:.3g}, median {each['median_spacing']:.3g}"
-
-
-def _time_words(each: Mapping[str, Any]) -> str:
-    first, last = each["times"]
-    if first == last:
-        return f"all {first:g}"
-    return f"{each['timesteps']} from {first:.3g} to {last:.3g}"
-
-
-def _cover_words(each: Mapping[str, Any]) -> str:
-    low, middle, high = each["opaque"]
-    words = "all" if low >= 0.9995 else f"{low:.0%} to {high:.0%}, median {middle:.0%}"
-    return words if each["looked_at"] == each["views"] else f"{words}, {each['looked_at']} views"
 
 
 def check_out(out: Path, settings: SceneSettings) -> None:

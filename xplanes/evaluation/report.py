@@ -1,4 +1,4 @@
-"""What a run says of itself: its first lines, metrics.json, TensorBoard, its last lines."""
+"""What a run reports: its first lines, metrics.json, hyperparameters, its last lines."""
 
 import math
 import shlex
@@ -30,7 +30,7 @@ LITTLE = 0.5
 """PSNR in dB above that of empty images below which a run shows nothing."""
 
 CLUTTERED = 0.2
-"""Share of floaters above which a run says so; scenes that succeed have less than a tenth."""
+"""Share of floaters above which a run warns; successful scenes have less than a tenth."""
 
 
 def header(
@@ -84,7 +84,7 @@ def header(
 
 
 def _estimated(experiment: Experiment, data: SceneDataModule, expected: Estimate) -> str:
-    """Seconds that the run is going to take, in words."""
+    """How long the run is going to take, as text."""
     trainer = experiment.trainer
     steps = float(trainer.get("max_steps", -1)) if trainer.get("max_steps", -1) > 0 else math.inf
     train = min(steps * expected.step, trainer.get("max_seconds") or math.inf)
@@ -221,8 +221,8 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
     if (share := metrics["test"].get("floaters", 0)) > CLUTTERED:
         warnings.append(
             f"warning  {100 * share:.0f}% of the background is not empty (floaters): train longer, "
-            "or check the cameras and times; what is too\n         thin or too fast for the views "
-            "comes out so as well"
+            "or check the cameras and times; content that\n         is too thin or too fast for "
+            "the views shows up as floaters as well"
         )
     place = shlex.quote(str(run))
     named = "".join(f" --plugin {name}" for name in experiment.config.get("plugins") or [])

@@ -1,4 +1,4 @@
-"""What lies behind the field's cube: a static world without end, in a ball of radius 2."""
+"""What lies behind the field's cube: static and unbounded, contracted to a ball of radius 2."""
 
 import torch
 from torch import Tensor, nn

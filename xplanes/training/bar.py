@@ -1,4 +1,4 @@
-"""One line that says how far training is."""
+"""A progress line."""
 
 import sys
 import time

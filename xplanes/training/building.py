@@ -134,7 +134,7 @@ def build_parts(
 
 
 def site_content(parts: Parts) -> dict[str, Any]:
-    """What data and LRM have settled about a field, as plain values and tensors."""
+    """What data and LRM determine about a field, as plain values and tensors."""
     site = parts.site
     return {
         "model": parts.settings.plain(),
@@ -199,7 +199,7 @@ def require_frame(parts: Parts, content: Mapping[str, Any]) -> None:
 
 
 def precision_of(settings: ModelSettings, device: torch.device) -> str:
-    """The precision of products, settled for a device where the settings say auto."""
+    """Precision of matrix products; ``auto`` is resolved for the device."""
     if settings.precision == "auto":
         return "bf16" if fast_bf16(device) else "32"
     return settings.precision

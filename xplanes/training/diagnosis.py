@@ -19,7 +19,7 @@ class TrainingError(XPlanesError, RuntimeError):
 
 
 def usable(gradient: Tensor) -> bool:
-    """Whether an optimiser can take in a gradient: the sum of its squares is finite.
+    """Whether an optimiser can use a gradient: the sum of its squares is finite.
 
     Adam keeps the squares. One that overflows its type would stay infinite for ever and hold its
     parameter where it is, without a NaN anywhere.
@@ -46,10 +46,10 @@ def broken_flag(parameters: Iterable[nn.Parameter], losses: Sequence[Tensor]) ->
 
 
 def leave_out(optimizer: torch.optim.Optimizer, broken: Tensor) -> None:
-    """Let an optimiser leave out its next step where a flag is 1.
+    """Make an optimiser skip its next step where a flag is 1.
 
-    Fused Adam takes the flag as that of a gradient scaler, and nothing waits for the device. Others
-    find no gradients.
+    Fused Adam takes the flag as that of a gradient scaler, and nothing waits for the device. For
+    other optimisers the gradients are removed.
     """
     if getattr(optimizer, "_step_supports_amp_scaling", False):
         optimizer.found_inf = broken  # type: ignore[attr-defined]
@@ -142,8 +142,8 @@ def _way_out(
     if module.site.initialised and not added and not (rendered and broken):
         largest = max(float(p.detach().abs().max()) for p in module.field.parameters())
         return (
-            "No step was done yet, so the initialisation is to blame, whose largest value is "
-            f"{largest:.3g}: set lrm=none, or make another one"
+            "No step was done yet, so the initialisation is to blame (largest value "
+            f"{largest:.3g}): set lrm=none, or use another one"
         )
     checked = " and ".join([type(module.field).__name__, *added])
     return f"No step was done yet: check the values and gradients of {checked}{precision}"

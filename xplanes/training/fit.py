@@ -1,4 +1,4 @@
-"""Lightning's Trainer with our budget, and fields that are trained on the way to something else."""
+"""Lightning's Trainer with a time budget, its warm-up, and short trainings during preparation."""
 
 import copy
 import logging
@@ -182,7 +182,6 @@ def fit_quietly(
     device: torch.device,
     max_steps: int,
     max_seconds: float | None,
-    checkpoint_every: int,
 ) -> None:
     """Train a field that is built on a scene, from its last checkpoint in a folder on.
 
@@ -193,7 +192,6 @@ def fit_quietly(
         device: Where to train.
         max_steps: Steps at most.
         max_seconds: Seconds at most; None for no limit.
-        checkpoint_every: Steps between checkpoints.
     """
     trainer = Trainer(
         accelerator="gpu" if device.type == "cuda" else "cpu",
@@ -202,7 +200,7 @@ def fit_quietly(
         # A Trainer sets these for the whole process, and the run's own was there first.
         deterministic=device.type == "cpu" and torch.are_deterministic_algorithms_enabled(),
         tf32=torch.backends.cudnn.allow_tf32,
-        callbacks=[CollapseWatch(), Checkpoints(checkpoint_every)],
+        callbacks=[CollapseWatch(), Checkpoints(every=250)],
         default_root_dir=folder,
         logger=False,
         enable_progress_bar=False,
@@ -214,7 +212,7 @@ def fit_quietly(
 
 
 def warm_up(module: RadianceModule, data: SceneDataModule, device: torch.device) -> None:
-    """Run all loops once on a few rays, so that compiling them is not on the training clock."""
+    """Run all loops once on a few rays, so that the training clock does not count compiling."""
     if device.type != "cpu":
         # The kernels are tried where they will run; Lightning would move the module a little later.
         module.to(device)
@@ -251,7 +249,7 @@ def rehearse(module: RadianceModule, rays: Batch) -> None:
 
 
 class Estimate(NamedTuple):
-    """What a run is going to take, from its first rays.
+    """How long a run is going to take, measured on its first rays.
 
     Attributes:
         step: Seconds of a step.
@@ -311,7 +309,7 @@ def _moved(batch: Batch, device: torch.device) -> Batch:
 
 
 def quiet_lightning() -> None:
-    """Hide, by name, what Lightning says that a user of this program cannot act on."""
+    """Hide messages of Lightning that a user of this program cannot act on."""
     for name in (
         "utilities.rank_zero",
         "trainer.connectors.checkpoint_connector",

@@ -18,7 +18,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class Interrupt(Callback):
-    """Turns the first SIGINT or SIGTERM into a stop after the step; a second one is at once."""
+    """Turns the first SIGINT or SIGTERM into a stop after the step; the second stops at once."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -82,7 +82,7 @@ class Interrupt(Callback):
             self._restore()
 
     def _listen(self) -> None:
-        """Take the signals; threads other than the main one cannot, and leave them be."""
+        """Install the signal handlers, which only the main thread can do."""
         if self._before or threading.current_thread() is not threading.main_thread():
             return
         for number in (signal.SIGINT, signal.SIGTERM):

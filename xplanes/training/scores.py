@@ -23,7 +23,7 @@ VISIBLE = 0.05
 """Opacity above which a background pixel shows a floater."""
 
 SOLID = 128
-"""Share of a pixel, of 255, from which it shows the thing."""
+"""Share of a pixel, of 255, from which it counts as showing the foreground object."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class ViewScore:
         time: Its time, from 0 to 1.
         psnr: In dB.
         ssim: Structural similarity.
-        psnr_thing: In dB, over the pixels that show the thing; NaN where they are not known.
+        psnr_thing: In dB, over the pixels that show the foreground object; NaN where not known.
         floaters: Share of background pixels (alpha 0 in the true image) that are not transparent;
             NaN where the image has none.
     """
@@ -139,12 +139,12 @@ def gathered(scores: Sequence[ViewScore], trainer: Trainer) -> list[ViewScore]:
 
 
 def psnr_thing(colour: Tensor, truth: Tensor, thing: Tensor | None) -> float:
-    """PSNR in dB of the pixels most of which show the thing; NaN where there are none.
+    """PSNR in dB of the pixels that show the foreground object; NaN where there are none.
 
     Args:
         colour: Rendered colours. [H, W, 3]
         truth: True colours. [H, W, 3]
-        thing: Share of each pixel that shows the thing; None where it is not known. uint8 [H, W]
+        thing: Share of each pixel that shows the object; None where not known. uint8 [H, W]
     """
     if thing is None or not (shown := thing.cpu() >= SOLID).any():
         return math.nan
@@ -179,7 +179,7 @@ def blank_psnr(views: Views, background: Tensor) -> float:
 
 
 def mean(values: Sequence[float]) -> float:
-    """Plain mean; NaN for none."""
+    """Mean; NaN for no values."""
     return math.fsum(values) / len(values) if values else math.nan
 
 
@@ -210,7 +210,7 @@ class ViewScoring(LightningModule):
     @property
     @abstractmethod
     def shared_parts(self) -> list[nn.Module]:
-        """What processes that share a run keep apart while they train."""
+        """Modules whose buffers differ between the processes of a run while they train."""
 
     def predict_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
         """One view: ``colour`` [H, W, 3], ``opacity`` and ``depth`` [H, W]."""
@@ -247,7 +247,7 @@ class ViewScoring(LightningModule):
     on_test_epoch_end = on_validation_epoch_end
 
     def agree(self) -> None:
-        """Go on with the first process's sampler, for each has seen the samples of its own rays.
+        """Copy the first process's sampler to all, each of which saw its own rays alone.
 
         What is scored, or goes into a checkpoint, is one field.
         """

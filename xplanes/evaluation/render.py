@@ -131,12 +131,21 @@ def write_video(path: Path, frames: Iterable[Tensor], *, fps: int, folder: bool 
     if folder:
         for number, frame in enumerate(frames):
             _write_image(path / f"frame_{number:04d}.png", frame)
-    elif path.suffix == ".mp4":
-        _write_mp4(path, frames, fps)
     elif path.suffix in IMAGES:
         _write_image(path, next(iter(frames)))
+    elif path.suffix == ".mp4":
+        imageio = require("imageio.v2", extra="video")
+        # imageio would resize frames to multiples of 16 if it were not told otherwise.
+        options = {"fps": fps, "macro_block_size": 2, "quality": 8}
+        with replacing(path) as temporary, imageio.get_writer(temporary, **options) as writer:
+            for frame in frames:
+                height, width = (side // 2 * 2 for side in frame.shape[:2])
+                writer.append_data(frame[:height, :width].numpy())
     else:
-        _write_webp(path, frames, fps)
+        first, *rest = [Image.fromarray(frame.numpy()) for frame in frames]
+        video = {"save_all": True, "append_images": rest, "duration": round(1000 / fps), "loop": 0}
+        with replacing(path) as temporary:
+            first.save(temporary, format="WEBP", quality=85, method=2, **video)
     return path
 
 
@@ -144,31 +153,6 @@ def _write_image(path: Path, frame: Tensor) -> None:
     with replacing(path) as temporary:
         # The quality is that of JPEG files.
         Image.fromarray(frame.numpy()).save(temporary, format=IMAGES[path.suffix], quality=95)
-
-
-def _write_webp(path: Path, frames: Iterable[Tensor], fps: int) -> None:
-    first, *rest = [Image.fromarray(frame.numpy()) for frame in frames]
-    with replacing(path) as temporary:
-        first.save(
-            temporary,
-            format="WEBP",
-            save_all=True,
-            append_images=rest,
-            duration=round(1000 / fps),
-            loop=0,
-            quality=85,
-            method=2,
-        )
-
-
-def _write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> None:
-    imageio = require("imageio.v2", extra="video")
-    # imageio would resize frames to multiples of 16 if it were not told otherwise.
-    options = {"fps": fps, "macro_block_size": 2, "quality": 8}
-    with replacing(path) as temporary, imageio.get_writer(temporary, **options) as writer:
-        for frame in frames:
-            height, width = (side // 2 * 2 for side in frame.shape[:2])
-            writer.append_data(frame[:height, :width].numpy())
 
 
 IMAGES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}

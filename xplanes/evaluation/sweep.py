@@ -1,4 +1,4 @@
-"""What the runs of a sweep say of themselves, whatever state they are in.
+"""Reads the runs of a sweep, whatever state they are in.
 
 Must stay quick, and a damaged file must not hide the other runs: every problem ends as a run's
 status.

@@ -82,7 +82,8 @@ nothing = torch.zeros(4, dtype=torch.long)
 total, _ = composite(torch.rand(4), torch.rand(4, 3), torch.rand(4), nothing, nothing[:1])
 assert total.isfinite().all()
 print(backend.name(torch.device("cpu")))
-wings = "baselines.gaussians.rasteriser_numba", "synthetic.pretraining.solids_numba"
+wings = ["baselines.gaussians.rasteriser_numba", "baselines.products_numba"]
+wings.append("synthetic.pretraining.solids_numba")
 for name in ("fields.lookup_numba", "rendering.rays_numba", *wings):
     importlib.import_module(f"xplanes.{name}")
 """

@@ -323,7 +323,7 @@ def test_steps_keep_to_their_budget_and_views_are_scored(fake_gpu, name):
     views, background = data.scene.splits["test"], data.scene.background
     score, images = score_view(module.field, module.renderer, module.frame, views, 0, background)
     assert 0 < score.psnr < 60
-    assert images.colour.device.type == "cpu"
+    assert images["colour"].device.type == "cpu"
 
 
 class Upkeep(Callback):

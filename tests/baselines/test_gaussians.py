@@ -22,10 +22,10 @@ from xplanes.baselines.gaussians.harmonics import spherical_harmonics
 from xplanes.baselines.gaussians.hull import hull_points
 from xplanes.baselines.gaussians.rasteriser import GaussianError, rasterise
 from xplanes.baselines.gaussians.renderer import GaussianRenderer, camera_in
+from xplanes.baselines.products import PlaneProducts
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, SceneError
 from xplanes.evaluation.export import ExportOptions, export
-from xplanes.fields.products import PlaneProducts
 from xplanes.models.initialisation import Method
 from xplanes.preparation.fixed_view import rendering_method
 from xplanes.rendering.sampler import Site

@@ -7,8 +7,8 @@ import torch
 
 from tests.baselines import oracles
 from tests.baselines.test_kplanes_field import products
+from xplanes.baselines.products import PlaneTerms
 from xplanes.baselines.proposal import UpdateSchedule
-from xplanes.fields.regularisers import PlaneTerms
 
 
 def test_values_equal_loops():

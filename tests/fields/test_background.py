@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from xplanes.fields.background import FARTHEST, Background, contract, contract_cube, expand
+from xplanes.baselines.kplanes.field import contract_cube
+from xplanes.fields.background import FARTHEST, Background, contract, expand
 from xplanes.rendering.behind import behind, look
 from xplanes.streams import Stream, initial_values
 

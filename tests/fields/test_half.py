@@ -4,8 +4,8 @@ import itertools
 
 import torch
 
-from xplanes.fields.decoder import Decoder
-from xplanes.fields.networks import ROWS, PaddedMLP, half_rows
+from xplanes.baselines.networks import PaddedMLP
+from xplanes.fields.decoder import ROWS, Decoder, half_rows
 
 NETWORKS = {
     "decoder": lambda: Decoder(4, precision="bf16"),

@@ -193,7 +193,7 @@ def test_channels_decoder_and_frame_of_the_file_prevail(tmp_path: Path):
 def test_options_that_no_decoder_has_are_refused(tmp_path: Path):
     options = OPTIONS | {"activation": "sine"}
     decoder = Decoder(8, **OPTIONS).state_dict()
-    with pytest.raises(ConfigError, match=r"triplanes\.pt does not fit.*activation=sine"):
+    with pytest.raises(ConfigError, match=r"triplanes\.pt: decoder_config\.activation=sine"):
         initialised(tmp_path, TriplaneSequence(SEQUENCE.triplanes, decoder, options))
 
 
@@ -267,7 +267,7 @@ def test_the_video_of_a_run_shows_the_field_in_its_own_frame(
         return original(field, renderer, frame, *others, **options)
 
     monkeypatch.setattr(render, "render_path", note)
-    monkeypatch.setattr(render, "VIDEO_FRAMES", 2)
+    monkeypatch.setattr(render, "FRAMES", 2)
     plain = small_config(
         scenes,
         "lrm=file",

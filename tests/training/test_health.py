@@ -21,8 +21,8 @@ from xplanes.run import run
 from xplanes.training import building, module
 from xplanes.training.checkpoints import find_resumable, load_checkpoint
 from xplanes.training.clock import TrainingClock
-from xplanes.training.diagnosis import TrainingError
-from xplanes.training.finite import (
+from xplanes.training.diagnosis import (
+    TrainingError,
     broken_flag,
     not_finite,
     unusable_gradients,

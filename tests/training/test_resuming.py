@@ -18,7 +18,7 @@ from xplanes.process import resume_command
 from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.dnerf import BlenderSettings
-from xplanes.training import scoring
+from xplanes.training import scores
 from xplanes.training.checkpoints import AtomicCheckpointIO
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import KEPT, RunRecord, require_same_settings
@@ -83,14 +83,14 @@ def test_the_best_is_chosen_by_the_same_views_throughout(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One view is scored on the way, and the others are harder by 10 dB."""
-    original = scoring.score_image
+    original = scores.score_image
     improved: list[tuple[str, dict]] = []
 
     def score(image, item):
         found = original(image, item)
         return replace(found, psnr=found.psnr - 10 * (item["index"] != 0))
 
-    monkeypatch.setattr(scoring, "score_image", score)
+    monkeypatch.setattr(scores, "score_image", score)
     note_checkpoints(improved, monkeypatch)
     few = (
         "trainer.limit_val_batches=1",

@@ -217,7 +217,7 @@ class XPlanesSettings(ModelSettings):
         else:
             with torch.no_grad():
                 decoder.layers[-1].bias[0] += options.density_bias  # type: ignore[index]
-                if background is None:  # White fog before a world would thin out to nothing.
+                if background is None:  # White fog in front of it would fade to nothing.
                     decoder.layers[-1].bias[1:] += options.colour_bias  # type: ignore[index]
         decoder.requires_grad_(not options.freeze)
         return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set, background=background)

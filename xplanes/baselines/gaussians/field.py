@@ -11,9 +11,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from xplanes.baselines.gaussians.ply import write_gaussians
+from xplanes.baselines.networks import layers, octaves
+from xplanes.baselines.products import PlaneProducts
 from xplanes.fields.base import Masked, Representation, Writer
-from xplanes.fields.networks import layers, octaves
-from xplanes.fields.products import PlaneProducts
 from xplanes.streams import Stream, TrainingState
 
 BASE = 0.28209479177387814

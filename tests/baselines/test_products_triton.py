@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from xplanes.fields import products
-from xplanes.fields.products import DYNAMIC, STATIC, plane_product_gpu, plane_product_reference
+from xplanes.baselines import products
+from xplanes.baselines.products import DYNAMIC, STATIC, plane_product_gpu, plane_product_reference
 
 pytest.importorskip("triton", reason="triton is not installed")
 

@@ -120,6 +120,32 @@ def test_a_world_gets_a_background_and_the_planes_are_initialised_as_ever():
     assert set(terms) == {"colour"}
 
 
+def test_light_that_passes_the_cube_costs_until_the_field_has_taken_shape():
+    module = built("world", "model.loss.passing=0.5", "model.loss.passing_steps=200")
+    batch = SceneDataModule.of(scene("world")).batches_for(module, 0).draw(0)
+    rendering = module.sampler.render(module.field, batch, module.state)
+    passed = float((1 - rendering.opacity.detach()).mean())
+    for step, weight in ((0, 0.5), (50, 0.375), (199, 0.0025), (200, None), (900, None)):
+        terms = module.model.losses(rendering, batch, replace(module.state, step=step))
+        found = terms.get("passing")
+        assert (found is None) == (weight is None), step
+        if weight is not None:
+            assert float(found) == pytest.approx(weight * passed)
+
+
+@pytest.mark.parametrize("kind", ["world", "white"])
+def test_before_a_background_planes_are_less_smooth_in_time_and_cells_stay_longer(kind):
+    module = built(kind, "model.sampler.sweep_at=[20,40]", "model.loss.world_time=0.25")
+    loss, world = module.model.settings.loss, kind == "world"
+    used = module.model.weights
+    for name in ("time_variation", "time_smoothness", "time_magnitude"):
+        assert getattr(used, name) == getattr(loss, name) * (0.25 if world else 1)
+    if world:
+        assert module.sampler.settings.sweep_at == [40]
+    else:
+        assert len(module.sampler.settings.sweep_at) == 2
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("world")

@@ -8,8 +8,8 @@ import torch
 
 from tests.baselines.oracles import product_features
 from xplanes.baselines.kplanes.field import DensityField, ExplicitDecoder, HybridDecoder, KPlanes
-from xplanes.fields.networks import PaddedMLP, spherical_harmonics, truncated_exponential
-from xplanes.fields.products import (
+from xplanes.baselines.networks import PaddedMLP, spherical_harmonics, truncated_exponential
+from xplanes.baselines.products import (
     PlaneProducts,
     plane_product,
     plane_product_reference,

@@ -5,15 +5,15 @@ import math
 import numpy as np
 import pytest
 import torch
-from xplanes.fields.networks import PaddedMLP, spherical_harmonics, truncated_exponential
-from xplanes.fields.products import (
+
+from tests.baselines.oracles import product_features
+from xplanes.baselines.kplanes.field import DensityField, ExplicitDecoder, HybridDecoder, KPlanes
+from xplanes.baselines.networks import PaddedMLP, spherical_harmonics, truncated_exponential
+from xplanes.baselines.products import (
     PlaneProducts,
     plane_product,
     plane_product_reference,
 )
-
-from tests.baselines.oracles import product_features
-from xplanes.baselines.kplanes.field import DensityField, ExplicitDecoder, HybridDecoder, KPlanes
 
 
 def products(time=3, channels=2, scales=(1, 2)):

@@ -11,11 +11,11 @@ from PIL import Image
 from xplanes.errors import ConfigError
 from xplanes.evaluation.render import (
     VideoOptions,
+    cameras,
     check_out,
-    poses,
+    find_view,
     render_video,
     times,
-    view_pose,
     write_video,
 )
 from xplanes.evaluation.runs import TrainedRun, load_run
@@ -41,6 +41,11 @@ def test_other_times_are_refused():
             times(name, 3)
 
 
+def poses(trained: TrainedRun, options: VideoOptions) -> torch.Tensor:
+    seen = cameras(options, trained.scene.splits, trained.frame)
+    return torch.stack([camera.camera_to_world for camera in seen])
+
+
 def test_camera_paths(trained: TrainedRun):
     centre = trained.frame.centre
     orbit = poses(trained, VideoOptions(frames=6, elevation=30))
@@ -56,9 +61,10 @@ def test_a_view_is_found_by_its_name(trained: TrainedRun):
     splits = trained.scene.splits
     expected = splits["test"].camera_to_world[1]
     for name in ("test/r_001.png", "test/r_001"):
-        assert torch.equal(view_pose(splits, name), expected)
+        views, index = find_view(splits, name)
+        assert torch.equal(views.camera_to_world[index], expected)
     with pytest.raises(ConfigError, match=r"test/r_00\d\.png"):
-        view_pose(splits, "test/r_0011")
+        find_view(splits, "test/r_0011")
 
 
 def test_the_camera_of_a_view_renders_that_view(trained: TrainedRun, tmp_path: Path):

@@ -61,7 +61,7 @@ class BundledLRMSettings(ImageLRMSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PublishedLRMSettings(ImageLRMSettings, WeightSource):
+class PublishedLRMSettings(WeightSource, ImageLRMSettings):
     """A published LRM."""
 
     def load_model(self, say: Callable[[str], None]) -> LoadedLRM:

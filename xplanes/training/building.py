@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from xplanes import __version__
 from xplanes.backend import fast_bf16
 from xplanes.components import build, plugins
 from xplanes.errors import ConfigError
@@ -60,7 +61,12 @@ class Parts:
         if initialisation is not None and values is not None:
             # It is large, and of use for some steps only.
             initialisation = replace(initialisation, values=replace(values, sparse=None))
-        field = require_field(model)
+        field: Any = model.field
+        if not isinstance(field, Representation):
+            raise ConfigError(
+                f"{type(model).__name__}.field: {type(field).__name__} must be derived from "
+                "xplanes.fields.base.RadianceField"
+            )
         settings.sampler.require_kind(type(field))
         sampler = settings.sampler.build(field, site)
         require_groups(model, sampler)
@@ -205,6 +211,27 @@ def precision_of(settings: ModelSettings, device: torch.device) -> str:
     return settings.precision
 
 
+def require_version(path: Any) -> None:
+    """Refuse a checkpoint of a version whose settings were others.
+
+    Args:
+        path: The file; what is no local file, or cannot be read, is left to others.
+
+    Raises:
+        ConfigError: With the version.
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        made = str(content.get("xplanes", "0.2 or older"))
+    except Exception:  # Whoever loads it says what is wrong.
+        return
+    if made.split(".")[:2] != __version__.split(".")[:2]:
+        raise ConfigError(
+            f"{path} was made by xplanes {made}, whose settings are not those of {__version__}: "
+            "load it with that version, or start a new run"
+        )
+
+
 def require_whole_floats(precision: str) -> None:
     """Refuse a Trainer that changes the precision: the model sets its own.
 
@@ -216,21 +243,6 @@ def require_whole_floats(precision: str) -> None:
             f"precision={precision}: a field computes in model.precision (auto, 32 or bf16), and "
             "its planes are float32; leave it out"
         )
-
-
-def require_field(model: Model) -> Representation:
-    """The field of a model, if it is one.
-
-    Raises:
-        ConfigError: If it is of another class.
-    """
-    field: Any = model.field
-    if not isinstance(field, Representation):
-        raise ConfigError(
-            f"{type(model).__name__}.field: {type(field).__name__} must be derived from "
-            "xplanes.fields.base.RadianceField"
-        )
-    return field
 
 
 def require_groups(model: Model, sampler: Sampler) -> None:

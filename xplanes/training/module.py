@@ -29,6 +29,7 @@ from xplanes.training.building import (
     build_parts,
     parts_from,
     require_frame,
+    require_version,
     require_whole_floats,
     site_content,
 )
@@ -138,7 +139,7 @@ class RadianceModule(ViewScoring):
                 checkpoint_path, *args, weights_only=weights_only, **kwargs
             )
         except ConfigError as error:
-            _require_version(checkpoint_path)
+            require_version(checkpoint_path)
             words, ask, _ = str(error).partition("plugins=[MODULE]")
             if not ask:
                 raise
@@ -458,24 +459,3 @@ def _read(config: Mapping[str, Any], modules: Sequence[str]) -> Method:
             return Method.read(config)
         except KeyError as error:
             raise ConfigError(f"the configuration lacks the group {error}") from error
-
-
-def _require_version(path: Any) -> None:
-    """Refuse a checkpoint of a version whose settings were others.
-
-    Args:
-        path: The file; what is no local file, or cannot be read, is left to others.
-
-    Raises:
-        ConfigError: With the version.
-    """
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-        made = str(content.get("xplanes", "0.2 or older"))
-    except Exception:  # Whoever loads it says what is wrong.
-        return
-    if made.split(".")[:2] != __version__.split(".")[:2]:
-        raise ConfigError(
-            f"{path} was made by xplanes {made}, whose settings are not those of {__version__}: "
-            "load it with that version, or start a new run"
-        )

@@ -347,14 +347,15 @@ def _view(options: argparse.Namespace) -> None:
 def _add_export(commands: "argparse._SubParsersAction") -> None:
     parser = commands.add_parser(
         "export",
-        help="write meshes, point clouds, planes, Gaussians or camera paths for other programs",
+        help="write meshes, points, a web page, planes, Gaussians or camera paths",
     )
     _add_run(parser)
     parser.add_argument(
         "--what",
         default="mesh",
-        help="what to write: mesh or points (extra: export), planes (X-Planes only), path (of the "
-        "training cameras), or what a model adds, such as gaussians; default: %(default)s",
+        help="what to write: mesh or points (extra: export), web (one HTML file below 20 MB that "
+        "plays them; extra: export), planes (X-Planes only), path (of the training cameras), or "
+        "what a model adds, such as gaussians; default: %(default)s",
     )
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="empty or new; default: RUN/export/WHAT"
@@ -362,7 +363,7 @@ def _add_export(commands: "argparse._SubParsersAction") -> None:
     parser.add_argument(
         "--times",
         help="a number of times spread evenly from 0 to 1, or times separated by commas; "
-        "default: 10, or 1 in a static scene",
+        "default: 10, 24 with --what web, or 1 in a static scene",
     )
     parser.add_argument(
         "--resolution",
@@ -378,9 +379,8 @@ def _add_export(commands: "argparse._SubParsersAction") -> None:
     parser.add_argument(
         "--points",
         type=int,
-        default=100_000,
         metavar="COUNT",
-        help="points of a point cloud; default: %(default)s",
+        help="points of a point cloud; default: 100000; with --what web, points replace the mesh",
     )
     parser.add_argument(
         "--format",

@@ -11,7 +11,7 @@ from xplanes import __version__
 from xplanes.errors import ConfigError
 from xplanes.evaluation.runs import OUTPUTS, is_run
 from xplanes.files import read_json
-from xplanes.lrm.weights import Probe
+from xplanes.lrm.weights import answers
 from xplanes.training.record import read_config
 
 SCHEME = "hf://"
@@ -79,7 +79,7 @@ def push(
     size = sum(operation.upload_info.size for operation in operations)
     say(f"uploading   {len(operations)} files, {size / 1e6:.1f} MB, to {repository}")
     api = HfApi(endpoint=endpoint)
-    if constants.HF_HUB_OFFLINE or not Probe(api.endpoint).answers():
+    if constants.HF_HUB_OFFLINE or not answers(api.endpoint):
         raise ConfigError(f"{api.endpoint} cannot be reached, or HF_HUB_OFFLINE is set: try later")
     try:
         api.create_repo(repository, private=private, exist_ok=True)
@@ -120,7 +120,7 @@ def fetch(
     suffix = "" if revision is None else f"@{revision.replace('/', '-')}"
     run = outputs / "hub" / f"{repository}{suffix}"
     server = endpoint or constants.ENDPOINT
-    if constants.HF_HUB_OFFLINE or not Probe(server).answers():
+    if constants.HF_HUB_OFFLINE or not answers(server):
         if not is_run(run):
             raise ConfigError(
                 f"{address} cannot be read: {server} cannot be reached, or HF_HUB_OFFLINE is set, "

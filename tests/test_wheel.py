@@ -73,3 +73,9 @@ def test_commands_work_from_an_empty_folder(installed: Path, tmp_path: Path) -> 
     ):
         assert words in printed, words
     assert {path.name for path in tmp_path.iterdir()} == {"data", "outputs", "video.webp"}
+
+
+def test_the_page_and_its_scripts_are_shipped(installed: Path) -> None:
+    parts = Path("xplanes", "evaluation", "web")
+    shipped = [{path.name for path in (place / parts).iterdir()} for place in (ROOT, installed)]
+    assert shipped[0] == shipped[1]

@@ -1,5 +1,6 @@
 """Gaussians that planes deform: what is added and removed, what is drawn, what is written."""
 
+import json
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -404,6 +405,23 @@ def test_a_ply_of_a_timestep_shows_what_the_renderer_shows(tmp_path, degree):
         shown = run.module.renderer.view(field, FRAME, camera, time, torch.ones(3))
         torch.testing.assert_close(image.colour, shown["colour"], atol=2e-4, rtol=0)
         assert float(shown["opacity"].max()) > 0.3
+
+
+def test_the_points_of_a_page_are_the_more_opaque_gaussians(tmp_path):
+    field, run = gaussians(40), trained(gaussians(40))
+    with torch.no_grad():
+        field.logits.copy_(torch.linspace(-3, 3, 40)[torch.randperm(40)])
+    run.module.field, run.path = field, tmp_path / "run"
+    points, colours = field.cloud(0.75)
+    posed = field.at(0.75)
+    kept = posed.opacities >= posed.opacities.max() / 2
+    assert 5 < len(points) == kept.sum() < 40
+    assert torch.equal(points[0], posed.means[posed.opacities.argmax()])
+    assert set(map(tuple, points.tolist())) == set(map(tuple, posed.means[kept].tolist()))
+    assert ((colours >= 0) & (colours <= 1)).all()
+    folder = export(run, ExportOptions("web", times="3"), tmp_path / "web", say=print)
+    listed = json.loads((folder / "export.json").read_text())
+    assert (listed["vertices"], listed["triangles"]) == (3 * len(points), 0)
 
 
 def test_what_does_not_fit_is_refused(tmp_path, scenes):

@@ -142,6 +142,14 @@ class Gaussians(Representation):
     def exports(self) -> Mapping[str, Writer]:
         return {"gaussians": lambda path, time, frame: write_gaussians(path, self.at(time), frame)}
 
+    @torch.no_grad()
+    def cloud(self, time: float) -> tuple[Tensor, Tensor]:
+        """Means and colours of the Gaussians at least half as opaque as the most opaque one."""
+        posed = self.at(time)
+        order = posed.opacities.argsort(descending=True)
+        order = order[: int((posed.opacities >= posed.opacities.max() / 2).sum())]
+        return posed.means[order], (0.5 + BASE * posed.harmonics[order, 0]).clamp(0, 1)
+
     def masked(self, keep: Callable[[Tensor], Tensor]) -> "MaskedGaussians":
         return MaskedGaussians(self, keep)
 

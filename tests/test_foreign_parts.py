@@ -106,8 +106,6 @@ def test_a_resumed_run_goes_on_with_its_csv(scenes: Path, tmp_path: Path) -> Non
     assert steps("parts") == steps("whole") == [1, 3, 5, 7, 9, 11, 13]
     kept = rows(tmp_path / "parts")[: len(before)]
     assert [{k: row[k] for k in before[0]} for row in kept][:4] == before[:4]
-    train("parts", 14, resume=True)  # Nothing is left to do.
-    assert steps("parts") == [1, 3, 5, 7, 9, 11, 13]
 
 
 def test_scores_are_of_the_averaged_weights_that_checkpoints_hold(
@@ -127,7 +125,7 @@ def test_scores_are_of_the_averaged_weights_that_checkpoints_hold(
 
 
 def test_epochs_end_the_schedules_too(scenes: Path) -> None:
-    config = small_config(scenes)
+    config = small_config(scenes, "model.rays.per_batch=1024")
 
     def rates(**options: Any) -> tuple[int, list[float]]:
         module, data = RadianceModule(config), SceneDataModule(config["data"])

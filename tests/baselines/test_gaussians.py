@@ -18,6 +18,7 @@ from xplanes.baselines.gaussians.field import (
     Gaussians,
     HexPlaneGaussians,
     PointCloud,
+    neighbour_distance,
 )
 from xplanes.baselines.gaussians.harmonics import spherical_harmonics
 from xplanes.baselines.gaussians.hull import hull_points
@@ -289,6 +290,14 @@ def test_points_on_the_hull_of_a_ball():
     anywhere = hull_points(opaque, FRAME, 500)
     assert float(anywhere.points.abs().max()) > 0.9
     assert (anywhere.colours == 0.5).all()
+
+
+def test_first_scales_are_the_distances_to_neighbours():
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
+    distance = (points[:, None].double() - points.double()).norm(dim=-1).sort(dim=1).values
+    expected = distance[:, 1:4].square().mean(dim=1).sqrt().float()
+    torch.testing.assert_close(neighbour_distance(points), expected, rtol=1e-3, atol=1e-5)
+    assert neighbour_distance(points[:1]) == 0.1
 
 
 def test_gradients_of_the_planes_terms_are_those_of_their_values():

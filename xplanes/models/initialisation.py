@@ -214,7 +214,12 @@ class Method:
             raise ConfigError(
                 f"seed={seed}: must be a whole number, not negative and below 4294967296 (2^32)"
             )
-        model = build(config["model"], ModelSettings, "model")
+        try:
+            model = build(config["model"], ModelSettings, "model")
+        except ConfigError as error:
+            if (recipe := config.get("recipe")) is None:
+                raise
+            raise ConfigError(f"{error} (recipe={recipe} changes settings of the model)") from None
         if "lrm" not in config:
             raise ConfigError(
                 f"lrm: model={model.name} chooses none; write `- /lrm@_global_.lrm: none`, or the "

@@ -17,12 +17,12 @@ from tests.balls import ball_scene
 from tests.test_contracts import built, small
 from tests.warm import train
 from xplanes.config import CONF, compose_plain, group_options
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, LRMError
 from xplanes.evaluation.published import check_published, read_published
 from xplanes.evaluation.sheet import check_what
 from xplanes.experiment import Experiment
 from xplanes.launch import FORMER, prepare
-from xplanes.sweeps import SMALL, jobs
+from xplanes.sweeps import SMALL, jobs, look_ahead
 from xplanes.training.losses import loss_terms
 
 PAPER = {
@@ -51,7 +51,7 @@ def multirun(*overrides: str) -> DictConfig:
 
 
 def jobs_of(*overrides: str) -> list[list[str]]:
-    return jobs(multirun(*overrides).hydra)
+    return jobs(OmegaConf.to_container(multirun(*overrides).hydra, resolve=False))
 
 
 def values_of(found: list[list[str]], key: str) -> list[str]:
@@ -93,7 +93,7 @@ def test_every_choice_of_every_sweep_exists(size: tuple[str, ...]) -> None:
     options = {group: set(group_options(group)) for group in groups}
     for name in PAPER if size else SWEEPS:
         config = multirun(f"sweep={name}", *size)
-        found = jobs(config.hydra)
+        found = jobs_of(f"sweep={name}", *size)
         for group in groups:
             assert set(values_of(found, group)) <= options[group], (name, group)
         check_published(list(config.hydra.callbacks.table.published))
@@ -205,45 +205,52 @@ def test_one_gpu_has_no_limit_of_time() -> None:
 # Before the first job
 
 
-def refused(*overrides: str, folder: Path) -> str:
-    """What a sweep says that does not begin."""
-    done = train(*overrides, f"hydra.sweep.dir={folder / 'sweep'}", cwd=folder)
+def looked_ahead(*overrides: str) -> str:
+    """What is said of a sweep before its first job."""
+    config = multirun(*overrides)
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return look_ahead(config)
+
+
+def test_a_sweep_is_run_with_the_flag(tmp_path: Path) -> None:
+    done = train("sweep=table1", "model=kplanes", cwd=tmp_path)
     assert done.returncode == 1
-    assert "Traceback" not in done.stderr
-    assert not (folder / "sweep").exists()
-    return done.stderr
+    assert done.stderr.startswith("error: a sweep is many runs: ")
+    assert done.stderr.endswith(" -m sweep=table1 model=kplanes\n")
+    assert not list(tmp_path.iterdir())
 
 
-def test_a_sweep_is_run_with_the_flag_and_alone(tmp_path: Path) -> None:
-    said = refused("sweep=table1", "model=kplanes", folder=tmp_path)
-    assert said.startswith("error: a sweep is many runs: ")
-    assert " -m sweep=table1 model=kplanes" in said
-    said = refused("-m", "sweep=table1,fair", folder=tmp_path)
-    assert "one sweep at a time" in said
-    assert "-m sweep=table1; " in said
-    shown = train("sweep=fair", SMALL, "--cfg", "job", cwd=tmp_path)
-    assert "max_steps: 300" in shown.stdout
+def test_a_sweep_is_run_alone() -> None:
+    with pytest.raises(ConfigError, match=r"one sweep at a time.* -m sweep=table1; .*sweep=fair"):
+        looked_ahead("sweep=table1,fair")
 
 
 def test_a_sweep_looks_for_its_data_and_weights_first(tmp_path: Path) -> None:
-    said = refused("-m", "sweep=table1", folder=tmp_path)
-    assert "bouncingballs does not exist" in said
-    assert "xplanes download dnerf" in said
-    (tmp_path / "data" / "dnerf" / "lego").mkdir(parents=True)
-    weights = f"lrm.weights={tmp_path / 'none.safetensors'}"
-    said = refused("-m", "sweep=rank", "data.scene=lego", "lrm=small", weights, folder=tmp_path)
-    assert "none.safetensors is not a file" in said
+    done = train("-m", "sweep=rank", f"hydra.sweep.dir={tmp_path / 'sweep'}", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "bouncingballs does not exist" in done.stderr
+    assert "xplanes download dnerf" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "lego").mkdir()
+    given = ("data.scene=lego", f"data.root={tmp_path}", "lrm=small")
+    with pytest.raises(LRMError, match=r"none\.safetensors is not a file"):
+        looked_ahead("sweep=rank", *given, f"lrm.weights={tmp_path / 'none.safetensors'}")
 
 
-def test_rows_and_sizes_that_a_sweep_does_not_have_are_named(tmp_path: Path) -> None:
-    said = refused("-m", "sweep=table1", "model=tineuvox_s", folder=tmp_path)
-    assert "no row of the sweep has the settings of the command line" in said
-    assert "model=nine_planes recipe=paper" in said
-    assert "sweep=suite has no small version" in refused(
-        "-m", "sweep=suite", SMALL, folder=tmp_path
-    )
-    wrong = "hydra.callbacks.table.published=[Table 9]"
-    assert "published=['Table 9']: must be" in refused("-m", "seed=0,1", wrong, folder=tmp_path)
+def test_rows_and_sizes_that_a_sweep_does_not_have_are_named() -> None:
+    with pytest.raises(ConfigError, match=r"no row .* model=nine_planes recipe=paper"):
+        looked_ahead("sweep=table1", "model=tineuvox_s")
+    with pytest.raises(ConfigError, match="sweep=suite has no small version"):
+        looked_ahead("sweep=suite", SMALL)
+
+
+def test_how_long_a_sweep_takes_is_said() -> None:
+    assert looked_ahead("sweep=suite").startswith("18 runs, at most 18 minutes")
+    assert looked_ahead("seed=0,1", "trainer.max_seconds=null").startswith("2 runs, 60000 steps")
+    # Jobs refuse their own settings, and Hydra says what it cannot compose.
+    assert looked_ahead("seed=0,1", "model.channels=0").startswith("2 runs, ")
+    assert looked_ahead("model=six_planes,nothing") == ""
 
 
 @pytest.mark.parametrize(

@@ -85,8 +85,8 @@ class SettingsCheck(Callback):
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         from xplanes.run import KNOWN_ERRORS, prepare
 
-        task = list(config.hydra.overrides.task)
         if config.hydra.runtime.choices.get("sweep") and config.resume is None:
+            task = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
             given = shlex.join(text for text in task if _split(text)[0] != "resume")
             sys.exit(f"error: a sweep is many runs: {train_command()} -m {given}")
         names = [str(name) for name in config if name != "hydra"]

@@ -33,13 +33,14 @@ def jobs(hydra: Mapping[str, Any], loader: ConfigLoader | None = None) -> list[l
     all rows set, the rows with this value are left; otherwise a row has the last word.
 
     Args:
-        hydra: Hydra's part of the configuration, as in multirun.yaml, with a sweeper over a grid.
+        hydra: Hydra's part of the configuration as builtins, as in multirun.yaml, with a sweeper
+            over a grid.
         loader: Lists the options that ``glob(...)`` stands for.
 
     Raises:
         HydraException: For overrides that Hydra cannot read, or ranges without steps.
     """
-    sweeper, task = hydra["sweeper"], list(hydra["overrides"]["task"])
+    sweeper, task = hydra["sweeper"], hydra["overrides"]["task"]
     grid = dict(sweeper)
     if SMALL in task:
         grid |= sweeper.get("demo") or {}
@@ -78,17 +79,20 @@ def look_ahead(config: DictConfig) -> str:
         ConfigError, SceneError, LRMError: For sweeps that cannot be run together, or what is not
             there.
     """
-    hydra = config.hydra
-    if not str(hydra.sweeper.get("_target_")).endswith(GRIDS):
+    hydra: Any = OmegaConf.to_container(config.hydra, resolve=False)
+    if not str(hydra["sweeper"]["_target_"]).endswith(GRIDS):
         return ""
     loader = GlobalHydra.instance().config_loader()
+    HydraConfig.instance().set_config(config)  # As Hydra does for a job, for ${hydra:...}.
+    known: dict[tuple[str, ...], Experiment | None] = {}
     try:
-        found = jobs(hydra, loader)
+        found = [tuple(t for t in job if not t.startswith("seed=")) for job in jobs(hydra, loader)]
         _require_one_sweep(hydra, found)
-        plains = _plains(config, found, loader)
+        for job in dict.fromkeys(found):
+            known[job] = _read(loader.load_sweep_config(config, list(job)))
     except HydraException:
         return ""
-    runs = [run for run in map(_read, plains) if run is not None]
+    runs = [run for job in found if (run := known[job]) is not None]
     for data in {str(run.data): run.data for run in runs}.values():
         if data.files and not data.folder.exists():
             data.load(("train",))  # It says where to get the scene.
@@ -97,44 +101,30 @@ def look_ahead(config: DictConfig) -> str:
     return _length(len(found), [run.trainer for run in runs])
 
 
-def _require_one_sweep(hydra: DictConfig, found: Sequence[Sequence[str]]) -> None:
+def _require_one_sweep(hydra: Mapping[str, Any], found: Sequence[Sequence[str]]) -> None:
     names = dict.fromkeys(text for job in found for text in job if text.startswith("sweep="))
     if len(names) > 1:
         commands = "; ".join(f"{train_command()} -m {name}" for name in names)
         raise ConfigError(
             f"{', '.join(names)}: one sweep at a time, as each has its own runs: {commands}"
         )
-    sweep = hydra.runtime.choices.get("sweep")
-    if sweep and SMALL in hydra.overrides.task and not hydra.sweeper.demo:
+    sweep, sweeper = hydra["runtime"]["choices"].get("sweep"), hydra["sweeper"]
+    if sweep and SMALL in hydra["overrides"]["task"] and not sweeper.get("demo"):
         raise ConfigError(f"{SMALL}: sweep={sweep} has no small version; leave it out")
     if not found:
-        rows = "; ".join(map(str, hydra.sweeper.rows))
+        rows = "; ".join(map(str, sweeper["rows"]))
         raise ConfigError(
             f"no row of the sweep has the settings of the command line; its rows: {rows}"
         )
 
 
-def _plains(
-    config: DictConfig, found: Sequence[Sequence[str]], loader: ConfigLoader
-) -> list[dict[str, Any] | None]:
-    """Resolved settings of each job; None where they refer to what Hydra knows in the job alone."""
-    HydraConfig.instance().set_config(config)  # For ${hydra:...}.
-    known: dict[tuple[str, ...], dict[str, Any] | None] = {}
-    keys = [tuple(text for text in job if not text.startswith("seed=")) for job in found]
-    for key in dict.fromkeys(keys):
-        job = loader.load_sweep_config(config, list(key))
-        try:
-            known[key] = to_plain(OmegaConf.masked_copy(job, [str(n) for n in job if n != "hydra"]))
-        except ConfigError:
-            known[key] = None
-    return [known[key] for key in keys]
-
-
-def _read(plain: dict[str, Any] | None) -> "Experiment | None":
+def _read(job: DictConfig) -> "Experiment | None":
+    """The settings of a job; None where it is to refuse them itself."""
     from xplanes.experiment import Experiment
 
+    own = [str(name) for name in job if name != "hydra"]
     try:
-        return None if plain is None else Experiment.read(plain)
+        return Experiment.read(to_plain(OmegaConf.masked_copy(job, own)))
     except ConfigError:
         return None
 

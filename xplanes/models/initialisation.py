@@ -190,7 +190,7 @@ class Method:
         lrm: What the field is initialised from.
         preparation: How an initialisation is made.
         decomposition: How triplanes become planes.
-        losses: Further terms of the loss by name.
+        losses: Further terms of the loss by name; those of weight 0 are left out.
     """
 
     seed: int
@@ -237,14 +237,17 @@ class Method:
         if model.field_class is not None:
             model.sampler.require_kind(model.field_class)
             model.sampler.require(model.field_class)
-        losses = config.get("losses") or {}
+        losses = {
+            name: build(node, LossTerm, f"losses.{name}")
+            for name, node in (config.get("losses") or {}).items()
+        }
         return cls(
             seed,
             model,
             lrm,
             build(config["preparation"], PreparationSettings, "preparation"),
             build(config["decomposition"], DecompositionSettings, "decomposition"),
-            {name: build(node, LossTerm, f"losses.{name}") for name, node in losses.items()},
+            {name: term for name, term in losses.items() if term.weight},
         )
 
     def require_devices(self, count: int) -> None:

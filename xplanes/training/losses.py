@@ -26,7 +26,7 @@ def loss_terms(
 
     Args:
         parts: What is trained.
-        added: Terms of the group ``losses``; those of weight 0 are left out.
+        added: Terms of the group ``losses``.
         rendering: The rendering of the batch.
         rays: The batch.
         state: Seed and progress of training.
@@ -39,8 +39,6 @@ def loss_terms(
     found = parts.model.losses(rendering, rays, state) | parts.sampler.losses(rendering)
     terms = {name: _number(term, f"loss term {name}", device) for name, term in found.items()}
     for name, term in added.items():
-        if not term.weight:
-            continue
         if name in found:
             raise ConfigError(
                 f"losses.{name}: the loss has a term of this name already; choose another name"

@@ -49,7 +49,7 @@ class RowSweeper(BasicSweeper):
         """Overrides of all jobs, in batches."""
         assert self.config is not None
         assert self.hydra_context is not None
-        hydra = OmegaConf.to_container(self.config.hydra, resolve=False)
+        hydra: Any = OmegaConf.to_container(self.config.hydra, resolve=False)
         found = jobs(hydra, self.hydra_context.config_loader)
         return [list(batch) for batch in self.split_overrides_to_chunks(found, max_batch_size)]
 

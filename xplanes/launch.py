@@ -86,7 +86,7 @@ class SettingsCheck(Callback):
         from xplanes.run import KNOWN_ERRORS, prepare
 
         if config.hydra.runtime.choices.get("sweep") and config.resume is None:
-            task = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
+            task: Any = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
             given = shlex.join(text for text in task if _split(text)[0] != "resume")
             sys.exit(f"error: a sweep is many runs: {train_command()} -m {given}")
         names = [str(name) for name in config if name != "hydra"]

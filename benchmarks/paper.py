@@ -149,13 +149,13 @@ class Sweep:
 
 
 def small(name: str, *given: str) -> tuple[str, ...]:
-    """Arguments of an experiment at small scale."""
-    return (f"experiment={name}", "scale=demo", *given)
+    """Arguments of a sweep at small scale."""
+    return ("-m", f"sweep={name}", "experiment=demo", *given)
 
 
 SWEEPS = {
     "table1": Sweep(
-        "## Table 1",
+        "## Table 1, figures 5, 7, 9 and 10",
         small("table1"),
         """\
 Nine planes use Tensor4D's learning rates, a quarter of K-Planes' for planes and a twentieth
@@ -164,13 +164,10 @@ table has the published one beside it.""",
         compared,
         (("sheet.png", "One view of the excavator by all methods"),),
     ),
-    "table2": Sweep(
-        "## Table 2", small("table2"), "Sizes of the LRM, six planes in the paper:", sizes
-    ),
-    "table3": Sweep(
-        "## Table 3",
-        small("table3"),
-        "The same runs beside the published figures of nine planes:",
+    "tables2_3": Sweep(
+        "## Tables 2 and 3",
+        small("tables2_3"),
+        "Sizes of the LRM:",
         sizes,
         (("sheet.png", "The excavator, initialised from both LRMs"),),
     ),
@@ -199,11 +196,6 @@ video; `data.train_on_video=true` gives them to all methods. PSNR:""",
         lambda rows: crossed(rows, "data.views", "training views"),
         (("against.png", "PSNR against the number of training views"),),
     ),
-    "figures5_7_9_10": Sweep(
-        "## Figures 5, 7, 9 and 10",
-        small("figures5_7_9_10"),
-        pictures=(("sheet.png", "One view by all methods"),),
-    ),
     "fair": Sweep(
         "## Equal rays, silhouettes and steps",
         small("fair"),
@@ -229,14 +221,12 @@ instead of rays. Means of three seeds; the image is of the first.""",
         show=ablated,
     ),
     "rank": Sweep(
-        "## Rank", small("rank"), "See also [rank against lambda and mu](rank_curve.md)."
-    ),
-    "figure3": Sweep(
-        "## Figure 3",
-        small("figure3"),
+        "## Rank, figure 3",
+        small("rank"),
         """\
-The rows of each scene are xy, xz and yz. For each timestep, the low-rank part is on the left
-and the sparse part, with a separate colour scale, on the right.""",
+See also [rank against lambda and mu](rank_curve.md). In the image, the rows of each scene are xy,
+xz and yz. For each timestep, the low-rank part is on the left and the sparse part, with a separate
+colour scale, on the right.""",
         pictures=(("sheet.png", "Low-rank and sparse parts at four timesteps"),),
     ),
     "time_planes": Sweep(
@@ -248,7 +238,7 @@ and the sparse part, with a separate colour scale, on the right.""",
             *("model.sampler.proposal_samples=[64,32]", "model.sampler.resolutions=[24,32]"),
             *("model.sampler.time_resolution=16", "model.sampler.samples=24"),
             *("trainer.max_steps=300", "callbacks.evaluation.at=[0,0.1,0.3,0.6,1]"),
-            *("sheet=steps", "media=false"),
+            *("hydra.callbacks.table.sheet=steps", "media=false"),
         ),
         "Steps 0, 30, 90, 180 and 300.",
         lambda rows: crossed(rows, "decomposition.dynamic", "time planes"),
@@ -332,15 +322,15 @@ def main() -> None:
 
     python benchmarks/paper.py
 
-A procedural scene of 64 pixels and the bundled LRMs (`scale=demo`). Experiments with the paper's
+A procedural scene of 64 pixels and the bundled LRMs (`experiment=demo`). Sweeps with the paper's
 recipe have reduced baselines, planes of 32 texels, float32, and schedules shortened to a hundredth.
 Budgets are 300 steps unless stated otherwise. PSNR is in dB, over six views of the test split; one
 seed unless a table has a standard deviation. Seconds are CPU time of one core. {machine()}. The
 linked tables state each protocol and the paper's figures, which are from other data and sizes.
 
-These pages show what each experiment writes. They do not rank methods: 300 steps are a hundredth of
+These pages show what each sweep writes. They do not rank methods: 300 steps are a hundredth of
 a full training, and the LRM sees 16 frames of the scene's own video that random initialisations and
-baselines do not see. The actual comparison, the experiments without `scale=demo`, has not been run.
+baselines do not see. The actual comparison, the sweeps without `experiment=demo`, has not been run.
 The fixed-view video is the scene's own, not rendered by K-Planes.
 """
     lines = [line for name in args.only for line in section(name, work)]

@@ -52,13 +52,17 @@ def merged(base: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
 
 def values(group: str, option: str) -> dict[str, Any]:
     """The values of a YAML file, those it inherits from a sibling included."""
-    content = yaml.safe_load((CONF / group / f"{option}.yaml").read_text(encoding="utf-8"))
+    text = (CONF / group / f"{option}.yaml").read_text(encoding="utf-8")
+    content = yaml.safe_load(_CASE.sub(r"\1", text))
     found: dict[str, Any] = {}
     for parent in content.pop("defaults", []):
         if isinstance(parent, str) and parent != "_self_":
             found = merged(found, values(group, parent))
     return merged(found, content)
 
+
+_CASE = re.compile(r"\$\{case:.*,(.*)\}")
+"""A value that depends on the recipe; the last part is the one without."""
 
 FIRST = "demo six_planes none default small base tineuvox_s tiny occupancy proposal csv".split()
 """Options that stand before others of their group."""
@@ -282,10 +286,8 @@ NODES = {
 
 SETS = {
     "recipe": "The paper's settings, or equal ones; see [the method and the paper](paper.md).",
-    "scale": "How large an experiment is.",
-    "experiment": "Settings for a purpose; most are sweeps.",
-    "entry": "One model with its initialisation, as a row of a table: "
-    "`entry=six_planes_tiny,kplanes`.",
+    "experiment": "Settings of one run for a purpose, or of each run of a sweep.",
+    "sweep": "Many runs and their table: `python train.py -m sweep=NAME`.",
 }
 """Groups whose files set keys of other groups."""
 

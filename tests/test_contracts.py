@@ -5,7 +5,6 @@ import copy
 import functools
 import importlib.util
 import inspect
-import itertools
 import math
 import re
 import subprocess
@@ -53,9 +52,7 @@ ROOT = Path(__file__).resolve().parents[1]
 OPTIONS = sorted(
     (path.parent.relative_to(CONF).as_posix(), path.stem)
     for path in CONF.rglob("*.yaml")
-    if path.parent != CONF and not {"hydra", "pretrain"} & set(path.relative_to(CONF).parts)
-    # Chosen by two groups together, or by an option.
-    if not {CONF / "recipe", CONF / "scale", CONF / "entry"} & set(path.parent.parents)
+    if path.parent != CONF and "pretrain" not in path.relative_to(CONF).parts
 )
 """Every option of every group that train.py knows."""
 
@@ -72,16 +69,6 @@ KINDS = {
 MODELS = [name for group, name in OPTIONS if group == "model"]
 
 
-def names(group, *, paper):
-    """Options of a group, of those that are for X-Planes alone or of the others."""
-    for option, name in OPTIONS:
-        if option == group and not name.startswith("gaussians"):  # They have no rays to set.
-            text = (CONF / group / f"{name}.yaml").read_text()
-            own = "recipe: paper" in text or "_planes" in name or name.startswith("ablation")
-            if own == paper:
-                yield f"{group}={name}"
-
-
 COMPOSITIONS = [
     # The groups that go with all others, as many options of them at once as there are.
     ["data=demo", "lrm=none", "decomposition=default", "trainer=default", "preparation=default"],
@@ -91,7 +78,7 @@ COMPOSITIONS = [
     ["lrm=large", "trainer=gpu", "logger=tensorboard"],
     ["lrm=small", "model/sampler=proposal", "logger=csv"],
     ["lrm=xlarge", "model/sampler=kplanes", "logger=wandb"],
-    ["lrm=file", "model/sampler=kplanes_explicit"],
+    ["lrm=file", "model/sampler=kplanes_reduced"],
     # A model brings its sampler along; here some are named.
     ["data=blender", "model=kplanes"],
     ["data=nerfstudio", "model=tineuvox_s", "model/sampler=fixed_step"],
@@ -99,23 +86,21 @@ COMPOSITIONS = [
     ["data=colmap", "model=tensor4d_density"],
     ["data=nerfies", "model=kplanes_explicit"],
     ["recipe=paper", "preparation=paper"],
-    ["recipe=fair", "scale=demo"],
+    ["recipe=paper_small", "sweep=rank", "experiment=demo"],
+    ["recipe=fair"],
     ["recipe=capture"],
+    ["model=kplanes_reduced", "experiment=published"],
     ["model=tineuvox_b"],
+    ["model=tineuvox_reduced", "sweep=suite"],
+    ["model=tensor4d_reduced", "sweep=suite_test"],
     ["model=gaussians_hexplane", "model/sampler=rasteriser"],
-    ["model=gaussians_hexplane_published", "entry=gaussians_hexplane_published"],
-    ["model=gaussians_deform", "entry=gaussians_hexplane"],
-    ["model=gaussians_deform_published", "entry=gaussians_deform"],
-    ["model=gaussians_spacetime", "lrm=field", "entry=gaussians_deform_published"],
-    ["model=gaussians_spacetime_published", "entry=gaussians_spacetime"],
-    ["entry=gaussians_spacetime_published"],
-    *(
-        [choice for choice in both if choice is not None]
-        for paper in (True, False)
-        for both in itertools.zip_longest(
-            names("entry", paper=paper), names("experiment", paper=paper)
-        )
-    ),
+    ["model=gaussians_hexplane_published", "sweep=table1"],
+    ["model=gaussians_deform", "sweep=lego_models"],
+    ["model=gaussians_deform_published"],
+    ["model=gaussians_spacetime", "lrm=field"],
+    ["model=gaussians_spacetime_published"],
+    *([f"sweep={name}"] for name in ("ablation", "fair", "few_shot", "figure6")),
+    *([f"sweep={name}"] for name in ("tables2_3", "table4")),
 ]
 """What is composed, so that every option is in it."""
 
@@ -192,8 +177,7 @@ def test_there_is_something_to_test():
         "callbacks",
         "logger",
         "recipe",
-        "scale",
-        "entry",
+        "sweep",
         "experiment",
     }
 
@@ -678,7 +662,7 @@ LAYERS = (
     ("rendering",),
     ("models",),
     ("training",),
-    ("experiment",),
+    ("experiment", "sweeps"),
     ("preparation",),
     ("evaluation",),
     ("baselines", "synthetic"),
@@ -697,7 +681,7 @@ WINGS = ("baselines", "synthetic")
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 
 EDGES = {
-    "launch": {"config", "errors", "files", "run"},
+    "launch": {"config", "errors", "files", "process", "run", "sweeps"},
     "train": {"cli"},
 }
 """What the ends of the command line may import, which must be quick to start."""
@@ -809,13 +793,13 @@ def test_modules_that_have_moved_are_found():
     for old, new in MOVED.items():
         assert importlib.util.find_spec(new) is not None, new
         assert old not in sources(), old
-    plain = copy.deepcopy(plains()[-1])
-    name = "xplanes.models.gaussians_spacetime.SpacetimeGaussiansSettings"
-    assert MOVED["xplanes.models.gaussians_spacetime"] in plain["model"]["_target_"]
-    moved = changed_value(plain, "model._target_", name)
-    sampler = "xplanes.rendering.gaussians.renderer.RasteriserSettings"
-    moved = changed_value(moved, "model.sampler._target_", sampler)
-    assert Method.read(moved) == Method.read(plain)
+    method = Method.read(plains()[-1])
+    text = yaml.safe_dump(method.plain())  # As in a checkpoint.
+    for name in ("gaussians_spacetime", "gaussians", "densification"):
+        old = f"xplanes.models.{name}"
+        assert f"{MOVED[old]}." in text, name
+        text = text.replace(f"{MOVED[old]}.", f"{old}.")
+    assert Method.read(yaml.safe_load(text)) == method
 
 
 def test_no_module_needs_itself_to_be_imported():
@@ -880,7 +864,6 @@ def test_no_module_calls_anything_for_its_effect_when_imported():
     for module, path in sources().items():
         for node in tree_of(path).body:
             loose = isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)
-            # Processes of Hydra's launchers import the job, and need to resolve its folder then.
-            assert not loose or module in ("train", "xplanes.__main__", "xplanes.launch"), (
+            assert not loose or module in ("train", "xplanes.__main__"), (
                 f"{module}:{node.lineno} calls at import"
             )

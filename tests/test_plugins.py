@@ -15,6 +15,7 @@ from xplanes import RadianceModule, SceneDataModule, __version__
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.evaluation.runs import load_run
+from xplanes.experiment import Experiment
 from xplanes.fields.base import RadianceField
 from xplanes.run import run
 
@@ -67,6 +68,24 @@ def test_all_four_train_log_and_load_again(config: dict, tmp_path: Path) -> None
     views = SceneDataModule.from_run(folder, plugins=["tests.plugins"]).scene.splits["train"]
     assert len(views) == DATA["count"]
     assert json.loads((folder / "metrics.json").read_text())["step"] == 40
+
+
+def test_a_recipe_reaches_a_model_of_ones_own_or_names_itself(tmp_path: Path) -> None:
+    group = tmp_path / "model"
+    group.mkdir()
+    rays = dict.fromkeys(("per_batch", "samples_per_batch"), "auto")
+    rays |= {"background": "white", "skip_background": False}
+    rays |= {"background_share": 0.2, "background_jitter": 0.05}
+    defaults = [{"sampler": "proposal"}, {"/lrm@_global_.lrm": "none"}, "_self_"]
+    (group / "blob.yaml").write_text(yaml.safe_dump({"defaults": defaults, **BLOB, "rays": rays}))
+    own = [f"hydra.searchpath=[file://{tmp_path}]", "plugins=[tests.plugins]", "model=blob"]
+    model = Experiment.read(compose_plain("train", [*own, "recipe=fair"])).method.model
+    ours = Experiment.read(compose_plain("train", ["recipe=fair"])).method.model
+    assert (model.rays, model.sampler) == (ours.rays, ours.sampler)
+    for recipe in ("capture", "paper"):
+        words = rf"model\.\w+: there is no such setting.*\(recipe={recipe} changes"
+        with pytest.raises(ConfigError, match=words):
+            Experiment.read(compose_plain("train", [*own, f"recipe={recipe}"]))
 
 
 def test_data_of_ones_own_is_composed_in_python() -> None:

@@ -16,6 +16,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
+from hydra_plugins.xplanes import file_name
 from tests import warm
 from tests.training.runs import SMALL
 from tests.warm import train
@@ -24,7 +25,7 @@ from xplanes import run as whole_run
 from xplanes.components import build
 from xplanes.config import CONF, compose_plain, quoted, unquoted, with_names
 from xplanes.errors import ConfigError
-from xplanes.launch import SettingsCheck, file_name, prepare
+from xplanes.launch import SettingsCheck, prepare
 from xplanes.process import resume_command
 from xplanes.scenes.colmap import ColmapSettings
 
@@ -81,11 +82,11 @@ def test_devices_in_a_sweep_are_refused(tmp_path: Path) -> None:
     assert "one device per job" in (result.stdout + result.stderr)
 
 
-def test_sweeps_of_experiments_are_resumed_job_by_job() -> None:
-    for sweep in (["experiment=planes"], ["-m"], ["--multirun"], ["hydra.mode=MULTIRUN"]):
+def test_sweeps_are_resumed_job_by_job() -> None:
+    for sweep in (["-m", "sweep=fair"], ["-m"], ["--multirun"], ["hydra.mode=MULTIRUN"]):
         with pytest.raises(ConfigError, match="one run at a time"):
             prepare([*sweep, "resume=somewhere"])
-    for single in (["experiment=published"], ["seed=1"], ["experiment=planes", "hydra.mode=RUN"]):
+    for single in (["experiment=published"], ["seed=1"], ["sweep=fair", "model=kplanes"]):
         with pytest.raises(ConfigError, match="not a run directory"):
             prepare([*single, "resume=somewhere"])
 
@@ -117,16 +118,6 @@ def test_runs_in_folders_of_any_name_are_resumed(tmp_path: Path) -> None:
     assert shlex.split(resume_command(run))[-1] == f"resume={run}"
 
 
-def test_one_job_of_an_experiment_that_is_a_sweep_goes_on_alone(tmp_path: Path) -> None:
-    (tmp_path / "overrides.txt").write_text("experiment=planes\ndata.scene=balls\n")
-    prepared = prepare([f"resume={tmp_path}"])
-    assert "hydra.mode=RUN" in prepared
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("train", prepared, return_hydra_config=True)
-    assert config.hydra.mode.name == "RUN"
-    assert (config.hydra.run.dir, config.data.scene) == (str(tmp_path), "balls")
-
-
 def test_auto_finds_runs_whatever_was_said_to_hydra(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "outputs" / "run"
@@ -136,20 +127,6 @@ def test_auto_finds_runs_whatever_was_said_to_hydra(tmp_path: Path, monkeypatch)
     own = ["seed=1", "hydra.searchpath=[file://groups]", "hydra.output_subdir=null"]
     assert prepare([*own, "resume=auto"])[-1].startswith("resume=outputs")
     assert prepare([own[0], own[2], "resume=auto"])[-1] == "resume=null"
-
-
-def test_sweeps_in_groups_of_the_users_own_are_known(tmp_path: Path) -> None:
-    (tmp_path / "experiment").mkdir()
-    (tmp_path / "experiment" / "mine.yaml").write_text("hydra: {mode: MULTIRUN}\n")
-    for place in (
-        [f"hydra.searchpath=[file://{tmp_path}]"],
-        [f"hydra.searchpath=['file:///none','file://{tmp_path}']"],
-        ["--config-dir", str(tmp_path)],
-        [f"--config-dir={tmp_path}"],
-    ):
-        given = [*place, "experiment=mine", f"hydra.sweep.dir={tmp_path}", "resume=auto"]
-        assert prepare(given) == given
-    assert prepare(["experiment=mine", "resume=auto"])[-1] == "resume=null"
 
 
 def test_a_sweep_does_not_take_other_jobs_for_its_own(tmp_path: Path) -> None:
@@ -290,17 +267,6 @@ def test_home_is_expanded(monkeypatch, tmp_path: Path) -> None:
     settings = build(plain, ColmapSettings, "data")
     assert settings.folder == tmp_path / "a b"
     assert (settings.masks, settings.times) == (f"{tmp_path}/m", f"{tmp_path}/t.csv")
-
-
-@pytest.mark.slow
-def test_an_experiment_needs_no_flag(root: str, tmp_path: Path) -> None:
-    place = f"hydra.sweep.dir={tmp_path}"
-    result = train(
-        "experiment=planes", *SMALL, root, "model=six_planes", "model.resolution=8,9", place
-    )
-    assert result.returncode == 0, result.stderr
-    assert len(list(tmp_path.glob("*/metrics.json"))) == 2
-    assert (tmp_path / "table.md").is_file()
 
 
 def test_piped_output_is_plain_and_ends_with_scores_and_paths(root: str, tmp_path: Path) -> None:

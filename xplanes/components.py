@@ -18,6 +18,8 @@ TRUSTED = ("xplanes", "lightning", "torchmetrics")
 """Packages whose classes any configuration may name."""
 
 MOVED = {
+    "xplanes.models.densification": "xplanes.baselines.gaussians.densification",
+    "xplanes.models.gaussians": "xplanes.baselines.gaussians.model",
     "xplanes.models.gaussians_deform": "xplanes.baselines.gaussians.deform",
     "xplanes.models.gaussians_hexplane": "xplanes.baselines.gaussians.hexplane",
     "xplanes.models.gaussians_spacetime": "xplanes.baselines.gaussians.spacetime",

@@ -90,8 +90,10 @@ def _hydra(conf: Path, name: str | None, overrides: Sequence[str]) -> Iterator[N
 def _initialized(conf: Path) -> Iterator[None]:
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.plugins import Plugins
     from hydra.core.singleton import Singleton
 
+    Plugins.instance()  # What they register belongs to the state that comes back.
     # Inside a job there is a Hydra already, which must be there again afterwards.
     outer = Singleton.get_state()
     GlobalHydra.instance().clear()

@@ -1,4 +1,4 @@
-"""Training from the command line: resumed runs, and the job that Hydra runs.
+"""Training from the command line: resumed runs, sweeps, and the job that Hydra runs.
 
 Must stay quick: it imports neither torch nor lightning before the job begins.
 """
@@ -11,26 +11,31 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+import hydra_plugins.xplanes  # noqa: F401  # Processes of launchers resolve run directories with it.
 from xplanes import __version__
 from xplanes.config import CONF, near_names, quoted, to_plain, unquoted, with_names
 from xplanes.errors import ConfigError
 from xplanes.files import StorageError, read_json, require_writable
+from xplanes.process import train_command
 
 SEARCHPATH = "hydra.searchpath"
 
-
-def file_name(scene: Any) -> str:
-    """The name of a scene as a part of a run directory's: no folders, and nothing to quote."""
-    return re.sub(r"[^\w.+-]+", "-", Path(str(scene)).name).strip("-") or "scene"
-
-
-OmegaConf.register_new_resolver("file_name", file_name, replace=True)
+FORMER = {
+    "figure3": "sweep=rank data.scene=hook,lego lrm=xlarge",
+    "figures5_7_9_10": "sweep=table1",
+    "initialisation": "data.scene=excavator,walker,balls,windmill model=six_planes,nine_planes "
+    "lrm=none,tiny,mini seed=0,1,2",
+    "planes": "model=six_planes,nine_planes model.resolution=32,64,128",
+    "table2": "sweep=tables2_3",
+    "table3": "sweep=tables2_3",
+    "views": "lrm=none,tiny data.views=5,10,20,null",
+}
+"""Sweeps that were experiments, and what they are where their names are others now."""
 
 
 def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
@@ -72,11 +77,18 @@ _prepared: dict[str, Any] = {}
 
 
 class SettingsCheck(Callback):
-    """Refuses settings before Hydra makes the run directory; jobs of a sweep check their own."""
+    """Refuses settings before Hydra makes the run directory; jobs of a sweep check their own.
+
+    Hydra makes warnings of exceptions in callbacks, hence the exits.
+    """
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         from xplanes.run import KNOWN_ERRORS, prepare
 
+        if config.hydra.runtime.choices.get("sweep") and config.resume is None:
+            task: Any = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
+            given = shlex.join(text for text in task if _split(text)[0] != "resume")
+            sys.exit(f"error: a sweep is many runs: {train_command()} -m {given}")
         names = [str(name) for name in config if name != "hydra"]
         HydraConfig.instance().set_config(config)  # As Hydra does for the job, for ${hydra:...}.
         try:
@@ -86,7 +98,17 @@ class SettingsCheck(Callback):
                     plain, Path(config.hydra.run.dir).absolute()
                 )
         except KNOWN_ERRORS as error:
-            sys.exit(f"error: {error}")  # Hydra makes warnings of other exceptions.
+            sys.exit(f"error: {error}")
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        from xplanes.run import KNOWN_ERRORS
+        from xplanes.sweeps import look_ahead
+
+        try:
+            if words := look_ahead(config):
+                print(words, flush=True)
+        except KNOWN_ERRORS as error:
+            sys.exit(f"error: {error}")
 
 
 def _resolved(config: DictConfig) -> dict[str, Any] | None:
@@ -155,7 +177,7 @@ def _require_same_job(folder: Path, overrides: Iterable[str]) -> None:
 def _may_differ(override: str) -> bool:
     """Whether a run may go on with this changed: how long it trains, what it writes, and where."""
     return not override or _split(override)[0].split(".")[0] in (
-        *("resume", "hydra", "trainer", "callbacks", "logger", "media", "viewer", "sheet"),
+        *("resume", "hydra", "trainer", "callbacks", "logger", "media", "viewer"),
     )
 
 
@@ -173,6 +195,7 @@ def prepare(arguments: list[str]) -> list[str]:
         StorageError: If the folder of the run cannot be written.
     """
     several = _is_multirun(arguments)
+    _require_present_names(arguments, several=several)
     arguments = [with_names(text, several=several) for text in arguments]
     values = {key: value for key, value in map(_split, arguments) if key}
     for key, value in values.items():
@@ -224,10 +247,60 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
     new = [a for a in arguments if not a.startswith(("resume=", "hydra.run.dir="))]
     changed = {key for key, _ in map(_split, new) if key}
     old = [line for line in text.splitlines() if line and _split(line)[0] not in changed]
-    # One job of an experiment that is a sweep goes on alone.
-    alone = [] if "hydra.mode" in changed else ["hydra.mode=RUN"]
+    try:
+        _require_present_names(old, several=False)
+    except ConfigError as error:
+        raise ConfigError(
+            f"resume={run}: it began with settings of an earlier version. {error}"
+        ) from None
     place = quoted(str(run))
-    return [*old, *new, *alone, f"hydra.run.dir={place}", f"resume={place}"]
+    return [*old, *new, f"hydra.run.dir={place}", f"resume={place}"]
+
+
+def _require_present_names(arguments: Sequence[str], *, several: bool) -> None:
+    """Answer choices that there were with those of today.
+
+    Raises:
+        ConfigError: With the commands.
+    """
+    former, commands = [], [""]
+    for text in arguments:
+        key, value = text.partition("=")[::2]
+        choices = [shlex.quote(text)]
+        if key in ("experiment", "sweep") and value in FORMER:
+            choices, several = [FORMER[value]], True
+        elif key == "experiment" and value and (CONF / "sweep" / f"{value}.yaml").is_file():
+            choices, several = [f"sweep={value}"], True
+        elif key == "scale":
+            choices = ["experiment=demo"]
+        elif key == "entry":
+            choices = _entries(value)
+            several = several or choices[0].startswith("sweep=")
+        elif text in ("-m", "--multirun"):
+            continue
+        if choices != [shlex.quote(text)]:
+            former.append(text)
+        commands = [f"{command} {choice}" for command in commands for choice in choices]
+    if former:
+        program = f"{train_command()} -m" if several else train_command()
+        lines = "\n".join(f"  {program}{command}" for command in commands)
+        raise ConfigError(f"{' '.join(former)}: that is now\n{lines}")
+
+
+def _entries(names: str) -> list[str]:
+    """What the group ``entry`` chose: models, together where the rest is the same."""
+    found: dict[str, list[str]] = {}
+    for name in names.split(","):
+        if name.startswith("ablation_"):
+            return ["sweep=ablation"]
+        model, rest = name.removesuffix("_occupancy"), ""
+        if model != name:
+            rest = " model/sampler=occupancy"
+        if planes := re.fullmatch(r"(six_planes|nine_planes)(_paper)?(_[a-z]+)?", name):
+            model, paper, lrm = planes.groups()
+            rest = (" recipe=paper" if paper else "") + (f" lrm={lrm[1:]}" if lrm else "")
+        found.setdefault(rest, []).append(model)
+    return [f"model={','.join(models)}{rest}" for rest, models in found.items()]
 
 
 def _require_version(run: Path) -> None:
@@ -278,28 +351,7 @@ def _split(argument: str) -> tuple[str, str]:
 
 
 def _is_multirun(arguments: list[str]) -> bool:
-    """Whether Hydra will run several jobs, by an option, by its mode or by the experiment."""
-    values = dict(map(_split, arguments))
+    """Whether Hydra will run several jobs, by an option or by its mode."""
     if not {"-m", "--multirun"}.isdisjoint(arguments):
         return True
-    if "hydra.mode" in values:
-        return values["hydra.mode"] == "MULTIRUN"
-    folders = re.findall(r"file://([^\]\[,'\"]+)", values.get(SEARCHPATH, ""))
-    for number, text in enumerate(arguments):
-        option, equals, folder = text.partition("=")
-        if option in ("--config-dir", "-cd"):
-            folders += [folder] if equals else arguments[number + 1 : number + 2]
-    return _is_sweep(values.get("experiment", ""), [CONF, *map(Path, folders)])
-
-
-def _is_sweep(experiment: str, folders: Iterable[Path]) -> bool:
-    """Whether the experiment's file says that it is a multirun."""
-    paths = [folder / "experiment" / f"{experiment}.yaml" for folder in folders]
-    path = next((path for path in paths if path.is_file()), None)
-    if path is None:
-        return False
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-        return (content.get("hydra") or {}).get("mode") == "MULTIRUN"
-    except (OSError, ValueError, AttributeError, yaml.YAMLError):
-        return False  # Hydra says what is wrong with it.
+    return dict(map(_split, arguments)).get("hydra.mode") == "MULTIRUN"

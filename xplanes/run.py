@@ -17,10 +17,8 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from xplanes.backend import warm_up
 from xplanes.errors import ConfigError, SceneError, XPlanesError
 from xplanes.evaluation.findings import camera_findings, opaque_findings, stray_findings
-from xplanes.evaluation.published import check_published
 from xplanes.evaluation.render import FRAMES, write_orbit
 from xplanes.evaluation.report import closing, header, log_hparams, rest, summary, write_pictures
-from xplanes.evaluation.sheet import check_what
 from xplanes.experiment import Experiment
 from xplanes.files import StorageError, clear_unfinished, storage_error, write_json
 from xplanes.locks import alone_in
@@ -76,8 +74,6 @@ def prepare(config: dict[str, Any], folder: Path) -> Job:
         ConfigError: If settings are missing, out of range, or contradict one another.
     """
     experiment = Experiment.read(config)
-    check_published(config.get("published", []))
-    check_what(config.get("sheet"))
     return Job(experiment, experiment.build_trainer(folder), folder)
 
 

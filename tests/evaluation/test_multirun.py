@@ -66,10 +66,9 @@ def test_the_table_comes_once(tmp_path: Path, capsys):
 
 def test_a_sheet_of_any_kind_has_the_name_that_pages_link_to(tmp_path: Path, capsys):
     pictured(tmp_path / "0")
-    callback, sweep = SweepTable(), settings(tmp_path)
-    sweep.sheet = "steps"
-    callback.on_multirun_start(sweep)  # type: ignore[arg-type]
-    callback.on_multirun_end(sweep)  # type: ignore[arg-type]
+    callback = SweepTable(sheet="steps")
+    callback.on_multirun_start(settings(tmp_path))  # type: ignore[arg-type]
+    callback.on_multirun_end(settings(tmp_path))  # type: ignore[arg-type]
     assert f"wrote {tmp_path / 'sheet.png'}\n" in capsys.readouterr().out
     assert len(areas(tmp_path / "sheet.png")) == 3  # The truth and two steps.
 

@@ -115,7 +115,7 @@ def test_every_setting_is_the_papers_or_its_references() -> None:
 
 def test_the_largest_lrm_is_its_own_and_others_can_be_chosen() -> None:
     assert compose_plain("train", ["recipe=paper"])["lrm"]["name"] == "xlarge"
-    plain = compose_plain("train", ["recipe=paper", "entry=nine_planes_tiny", "seed=3"])
+    plain = compose_plain("train", ["recipe=paper", "model=nine_planes", "lrm=tiny", "seed=3"])
     assert (plain["lrm"]["name"], plain["model"]["plane_lr"]) == ("tiny", 0.0025)
     plain = compose_plain("train", ["recipe=paper", "lrm=none", "model.plane_lr=0.5"])
     assert (plain["lrm"]["name"], plain["model"]["plane_lr"]) == ("none", 0.5)

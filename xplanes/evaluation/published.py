@@ -12,7 +12,7 @@ from xplanes.files import read_rows
 KEYS = {"model": "model.name", "lrm": "lrm.name", "sampler": "model.sampler.name"}
 """Settings that runs are told apart by, and their columns in the file."""
 
-MEANT = ("data.scene", "seed", "entry")
+MEANT = ("data.scene", "seed")
 """Settings that the means go over."""
 
 OWN = ["runs", "psnr", "ssim", "minutes"]
@@ -34,25 +34,25 @@ def check_published(names: object) -> list[str]:
     """
     known = list(dict.fromkeys(entry["table"] for entry in read_published()))
     if not isinstance(names, list) or any(name not in known for name in names):
-        raise ConfigError(f"published={names}: must be a list of some of {', '.join(known)}")
+        raise ConfigError(
+            f"hydra.callbacks.table.published={names}: must be a list of some of {', '.join(known)}"
+        )
     return names
 
 
-def beside(rows: Sequence[RunRow]) -> str | None:
+def beside(rows: Sequence[RunRow], tables: Sequence[str] = ()) -> str | None:
     """Means of a sweep's finished runs beside what was published.
 
     Figures are set beside runs on D-NeRF's scenes with all views that agree in model, LRM, sampler
-    and, where they name it, the planes' resolution. Where runs name tables (``published``), these
-    are shown whole, whatever the data.
+    and, where they name it, the planes' resolution.
 
     Args:
         rows: The sweep.
+        tables: Published tables that are shown whole, whatever the data.
 
     Returns:
         Words and tables in markdown; None where nothing was published of these models.
     """
-    named = [name for row in rows for name in row.settings.get("published") or ()]
-    tables = check_published(list(dict.fromkeys(named)))
     entries = [e for e in read_published() if not tables or e["table"] in tables]
     scored = [entry for entry in entries if entry["psnr"]]
     parts = [_ranks(rows, entry) for entry in entries if tables and entry["rank"]]

@@ -120,7 +120,9 @@ def check_what(what: str | None) -> None:
         ConfigError: If it is neither None nor one of `WHAT`.
     """
     if what is not None and what not in WHAT:
-        raise ConfigError(f"sheet={what}: must be null or one of {', '.join(WHAT)}")
+        raise ConfigError(
+            f"hydra.callbacks.table.sheet={what}: must be null or one of {', '.join(WHAT)}"
+        )
 
 
 def _path(folder: Path, row: RunRow) -> Path:

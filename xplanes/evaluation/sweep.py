@@ -9,6 +9,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -268,23 +269,26 @@ def _settings_of(overrides: Iterable[str]) -> tuple[str, ...]:
     return tuple(sorted(text for text in overrides if _key(text).split(".")[0] not in mine))
 
 
-def _jobs(multirun: dict[str, Any]) -> list[tuple[str, ...]]:
+def _jobs(multirun: dict[str, Any]) -> list[list[str]]:
     """Overrides of each job of a sweep over a grid; none for other sweepers."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
+    from xplanes.sweeps import GRIDS, jobs
+
     try:
-        settings = multirun["hydra"]
-        if not settings["sweeper"]["_target_"].endswith(".BasicSweeper"):
-            return []
-        params = [f"{key}={value}" for key, value in (settings["sweeper"]["params"] or {}).items()]
-        lines = [*params, *settings["overrides"]["task"]]
-        choices: dict[str, list[str]] = {}
-        for each in OverridesParser.create().parse_overrides(lines):
-            swept = each.is_discrete_sweep()
-            values = each.sweep_string_iterator() if swept else [each.get_value_element_as_str()]
-            key = each.get_key_element()
-            choices[key] = [f"{key}={value}" for value in values]
-        return list(itertools.product(*choices.values()))
+        target = multirun["hydra"]["sweeper"]["_target_"]
+        return jobs(multirun["hydra"]) if target.endswith(GRIDS) else []
     except (KeyError, TypeError, AttributeError, HydraException):
         return []
+
+
+def published_tables(folder: Path) -> list[str]:
+    """Published tables that the sweeps in a folder are shown with."""
+    found: list[str] = []
+    for place, _ in _groups(folder):
+        content = _mapping(place / "multirun.yaml", []) or {}
+        with suppress(KeyError, TypeError):
+            # Sweeps of early 0.3 have it at the top.
+            own = content.get("published") or content["hydra"]["callbacks"]["table"]["published"]
+            found += [name for name in own if name not in found]
+    return found

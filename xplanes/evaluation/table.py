@@ -2,6 +2,7 @@
 
 import atexit
 import os
+import sys
 import traceback
 from collections.abc import MutableMapping, Sequence
 from pathlib import Path
@@ -14,9 +15,9 @@ from omegaconf import DictConfig
 
 from xplanes.errors import ConfigError
 from xplanes.evaluation.curves import plot_against, plot_curves
-from xplanes.evaluation.published import beside
-from xplanes.evaluation.sheet import write_sheet
-from xplanes.evaluation.sweep import RunRow, read_rows
+from xplanes.evaluation.published import beside, check_published
+from xplanes.evaluation.sheet import check_what, write_sheet
+from xplanes.evaluation.sweep import RunRow, published_tables, read_rows
 from xplanes.evaluation.tabulate import (
     SEED,
     Line,
@@ -61,7 +62,7 @@ def write_tables(folder: Path, out: Path | None = None) -> str:
         means = seed_table(seeds, [name for name in names if name != SEED])
         text += ["Mean and standard deviation over seeds:", shown(means)]
         _write(out / "table_seeds.csv", means)
-    if (published := beside(rows)) is not None:
+    if (published := beside(rows, published_tables(folder))) is not None:
         text.append(published)
     if parts := decomposition_table(rows, names):
         text += ["Decomposition of the LRM's triplanes (means over xy, xz, yz):", shown(parts)]
@@ -120,15 +121,24 @@ class SweepTable(Callback):
 
     The table comes at the end of the process, whichever that is: Hydra leaves out
     ``on_multirun_end`` when a job has failed or the sweep is stopped.
+
+    Args:
+        published: Published tables to show with it, whatever the data.
+        sheet: What the contact sheet at the end shows, one of `xplanes.evaluation.sheet.WHAT`;
+            None for no sheet.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, published: Sequence[str] = (), sheet: str | None = None) -> None:
         self._folder: Path | None = None
-        self._sheet: str | None = None
+        self._published, self._sheet = list(published), sheet
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        try:
+            check_published(self._published)
+            check_what(self._sheet)
+        except ConfigError as error:
+            sys.exit(f"error: {error}")  # Hydra makes warnings of other exceptions.
         self._folder = Path(config.hydra.sweep.dir).absolute()
-        self._sheet = getattr(config, "sheet", None)
         atexit.register(self._finish)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:

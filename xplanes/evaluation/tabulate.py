@@ -16,8 +16,6 @@ UNLISTED = (
     "callbacks.evaluation.views",
     "media",
     "trainer.log_every_n_steps",
-    "published",
-    "sheet",
 )
 """Settings that say nothing about a result."""
 

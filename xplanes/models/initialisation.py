@@ -190,7 +190,7 @@ class Method:
         lrm: What the field is initialised from.
         preparation: How an initialisation is made.
         decomposition: How triplanes become planes.
-        losses: Further terms of the loss by name.
+        losses: Further terms of the loss by name; those of weight 0 are left out.
     """
 
     seed: int
@@ -214,7 +214,12 @@ class Method:
             raise ConfigError(
                 f"seed={seed}: must be a whole number, not negative and below 4294967296 (2^32)"
             )
-        model = build(config["model"], ModelSettings, "model")
+        try:
+            model = build(config["model"], ModelSettings, "model")
+        except ConfigError as error:
+            if (recipe := config.get("recipe")) is None:
+                raise
+            raise ConfigError(f"{error} (recipe={recipe} changes settings of the model)") from None
         if "lrm" not in config:
             raise ConfigError(
                 f"lrm: model={model.name} chooses none; write `- /lrm@_global_.lrm: none`, or the "
@@ -232,14 +237,17 @@ class Method:
         if model.field_class is not None:
             model.sampler.require_kind(model.field_class)
             model.sampler.require(model.field_class)
-        losses = config.get("losses") or {}
+        losses = {
+            name: build(node, LossTerm, f"losses.{name}")
+            for name, node in (config.get("losses") or {}).items()
+        }
         return cls(
             seed,
             model,
             lrm,
             build(config["preparation"], PreparationSettings, "preparation"),
             build(config["decomposition"], DecompositionSettings, "decomposition"),
-            {name: build(node, LossTerm, f"losses.{name}") for name, node in losses.items()},
+            {name: term for name, term in losses.items() if term.weight},
         )
 
     def require_devices(self, count: int) -> None:

@@ -1,0 +1,332 @@
+"""Sweeps, the paper's tables and figures among them: what they consist of, and their jobs."""
+
+import functools
+import itertools
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
+
+from hydra_plugins.xplanes import ALIASES
+from tests.balls import ball_scene
+from tests.test_contracts import built, small
+from tests.warm import train
+from xplanes.config import CONF, compose_plain, group_options
+from xplanes.errors import ConfigError, LRMError
+from xplanes.evaluation.published import check_published, read_published
+from xplanes.evaluation.sheet import check_what
+from xplanes.experiment import Experiment
+from xplanes.launch import FORMER, prepare
+from xplanes.sweeps import SMALL, jobs, look_ahead
+from xplanes.training.losses import loss_terms
+
+PAPER = {
+    "table1": (8, 7),
+    "tables2_3": (8, 8),
+    "table4": (8, 8),
+    "few_shot": (8, 9),
+    "figure6": (1, 4),
+    "rank": (8, 4),
+    "fair": (8, 7),
+    "ablation": (4, 30),
+}
+"""Scenes, and runs of each."""
+
+SWEEPS = sorted(path.stem for path in (CONF / "sweep").glob("*.yaml"))
+
+
+@functools.cache
+def multirun(*overrides: str) -> DictConfig:
+    """The configuration of a multirun."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        composable = [text for text in overrides if "," not in text]
+        config = compose("train", composable, return_hydra_config=True)
+    OmegaConf.update(config, "hydra.overrides.task", list(overrides))
+    return config
+
+
+def jobs_of(*overrides: str) -> list[list[str]]:
+    return jobs(OmegaConf.to_container(multirun(*overrides).hydra, resolve=False))
+
+
+def values_of(found: list[list[str]], key: str) -> list[str]:
+    """Different values of a setting in jobs."""
+    texts = itertools.chain(*found)
+    return list(dict.fromkeys(t.partition("=")[2] for t in texts if t.startswith(f"{key}=")))
+
+
+def test_sweeps_have_the_papers_scenes_and_rows() -> None:
+    for name, (scenes, runs) in PAPER.items():
+        found = jobs_of(f"sweep={name}")
+        assert len(values_of(found, "data.scene")) == scenes, name
+        assert len({tuple(job) for job in found}) == len(found) == scenes * runs, name
+        if name != "ablation":
+            plain = compose_plain("train", found[0])
+            assert (plain["data"]["name"], plain["data"]["resolution"]) == ("dnerf", 400), name
+            assert plain["data"]["eval_split"] is None, name
+            assert plain["trainer"]["max_seconds"] is None, name
+    tables = {"table1": ["Table 1"], "tables2_3": ["Table 2", "Table 3"], "table4": ["Table 4"]}
+    for name, published in (tables | {"rank": ["Rank"]}).items():
+        assert multirun(f"sweep={name}").hydra.callbacks.table.published == published, name
+
+
+def test_published_resolutions_and_lrms_are_those_that_are_swept() -> None:
+    for name, table, key in (
+        ("tables2_3", "Table 3", "lrm"),
+        ("table4", "Table 4", "model.resolution"),
+    ):
+        found = jobs_of(f"sweep={name}")
+        entries = [entry for entry in read_published() if entry["table"] == table]
+        column = key.split(".")[-1]
+        assert {entry[column] for entry in entries} == set(values_of(found, key))
+        assert {entry["model"] for entry in entries} == set(values_of(found, "model"))
+
+
+@pytest.mark.parametrize("size", [(), (SMALL,)], ids=str)
+def test_every_choice_of_every_sweep_exists(size: tuple[str, ...]) -> None:
+    groups = ("model", "lrm", "recipe", "model/sampler")
+    options = {group: set(group_options(group)) for group in groups}
+    for name in PAPER if size else SWEEPS:
+        config = multirun(f"sweep={name}", *size)
+        found = jobs_of(f"sweep={name}", *size)
+        for group in groups:
+            assert set(values_of(found, group)) <= options[group], (name, group)
+        check_published(list(config.hydra.callbacks.table.published))
+        check_what(config.hydra.callbacks.table.sheet)
+        assert "params" in config.hydra.sweeper, name
+        if size:
+            assert (config.data.name, config.data.resolution) == ("demo", 64), name
+            steps = values_of(found, "trainer.max_steps") or [config.trainer.max_steps]
+            assert int(steps[0]) * len(found) <= 9000, name
+
+
+def test_a_sweep_is_narrowed_down_on_the_command_line() -> None:
+    found = jobs_of("sweep=table1", "model=kplanes,six_planes", "data.scene=lego")
+    assert found == [
+        ["data.scene=lego", "sweep=table1", "model=kplanes"],
+        ["data.scene=lego", "sweep=table1", "model=six_planes", "recipe=paper"],
+    ]
+    # What only some rows set is the others' alone.
+    found = jobs_of("sweep=ablation", "lrm=mini", "seed=3", "data.scene=balls")
+    assert len(found) == 10
+    assert sorted(values_of(found, "lrm")) == ["mini", "none"]
+    assert jobs_of("sweep=table1", "model=tineuvox_s") == []
+    # Without rows the grid is Hydra's own.
+    assert jobs_of("model=a,b", "seed=0,1") == [
+        [f"model={model}", f"seed={seed}"] for model in "ab" for seed in (0, 1)
+    ]
+
+
+def cases() -> Iterator[tuple[str, ...]]:
+    """Jobs of all sweeps that differ in more than numbers and scenes."""
+    for name, size in itertools.product(SWEEPS, ((), (SMALL,))):
+        if size and name not in PAPER:
+            continue
+        left_out = ("seed", "data.scene", "data.views", "model.resolution")
+        different = {
+            tuple(text for text in job if text.partition("=")[0] not in left_out)
+            for job in jobs_of(f"sweep={name}", *size)
+        }
+        yield from sorted(different)
+
+
+def test_jobs_build_and_do_a_step() -> None:
+    found = list(cases())
+    assert len(found) > 60
+    does_a_step(found[::9])
+
+
+@pytest.mark.slow
+def test_all_jobs_build_and_do_a_step() -> None:
+    does_a_step(list(cases()))
+
+
+def does_a_step(chosen: list[tuple[str, ...]]) -> None:
+    scene = ball_scene()
+    for overrides in chosen:
+        experiment = Experiment.read(small(*overrides))
+        module, batches = built(experiment.config, scene)
+        rays, state = batches.draw(0), module.state
+        rendering = module.sampler.render(module.field, rays, state)
+        loss = sum(loss_terms(module.parts, module.method.losses, rendering, rays, state).values())
+        assert torch.isfinite(loss), overrides
+        loss.backward()
+        module.model.regularise(state)
+        gradients = [p.grad for p in module.field.parameters() if p.grad is not None]
+        assert any(bool(gradient.any()) for gradient in gradients), overrides
+
+
+def test_fair_means_equal_rays_samples_and_terms() -> None:
+    rays, samplers, losses = set(), set(), set()
+    for overrides in jobs_of("sweep=fair", "data.scene=lego"):
+        plain = compose_plain("train", overrides)
+        experiment = Experiment.read(plain)
+        model = experiment.method.model
+        rays.add(str(model.rays))
+        samplers.add(str(model.sampler))
+        weights = plain["model"].get("loss", {})
+        losses.add((weights.get("opacity", 0.0), weights.get("floaters", 0.0)))
+        assert experiment.method.losses == {}
+        assert experiment.trainer["max_steps"] == 30000
+    assert len(rays) == len(samplers) == 1
+    assert losses == {(0.0, 0.0)}
+
+
+@pytest.mark.parametrize("chosen", [["recipe=paper", "lrm=tiny"], ["recipe=paper"], []])
+def test_the_ablation_changes_one_thing_at_a_time(chosen: list[str]) -> None:
+    whole = compose_plain("train", chosen)
+    for overrides in jobs_of("sweep=ablation", "data.scene=excavator", "seed=0", *chosen):
+        plain = compose_plain("train", overrides)
+        changed = {group for group in whole if plain[group] != whole[group]}
+        random = "lrm=none" in overrides
+        assert ("lrm" in changed) == random, overrides
+        assert plain["lrm"]["name"] == ("none" if random else whole["lrm"]["name"])
+        assert len(changed - {"lrm"}) <= 1, overrides
+
+
+def test_published_lrms_have_their_own_names_beside_the_papers() -> None:
+    assert set(ALIASES) <= set(group_options("lrm"))
+    for alias, name in ALIASES.items():
+        plain = compose_plain("train", [f"lrm={alias}"])["lrm"]
+        assert plain == compose_plain("train", [f"lrm={name}"])["lrm"]
+        assert plain["architecture"].startswith(alias.replace("_", "-"))
+
+
+def test_one_gpu_has_no_limit_of_time() -> None:
+    trainer = compose_plain("train", ["trainer=gpu"])["trainer"]
+    assert (trainer["max_seconds"], trainer["max_steps"]) == (None, 30000)
+
+
+# Before the first job
+
+
+def looked_ahead(*overrides: str) -> str:
+    """What is said of a sweep before its first job."""
+    config = multirun(*overrides)
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return look_ahead(config)
+
+
+def test_a_sweep_is_run_with_the_flag(tmp_path: Path) -> None:
+    done = train("sweep=table1", "model=kplanes", cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: a sweep is many runs: ")
+    assert done.stderr.endswith(" -m sweep=table1 model=kplanes\n")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_sweep_is_run_alone() -> None:
+    with pytest.raises(ConfigError, match=r"one sweep at a time.* -m sweep=table1; .*sweep=fair"):
+        looked_ahead("sweep=table1,fair")
+
+
+def test_a_sweep_looks_for_its_data_and_weights_first(tmp_path: Path) -> None:
+    done = train("-m", "sweep=rank", f"hydra.sweep.dir={tmp_path / 'sweep'}", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "bouncingballs does not exist" in done.stderr
+    assert "xplanes download dnerf" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "lego").mkdir()
+    given = ("data.scene=lego", f"data.root={tmp_path}", "lrm=small")
+    with pytest.raises(LRMError, match=r"none\.safetensors is not a file"):
+        looked_ahead("sweep=rank", *given, f"lrm.weights={tmp_path / 'none.safetensors'}")
+
+
+def test_rows_and_sizes_that_a_sweep_does_not_have_are_named() -> None:
+    with pytest.raises(ConfigError, match=r"no row .* model=nine_planes recipe=paper"):
+        looked_ahead("sweep=table1", "model=tineuvox_s")
+    with pytest.raises(ConfigError, match="sweep=suite has no small version"):
+        looked_ahead("sweep=suite", SMALL)
+
+
+def test_how_long_a_sweep_takes_is_said() -> None:
+    assert looked_ahead("sweep=suite").startswith("18 runs, at most 18 minutes")
+    assert looked_ahead("seed=0,1", "trainer.max_seconds=null").startswith("2 runs, 60000 steps")
+    # Jobs refuse their own settings, and Hydra says what it cannot compose.
+    assert looked_ahead("seed=0,1", "model.channels=0").startswith("2 runs, ")
+    assert looked_ahead("model=six_planes,nothing") == ""
+
+
+@pytest.mark.parametrize(
+    ("former", "now"),
+    [
+        ("experiment=table1", ["-m sweep=table1"]),
+        ("experiment=table3 scale=demo seed=1", ["-m sweep=tables2_3 experiment=demo seed=1"]),
+        ("-m experiment=figures5_7_9_10", ["-m sweep=table1"]),
+        ("scale=demo", ["experiment=demo"]),
+        ("entry=kplanes", ["model=kplanes"]),
+        ("entry=nine_planes_paper_tiny", ["model=nine_planes recipe=paper lrm=tiny"]),
+        ("entry=ablation_ones", ["-m sweep=ablation"]),
+        (
+            "-m entry=six_planes_none,kplanes,kplanes_occupancy,tensor4d seed=0,1",
+            [
+                "-m model=six_planes lrm=none seed=0,1",
+                "-m model=kplanes,tensor4d seed=0,1",
+                "-m model=kplanes model/sampler=occupancy seed=0,1",
+            ],
+        ),
+    ],
+)
+def test_former_names_are_answered_with_those_of_today(former: str, now: list[str]) -> None:
+    with pytest.raises(ConfigError, match="that is now") as caught:
+        prepare(former.split())
+    lines = str(caught.value).splitlines()[1:]
+    assert [line.split(" train ")[-1].split("train.py ")[-1] for line in lines] == now
+    for line in now:
+        chosen = [text for text in line.split() if text != "-m"]
+        assert jobs_of(*chosen)
+        assert prepare(line.split()) == line.split()
+
+
+def test_what_former_sweeps_are_now_exists() -> None:
+    for name, now in FORMER.items():
+        assert jobs_of(*shlex.split(now)), name
+        assert name not in SWEEPS
+
+
+def test_a_run_that_began_with_former_names_says_so(tmp_path: Path) -> None:
+    (tmp_path / "overrides.txt").write_text("entry=kplanes\nseed=1\n")
+    with pytest.raises(ConfigError, match="settings of an earlier version") as caught:
+        prepare([f"resume={tmp_path}"])
+    assert str(caught.value).endswith("model=kplanes seed=1")
+
+
+def test_a_sweep_says_how_long_it_takes_and_its_jobs_go_on(scenes: Path, tmp_path: Path) -> None:
+    own = tmp_path / "conf" / "sweep"
+    own.mkdir(parents=True)
+    sweep = {
+        "defaults": [{"override /experiment": "demo"}],
+        "hydra": {
+            "callbacks": {"table": {"sheet": "runs"}},
+            "sweeper": {"params": {"seed": "0,1"}, "rows": ["lrm=none", "model.resolution=12"]},
+        },
+    }
+    text = "# @package _global_\n" + yaml.safe_dump(sweep, sort_keys=False)
+    (own / "mine.yaml").write_text(text)
+    tiny = (
+        *("data.resolution=32", "data.train_views=10", "data.test_views=3", "data.val_views=2"),
+        *("model.rays.per_batch=64", "model.rays.samples_per_batch=1024", "lrm=none"),
+        *("model.sampler.grid_resolution=12", "logger=none", f"data.root={scenes}"),
+    )
+    place = tmp_path / "sweep"
+    given = ("-m", "sweep=mine", f"hydra.searchpath=[file://{tmp_path / 'conf'}]", *tiny)
+    given = (*given, f"hydra.sweep.dir={place}")
+    first = train(*given, "trainer.max_steps=2", cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    assert first.stdout.startswith("4 runs, 8 steps in all")
+    runs = sorted(place.glob("*/metrics.json"))
+    assert len(runs) == 4
+    assert (place / "table.md").is_file()
+    assert (place / "sheet.png").is_file()
+    again = train(*given, "trainer.max_steps=3", "resume=auto", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    alone = train(f"resume={runs[0].parent}", "trainer.max_steps=4", cwd=tmp_path)
+    assert alone.returncode == 0, alone.stderr
+    steps = [yaml.safe_load(path.read_text())["step"] for path in runs]
+    assert steps == [4, 3, 3, 3]

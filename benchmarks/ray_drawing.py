@@ -2,8 +2,8 @@
 
     python benchmarks/ray_drawing.py [--gigabytes 2] [--step-ms 25] [--cache FOLDER]
 
-Writes results/ray_drawing.md and ray_drawing.csv beside this file. Frames of noise are written as a
-file of tiles and removed again. Between draws the script waits for the rest of a step, in which the
+Writes results/ray_drawing.md and ray_drawing.csv beside this file. Frames of noise are written to a
+file and removed again. Between draws the script waits for the rest of a step, in which the
 system reads what was announced; "cold" drops the file from the system's cache at the beginning.
 """
 
@@ -101,7 +101,7 @@ def main() -> None:
         began = time.perf_counter()
         images = store.decoded([source], "benchmark", [SIZE] * count, 3, jobs, Path(place))
         writing = time.perf_counter() - began
-        file = next(Path(place).glob("*.tiles"))
+        file = next(Path(place).glob("*.pixels"))
 
         def drop() -> None:
             with file.open("rb") as handle:
@@ -121,7 +121,7 @@ def main() -> None:
         rows.append(measure("on disk, cold", batches, pause, drop))
         rows.append(measure("on disk, in the system's cache", batches, pause, warm))
         silent = RayBatches(views, frame, settings, seed=0)
-        silent._prefetch = lambda step: None  # type: ignore[method-assign]
+        silent._prefetch = lambda step, rays: None  # type: ignore[method-assign]
         rows.append(measure("on disk, cold, without prefetching", silent, pause, drop))
         size = file.stat().st_size
         del batches, silent, prefetched, views, images
@@ -131,7 +131,7 @@ def main() -> None:
     write_rows(RESULTS / "ray_drawing.csv", COLUMNS, rows)
     page = f"""# Drawing rays from images on disk
 
-{count} images of {SIZE[1]} x {SIZE[0]} pixels without alpha, {size / 2**30:.1f} GB in one tiled
+{count} images of {SIZE[1]} x {SIZE[0]} pixels without alpha, {size / 2**30:.1f} GB in one
 file, written in {writing:.0f} s; {settings.per_batch} rays per batch; a training step is assumed to
 take {args.step_ms:g} ms; {STEPS} steps, warm-up included; {machine()}, load average
 {os.getloadavg()[0]:.1f}. `{command()}`

@@ -20,21 +20,21 @@ pytestmark = pytest.mark.stress
 DECODE = """
 import sys, time
 from pathlib import Path
-from xplanes.scenes import store
+from xplanes.scenes import images, store
 from xplanes.scenes.images import native_sizes, read_images
 
-store.IN_MEMORY, cut, pause = 0, store.to_tiles, float(sys.argv[3])
+store.IN_MEMORY, read, pause = 0, images.read_image, float(sys.argv[3])
 calls = []
 
-def slow(pixels):
+def slow(*arguments):
     calls.append(1)
     time.sleep(pause)
-    return cut(pixels)
+    return read(*arguments)
 
-store.to_tiles = slow
+images.read_image = slow
 paths = sorted(Path(sys.argv[1]).iterdir())
-images = read_images(paths, native_sizes(paths), cache=Path(sys.argv[2]))
-print(sum(int(images.image(i).sum()) for i in range(len(images))), len(calls))
+found = read_images(paths, native_sizes(paths), cache=Path(sys.argv[2]))
+print(sum(int(found.image(i).sum()) for i in range(found.shape[0])), len(calls))
 """
 """Decodes slowly; prints the sum of all pixels, and how many images it decoded."""
 
@@ -66,7 +66,7 @@ def test_killed_and_at_once(tally, tmp_path: Path) -> None:
     os.kill(victim.pid, signal.SIGKILL)
     victim.communicate()
     assert len(unfinished()) == 1
-    assert not list(cache.glob("[!.]*.tiles"))
+    assert not list(cache.glob("[!.]*.pixels"))
     both = [start(scene, cache, 0.1) for _ in range(2)]
     said = [process.communicate(timeout=120)[0].splitlines()[-1] for process in both]
     # One decoded all images, the other waited for them.

@@ -22,13 +22,13 @@ from xplanes.rendering.carving import carve
 from xplanes.rendering.filling import fill
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.batches import RayBatches, RaySettings
-from xplanes.scenes.cameras import focal_length
+from xplanes.scenes.cameras import PosedCamera, focal_length
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.dnerf import read_scene
 from xplanes.scenes.frame import cube_frame, optical_centre, scene_frame
 from xplanes.scenes.silhouettes import foreground, may_hold
 from xplanes.scenes.source import frames_are_equal
-from xplanes.scenes.views import Intrinsics, Scene, Views, camera_rays, joined
+from xplanes.scenes.views import Intrinsics, Scene, Views, joined
 from xplanes.training.scores import score_view
 
 RADIUS = 0.5
@@ -502,7 +502,7 @@ def test_an_image_from_a_view_shows_it_whole():
             assert size == (factor * height, factor * width)
             focal, centre, own = lens({"train": views}, path, size)
             assert own is None
-            _, found = camera_rays(views.camera_to_world[index], focal, *size, centre)
+            _, found = PosedCamera(views.camera_to_world[index], focal, *size, centre).rays()
             found = found.view(*size, 3)[factor // 2 :: factor, factor // 2 :: factor]
             found = found.reshape(-1, 3)
             torch.testing.assert_close(found, views.image_rays(index)[1], atol=1e-6, rtol=0)

@@ -13,12 +13,12 @@ from xplanes.errors import SceneError
 from xplanes.evaluation.render import lens as lens_of_picture
 from xplanes.preparation.fixed_view import check_camera
 from xplanes.scenes.batches import RayBatches
-from xplanes.scenes.cameras import ball_extent, cast_rays, look_at, project
+from xplanes.scenes.cameras import PosedCamera, ball_extent, cast_rays, look_at, project
 from xplanes.scenes.datamodule import UNIFORM
 from xplanes.scenes.frame import backwards, cube_frame, scene_frame
 from xplanes.scenes.lenses import COEFFICIENTS, WIDEST, Lenses, LensModel
 from xplanes.scenes.silhouettes import may_hold
-from xplanes.scenes.views import Intrinsics, Views, camera_rays, joined
+from xplanes.scenes.views import Intrinsics, Views, joined
 
 HEIGHT, WIDTH = 30, 44
 FOCAL, CENTRE = (35.0, 37.0), (20.5, 16.25)
@@ -145,7 +145,7 @@ def test_lenses_that_distort_nothing_cost_nothing():
     weak = replace(weak, lenses=replace(weak.lenses, coefficients=weak.lenses.coefficients * 1e-12))
     assert weak.lenses is not None
     rays = [
-        camera_rays(torch.eye(4), weak.focal[0], HEIGHT, WIDTH, weak.centre[0], lens)[1]
+        PosedCamera(torch.eye(4), weak.focal[0], HEIGHT, WIDTH, weak.centre[0], lens).rays()[1]
         for lens in (weak.lens(0), None)
     ]
     torch.testing.assert_close(rays[0], rays[1], atol=2e-7, rtol=0)
@@ -319,7 +319,7 @@ def test_a_picture_from_a_view_has_its_lens():
     for index in (0, 1):
         size = (2 * HEIGHT, 2 * WIDTH)
         focal, centre, lens = lens_of_picture({"train": views}, f"view:{index}", size)
-        _, found = camera_rays(views.camera_to_world[index], focal, *size, centre, lens)
+        _, found = PosedCamera(views.camera_to_world[index], focal, *size, centre, lens).rays()
         # The middle of four pixels is the centre of one of the view.
         found = found.view(HEIGHT, 2, WIDTH, 2, 3).mean(dim=(1, 3)).reshape(-1, 3)
         torch.testing.assert_close(found, views.image_rays(index)[1], atol=1e-3, rtol=0)

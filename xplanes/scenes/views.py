@@ -1,4 +1,4 @@
-"""Images of a scene with poses and times, in memory or in a file of tiles."""
+"""Images of a scene with poses and times, in memory or in a file of pixels."""
 
 import math
 from collections.abc import Mapping
@@ -10,10 +10,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from xplanes.scenes.cameras import cast_rays
+from xplanes.scenes.cameras import PosedCamera, cast_rays
 from xplanes.scenes.lenses import Lenses, Sight, sight
 from xplanes.scenes.matte import silhouette_of
-from xplanes.scenes.store import CELL, TILE, StoredImages, TileFile, count_in_squares
+from xplanes.scenes.store import PixelFile, StoredImages
 
 PALE_STEPS, PALE_EDGE = 16, 0.9
 """Pixels so far from the background look like it; share of an image's edge that ends in it then."""
@@ -76,7 +76,7 @@ class Intrinsics:
 
     def subset(self, indices: Tensor) -> "Intrinsics":
         """Those of the images at ``indices``, in that order. [K]"""
-        lenses = None if self.lenses is None else self.lenses.subset(indices)
+        lenses = None if self.lenses is None else self.lenses[indices]
         return Intrinsics(self.focal[indices], self.centre[indices], self.size[indices], lenses)
 
     def joined(self, other: "Intrinsics") -> "Intrinsics":
@@ -85,30 +85,31 @@ class Intrinsics:
             torch.cat([self.focal, other.focal]),
             torch.cat([self.centre, other.centre]),
             torch.cat([self.size, other.size]),
-            _joined_lenses(self, other),
+            self._all_lenses().joined(other._all_lenses()),
         )
+
+    def _all_lenses(self) -> Lenses:
+        return self.lenses or Lenses.pinholes(len(self))
 
     @property
     def is_shared(self) -> bool:
         """Whether all images have the same, as those of one camera."""
         room = SAME_CAMERA * self.size.max()
-        return (
-            bool((self.size == self.size[0]).all())
-            and bool(((self.focal / self.focal[0] - 1).abs() <= SAME_CAMERA).all())
-            and bool(((self.centre - self.centre[0]).abs() <= room).all())
-            and (self.lenses is None or self._lenses_are_equal(self.lenses, float(room)))
-        )
-
-    def _lenses_are_equal(self, lenses: Lenses, room: float) -> bool:
-        return (
-            bool((lenses.model == lenses.model[0]).all())
-            and bool(((lenses.coefficients - lenses.coefficients[0]).abs() <= SAME_CAMERA).all())
-            and bool(((lenses.skew - lenses.skew[0]).abs() <= room).all())
+        pairs = [
+            (self.focal / self.focal[0] - 1, SAME_CAMERA),
+            (self.centre - self.centre[0], room),
+        ]
+        if (lenses := self.lenses) is not None:
+            pairs.append((lenses.model - lenses.model[0], 0))
+            pairs.append((lenses.coefficients - lenses.coefficients[0], SAME_CAMERA))
+            pairs.append((lenses.skew - lenses.skew[0], float(room)))
+        return bool((self.size == self.size[0]).all()) and all(
+            bool((apart.abs() <= most).all()) for apart, most in pairs
         )
 
     def lens(self, index: int) -> Lenses | None:
         """The lens of image ``index`` alone; None for a pinhole."""
-        return None if self.lenses is None else self.lenses.subset(slice(index, index + 1))
+        return None if self.lenses is None else self.lenses[index : index + 1]
 
     @cached_property
     def sights(self) -> list[Sight] | None:
@@ -127,7 +128,7 @@ class Intrinsics:
         for index, key in enumerate(map(tuple, numbers.tolist())):
             if key not in known:
                 height, width = self.size[index].tolist()
-                lens = lenses.subset(slice(index, index + 1))
+                lens = lenses[index : index + 1]
                 known[key] = sight(lens, self.focal[index], self.centre[index], height, width)
             found.append(known[key])
         return found
@@ -157,13 +158,6 @@ class Intrinsics:
         return float((self.pinhole.mean(dim=1) * size / longer).median())
 
 
-def _joined_lenses(first: Intrinsics, second: Intrinsics) -> Lenses | None:
-    if first.lenses is None and second.lenses is None:
-        return None
-    lenses = [each.lenses or Lenses.pinholes(len(each)) for each in (first, second)]
-    return lenses[0].joined(lenses[1])
-
-
 @dataclass(frozen=True)
 class Views:
     """The images of one split with their cameras and times.
@@ -172,7 +166,7 @@ class Views:
     `image`, `composite` and `image_rays` leave the padding out.
 
     Attributes:
-        images: RGB premultiplied by alpha, and alpha, as a tensor or a reader of a file of tiles.
+        images: RGB premultiplied by alpha, and alpha, as a tensor or a reader of a file of pixels.
             uint8 [V, H, W, 4]
         camera_to_world: Rigid camera poses with OpenGL axes. [V, 4, 4]
         times: Time of each image, from 0 to 1. [V]
@@ -252,14 +246,8 @@ class Views:
     def is_opaque(self) -> bool:
         """Whether the silhouettes are the whole images: alpha says nothing then."""
         for index in range(len(self)):
-            has_ray = self.shown(index)
-            if isinstance(self.images, StoredImages):
-                shown = self.images.solid(index)
-                if has_ray is not None:
-                    has_ray = count_in_squares(has_ray, TILE) == TILE**2
-            else:
-                shown, _ = self.silhouette(index)
-            if not (shown if has_ray is None else shown[has_ray]).all():
+            silhouette, shown = self.silhouette(index), self.shown(index)
+            if not (silhouette if shown is None else silhouette[shown]).all():
                 return False
         return True
 
@@ -275,7 +263,7 @@ class Views:
 
     @property
     def is_stored(self) -> bool:
-        """Whether the images are in a file of tiles, not in memory."""
+        """Whether the images are in a file of pixels, not in memory."""
         return isinstance(self.images, StoredImages)
 
     @property
@@ -332,16 +320,11 @@ class Views:
             whole[index, :height, :width] = self.images.image(index)
         return whole
 
-    def silhouette(self, index: int) -> tuple[Tensor, int]:
-        """The silhouette of image ``index``, see `silhouette_of`, in square cells.
-
-        Returns:
-            Whether any pixel of a cell belongs to it, and the cells' side in pixels: 1, but `CELL`
-            for images in a file of tiles, of which nothing is read. bool [rows, columns]
-        """
+    def silhouette(self, index: int) -> Tensor:
+        """The silhouette of image ``index``, see `silhouette_of`. bool [h, w]"""
         if isinstance(self.images, StoredImages):
-            return self.images.lit(index), CELL
-        return silhouette_of(self.image(index)[..., 3]), 1
+            return self.images.silhouette(index)
+        return silhouette_of(self.image(index)[..., 3])
 
     def valid(self) -> Tensor:
         """Which pixels show something: no padding, and a ray leads there. bool [V, H, W]"""
@@ -428,22 +411,15 @@ class Views:
     def outline_rays(self, index: int) -> tuple[Tensor, Tensor]:
         """Rays through the outline of the silhouette of image ``index``.
 
-        These are its pixels that have a neighbour outside of it, or lie at the image's edge. Of
-        images in a file of tiles, the corners of the cells that hold pixels of the silhouette.
+        These are its pixels that have a neighbour outside of it, or lie at the image's edge.
 
         Returns:
             Origins and unit directions in the world. [N, 3], [N, 3]
         """
-        mask, cell = self.silhouette(index)
-        if cell == 1:
-            around = F.pad(mask, (1, 1, 1, 1))
-            inside = around[:-2, 1:-1] & around[2:, 1:-1] & around[1:-1, :-2] & around[1:-1, 2:]
-            rows, columns = (mask & ~inside).nonzero().T
-        else:
-            first = mask.nonzero() * cell
-            last = torch.minimum(first + cell, self.intrinsics.size[index]) - 1
-            corners = torch.cat([first, last, torch.stack([first[:, 0], last[:, 1]], dim=1)])
-            rows, columns = torch.cat([corners, torch.stack([last[:, 0], first[:, 1]], dim=1)]).T
+        mask = self.silhouette(index)
+        around = F.pad(mask, (1, 1, 1, 1))
+        inside = around[:-2, 1:-1] & around[2:, 1:-1] & around[1:-1, :-2] & around[1:-1, 2:]
+        rows, columns = (mask & ~inside).nonzero().T
         return self.pixel_rays(torch.full_like(rows, index), rows.float(), columns.float())
 
     def pixel_rays(self, views: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
@@ -464,7 +440,7 @@ class Views:
             columns,
             focal=intrinsics.focal[views],
             centre=intrinsics.centre[views],
-            lenses=None if intrinsics.lenses is None else intrinsics.lenses.subset(views),
+            lenses=None if intrinsics.lenses is None else intrinsics.lenses[views],
         )
 
 
@@ -475,7 +451,7 @@ def joined(first: Views, second: Views) -> Views:
         parts = [_padded(images, height, width) for images in (first.images, second.images)]
         images = torch.cat(parts)
     else:
-        images = _tiled(first).joined(_tiled(second))
+        images = _stored(first).joined(_stored(second))
     return Views(
         images,
         torch.cat([first.camera_to_world, second.camera_to_world]),
@@ -496,12 +472,11 @@ def _joined_ignored(first: Views, second: Views) -> Tensor:
     return found
 
 
-def _tiled(views: Views) -> StoredImages:
-    """The images in tiles."""
+def _stored(views: Views) -> StoredImages:
+    """The images as if they were in a file."""
     if isinstance(views.images, StoredImages):
         return views.images
-    file = TileFile.of(views.image(index) for index in range(len(views)))
-    return StoredImages.all_of(file)
+    return StoredImages.all_of(PixelFile.of(views.image(index) for index in range(len(views))))
 
 
 def _padded(images: Tensor, height: int, width: int) -> Tensor:
@@ -551,74 +526,8 @@ class Scene:
         return 2 * sum(plain) <= len(plain)
 
 
-@dataclass(frozen=True)
-class PosedCamera:
-    """A camera somewhere in the world, and the size of its image; arguments of `camera_rays`.
-
-    Attributes:
-        camera_to_world: Its pose. [4, 4]
-        focal: Focal length in pixels, or those along x and y. [2]
-        height: Rows.
-        width: Columns.
-        centre: Principal point, x from the left and y from the top; the middle when None. [2]
-        lens: Its lens; a pinhole when None.
-    """
-
-    camera_to_world: Tensor
-    focal: float | Tensor
-    height: int
-    width: int
-    centre: Tensor | None = None
-    lens: Lenses | None = None
-
-    def rays(self) -> tuple[Tensor, Tensor]:
-        """Rays through every pixel, row by row, in the world. [H W, 3], [H W, 3]"""
-        size = (self.height, self.width)
-        return camera_rays(self.camera_to_world, self.focal, *size, self.centre, self.lens)
-
-    def to(self, device: torch.device) -> "PosedCamera":
-        """The same: cameras stay on the CPU when Lightning moves a batch."""
-        return self
-
-
-def camera_rays(
-    camera_to_world: Tensor,
-    focal: float | Tensor,
-    height: int,
-    width: int,
-    centre: Tensor | None = None,
-    lens: Lenses | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Rays through every pixel of one camera, row by row.
-
-    Args:
-        camera_to_world: Its pose. [4, 4]
-        focal: Focal length in pixels, or those along x and y. [2]
-        height: Rows.
-        width: Columns.
-        centre: Principal point, x from the left and y from the top; the middle when None. [2]
-        lens: Its lens; a pinhole when None.
-
-    Returns:
-        Origins and unit directions in the world. [H W, 3], [H W, 3]
-    """
-    rows, columns = torch.meshgrid(
-        torch.arange(height, dtype=torch.float32),
-        torch.arange(width, dtype=torch.float32),
-        indexing="ij",
-    )
-    return cast_rays(
-        camera_to_world,
-        rows.flatten(),
-        columns.flatten(),
-        focal=focal if isinstance(focal, Tensor) else (focal, focal),
-        centre=(0.5 * width, 0.5 * height) if centre is None else centre,
-        lenses=lens,
-    )
-
-
 def spread(count: int, total: int) -> list[int]:
     """``count`` indices spread evenly over ``total``, both ends included."""
     if count >= total:
         return list(range(total))
-    return torch.linspace(0, total - 1, count).round().long().tolist()
+    return [round(i * (total - 1) / max(count - 1, 1)) for i in range(count)]

@@ -15,7 +15,7 @@ from tests.refusals import assert_refused
 from xplanes.components import build
 from xplanes.config import CONF, compose_plain
 from xplanes.errors import SceneError
-from xplanes.scenes.cameras import focal_length, pixel_rays
+from xplanes.scenes.cameras import cast_rays, focal_length
 from xplanes.scenes.source import SceneSettings
 from xplanes.synthetic.demo.assembly import Assembly, Part
 from xplanes.synthetic.demo.geometry import Box, Plain, Translucent, Unlit
@@ -215,7 +215,7 @@ def test_things_are_hidden_by_turns(name):
     steps = torch.arange(40) - 0.5
     rows, columns = (grid.flatten() for grid in torch.meshgrid(steps, steps, indexing="ij"))
     focal = focal_length(CAMERA_ANGLE_X, 40)
-    rays = pixel_rays(camera.float(), rows, columns, focal=focal, height=40, width=40)
+    rays = cast_rays(camera.float(), rows, columns, focal=focal, centre=(20.0, 20.0))
     seen = [set(pose.cast(*rays).part.tolist()) for pose in posed]
     changing = [part for part in moving if 0 < sum(part in view for view in seen) < len(seen)]
     assert len(changing) >= 2

@@ -10,11 +10,13 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.captures import settings
 from tests.refusals import assert_refused
 from xplanes.components import build
 from xplanes.config import compose_plain
+from xplanes.errors import SceneError
 from xplanes.scenes.cameras import focal_length, look_at
-from xplanes.scenes.dnerf import SceneError, read_scene
+from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.scenes.images import load_images, load_premultiplied, shrink
 from xplanes.scenes.lenses import COEFFICIENTS
 from xplanes.scenes.source import SceneSettings
@@ -36,6 +38,10 @@ def pose(index):
     angle = 0.3 + index
     place = torch.tensor([[4 * math.cos(angle), 4 * math.sin(angle), 1.0]], dtype=torch.float64)
     return look_at(place)[0].tolist()
+
+
+def read_scene(folder, splits, **changes):
+    return settings(BlenderSettings, "blender", folder, **changes).load(splits)
 
 
 class SceneFolder:
@@ -67,7 +73,7 @@ class SceneFolder:
         (self.path / f"transforms_{split}.json").write_text(text)
 
     def read(self, resolution=None, splits=("train",), **counts):
-        return read_scene(self.path, resolution=resolution, splits=splits, **counts)
+        return read_scene(self.path, splits, resolution=resolution, **counts)
 
     def error(self, case=None, **arguments):
         return assert_refused(SceneError, "", partial(self.read, **arguments), case)
@@ -304,10 +310,9 @@ def test_fewer_views_are_scored(scene):
 
 
 def test_more_views_than_there_are(scene):
-    for count in (0, -1, 6):
-        message = scene.error(str(count), views=count)
-        assert f"data.views={count}, but the train split" in message
-        assert "1 to 5" in message
+    message = scene.error(views=6)
+    assert "data.views=6, but the train split" in message
+    assert "1 to 5" in message
     # Of scored views that is the most: splits differ in how many they have.
     scene.add("val", 3)
     assert len(scene.read(splits=["train", "val"], eval_views=6).splits["val"]) == 3
@@ -460,10 +465,9 @@ def test_a_video_needs_frames_of_equal_size(scene):
 
 
 def test_impossible_resolution(scene):
-    for resolution, words in ((13, "at most 12"), (0, "1 to 12")):
-        message = scene.error(resolution, resolution=resolution)
-        assert f"data.resolution={resolution}" in message
-        assert words in message, resolution
+    message = scene.error(resolution=13)
+    assert "data.resolution=13" in message
+    assert "at most 12" in message
 
 
 def test_pose_of_another_shape(scene):
@@ -697,15 +701,13 @@ def test_a_listing_keeps_what_belongs_to_an_image(scene):
     named = replace(
         listing,
         masks=(None, *(path.with_suffix(".mask") for path in listing.paths[1:])),
-        cameras=tuple("abcde"),
     )
     part = named.subset([3, 0])
     assert part.files == ("train/r_3.png", "train/r_0.png")
     assert part.masks == (listing.paths[3].with_suffix(".mask"), None)
-    assert part.cameras == ("d", "a")
     assert part.times.tolist() == [0.75, 0]
     assert torch.equal(part.camera_to_world[0], listing.camera_to_world[3])
-    assert listing.subset([1]).masks == listing.subset([1]).cameras == ()
+    assert listing.subset([1]).masks == ()
 
 
 def test_masks_that_do_not_fit(scene):
@@ -742,7 +744,7 @@ def test_video_of_a_moving_camera(scene):
 
 @pytest.mark.skipif(not LEGO.is_dir(), reason=f"the D-NeRF lego scene is not at {LEGO}")
 def test_lego():
-    scene = read_scene(LEGO, resolution=100, splits=["train", "val"], views=8)
+    scene = read_scene(LEGO, ["train", "val"], resolution=100, views=8)
     train, val = scene.splits["train"], scene.splits["val"]
     assert (len(train), len(val)) == (8, 11)
     assert (train.times[0], train.times[-1]) == (0, 1)
@@ -760,4 +762,4 @@ def test_lego_without_its_test_split():
     if (LEGO / "transforms_test.json").exists():
         pytest.skip("this copy of lego has a test split")
     with pytest.raises(SceneError, match=r"Leave data\.eval_split out"):
-        read_scene(LEGO, resolution=100, splits=["train", "test"])
+        read_scene(LEGO, ["train", "test"], resolution=100)

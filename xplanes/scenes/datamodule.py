@@ -18,9 +18,9 @@ from xplanes.errors import ConfigError, MissingSplitError
 from xplanes.files import read_json
 from xplanes.scenes.batches import Batch, Batches, DeviceBatches, RayBatches, RaySettings
 from xplanes.scenes.frame import scene_frame
-from xplanes.scenes.listing import even_ranks, held_out_places
+from xplanes.scenes.listing import held_out_places
 from xplanes.scenes.source import HELD_OUT, SceneSettings, may_hold_out
-from xplanes.scenes.views import Scene, Views
+from xplanes.scenes.views import Scene, Views, spread
 
 UNIFORM = RaySettings(
     per_batch=1024,
@@ -204,7 +204,7 @@ class SceneDataModule(LightningDataModule):
         times, order = train.times.sort(stable=True)
         places = held_out_places(times.tolist(), HELD_OUT)
         if (most := self.settings.eval_views) is not None:
-            places = [places[rank] for rank in even_ranks(min(most, len(places)), len(places))]
+            places = [places[rank] for rank in spread(most, len(places))]
         chosen[order[places]] = True
         parts = {
             "train": train.subset((~chosen).nonzero()[:, 0]),

@@ -7,7 +7,6 @@ import math
 import os
 import re
 import unicodedata
-import warnings
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -16,7 +15,7 @@ from typing import Any, TypeGuard
 import numpy as np
 import torch
 
-from xplanes.errors import BrokenFrameError, MissingSplitError, SceneError, first_of
+from xplanes.errors import BrokenFrameError, MissingSplitError, SceneError, first_of, warn
 from xplanes.files import stand_in
 from xplanes.scenes.cameras import upright
 from xplanes.scenes.formats import ENDINGS, is_image, orientation
@@ -97,10 +96,7 @@ def found_images(
     if len(missing) == len(found):
         raise MissingSplitError(first_of(missing))
     if missing:
-        warnings.warn(
-            f"{len(missing)} of {len(found)} images are left out:\n{first_of(missing)}",
-            stacklevel=4,
-        )
+        warn(f"{len(missing)} of {len(found)} images are left out:\n{first_of(missing)}")
     return found
 
 
@@ -196,10 +192,9 @@ def mask_files(
             f"mask of any image, such as {bare[0]}. Put the masks there, or set {key}=null."
         )
     if bare:
-        warnings.warn(
+        warn(
             f"{folder} has no mask of {len(bare)} of {len(masks)} images, which are shown whole: "
-            f"{some(bare)}.",
-            stacklevel=4,
+            f"{some(bare)}."
         )
     return masks
 
@@ -339,10 +334,9 @@ def oriented(
     right, upward = np.array([UP.get(tag, (0, 1)) for tag in tags], np.float64).T[..., None]
     rotation = upright(torch.from_numpy(poses[:, :3, 0] * right + poses[:, :3, 1] * upward))
     if rotation is None:
-        warnings.warn(
+        warn(
             "The up vectors of the cameras cancel out, so the world keeps the axes that the files "
-            "give it. data.orient=false says that it should.",
-            stacklevel=4,
+            "give it. data.orient=false says that it should."
         )
         return poses, points
     turned, turn = poses.copy(), rotation.numpy()

@@ -1,7 +1,6 @@
 """Mask files: what their values and black parts stand for, decided over a whole capture."""
 
 import logging
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from xplanes.errors import SceneError
+from xplanes.errors import SceneError, warn
 from xplanes.scenes.formats import (
     SIXTEEN_BIT_MODES,
     UNREADABLE,
@@ -174,10 +173,9 @@ def chosen_use(use: MaskUse, kind: MaskKind, where: str, told: str = "") -> tupl
     text = f"masks leave out {kind.share:.1%} of the pixels. They are taken for {meaning[found]}"
     if use == "auto" and not told and kind.is_unclear:
         hint = " Silhouettes are white where the scene is." if found == "ignore" else ""
-        warnings.warn(
+        warn(
             f"{where}: {text}. Both readings are possible: set data.mask_use={found} to "
-            f"confirm it, or data.mask_use={other} if they are {meaning[other]}.{hint}",
-            stacklevel=4,
+            f"confirm it, or data.mask_use={other} if they are {meaning[other]}.{hint}"
         )
     else:
         logger.info("%s: %s (data.mask_use=%s)", where, text, found)

@@ -1,13 +1,13 @@
 """Times of images from the numbers in their names."""
 
 import re
-import warnings
 from collections import defaultdict
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import PurePosixPath
 
+from xplanes.errors import warn
 from xplanes.files import natural
 from xplanes.scenes.entries import some
 
@@ -61,7 +61,7 @@ def times_in_names(names: Sequence[str]) -> list[Number]:
         if len(set(found)) > 1 or (found and len(names) == 1):
             break
     if why := _no_series(names, stems, found):
-        warnings.warn(f"{why}: all images are taken for one timestep. {OTHER_TIMES}", stacklevel=6)
+        warn(f"{why}: all images are taken for one timestep. {OTHER_TIMES}")
         return []
     return _checked(names, found)
 
@@ -139,7 +139,5 @@ def _checked(names: Sequence[str], times: list[Number]) -> list[Number]:
         why = f"are only {len(set(times))}, for {len(names)} images"
     if why:
         pairs = ", ".join(f"{names[place]} -> {times[place]}" for place in shown)
-        warnings.warn(
-            f"The times from the numbers in the names {why} ({pairs}). {OTHER_TIMES}", stacklevel=6
-        )
+        warn(f"The times from the numbers in the names {why} ({pairs}). {OTHER_TIMES}")
     return times

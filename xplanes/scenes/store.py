@@ -88,11 +88,11 @@ class PixelFile:
     @classmethod
     def of(cls, images: Iterable[Tensor]) -> "PixelFile":
         """The same in memory, of images with alpha. uint8 [h, w, 4] each"""
-        images = [image.numpy() for image in images]
-        sizes = [(image.shape[0], image.shape[1]) for image in images]
+        arrays = [image.numpy() for image in images]
+        sizes = [(array.shape[0], array.shape[1]) for array in arrays]
         first, content = _firsts(sizes), np.zeros(_length(sizes, 4), np.uint8)
-        for index, image in enumerate(images):
-            for offset, part in _parts(first, 4, index, image):
+        for index, array in enumerate(arrays):
+            for offset, part in _parts(first, 4, index, array):
                 content[offset : offset + len(part)] = part
         return cls(content, hashlib.sha256(content.data).hexdigest(), sizes, 4)
 
@@ -232,10 +232,31 @@ def default_cache() -> Path:
     return Path(base) / "xplanes" / "images"
 
 
-def is_needed(sizes: Sequence[Size]) -> bool:
-    """Whether images of these heights and widths are too much for memory."""
+def images(
+    sizes: Sequence[Size],
+    jobs: Sequence[Job],
+    sources: Sequence[Path],
+    recipe: Any,
+    has_alpha: Callable[[], bool],
+    folder: Path | None,
+) -> "Tensor | StoredImages":
+    """Decode images to memory, or to a file of the cache if they take more than `IN_MEMORY` bytes.
+
+    Args:
+        sizes: Height and width of each image. [V]
+        jobs: Decode the images, each some of them. They run in threads.
+        sources: As for `decoded`.
+        recipe: As for `decoded`.
+        has_alpha: Tells whether any image has alpha.
+        folder: As for `decoded`.
+
+    Raises:
+        StorageError: If the cache cannot be written.
+    """
     height, width = _largest(sizes)
-    return 4 * len(sizes) * height * width > IN_MEMORY
+    if 4 * len(sizes) * height * width <= IN_MEMORY:
+        return in_memory(sizes, jobs)
+    return decoded(sources, recipe, sizes, 4 if has_alpha() else 3, jobs, folder)
 
 
 def in_memory(sizes: Sequence[Size], jobs: Sequence[Job]) -> Tensor:
@@ -293,7 +314,7 @@ def decoded(
     path = folder / f"{key[:32]}.pixels"
     length = _length(sizes, channels)
 
-    def ready() -> StoredImages | None:
+    def stored() -> StoredImages | None:
         try:
             if path.stat().st_size != length:
                 return None
@@ -303,15 +324,15 @@ def decoded(
         except (FileNotFoundError, NotADirectoryError, PermissionError):
             return None
 
-    if (images := ready()) is not None:
-        return images
+    if (ready := stored()) is not None:
+        return ready
     try:
         require_writable(folder)
     except StorageError as problem:
         raise StorageError(f"{problem}: data.cache names the one for decoded images") from problem
     with in_turn(path.with_suffix(".lock")):
-        if (images := ready()) is not None:
-            return images
+        if (ready := stored()) is not None:
+            return ready
         # Whoever holds the lock owns what others left unfinished under this name.
         for leftover in folder.glob(f".{path.name}{MARK}*"):
             leftover.unlink(missing_ok=True)
@@ -334,9 +355,9 @@ def decoded(
         )
         with replacing(path) as temporary:
             _write(temporary, sizes, channels, jobs)
-    images = ready()
-    assert images is not None
-    return images
+    ready = stored()
+    assert ready is not None
+    return ready
 
 
 def _remove_unused(folder: Path) -> None:

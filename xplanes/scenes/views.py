@@ -1,7 +1,7 @@
 """Images of a scene with poses and times, in memory or in a file of pixels."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -353,12 +353,13 @@ class Views:
             self.files,
         )
 
-    def subset(self, indices: Tensor) -> "Views":
+    def subset(self, indices: Tensor | Sequence[int]) -> "Views":
         """Select views by index.
 
         Args:
             indices: Indices of views, in the order of the result. int64 [K]
         """
+        indices = torch.as_tensor(indices, dtype=torch.int64)
         intrinsics = self.intrinsics.subset(indices)
         if isinstance(self.images, StoredImages):
             images = self.images.subset(indices)

@@ -216,7 +216,7 @@ def test_images_of_several_sizes_and_widths(capture):
         path = capture.path / capture.frames[index]["file_path"]
         with Image.open(path) as picture:
             picture.resize((48, 36)).save(path)
-    assert "another aspect ratio" in capture.refused("cut or turned", resolution=12)
+    assert "another aspect ratio" in capture.refused("cropped or turned", resolution=12)
     for index in (1, 4):
         capture.frames[index] |= {"h": 18, "cy": 9.0}
     views = capture.read(resolution=12, eval_every=100).splits["train"]

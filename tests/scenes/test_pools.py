@@ -19,7 +19,7 @@ def masks(shape, seed=0):
     return near, plain, valid
 
 
-@pytest.mark.parametrize("block", [16, 1024, 2**22])
+@pytest.mark.parametrize("block", [16, 1024, 2**16])
 def test_the_list_holds_each_pixel_once_kind_by_kind(monkeypatch, block):
     monkeypatch.setattr(pools, "BLOCK", block)
     near, plain, valid = masks((3, 20, 31))
@@ -27,7 +27,15 @@ def test_the_list_holds_each_pixel_once_kind_by_kind(monkeypatch, block):
     expected = [kind.flatten().nonzero()[:, 0] for kind in kinds]
     found = PixelPools(near.clone(), plain, valid)
     assert found.sizes == tuple(map(len, expected))
-    assert torch.equal(found.listed, torch.cat(expected).int())
+    assert torch.equal(found.numbers(torch.arange(found.total)), torch.cat(expected))
+
+
+def test_numbers_beyond_16_bits_are_told_apart():
+    near, *_ = masks((3, 300, 301))
+    found = PixelPools(near.clone())
+    expected = torch.cat([kind.flatten().nonzero()[:, 0] for kind in (~near, near)])
+    assert expected.max() > 2**17
+    assert torch.equal(found.numbers(torch.arange(found.total)), expected)
 
 
 def test_plain_pixels_are_no_kind_where_all_near_ones_are_plain():

@@ -24,7 +24,7 @@ NEAR_SILHOUETTE = 0.02
 """Share of the image's side around silhouettes that counts as near."""
 
 PLAIN_SHARE = 0.2
-"""Share of rays at opaque pixels of one colour with all around them."""
+"""Share of rays at opaque pixels whose surroundings have the same colour."""
 
 STILL_SHARE = 0.5
 """Share of rays at pixels of fixed cameras where nothing changes."""
@@ -39,13 +39,13 @@ LARGEST_SHARE = 0.25
 """Share of a GPU's free memory that images may take."""
 
 AHEAD = 8
-"""Batches whose pixels the system is told to read in advance."""
+"""Batches whose pixels the system is asked to read ahead."""
 
 CPU_RAYS, CPU_SAMPLES = 1365, 8192
-"""Largest batch on the CPU where the settings leave it open; schedules in steps are made for it."""
+"""Largest batch on the CPU under per_batch=auto, for which schedules in steps are made."""
 
 GPU_RAYS, GPU_SAMPLES = 2**15, 2**19
-"""The same on a GPU, which a small batch leaves idle."""
+"""The same on a GPU, which small batches leave idle."""
 
 
 class Batches(ABC):
@@ -54,7 +54,7 @@ class Batches(ABC):
     Attributes:
         views: Training views.
         rays: Rays of a batch.
-        skipped: Share of all pixels that uniform drawing would have shown and this one leaves out.
+        skipped: Share of rays that uniform sampling would have drawn and this one does not.
     """
 
     views: Views
@@ -73,21 +73,21 @@ class Batches(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class BatchSettings(Settings, ABC):
-    """What a training step gets to see."""
+    """What a training step is given."""
 
     def on(self, device: torch.device) -> "BatchSettings":
-        """The same with sizes that suit a device, where these are open."""
+        """The same settings with each auto replaced by what suits a device."""
         return self
 
     @property
     @abstractmethod
     def most(self) -> int:
-        """Rays of a batch at most; 0 where that is those of a view."""
+        """Maximum rays per batch; 0 if a batch is a whole view."""
 
     @property
     @abstractmethod
     def most_samples(self) -> int | None:
-        """Samples of a batch at most, on average; None where rays have none."""
+        """Maximum samples per batch, on average; None without samples along rays."""
 
     @abstractmethod
     def batches(self, views: Views, frame: Frame, *, seed: int, rank: int) -> Batches:
@@ -345,7 +345,7 @@ class RayBatches(Batches):
         return tuple(each[:number] for each in drawn)  # The last run may have to give fewer.
 
     def _prefetch(self, step: int, rays: int) -> None:
-        """Let the system read the runs of the next batches, as far as it was not told yet."""
+        """Ask the system to read the runs of the next batches ahead, each once."""
         assert isinstance(self.views.images, StoredImages)
         assert isinstance(self.pools, RunPools)
         if not step <= self._prefetched <= step + AHEAD:

@@ -137,7 +137,7 @@ def project(
     centre: Tensor,
     lenses: Lenses | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Find the pixels at which a camera sees points; the inverse of `cast_rays`.
+    """The pixels at which a camera sees points; the inverse of `cast_rays`.
 
     Args:
         camera_to_world: Pose of the camera. [4, 4]
@@ -148,8 +148,8 @@ def project(
 
     Returns:
         Distances in pixels from the image's left and top edges, at +0.5 in the middle of a row or
-        column, [N] each, and whether the camera can see each point, however large its image may be,
-        bool [N]. The distances of other points mean nothing.
+        column, [N] each, and whether the camera can see each point, inside its image or beyond,
+        bool [N]. The distances of other points are meaningless.
     """
     local = camera_axes(camera_to_world, points)
     (focal_x, focal_y), (centre_x, centre_y) = focal.unbind(-1), centre.unbind(-1)

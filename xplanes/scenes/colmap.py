@@ -96,7 +96,7 @@ class ColmapSettings(CaptureSettings):
     def load(self, splits: Sequence[str]) -> Scene:
         source = _model_folder(self.folder, self.model)
         if "test" in splits and not self.test_cameras:
-            # Known before the model and all images are looked at.
+            # This needs no reading of the model and the images.
             raise MissingSplitError(
                 f"{source} has no test split. Name the folders of some cameras in "
                 "data.test_cameras, or choose another data.eval_split."

@@ -39,7 +39,7 @@ LENSES: dict[str, tuple[int, LensModel, str]] = {
 """COLMAP's camera models: their numbers in binary files, and their parameters in order."""
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "sparse_/0", "sparse_", "colmap/sparse")
-"""Where sparse models are looked for. That in colmap/ is what transforms.json was made of."""
+"""Usual folders of sparse models. The one in colmap/ is the source of a transforms.json."""
 
 DEEPEST = 3
 """Levels of folders in which models are searched for, as in dense/0/sparse."""
@@ -62,7 +62,7 @@ Lens = tuple[str, int, int, Sequence[float]]
 
 @dataclass(frozen=True)
 class SparseModel:
-    """What COLMAP found out about the images that it registered, in the order of their names.
+    """A sparse model: the images that COLMAP registered, in the order of their names.
 
     Attributes:
         source: The file that lists the images.
@@ -114,7 +114,7 @@ def read_model(folder: Path) -> SparseModel:
         folder: Folder of cameras, images and points3D, each .bin or .txt.
 
     Raises:
-        SceneError: If a file is missing, damaged, or tells of a lens that is not read.
+        SceneError: If a file is missing, damaged, or has a lens that is not read.
     """
     cameras_path, images_path = _part(folder, "cameras"), _part(folder, "images")
     cameras: dict[int, Calibration] = {}
@@ -193,7 +193,7 @@ class _Binary:
         self.file.seek(count, os.SEEK_CUR)
 
     def entries(self, kind: str) -> Iterator[str]:
-        """Labels of as many entries as the file says that it holds; all of it must be read then."""
+        """Labels of the entries; the file must end after the last one."""
         (count,) = self.take(COUNT, f"the number of {kind}s")
         for index in range(count):
             yield f"{kind} {index + 1} of {count}"
@@ -238,7 +238,7 @@ def _text_lines(path: Path) -> Iterator[tuple[str, str]]:
 def _parsed(
     label: str, line: str, kind: str, parse: Callable[[list[str]], Parsed], most: int = -1
 ) -> Parsed:
-    """What ``parse`` makes of a line's words, of which the last holds all after ``most``."""
+    """What ``parse`` makes of a line's words; the last word holds all after ``most``."""
     try:
         return parse(line.split(maxsplit=most))
     except (ValueError, IndexError, OverflowError) as problem:
@@ -336,7 +336,7 @@ def _positions(path: Path) -> np.ndarray:
 def _calibration(
     label: str, model: str, width: int, height: int, values: Sequence[float]
 ) -> Calibration:
-    """The lens that COLMAP's parameters stand for."""
+    """The lens with COLMAP's parameters."""
     if model not in LENSES:
         raise SceneError(
             f"{label} has the camera model {model}, which is not read. These are: "

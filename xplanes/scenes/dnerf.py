@@ -58,7 +58,7 @@ def read_scene(settings: SceneSettings, splits: Sequence[str]) -> Scene:
 
 
 def _listed(split: str, path: Path) -> Listing:
-    """The frames of a split; a warning tells why those of a split that is only scored are none."""
+    """The frames of a split; warns why a split that is only scored has none."""
     try:
         return read_transforms(path)
     except MissingSplitError as problem:
@@ -68,7 +68,7 @@ def _listed(split: str, path: Path) -> Listing:
 
 
 def _require_times(folder: Path, parts: Mapping[str, Listing], video: Listing | None) -> None:
-    """Refuse frames of a moving scene that do not tell their times."""
+    """Refuse frames of a dynamic scene without times."""
     train = parts.get("train")
     if train is None or len(train.times.unique()) == 1:
         return

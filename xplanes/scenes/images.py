@@ -161,7 +161,7 @@ def cleared(pixels: np.ndarray, shown: Tensor | None) -> np.ndarray:
 
 
 def digests(masks: Sequence[Tensor | None]) -> list[str]:
-    """Hashes of masks, most of which are one and the same tensor."""
+    """Hashes of masks, most of which are the same tensor."""
     known: dict[int, str] = {id(None): ""}
     for mask in masks:
         if mask is not None and id(mask) not in known:

@@ -21,7 +21,7 @@ class LensModel(IntEnum):
     FISHEYE = 1
     """Equidistant: OPENCV_FISHEYE, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, THIN_PRISM_FISHEYE."""
     FOV = 2
-    """One angle, omega, that stands in the place of k1."""
+    """One angle, omega, stored in place of k1."""
 
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
@@ -35,7 +35,7 @@ STEEPEST = 1e3
 """Tangent of the largest angle from the optical axis at which perspective lenses are used."""
 
 WIDEST = math.radians(120)
-"""Largest field of view of the pinhole that stands for a lens where only a pinhole will do."""
+"""Largest field of view of the pinhole that replaces a lens where pinholes are required."""
 
 NODES = 4096
 """Radii at which lenses are searched for folds."""

@@ -35,15 +35,15 @@ SHAPE_TOLERANCE = 0.02
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a file tells about the camera of one image.
+    """The camera of one image as a file gives it.
 
     Attributes:
-        per_width: Focal length in image widths; None where ``fl_x`` tells it.
+        per_width: Focal length in image widths; None if ``fl_x`` is given.
         fl_x: Focal length along x in pixels of an image of ``w`` x ``h``.
         fl_y: The same along y; None for square pixels.
         cx: Principal point, from the left; None for the middle.
         cy: Principal point, from the top; None for the middle.
-        w: Width of the image that these numbers speak of; None for that of the image file.
+        w: Width of the image that these numbers refer to; None for that of the image file.
         h: Its height.
         model: Kind of lens.
         distortion: Its coefficients, in the order of `COEFFICIENTS`; none for a lens without.
@@ -71,7 +71,7 @@ class Calibration:
             size: Those after it was resized.
         """
         (rows, columns), (height, width) = native, size
-        # Of an image of another size only one side may be told.
+        # Of an image of another size, only one side may be given.
         wide = self.w or (columns if self.h is None else columns * self.h / rows)
         high = self.h or (rows if self.w is None else rows * self.w / columns)
         per_width = self.per_width if self.fl_x is None else self.fl_x / wide
@@ -87,7 +87,7 @@ class Calibration:
 
     @property
     def words(self) -> str:
-        """The lens in words."""
+        """The lens, for messages."""
         named = [
             f"{'omega' if self.model == LensModel.FOV else name}={value:g}"
             for name, value in zip(COEFFICIENTS, self.distortion, strict=False)
@@ -106,11 +106,11 @@ class Listing:
         camera_to_world: Rigid camera poses with OpenGL's axes. [V, 4, 4]
         times: Time of each image, from 0 to 1; all 0 for a static scene. [V]
         calibrations: Focal length, principal point and lens of each image. [V]
-        timed: Whether the source tells the times.
+        timed: Whether the source has times.
         masks: A mask file for each image, white where it shows the scene and black elsewhere, or
             None for an image without; empty where there are none. [V]
-        mask_meaning: What the source says that masks are: alpha, or white where pixels are to be
-            ignored; empty where it says nothing.
+        mask_meaning: What the source defines masks as: "alpha", or "ignored" (white where pixels
+            are to be ignored); empty if it does not.
         time_source: Where times come from, with examples; empty where there are none.
     """
 
@@ -176,9 +176,9 @@ def time_source(origin: str, files: Sequence[str], times: Sequence[Any]) -> str:
     """Where times come from, with examples.
 
     Args:
-        origin: What tells them.
+        origin: Their source.
         files: Names of the images. [V]
-        times: Their times as they are told. [V]
+        times: Their times as given. [V]
     """
     shown = dict.fromkeys(spread(min(len(files), 3), len(files)))
     examples = ", ".join(f"{files[rank]} -> {times[rank]}" for rank in shown)
@@ -194,7 +194,7 @@ def held_out_places(times: Sequence[float], every: int) -> list[int]:
 
     Args:
         times: Times of the views, in order.
-        every: Views of which one is held out.
+        every: One in so many views is held out.
     """
     # Multiples of the golden ratio spread evenly, too.
     step = 0.5 * (math.sqrt(5) - 1) if 1 < len(set(times)) < len(times) else 0.0
@@ -259,8 +259,8 @@ def read_views(
         resolution: Width in pixels; None keeps the sizes of the files.
         cache: Folder of images that are too large for memory; that of the user when None.
         ignore: Whether pixels that masks leave out are ignored; they get alpha 0 otherwise. Images
-            of which nothing remains are left out, with a warning.
-        kind: What masks mean; None finds out.
+            without any other pixels are left out, with a warning.
+        kind: What masks mean; None determines it.
 
     Raises:
         MissingSplitError: If masks leave out all pixels of all images.
@@ -299,7 +299,7 @@ def read_views(
 
 
 def _without_ignored(listing: Listing, rest: Sequence[int]) -> Listing:
-    """The images at ``rest``; a warning names the others, of which masks leave out all pixels."""
+    """The images at ``rest``; a warning names the others, whose pixels are all masked out."""
     gone = [file for index, file in enumerate(listing.files) if index not in {*rest}]
     text = (
         f"masks leave out all pixels of {len(gone)} of {len(listing)} images: {some(gone)} in "
@@ -385,7 +385,7 @@ def misshapen(path: Path, size: Size, camera: Calibration) -> str | None:
     Args:
         path: The file.
         size: Its height and width.
-        camera: Its calibration; it may tell width and height, of another aspect ratio.
+        camera: Its calibration, which may have a width and height of another aspect ratio.
     """
     if camera.w is None or camera.h is None:
         return None
@@ -405,8 +405,8 @@ def misshapen(path: Path, size: Size, camera: Calibration) -> str | None:
             f"copies of the images (magick mogrify -auto-orient *{path.suffix})."
         )
     return (
-        f"{text} Perhaps the image was cut or turned: take the one that the camera was calibrated "
-        "with."
+        f"{text} Perhaps the image was cropped or turned: use the one that the camera was "
+        "calibrated with."
     )
 
 
@@ -420,7 +420,7 @@ def final_intrinsics(
 
     Args:
         labels: The images, for messages. [V]
-        calibrations: What is told about their cameras. [V]
+        calibrations: Their cameras as given. [V]
         native: Heights and widths of the files. [V]
         sizes: Those after the images were resized. [V]
 
@@ -451,7 +451,7 @@ def _require_real(
     centre: tuple[float, float],
     skew: float,
 ) -> None:
-    """Refuse cameras so extreme that their rays cannot be told apart, or overflow."""
+    """Refuse cameras so extreme that their rays coincide or overflow."""
     for axis, along, middle, pixels in zip("xy", focal, centre, reversed(size), strict=True):
         for name, value, low, high in (
             ("focal length", along / pixels, SHORTEST, LONGEST),
@@ -477,13 +477,13 @@ def _require_real(
 def require_rays(
     labels: Sequence[str], lenses: Sequence[Calibration], has_ray: Sequence[Tensor | None]
 ) -> None:
-    """Refuse images most of which show nothing, as where their lens folds back inside them.
+    """Refuse images whose lens maps no direction to most of their pixels.
 
-    A warning tells of pixels that perspective lenses map no direction to: they are left out.
+    Such pixels of perspective lenses are left out with a warning where they are fewer.
 
     Args:
         labels: The images, for messages. [V]
-        lenses: What is told about their cameras. [V]
+        lenses: Their cameras as given. [V]
         has_ray: Pixels that the lens maps a direction to, None for all. bool [h, w] each, [V]
 
     Raises:

@@ -66,7 +66,7 @@ SAME_RATE = 1e-3
 """Share by which frame rates of synchronised cameras differ at most."""
 
 LATE = 1.5
-"""Times between frames that are so much longer than most are not of a constant rate."""
+"""How many times the median a gap between frames is if the rate varies."""
 
 SAME_POSE = 1e-4
 """Largest difference between poses of a fixed camera."""
@@ -149,7 +149,7 @@ class Camera:
         source: The video or the folder.
         pose: Camera-to-world matrix with OpenGL's axes. float64 [4, 4]
         calibration: Its focal length, principal point and lens.
-        label: Where the calibration tells of it, for messages.
+        label: The file and entry that calibrate it, for messages.
     """
 
     name: str
@@ -167,7 +167,7 @@ class Recording:
         camera: The camera.
         size: Height and width of the frames.
         count: Number of frames.
-        rate: Frames per second; None for images and where the video does not tell.
+        rate: Frames per second; None for images and if the video has none.
         images: The image files in the order of time; empty for a video. [count]
         times: Seconds at which a video shows its frames; empty where that is not known. [count]
     """
@@ -486,10 +486,10 @@ def _are_stamped(recordings: Sequence[Recording]) -> bool:
 
 
 def _require_same_frames(recordings: Sequence[Recording]) -> None:
-    """Refuse folders of numbered images of which a camera lacks some in the middle.
+    """Refuse folders of numbered images where a camera lacks some in the middle.
 
-    Frames that follow the missing one would be those of earlier times in other cameras. Where
-    cameras begin to count is up to them, and some may have stopped early.
+    Its later frames would be paired with earlier ones of other cameras. Numbering may start
+    anywhere, and some cameras may have stopped early.
     """
     first: tuple[Recording, list[int]] | None = None
     for recording in recordings:
@@ -595,7 +595,7 @@ def _read_views(
 def _job(
     recording: Recording, numbers: range, size: Size, shown: Tensor | None, place: int
 ) -> store.Job:
-    """What decodes the frames of a camera, the first of which is image number ``place``."""
+    """Decodes the frames of a camera, which are the images from number ``place`` on."""
 
     def decode() -> Iterator[tuple[int, np.ndarray]]:
         if recording.images:

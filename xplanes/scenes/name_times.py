@@ -17,13 +17,13 @@ OTHER_TIMES = (
 )
 
 FEW = 0.5
-"""Share of the images of a folder below which different times are suspiciously few."""
+"""Share of a folder's images below which the number of distinct times is suspicious."""
 
 CAMERA = re.compile(
     r"(?i)(?<![a-z])(cam|camera|view|lens|sensor|rig)s?[_\- ]*\d+(?![a-z\d])"
     r"|(?<![^_\-. ])[cv]\d+(?=$|[_\-. ])"
 )
-"""A number that is a camera's, as in 034_cam1."""
+"""The number of a camera, as in 034_cam1."""
 
 CLOCK = re.compile(r"(?<![A-Za-z\d])\d+\.\d+$|(?<!\d)(\d{10})[_-](\d{9}|\d{6})$")
 """Seconds and their fraction at the end of a name, as in 1305031102.175304."""
@@ -38,7 +38,7 @@ Number = int | float
 
 
 def times_in_names(names: Sequence[str]) -> list[Number]:
-    """Times of images, in any unit, from their names; none, with a warning, where these tell none.
+    """Times of images, in any unit, from their names; none, with a warning, if these have none.
 
     They are dates and times of day, seconds with a fraction, or else the number that differs most
     among the names and is no camera's. A warning shows names and times where their orders disagree,
@@ -128,7 +128,7 @@ def _few(names: Sequence[str], times: Sequence[Number]) -> bool:
 
 
 def _checked(names: Sequence[str], times: list[Number]) -> list[Number]:
-    """The times, with a warning where they hardly are those of the images."""
+    """The times, with a warning if they are unlikely."""
     why, shown = "", list(range(min(3, len(names))))
     for places in _folders(names):
         back = [pair for pair in pairwise(places) if times[pair[1]] < times[pair[0]]]

@@ -297,9 +297,8 @@ def _camera(path: Path) -> tuple[np.ndarray, Calibration]:
 def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) -> str:
     """The folder in rgb of the smallest images that are at least as wide as asked for.
 
-    The largest images, where none are, or none were asked for. Where images of that scale are
-    missing, another that lacks fewer takes its place, the next larger first; a warning says so, and
-    names the images that it lacks.
+    Without such images, or a width, the largest ones. If images of that scale are missing, the
+    scale that lacks the fewest takes its place with a warning, the next larger first.
     """
     widths: dict[str, int] = {}
     lost: dict[str, list[str]] = {}
@@ -335,7 +334,7 @@ def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) 
 
 
 def _missing(folder: Path, names: Sequence[str], ends: Sequence[str]) -> list[str]:
-    """Names of which a folder has no file."""
+    """Names without a file in a folder."""
     return [name for name in names if not any((folder / f"{name}{end}").is_file() for end in ends)]
 
 

@@ -77,7 +77,7 @@ def _listed_splits(
                 image = image_path(str(path), path.parent.resolve(), name, key)
             except BrokenFrameError:
                 if name in {frame["file_path"] for frame in content["frames"]}:
-                    continue  # A warning told of it.
+                    continue  # There was a warning of it.
                 raise
             if image not in places:
                 raise SceneError(

@@ -19,21 +19,25 @@ FAR, OTHER, PLAIN, NOTHING = range(4)
 ORDER = (FAR, PLAIN, OTHER)
 """Kinds as they are listed."""
 
-BLOCK = 2**22
-"""Pixels that are listed at a time."""
+BLOCK = 2**16
+"""Pixels that 16 bits can number."""
+
+PART = 2**22
+"""Pixels whose whole numbers are computed at a time."""
 
 CELLS = 8
 """Pixels of a run, and rows and columns of an image, that are near together."""
 
 
 class PixelPools:
-    """Pixels of three kinds, each of which has a share of its own: far, plain and all others.
+    """Pixels of three kinds, each with a share of its own: far, plain and all others.
 
-    Pixels are listed by their numbers, kind by kind.
+    Pixels are listed kind by kind, by the lower 16 bits of their numbers: whole numbers would take
+    as much memory as the images.
 
     Args:
         near: Pixels near silhouettes; all others are far. Overwritten. bool [V, H, W]
-        plain: Which pixels have one colour with all around them; None for none. bool [V, H, W]
+        plain: Pixels whose surroundings have the same colour; None for none. bool [V, H, W]
         valid: Which pixels show something; None for all. bool [V, H, W]
 
     Attributes:
@@ -49,30 +53,41 @@ class PixelPools:
         if valid is not None:
             kinds.masked_fill_(~valid, NOTHING)
         blocks = kinds.flatten().split(BLOCK)
-        self.sizes = tuple(sum(int((part == kind).sum()) for part in blocks) for kind in ORDER)
+        counts = torch.tensor([[int((part == kind).sum()) for part in blocks] for kind in ORDER])
+        sizes = counts.sum(dim=1)
+        self.sizes: tuple[int, ...] = tuple(sizes.tolist())
         self.total = sum(self.sizes)
-        self.counts = torch.tensor(self.sizes, dtype=torch.float64)
+        self.counts = sizes.double()
         self.starts = self.counts.cumsum(dim=0) - self.counts
         self.bounds = torch.zeros(2, dtype=torch.float64)
+        self.before = F.pad(counts.flatten().cumsum(dim=0), (1, 0))
+        """Listed pixels before those of each kind and block, kind by kind. int64 [3 B + 1]"""
+        self.whole: Tensor | None = None
+        """Numbers of all pixels, on a GPU. [N]"""
         self.listed = None
-        """Numbers of the pixels; None where all are of one kind. int32 [N]"""
+        """Lower bits of all pixels' numbers; None where all are of one kind. int16 [N]"""
         if max(self.sizes) < near.numel():
-            self.listed, end = torch.empty(self.total, dtype=torch.int32), 0
-            for kind, (block, part) in itertools.product(ORDER, enumerate(blocks)):
-                found = (part == kind).nonzero()[:, 0]
-                self.listed[end : end + len(found)] = found.add_(block * BLOCK)
-                end += len(found)
+            self.listed = torch.empty(self.total, dtype=torch.int16)
+            places = iter(self.listed.split(counts.flatten().tolist()))
+            for kind, part in itertools.product(ORDER, blocks):
+                next(places).copy_((part == kind).nonzero()[:, 0])
 
     def share(self, far: float, plain: float) -> None:
-        """Settle the shares of far and of plain pixels."""
+        """Set the shares of far and of plain pixels."""
         self.bounds = torch.tensor([far, plain], dtype=torch.float64).cumsum(dim=0)
 
     def to(self, device: torch.device) -> "PixelPools":
         """The same on another device."""
         moved = copy.copy(self)
-        vars(moved).update(
-            {k: v.to(device) for k, v in vars(self).items() if isinstance(v, Tensor)}
-        )
+        if self.listed is not None:
+            # A GPU has room for whole numbers, and a draw there is a few operations shorter.
+            kind = torch.int32 if len(self.before) // len(ORDER) * BLOCK < 2**31 else torch.int64
+            steps = range(0, self.total, PART)
+            parts = (torch.arange(n, min(n + PART, self.total)) for n in steps)
+            whole = torch.cat([self.numbers(part).to(kind) for part in parts])
+            moved.whole = whole.to(device)
+        for name in ("counts", "starts", "bounds"):
+            setattr(moved, name, getattr(self, name).to(device))
         return moved
 
     def pick(self, kind: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
@@ -80,7 +95,17 @@ class PixelPools:
         kind = torch.bucketize(kind.contiguous(), self.bounds, right=True)
         place = torch.addcmul(self.starts[kind], where, self.counts[kind]).long()
         place.clamp_(max=self.total - 1)
-        return kind == 0, place if self.listed is None else self.listed[place].long()
+        return kind == 0, self.numbers(place)
+
+    def numbers(self, place: Tensor) -> Tensor:
+        """Pixels at places in the list. int64 [R] -> int64 [R]"""
+        if self.whole is not None:
+            return self.whole[place].long()
+        if self.listed is None:
+            return place
+        block = torch.searchsorted(self.before, place, right=True) - 1
+        block %= len(self.before) // len(ORDER)
+        return BLOCK * block + (self.listed[place].long() & (BLOCK - 1))
 
 
 class RunPools:
@@ -124,7 +149,7 @@ class RunPools:
         self.far_share = 0.0
 
     def share(self, far: float, plain: float) -> None:
-        """Settle the share of far pixels; none are plain."""
+        """Set the share of far pixels; none are plain."""
         self.far_share = far
 
     def pick(self, kind: Tensor, where: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -11,7 +11,7 @@ from xplanes.scenes.cameras import ball_extent, project
 from xplanes.scenes.views import Views
 
 WINDOW = 0.06
-"""Share of the time span over which content counts as static when silhouettes are joined."""
+"""Share of the time span over which content counts as static when silhouettes are intersected."""
 
 SAME_COLOUR = 4
 """Steps of 255 by which pixels of one colour differ at most."""
@@ -20,10 +20,10 @@ LEAST_FRAMES = 3
 """Images that a camera must have taken for their median to show what is static."""
 
 CHANGE = 20
-"""Difference from the median, of 255 in any channel, from which a pixel has changed."""
+"""Least difference from the median, of 255 in any channel, of a pixel that has changed."""
 
 MOST_VIEWS = 5
-"""Views of such a span at most: more rule out little empty space, but ever more of what moves."""
+"""Most views in such a span: more would cut into moving content and empty little else."""
 
 
 def foreground(views: Views, margin: int | Sequence[int]) -> Tensor:
@@ -42,11 +42,11 @@ def foreground(views: Views, margin: int | Sequence[int]) -> Tensor:
 
 
 def plain(views: Views, margins: Sequence[int]) -> Tensor:
-    """Opaque pixels around which all have one colour: walls and floors without texture.
+    """Opaque pixels in surroundings of one colour: walls and floors without texture.
 
     Args:
         views: Images in memory.
-        margins: Pixels around that have the same colour at least, for each image. [V]
+        margins: Size of these surroundings in pixels, for each image. [V]
 
     Returns:
         bool [V, H, W]

@@ -77,7 +77,7 @@ class SceneSettings(Settings, ABC):
     cache: Location | None  # Folder for images too large for memory; null: the user's cache.
 
     files: ClassVar[str] = ""
-    """What a folder of this format holds, in words; empty for formats without such folders."""
+    """What a folder of this format holds, for messages; empty for formats without folders."""
 
     @property
     def folder(self) -> Path:
@@ -211,7 +211,7 @@ class CaptureSettings(SceneSettings, ABC):
     # name; never the first or last.
     eval_every: Count
     # What masks leave out. alpha: is empty; ignore: is neither trained on nor scored; auto: alpha
-    # where they look like silhouettes, else ignore; lrm: is cut from the LRM's input alone.
+    # where they look like silhouettes, else ignore; lrm: is cropped from the LRM's input alone.
     mask_use: MaskUse
 
     def capture(

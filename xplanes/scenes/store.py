@@ -119,7 +119,7 @@ class PixelFile:
         return content.reshape(-1, self.channels)
 
     def prefetch(self, index: int, start: int, count: int) -> None:
-        """Let the system begin to read pixels, where it can be told."""
+        """Ask the system to read pixels ahead, where it can be asked."""
         if self._file is not None and hasattr(os, "posix_fadvise"):
             span = (self.first[index] + start) * self.channels, count * self.channels
             os.posix_fadvise(self._file.fileno(), *span, os.POSIX_FADV_WILLNEED)
@@ -171,7 +171,7 @@ class StoredImages:
 
     @property
     def identity(self) -> list[Any]:
-        """What tells these images from others, as builtins."""
+        """What distinguishes these images from others, as builtins."""
         return [[file.key, image] for file, image in self.places]
 
     def image(self, index: int) -> Tensor:
@@ -203,7 +203,7 @@ class StoredImages:
         return torch.from_numpy(found)
 
     def prefetch(self, views: Tensor, runs: Tensor) -> None:
-        """Let the system begin to read some runs. int64 [K], int64 [K]"""
+        """Ask the system to read some runs ahead. int64 [K], int64 [K]"""
         for view, run in zip(views.tolist(), runs.tolist(), strict=True):
             file, image = self.places[view]
             file.prefetch(image, run * RUN, RUN)
@@ -247,7 +247,7 @@ def images(
         jobs: Decode the images, each some of them. They run in threads.
         sources: As for `decoded`.
         recipe: As for `decoded`.
-        has_alpha: Tells whether any image has alpha.
+        has_alpha: Whether any image has alpha.
         folder: As for `decoded`.
 
     Raises:
@@ -296,7 +296,7 @@ def decoded(
 
     Args:
         sources: Files that the images come from; the result belongs to their sizes and times.
-        recipe: Builtins that say how they are decoded.
+        recipe: How they are decoded, as builtins.
         sizes: Height and width of each image.
         channels: 3 if no image has alpha, else 4.
         jobs: Decode the images, each some of them. They run in threads.

@@ -42,7 +42,7 @@ OTHER_MODELS = ("FISHEYE", "EQUIRECTANGULAR", "ORTHO", "OMNI", "VR180", "DIVISIO
 """Parts of the names of lens models that are not read, but for those above."""
 
 OTHER_LENSES = ("equirectangular", "latlong", "orthographic", "ftheta_p0")
-"""Keys with which instant-ngp tells of further lenses."""
+"""Keys of further lenses in files of instant-ngp."""
 
 DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Order of the list of coefficients that nerfstudio writes and reads."""
@@ -124,7 +124,7 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
 
 
 class _Frame(NamedTuple):
-    """A frame that can be used: its label for messages, its entry, and what this stands for."""
+    """A frame that can be used: its label for messages, its entry, and what this refers to."""
 
     label: str
     entry: dict[str, Any]
@@ -180,7 +180,7 @@ def _masks_beside(paths: Sequence[Path]) -> tuple[list[Path | None], str]:
 def _calibrations(
     path: Path, content: Mapping[str, Any], frames: Sequence[_Frame]
 ) -> tuple[Calibration, ...]:
-    """The cameras of all frames; a warning tells of pixels that are not square. [V]"""
+    """The cameras of all frames, with a warning of pixels that are not square. [V]"""
     stated = [read_calibration(str(path), content, frame.label, frame.entry) for frame in frames]
     found = tuple(
         _with_height(camera, {**content, **frame.entry}, frame.image)
@@ -196,7 +196,7 @@ def _calibrations(
 
 
 def _with_height(camera: Calibration, keys: Mapping[str, Any], image: Path) -> Calibration:
-    """A camera whose pixels are not square where its two fields of view say so."""
+    """A camera, with pixels that are not square if its two fields of view imply that."""
     angle = keys.get("camera_angle_y")
     if camera.fl_y is not None or not is_positive(angle) or angle >= math.pi:
         return camera
@@ -224,7 +224,7 @@ def _warn_of_unknown(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _says_something(value: Any) -> bool:
-    """Whether a value is more than null, false, zeros or nothing at all."""
+    """Whether a value is more than null, false, zeros or empty."""
     return any(map(_says_something, value)) if isinstance(value, list) else bool(value)
 
 
@@ -342,9 +342,9 @@ def read_calibration(
 
 
 def _pixels(name: str, keys: Mapping[str, Any]) -> dict[str, float]:
-    """The keys in pixels that are given; null, and 0 where it can be no size, stand for none."""
+    """The keys in pixels that are given; null is none, and so is 0 for sizes."""
     if all(keys.get(key) is None for key in PIXELS[:4]):
-        # A size alone says nothing: whatever it is, it is not looked at.
+        # A size alone means nothing, so it is not checked.
         return {key: keys[key] for key in ("w", "h") if is_positive(keys.get(key))}
     found = {}
     for key in PIXELS:
@@ -419,7 +419,7 @@ def _listed_distortion(source: str, keys: Mapping[str, Any]) -> Mapping[str, Any
 
 
 def _model(source: str, name: str) -> LensModel:
-    """The kind of lens that a name stands for; unknown names are those of perspective cameras."""
+    """The kind of lens that a name means; unknown names are perspective cameras."""
     if name in FISHEYES:
         return LensModel.FISHEYE
     if any(word in name for word in OTHER_MODELS):

@@ -23,14 +23,14 @@ HDR = {16: "PQ", 18: "HLG"}
 
 @dataclass(frozen=True)
 class Video:
-    """What a video file says about itself.
+    """The header of a video file.
 
     Attributes:
         path: The file.
         size: Height and width of its frames.
         count: Number of the frames that it shows.
-        rate: Frames per second; None where the file does not tell.
-        times: When they are shown, in seconds; empty where the file does not tell.
+        rate: Frames per second; None if unknown.
+        times: When they are shown, in seconds; empty if unknown.
     """
 
     path: Path

@@ -16,13 +16,13 @@ from xplanes.scenes.matte import silhouette_of
 from xplanes.scenes.store import PixelFile, StoredImages
 
 PALE_STEPS, PALE_EDGE = 16, 0.9
-"""Pixels so far from the background look like it; share of an image's edge that ends in it then."""
+"""Steps of 255 by which background pixels differ at most; their least share of an image's edge."""
 
 RIM = 0.02
 """Width of an image's edge, as a share of its smaller side."""
 
 MOST_EDGES = 32
-"""Views whose edges are looked at, spread evenly."""
+"""Views whose edges are sampled, spread evenly."""
 
 SAME_CAMERA = 1e-4
 """Share by which intrinsics of one camera differ at most."""
@@ -30,7 +30,7 @@ SAME_CAMERA = 1e-4
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """What the cameras of some images see, in pixels; pixel centres lie at +0.5.
+    """Intrinsics of the cameras of some images, in pixels; pixel centres lie at +0.5.
 
     Attributes:
         focal: Focal lengths along x and y. float64 [V, 2]
@@ -244,7 +244,7 @@ class Views:
 
     @cached_property
     def is_opaque(self) -> bool:
-        """Whether the silhouettes are the whole images: alpha says nothing then."""
+        """Whether the silhouettes are the whole images, so that alpha carries no information."""
         for index in range(len(self)):
             silhouette, shown = self.silhouette(index), self.shown(index)
             if not (silhouette if shown is None else silhouette[shown]).all():
@@ -253,7 +253,7 @@ class Views:
 
     @property
     def outline(self) -> str:
-        """The images' size, in words."""
+        """The images' size, for messages."""
         return f"{'up to ' if self.is_padded else ''}{self.width}x{self.height} px"
 
     @property
@@ -273,7 +273,7 @@ class Views:
 
     @property
     def identity(self) -> Any:
-        """What tells these images from others: their bytes, or what they were decoded from."""
+        """What distinguishes these images from others: their bytes, or their sources."""
         return self.images if isinstance(self.images, Tensor) else self.images.identity
 
     def size(self, index: int) -> tuple[int, int]:
@@ -500,7 +500,7 @@ class Scene:
             float32 [N, 3]
         cut: Training views masked to the foreground object, for LRMs, while ``splits`` show whole
             images; None if the alpha of ``splits`` holds the masks, or there are no masks.
-        notes: What was found out while it was read, in words, by what that is about.
+        notes: What reading the scene revealed: sentences by subject.
     """
 
     name: str

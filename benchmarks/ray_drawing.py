@@ -90,6 +90,7 @@ def main() -> None:
     pause, frame = args.step_ms / 1000, cube_frame(4.0, torch.zeros(3))
     count = max(8, round(args.gigabytes * 2**30 / (3 * SIZE[0] * SIZE[1])))
     rows = [["none (process only)", "", "", "", f"{private_bytes() / 2**20:.0f}"]]
+    limit = store.IN_MEMORY
     with tempfile.TemporaryDirectory(dir=args.cache) as place:
         source = Path(place) / "source"
         source.write_bytes(b"")
@@ -99,7 +100,10 @@ def main() -> None:
             for first in range(0, count, per_job)
         ]
         began = time.perf_counter()
-        images = store.decoded([source], "benchmark", [SIZE] * count, 3, jobs, Path(place))
+        store.IN_MEMORY = 0
+        images = store.images(
+            [SIZE] * count, jobs, [source], "benchmark", lambda: False, Path(place)
+        )
         writing = time.perf_counter() - began
         file = next(Path(place).glob("*.pixels"))
 
@@ -125,6 +129,7 @@ def main() -> None:
         rows.append(measure("on disk, cold, without prefetching", silent, pause, drop))
         size = file.stat().st_size
         del batches, silent, prefetched, views, images
+    store.IN_MEMORY = limit
     held = store.in_memory([SIZE] * 32, [lambda: frames(0, 32)])
     small = RayBatches(views_of(held), frame, settings, seed=0)
     rows.append(measure("32 images in memory", small, pause, lambda: None))

@@ -17,7 +17,7 @@ class ConfigError(XPlanesError, ValueError):
 
 
 class DeviceError(XPlanesError, RuntimeError):
-    """A device that does not work any more; the message names what it was doing and the way out."""
+    """A device stopped working; the message names what it was doing and the way out."""
 
 
 class LRMError(XPlanesError, ValueError):
@@ -41,7 +41,7 @@ SHOWN = 5
 
 
 def refuse_all(problems: Sequence[str]) -> None:
-    """Refuse a capture with all that is wrong with it at once; nothing if nothing is.
+    """Refuse a capture with all of its problems at once, if there are any.
 
     Raises:
         SceneError: With the first of many problems, and their number.

@@ -342,9 +342,8 @@ def test_drawing_takes_no_memory_of_the_images(tmp_path: Path, small, capsys) ->
     source.write_bytes(b"")
     whole = 3 * count * size[0] * size[1]  # 63 MB
     before = private_bytes()
-    images = store.decoded(
-        [source], "test", [size] * count, 3, [job(i) for i in range(count)], tmp_path / "cache"
-    )
+    jobs = [job(i) for i in range(count)]
+    images = store.images([size] * count, jobs, [source], "test", lambda: False, tmp_path / "cache")
     poses = ball_views(count, 0.5, size=4)
     batches = RayBatches(
         Views(images, poses.camera_to_world, poses.times, 1000.0, poses.files), FRAME, RAYS, seed=0
@@ -477,7 +476,7 @@ def test_a_cache_that_is_named_is_the_users_to_clean(tmp_path: Path, small, caps
     assert old.exists()
 
 
-def test_an_interrupted_decoder_stops_soon(tmp_path: Path) -> None:
+def test_an_interrupted_decoder_stops_soon(tmp_path: Path, small) -> None:
     source = tmp_path / "source"
     source.write_bytes(b"")
     begun = threading.Event()
@@ -495,7 +494,9 @@ def test_an_interrupted_decoder_stops_soon(tmp_path: Path) -> None:
 
     began = time.monotonic()
     with pytest.raises(SceneError, match="camera 7"):
-        store.decoded([source], "", [(4, 4)] * 101, 3, [slow, broken], tmp_path / "cache")
+        store.images(
+            [(4, 4)] * 101, [slow, broken], [source], "", lambda: False, tmp_path / "cache"
+        )
     assert time.monotonic() - began < 1.5
 
 

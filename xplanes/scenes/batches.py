@@ -1,4 +1,4 @@
-"""Ray batches drawn without memory: the step alone decides what is in them."""
+"""Stateless ray batches: the step alone determines their content."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace

@@ -120,16 +120,17 @@ def backwards(views: Views) -> Tensor:
 
     They are the cameras' z axes if principal points are centred.
     """
-    focal, centre, size = views.intrinsics.focal, views.intrinsics.centre, views.intrinsics.size
-    if (lenses := views.intrinsics.lenses) is not None:
-        rows, columns = (0.5 * size.double() - 0.5).unbind(dim=1)
-        poses = views.camera_to_world.double()
-        looks = cast_rays(poses, rows, columns, focal=focal, centre=centre, lenses=lenses)[1]
-        return -looks.float()
-    right, down = ((0.5 * size.flip(1) - centre) / focal).unbind(dim=1)
-    local = torch.stack([-right, down, torch.ones_like(right)], dim=1)
-    local = local / local.norm(dim=1, keepdim=True)
-    return (views.camera_to_world[:, :3, :3].double() @ local[..., None])[..., 0].float()
+    intrinsics = views.intrinsics
+    rows, columns = (0.5 * intrinsics.size.double() - 0.5).unbind(dim=1)
+    _, directions = cast_rays(
+        views.camera_to_world.double(),
+        rows,
+        columns,
+        focal=intrinsics.focal,
+        centre=intrinsics.centre,
+        lenses=intrinsics.lenses,
+    )
+    return -directions.float()
 
 
 def optical_centre(views: Views) -> Tensor:

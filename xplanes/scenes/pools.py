@@ -125,20 +125,23 @@ class RunPools:
 
     def __init__(self, views: Views, images: StoredImages, margins: Sequence[int]) -> None:
         self.views = views
-        pixels = images.sizes.prod(dim=1)
-        self.first = F.pad((-(-pixels // RUN)).cumsum(dim=0), (1, 0))
+        self.pixels = images.sizes.prod(dim=1)
+        self.first = F.pad((-(-self.pixels // RUN)).cumsum(dim=0), (1, 0))
         """Number of each view's first run, and that of all runs. int64 [V + 1]"""
         total = int(self.first[-1])
-        counts = torch.empty(2, total, dtype=torch.int64)
-        self.near = torch.empty(total, RUN // CELLS // 8, dtype=torch.uint8)
+        counts = torch.zeros(2, total, dtype=torch.int64)
+        self.near = torch.full((total, RUN // CELLS // 8), 255, dtype=torch.uint8)
         """A bit for each `CELLS` pixels of a run. uint8 [runs, B]"""
+        self.all_near = True
         for index, margin in enumerate(margins):
             runs = slice(int(self.first[index]), int(self.first[index + 1]))
-            near = _in_runs(_widened(images.silhouette(index), margin))
-            cells = near.view(-1, RUN // CELLS, CELLS).any(dim=2)
-            valid = _in_runs(torch.ones(views.size(index), dtype=torch.bool))
-            if (shown := views.shown(index)) is not None:
-                valid = _in_runs(shown)
+            near, shown = _widened(images.silhouette(index), margin), views.shown(index)
+            if shown is None and near.all():
+                counts[1, runs] = self._lengths(index, torch.arange(runs.stop - runs.start))
+                continue
+            self.all_near = False
+            cells = _in_runs(near).view(-1, RUN // CELLS, CELLS).any(dim=2)
+            valid = _in_runs(torch.ones_like(near) if shown is None else shown)
             self.near[runs] = torch.from_numpy(np.packbits(cells.numpy(), axis=1))
             near = cells.repeat_interleave(CELLS, dim=1)
             counts[0, runs], counts[1, runs] = ((valid & (near == kind)).sum(1) for kind in (0, 1))
@@ -147,6 +150,10 @@ class RunPools:
         far, near = counts.sum(dim=1).tolist()
         self.sizes = far, 0, near
         self.far_share = 0.0
+
+    def _lengths(self, view: Tensor | int, run: Tensor) -> Tensor:
+        """Pixels of runs: the last one of an image may have fewer. [K]"""
+        return (self.pixels[view] - RUN * run).clamp(max=RUN)
 
     def share(self, far: float, plain: float) -> None:
         """Set the share of far pixels; none are plain."""
@@ -163,12 +170,13 @@ class RunPools:
 
     def inside(self, far: Tensor, view: Tensor, run: Tensor, uniform: Tensor) -> Tensor:
         """Pixels of runs, as `pick` gives these, by numbers from 0 to 1. [K, P] -> int64 [K, P]"""
+        length = self._lengths(view, run)
+        if self.all_near:
+            return torch.minimum((uniform * length[:, None]).long(), length[:, None] - 1)
         bits = self.near[self.first[view] + run].numpy()
         near = torch.from_numpy(np.unpackbits(bits, axis=1)).bool().repeat_interleave(CELLS, dim=1)
-        chosen = near != far[:, None]
+        chosen = (near != far[:, None]) & (torch.arange(RUN) < length[:, None])
         for row, (index, start) in enumerate(zip(view.tolist(), (RUN * run).tolist(), strict=True)):
-            height, width = self.views.size(index)
-            chosen[row, max(0, height * width - start) :] = False
             if (shown := self.views.shown(index)) is not None:
                 part = shown.flatten()[start : start + RUN]
                 chosen[row, : len(part)] &= part

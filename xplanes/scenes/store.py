@@ -242,21 +242,25 @@ def images(
 ) -> "Tensor | StoredImages":
     """Decode images to memory, or to a file of the cache if they take more than `IN_MEMORY` bytes.
 
+    Of several processes that need the same images one decodes and the others wait. What a killed
+    process left behind is removed by the next one. Before the user's cache takes a new file, those
+    that were not used for `UNUSED_DAYS` are removed from it.
+
     Args:
         sizes: Height and width of each image. [V]
         jobs: Decode the images, each some of them. They run in threads.
-        sources: As for `decoded`.
-        recipe: As for `decoded`.
+        sources: Files that the images come from; the result belongs to their sizes and times.
+        recipe: How they are decoded, as builtins.
         has_alpha: Whether any image has alpha.
-        folder: As for `decoded`.
+        folder: The cache; that of the user when None.
 
     Raises:
-        StorageError: If the cache cannot be written.
+        StorageError: If the disk lacks the space, or cannot be written.
     """
     height, width = _largest(sizes)
     if 4 * len(sizes) * height * width <= IN_MEMORY:
         return in_memory(sizes, jobs)
-    return decoded(sources, recipe, sizes, 4 if has_alpha() else 3, jobs, folder)
+    return _decoded(sizes, jobs, sources, recipe, 4 if has_alpha() else 3, folder)
 
 
 def in_memory(sizes: Sequence[Size], jobs: Sequence[Job]) -> Tensor:
@@ -280,31 +284,15 @@ def in_memory(sizes: Sequence[Size], jobs: Sequence[Job]) -> Tensor:
     return images
 
 
-def decoded(
+def _decoded(
+    sizes: Sequence[Size],
+    jobs: Sequence[Job],
     sources: Sequence[Path],
     recipe: Any,
-    sizes: Sequence[Size],
     channels: int,
-    jobs: Sequence[Job],
     folder: Path | None,
 ) -> StoredImages:
-    """Decode images to a file of the cache, unless it is there already.
-
-    Of several processes that need the same images one decodes and the others wait. What a killed
-    process left behind is removed by the next one. Before the user's cache takes a new file, those
-    that were not used for `UNUSED_DAYS` are removed from it.
-
-    Args:
-        sources: Files that the images come from; the result belongs to their sizes and times.
-        recipe: How they are decoded, as builtins.
-        sizes: Height and width of each image.
-        channels: 3 if no image has alpha, else 4.
-        jobs: Decode the images, each some of them. They run in threads.
-        folder: The cache; that of the user when None.
-
-    Raises:
-        StorageError: If the disk lacks the space, or cannot be written.
-    """
+    """The images in a file of the cache, decoded unless it is there already."""
     is_default = folder is None
     folder = default_cache() if folder is None else folder
     states = [(str(path.resolve()), path.stat()) for path in sources]

@@ -285,8 +285,11 @@ class Views:
         """Image ``index`` without padding; do not modify it. uint8 [h, w, 4]"""
         if isinstance(self.images, StoredImages):
             return self.images.image(index)
+        return self._cropped(self.images, index)
+
+    def _cropped(self, pixels: Tensor, index: int) -> Tensor:
         height, width = self.size(index)
-        return self.images[index, :height, :width]
+        return pixels[index, :height, :width]
 
     def shown(self, index: int) -> Tensor | None:
         """Pixels of image ``index`` that are trained on and scored; None for all. bool [h, w]
@@ -296,8 +299,7 @@ class Views:
         has_ray = self.intrinsics.has_ray(index)
         if self.ignored is None:
             return has_ray
-        height, width = self.size(index)
-        shown = ~self.ignored[index, :height, :width]
+        shown = ~self._cropped(self.ignored, index)
         return shown if has_ray is None else shown & has_ray
 
     def thing_in(self, index: int) -> Tensor | None:
@@ -305,10 +307,7 @@ class Views:
 
         None if unknown.
         """
-        if self.thing is None:
-            return None
-        height, width = self.size(index)
-        return self.thing[index, :height, :width]
+        return None if self.thing is None else self._cropped(self.thing, index)
 
     def in_memory(self) -> Tensor:
         """All images, with padding. uint8 [V, H, W, 4]"""
@@ -316,8 +315,7 @@ class Views:
             return self.images
         whole = torch.zeros(self.images.shape, dtype=torch.uint8)
         for index in range(len(self)):
-            height, width = self.size(index)
-            whole[index, :height, :width] = self.images.image(index)
+            self._cropped(whole, index).copy_(self.images.image(index))
         return whole
 
     def silhouette(self, index: int) -> Tensor:
@@ -339,19 +337,12 @@ class Views:
 
     def to(self, device: torch.device) -> "Views":
         """Views in memory, without lenses, on another device."""
-        intrinsics = self.intrinsics
         assert isinstance(self.images, Tensor)
-        assert intrinsics.lenses is None
-        focal, centre, size = (
-            number.to(device) for number in (intrinsics.focal, intrinsics.centre, intrinsics.size)
-        )
-        return Views(
-            self.images.to(device),
-            self.camera_to_world.to(device),
-            self.times.to(device),
-            Intrinsics(focal, centre, size),
-            self.files,
-        )
+        assert self.intrinsics.lenses is None
+        names = ("focal", "centre", "size")
+        intrinsics = Intrinsics(*(getattr(self.intrinsics, name).to(device) for name in names))
+        images, poses = self.images.to(device), self.camera_to_world.to(device)
+        return Views(images, poses, self.times.to(device), intrinsics, self.files)
 
     def subset(self, indices: Tensor | Sequence[int]) -> "Views":
         """Select views by index.
@@ -447,30 +438,32 @@ class Views:
 
 def joined(first: Views, second: Views) -> Views:
     """The views of both."""
+    height, width = max(first.height, second.height), max(first.width, second.width)
+
+    def together(parts: Sequence[Tensor]) -> Tensor:
+        """Images with zeros at the bottom and on the right. [V, h, w, C] each"""
+        whole = parts[0].new_zeros(sum(map(len, parts)), height, width, *parts[0].shape[3:])
+        for part, room in zip(parts, whole.split([*map(len, parts)]), strict=True):
+            room[:, : part.shape[1], : part.shape[2]] = part
+        return whole
+
     if isinstance(first.images, Tensor) and isinstance(second.images, Tensor):
-        height, width = max(first.height, second.height), max(first.width, second.width)
-        parts = [_padded(images, height, width) for images in (first.images, second.images)]
-        images = torch.cat(parts)
+        images = together([first.images, second.images])
     else:
         images = _stored(first).joined(_stored(second))
+    ignored = None
+    if first.ignored is not None or second.ignored is not None:
+        none = (torch.zeros(each.images.shape[:3], dtype=torch.bool) for each in (first, second))
+        given = (first.ignored, second.ignored)
+        ignored = together([e if e is not None else n for e, n in zip(given, none, strict=True)])
     return Views(
         images,
         torch.cat([first.camera_to_world, second.camera_to_world]),
         torch.cat([first.times, second.times]),
         first.intrinsics.joined(second.intrinsics),
         first.files + second.files,
-        ignored=None if first.ignored is second.ignored else _joined_ignored(first, second),
+        ignored=ignored,
     )
-
-
-def _joined_ignored(first: Views, second: Views) -> Tensor:
-    """Ignored pixels of the views of both. bool [V, H, W]"""
-    height, width = max(first.height, second.height), max(first.width, second.width)
-    found = torch.zeros(len(first) + len(second), height, width, dtype=torch.bool)
-    for start, views in ((0, first), (len(first), second)):
-        if views.ignored is not None:
-            found[start : start + len(views), : views.height, : views.width] = views.ignored
-    return found
 
 
 def _stored(views: Views) -> StoredImages:
@@ -478,12 +471,6 @@ def _stored(views: Views) -> StoredImages:
     if isinstance(views.images, StoredImages):
         return views.images
     return StoredImages.all_of(PixelFile.of(views.image(index) for index in range(len(views))))
-
-
-def _padded(images: Tensor, height: int, width: int) -> Tensor:
-    """Images with zeros at the bottom and on the right. [..., h, w, 4] -> [..., H, W, 4]"""
-    rows, columns = height - images.shape[-3], width - images.shape[-2]
-    return F.pad(images, (0, 0, 0, columns, 0, rows)) if rows or columns else images
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,8 @@ from runner import markdown
 from triton.backends.compiler import GPUTarget
 from triton.runtime.jit import JITFunction
 
+from xplanes.baselines.products import DYNAMIC, plane_product_gpu
 from xplanes.fields.lookup import plane_features_gpu
-from xplanes.fields.products import DYNAMIC, plane_product_gpu
 from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 from xplanes.rendering.compositing import composite_gpu
 from xplanes.rendering.marching import march_gpu

@@ -42,10 +42,10 @@ from torch.profiler import ProfilerActivity
 
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.backend import synchronize
+from xplanes.baselines.products import DYNAMIC, plane_product_gpu, plane_product_reference
 from xplanes.config import compose_plain
 from xplanes.decomposition import decompose
 from xplanes.fields.lookup import plane_features_gpu, plane_features_reference
-from xplanes.fields.products import DYNAMIC, plane_product_gpu, plane_product_reference
 from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 from xplanes.files import read_json, require_writable, write_json, write_rows, write_text
 from xplanes.lrm.bundled import load_bundled

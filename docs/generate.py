@@ -1,13 +1,15 @@
 """Write the pages that follow from the code: `python docs/generate.py`.
 
 docs/configuration.md comes from conf/ and the classes it names, docs/command_line.md from the
-parser of the command line, docs/api.md from the signatures and docstrings of what it lists.
+parser of the command line, docs/api.md from the signatures and docstrings of what it lists,
+examples/first_minute.ipynb from the script beside it.
 """
 
 import argparse
 import ast
 import importlib
 import inspect
+import json
 import pkgutil
 import re
 import textwrap
@@ -522,10 +524,34 @@ def signature(lines: list[str], node: Any) -> list[str]:
     return head
 
 
-PAGES = {"configuration.md": document, "command_line.md": command_line, "api.md": api}
+def notebook() -> str:
+    """The notebook with the cells of examples/first_minute.py, without outputs."""
+    script = (ROOT / "examples" / "first_minute.py").read_text(encoding="utf-8")
+    cells: list[dict[str, Any]] = []
+    for number, text in enumerate(re.split(r"^# %%", script, flags=re.MULTILINE)[1:]):
+        kind, _, body = text.partition("\n")
+        cell = {"id": f"cell-{number}", "metadata": {}}
+        if kind.strip() == "[markdown]":
+            body = re.sub(r"^# ?", "", body, flags=re.MULTILINE)
+            cell |= {"cell_type": "markdown"}
+        else:
+            cell |= {"cell_type": "code", "execution_count": None, "outputs": []}
+        cells.append(cell | {"source": body.strip().splitlines(keepends=True)})
+    kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
+    metadata = {"kernelspec": kernel, "language_info": {"name": "python"}}
+    whole = {"cells": cells, "metadata": metadata, "nbformat": 4, "nbformat_minor": 5}
+    return json.dumps(whole, indent=1) + "\n"
+
+
+PAGES = {
+    "configuration.md": document,
+    "command_line.md": command_line,
+    "api.md": api,
+    "../examples/first_minute.ipynb": notebook,
+}
 """The pages that are written, and what writes them."""
 
 
 if __name__ == "__main__":
     for name, write in PAGES.items():
-        (ROOT / "docs" / name).write_text(write(), encoding="utf-8")
+        (ROOT / "docs" / name).write_text(write(), encoding="utf-8", newline="\n")

@@ -1,6 +1,5 @@
 """The compiled loops agree with torch on the number of threads, and may be absent."""
 
-import json
 import os
 import shutil
 import subprocess
@@ -11,23 +10,11 @@ from pathlib import Path
 import pytest
 
 from tests.training.runs import SMALL
+from tests.warm import forked
 from xplanes import backend
 from xplanes.backend import COMPILING, WarmUp
 
 ROOT = Path(__file__).resolve().parents[1]
-
-FORK = """
-import json, os, sys
-import torch
-for code in json.loads(sys.argv[1]):
-    child = os.fork()
-    if not child:
-        exec(code)
-        sys.stdout.flush()
-        os._exit(0)
-    assert os.waitpid(child, 0)[1] == 0, code
-"""
-"""Runs each of several scripts where torch is loaded, and nothing else."""
 
 COUNT = """
 torch.set_num_threads({count})
@@ -54,36 +41,23 @@ except ModuleNotFoundError as error:
 """
 
 
-@pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> subprocess.CompletedProcess[str]:
-    """What three new processes say: with one thread, with two, and where numba does not load."""
-    place = tmp_path_factory.mktemp("broken")
-    (place / "numba").mkdir()
-    (place / "numba" / "__init__.py").write_text("raise ImportError('Numba needs NumPy 0.1')")
-    codes = [COUNT.format(count=1), COUNT.format(count=2), FALLBACK.format(place=str(place))]
-    return subprocess.run(
-        [sys.executable, "-c", FORK, json.dumps(codes)],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=ROOT,
-    )
-
-
-def test_the_first_loop_leaves_the_number_of_threads_alone(result) -> None:
-    for count, line in zip((1, 2), result.stdout.splitlines(), strict=False):
+def test_loops_share_the_threads_of_torch_and_may_be_absent(tmp_path: Path) -> None:
+    """With one thread, with two, and where numba does not load."""
+    broken = tmp_path / "broken"
+    (broken / "numba").mkdir(parents=True)
+    (broken / "numba" / "__init__.py").write_text("raise ImportError('Numba needs NumPy 0.1')")
+    codes = [COUNT.format(count=1), COUNT.format(count=2), FALLBACK.format(place=str(broken))]
+    *counted, (code, printed) = forked("import torch", codes, tmp_path)
+    for count, (_, line) in zip((1, 2), counted, strict=True):
         torchs, loops, cores = map(int, line.split())
         assert torchs == count
         assert loops == min(count, cores)
-
-
-def test_a_numba_that_does_not_load_is_done_without(result) -> None:
-    assert len(result.stdout.splitlines()) == 4
-    assert result.stdout.splitlines()[2] == "torch"
-    # Kernels for GPUs have no need of it.
-    assert result.stdout.splitlines()[3] in ("loaded", "triton")
-    assert "numba cannot be imported (Numba needs NumPy 0.1)" in result.stderr
-    assert "pip install --upgrade numba" in result.stderr
+    assert code == 0, printed
+    # Kernels for GPUs have no need of numba.
+    kind, kernels = [line for line in printed.splitlines() if " " not in line]
+    assert (kind, kernels) in (("torch", "loaded"), ("torch", "triton"))
+    assert "numba cannot be imported (Numba needs NumPy 0.1)" in printed
+    assert "pip install --upgrade numba" in printed
 
 
 def test_warming_up_inside_warming_up_counts_once() -> None:
@@ -108,7 +82,8 @@ nothing = torch.zeros(4, dtype=torch.long)
 total, _ = composite(torch.rand(4), torch.rand(4, 3), torch.rand(4), nothing, nothing[:1])
 assert total.isfinite().all()
 print(backend.name(torch.device("cpu")))
-wings = "baselines.gaussians.rasteriser_numba", "synthetic.pretraining.solids_numba"
+wings = ["baselines.gaussians.rasteriser_numba", "baselines.products_numba"]
+wings.append("synthetic.pretraining.solids_numba")
 for name in ("fields.lookup_numba", "rendering.rays_numba", *wings):
     importlib.import_module(f"xplanes.{name}")
 """

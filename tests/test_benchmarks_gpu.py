@@ -2,7 +2,6 @@
 
 import csv
 import importlib
-import math
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +9,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from lightning.pytorch.strategies import SingleDeviceStrategy
-
-from tests import on_device
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 
@@ -135,37 +131,6 @@ def test_without_a_gpu_the_page_says_what_is_missing(gpu, faked, tmp_path):
     assert "Triton's interpreter" in page
 
 
-@pytest.mark.slow
-def test_steps_and_preparation_are_measured_where_they_run(gpu, fake_gpu, monkeypatch, tmp_path):
-    monkeypatch.setattr(
-        gpu,
-        "SingleDeviceStrategy",
-        lambda device: SingleDeviceStrategy(device, accelerator=on_device.FakeAccelerator()),
-    )
-    small = ("lrm=none", "data.resolution=16", "data.train_views=4", "data.test_views=1")
-    part = gpu.Part("step", "six planes", overrides=(*small, "data.val_views=1"))
-    record, args = gpu.Record(tmp_path / "record.json"), SimpleNamespace(work=tmp_path)
-    gpu.measure_step(record, part, args, fake_gpu)
-    gpu.measure_preparation(record, part, args, fake_gpu)
-    found = {(f.table, f.row, f.column): f.value for f in record.figures}
-    whole, inside = (found["step", row, "time a step"] for row in ("whole", "in kernels"))
-    assert 0 < inside <= whole
-    rows = [f for f in record.figures if f.table == "step" and f.column == "time a step"]
-    assert len(rows) == gpu.KERNELS + 2
-    times = [f.value for f in rows[2:]]
-    assert times == sorted(times, reverse=True)
-    prepared = {row: value for (part, row, _), value in found.items() if part == "preparation"}
-    assert [row.split(",")[0] for row in prepared] == ["LRM tiny", "LRM mini"] + 2 * ["robust PCA"]
-    assert [row.split(", ")[-1] for row in list(prepared)[2:]] == ["fake", "cpu"]
-    assert all(value > 0 for value in prepared.values())
-
-
-def test_seconds_to_a_goal(gpu):
-    curve = [{"seconds": f"{n}", "psnr": f"{20 + n}"} for n in (1, 4, 5, 6)]
-    assert gpu.first_at(curve, 24.5) == 5
-    assert math.isnan(gpu.first_at(curve, 30))
-
-
 def test_errors_of_kernels_are_seen(gpu, tmp_path):
     pytest.importorskip("triton", reason="triton is not installed")
     record = gpu.Record(tmp_path / "record.json")
@@ -182,24 +147,6 @@ def test_errors_of_kernels_are_seen(gpu, tmp_path):
     gpu.compare(record, "products", broken, sizes)
     assert "products, 2 channels, 8 texels" in record.error
     assert gpu.Record.load(record.path) == record
-
-
-def test_a_kernel_that_gives_nan_is_wrong(gpu, tmp_path):
-    def broken(sizes):
-        case = gpu.product_case(sizes)
-        empty = case.leaves[0].new_tensor(torch.nan)
-        return gpu.Case(case.leaves, lambda leaves: empty * case.twin(leaves), case.twin, (1, 1))
-
-    record = gpu.Record(tmp_path / "record.json")
-    gpu.compare(record, "products", broken, gpu.Sizes(gpu.RAY, 2, 8, 4, torch.device("cpu")))
-    assert "nan" in record.error
-
-
-def test_steps_per_second_leave_the_beginning_out(gpu):
-    metrics = {"step": 100, "seconds": {"train": 10.0}}
-    first, last = {"step": "40", "seconds": "7.0"}, {"step": "100", "seconds": "10.0"}
-    assert gpu.steps_per_second(gpu.Measured(metrics, [first, last])) == 20
-    assert gpu.steps_per_second(gpu.Measured(metrics, [last])) == 10
 
 
 def test_a_process_that_ends_early_leaves_one_line(gpu, monkeypatch, tmp_path, capsys):

@@ -1,7 +1,6 @@
 """The command line after training: quick to ask, plain when something is wrong."""
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -11,35 +10,6 @@ from tests import warm
 from xplanes.baselines.gaussians.rasteriser import GaussianError
 from xplanes.cli import main
 from xplanes.errors import DeviceError
-
-
-def python(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, *arguments], cwd=cwd, capture_output=True, text=True, timeout=120
-    )
-
-
-def test_help_loads_nothing_heavy(tmp_path):
-    code = (
-        "import sys; from xplanes.cli import build_parser; text = build_parser().format_help();"
-        "heavy = {'torch', 'lightning', 'hydra', 'omegaconf', 'numpy'} & set(sys.modules);"
-        "print(text); sys.exit(f'loaded {heavy}' if heavy else 0)"
-    )
-    done = python("-c", code, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    for verb in ("download", "triplanes", "evaluate", "render", "view", "table"):
-        assert verb in done.stdout
-
-
-def test_the_error_of_a_quick_command_waits_for_nothing_heavy(tmp_path):
-    code = (
-        "import sys; from xplanes.cli import main; code = main(['inspect', 'nowhere']);"
-        "heavy = {'lightning', 'xplanes.run'} & set(sys.modules);"
-        "sys.exit(f'loaded {heavy}' if heavy else code)"
-    )
-    done = python("-c", code, cwd=tmp_path)
-    assert done.returncode == 1
-    assert done.stderr.startswith("error: nowhere")
 
 
 def test_evaluate_as_a_program(trained_run: Path, tmp_path: Path):

@@ -25,7 +25,8 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 def test_generated_pages_are_what_the_generator_writes() -> None:
     pages = runpy.run_path(str(ROOT / "docs" / "generate.py"))["PAGES"]
-    assert set(pages) == {"configuration.md", "command_line.md", "api.md"}
+    notebook = "../examples/first_minute.ipynb"
+    assert set(pages) == {"configuration.md", "command_line.md", "api.md", notebook}
     for name, write in pages.items():
         page = (ROOT / "docs" / name).read_text(encoding="utf-8")
         assert page == write(), "run: python docs/generate.py"

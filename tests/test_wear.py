@@ -18,7 +18,6 @@ from xplanes.run import run
 from xplanes.synthetic.demo import ensure_demo_scene, write
 from xplanes.synthetic.pretraining.pool import RECORD, SHARD, ensure_pool
 from xplanes.training.checkpoints import LAST
-from xplanes.training.evaluation import Curve
 
 
 def aged(path: Path) -> Path:
@@ -63,14 +62,6 @@ def test_a_damaged_record_of_a_pool_is_named(tmp_path: Path) -> None:
     (tmp_path / RECORD).write_text('{"version": 1,')
     with pytest.raises(ConfigError, match=r"pool\.json is damaged.*delete it"):
         ensure_pool(tmp_path, range(SHARD), views=1, side=4)
-
-
-def test_a_damaged_row_of_a_curve_is_dropped(tmp_path: Path, caplog) -> None:
-    path = tmp_path / "curve.csv"
-    path.write_text("seconds,step,split,psnr,ssim\n0.0,0,test,9.1,0.2\n1.5,20,te")
-    curve = Curve(path, until=40)
-    assert [row[1] for row in curve.rows] == ["0"]
-    assert "curve.csv is damaged" in caplog.text
 
 
 def test_no_place_for_the_output_is_said_before_anything_is_loaded(tmp_path: Path) -> None:

@@ -86,7 +86,7 @@ def build_parser(further: Sequence[AddCommands] = ()) -> argparse.ArgumentParser
         "overrides", nargs="*", metavar="KEY=VALUE", help="what changes, and options of Hydra"
     )
     verbs = (_add_download, _add_inspect, _add_triplanes, _add_evaluate, _add_render, _add_view)
-    for add in (*verbs, _add_export, _add_table, _add_sheet, *further):
+    for add in (*verbs, _add_export, _add_push, _add_table, _add_sheet, *further):
         add(commands)
     return parser
 
@@ -178,7 +178,9 @@ def _triplanes(options: argparse.Namespace) -> None:
 
 
 def _add_run(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", type=Path, metavar="RUN", help="the run directory")
+    parser.add_argument(
+        "run", metavar="RUN", help="the run directory, or hf://USER/REPOSITORY of the hub"
+    )
     parser.add_argument(
         "--checkpoint", choices=["last", "best"], default="last", help="default: %(default)s"
     )
@@ -192,9 +194,11 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
 
 
 def _load(options: argparse.Namespace, split: str | None = None) -> "TrainedRun":
+    from xplanes.evaluation.hub import SCHEME, fetch
     from xplanes.evaluation.runs import find_run, load_run
 
-    run = find_run(options.run)
+    on_hub = options.run.startswith(SCHEME)
+    run = fetch(options.run, say=_say) if on_hub else find_run(Path(options.run))
     return load_run(
         run,
         checkpoint=options.checkpoint,
@@ -347,14 +351,15 @@ def _view(options: argparse.Namespace) -> None:
 def _add_export(commands: "argparse._SubParsersAction") -> None:
     parser = commands.add_parser(
         "export",
-        help="write meshes, point clouds, planes, Gaussians or camera paths for other programs",
+        help="write meshes, points, a web page, planes, Gaussians or camera paths",
     )
     _add_run(parser)
     parser.add_argument(
         "--what",
         default="mesh",
-        help="what to write: mesh or points (extra: export), planes (X-Planes only), path (of the "
-        "training cameras), or what a model adds, such as gaussians; default: %(default)s",
+        help="what to write: mesh or points (extra: export), web (one HTML file below 20 MB that "
+        "plays them; extra: export), planes (X-Planes only), path (of the training cameras), or "
+        "what a model adds, such as gaussians; default: %(default)s",
     )
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="empty or new; default: RUN/export/WHAT"
@@ -362,7 +367,7 @@ def _add_export(commands: "argparse._SubParsersAction") -> None:
     parser.add_argument(
         "--times",
         help="a number of times spread evenly from 0 to 1, or times separated by commas; "
-        "default: 10, or 1 in a static scene",
+        "default: 10, 24 with --what web, or 1 in a static scene",
     )
     parser.add_argument(
         "--resolution",
@@ -378,9 +383,8 @@ def _add_export(commands: "argparse._SubParsersAction") -> None:
     parser.add_argument(
         "--points",
         type=int,
-        default=100_000,
         metavar="COUNT",
-        help="points of a point cloud; default: %(default)s",
+        help="points of a point cloud; default: 100000; with --what web, points replace the mesh",
     )
     parser.add_argument(
         "--format",
@@ -406,6 +410,24 @@ def _export(options: argparse.Namespace) -> None:
     if options.out is not None:
         check_folder(options.out)
     _say(f"wrote {export(_load(options), wanted, options.out, say=_say)}")
+
+
+def _add_push(commands: "argparse._SubParsersAction") -> None:
+    parser = commands.add_parser("push", help="upload a run to the Hugging Face hub")
+    parser.add_argument("run", type=Path, metavar="RUN", help="the run directory")
+    parser.add_argument(
+        "repository", metavar="USER/REPOSITORY", help="made if it does not exist yet"
+    )
+    parser.add_argument("--private", action="store_true", help="make a private repository")
+    parser.set_defaults(command=_push)
+
+
+def _push(options: argparse.Namespace) -> None:
+    from xplanes.evaluation.hub import push
+    from xplanes.evaluation.runs import find_run
+
+    run = find_run(options.run)
+    _say(f"wrote {push(run, options.repository, private=options.private, say=_say)}")
 
 
 def _add_table(commands: "argparse._SubParsersAction") -> None:

@@ -18,7 +18,7 @@ from xplanes.backend import warm_up
 from xplanes.errors import ConfigError, SceneError, XPlanesError
 from xplanes.evaluation.findings import camera_findings, opaque_findings, stray_findings
 from xplanes.evaluation.published import check_published
-from xplanes.evaluation.render import VIDEO_FRAMES, write_orbit
+from xplanes.evaluation.render import FRAMES, write_orbit
 from xplanes.evaluation.report import closing, header, log_hparams, rest, summary, write_pictures
 from xplanes.evaluation.sheet import check_what
 from xplanes.experiment import Experiment
@@ -230,7 +230,7 @@ def train(
     metrics["decomposition"] = found.report
     metrics["lrm"] = found.lrm
     if experiment.media:
-        say(f"rendering {VIDEO_FRAMES} frames of the orbit video ...")
+        say(f"rendering {FRAMES} frames of the orbit video ...")
         metrics["media"] = str(write_orbit(module, scene, folder).relative_to(folder))
     seconds |= rest(seconds, record.total_seconds)
     write_json(folder / "metrics.json", metrics)

@@ -1,5 +1,6 @@
 """Gaussians that planes deform: what is added and removed, what is drawn, what is written."""
 
+import json
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -17,17 +18,15 @@ from xplanes.baselines.gaussians.field import (
     Gaussians,
     HexPlaneGaussians,
     PointCloud,
-    neighbour_distance,
 )
 from xplanes.baselines.gaussians.harmonics import spherical_harmonics
 from xplanes.baselines.gaussians.hull import hull_points
-from xplanes.baselines.gaussians.model import camera_extent
 from xplanes.baselines.gaussians.rasteriser import GaussianError, rasterise
 from xplanes.baselines.gaussians.renderer import GaussianRenderer, camera_in
+from xplanes.baselines.products import PlaneProducts
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, SceneError
 from xplanes.evaluation.export import ExportOptions, export
-from xplanes.fields.products import PlaneProducts
 from xplanes.models.initialisation import Method
 from xplanes.preparation.fixed_view import rendering_method
 from xplanes.rendering.sampler import Site
@@ -166,25 +165,6 @@ def test_halves_are_drawn_from_the_gaussian_that_is_split():
     assert (torch.corrcoef(along.T) - torch.eye(3)).abs().max() < 0.05
 
 
-def test_optimiser_goes_on_as_if_rows_had_not_moved():
-    """The same gradients, one optimiser before and one after rows were reordered."""
-    plain, moved = gaussians(20), gaussians(20)
-    torch.manual_seed(3)
-    first = stepped(plain)
-    torch.manual_seed(3)
-    second = stepped(moved)
-    order = torch.randperm(20)
-    select_rows(moved, second, order, torch.zeros(20, dtype=torch.bool))
-    for _ in range(3):
-        for name in plain.PARAMETERS:
-            gradient = torch.randn_like(getattr(plain, name))
-            getattr(plain, name).grad, getattr(moved, name).grad = gradient, gradient[order]
-        first.step()
-        second.step()
-    for name in plain.PARAMETERS:
-        assert torch.equal(getattr(plain, name)[order], getattr(moved, name)), name
-
-
 def test_no_more_than_the_most_and_those_with_the_largest_gradients():
     field = gaussians(30)
     field.seen.fill_(1)
@@ -262,19 +242,6 @@ def test_nothing_left_and_numbers_that_are_not_finite_are_named():
         renderer.view(field, FRAME, view, 0.5, torch.ones(3))
 
 
-def test_a_state_of_another_number_of_gaussians_is_loaded():
-    field, other = gaussians(12), gaussians(5)
-    other.load_state_dict(field.state_dict())
-    assert len(other) == 12
-    assert len(other.slopes) == 12
-    for (name, mine), theirs in zip(
-        field.state_dict().items(), other.state_dict().values(), strict=True
-    ):
-        assert torch.equal(mine, theirs), name
-    with pytest.raises(RuntimeError, match="size mismatch for detail"):
-        gaussians(5, degree=2).load_state_dict(field.state_dict())
-
-
 @pytest.mark.parametrize("frame", [FRAME, TURNED], ids=["world axes", "turned"])
 def test_a_gaussian_is_seen_where_its_point_is(frame):
     views = ball_views(3, 0.6, size=48)
@@ -322,34 +289,6 @@ def test_points_on_the_hull_of_a_ball():
     anywhere = hull_points(opaque, FRAME, 500)
     assert float(anywhere.points.abs().max()) > 0.9
     assert (anywhere.colours == 0.5).all()
-
-
-def test_first_scales_are_the_distances_to_neighbours():
-    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
-    distance = (points[:, None].double() - points.double()).norm(dim=-1).sort(dim=1).values
-    expected = distance[:, 1:4].square().mean(dim=1).sqrt().float()
-    torch.testing.assert_close(neighbour_distance(points), expected, rtol=1e-3, atol=1e-5)
-    assert neighbour_distance(points[:1]) == 0.1
-
-
-def test_learning_rates_decay_in_each_stage():
-    model = settings().build(Site(FRAME, torch.tensor([0.0, 1.0]), 0, "32"))
-    peaks = {group["name"]: group["lr"] for group in model.groups()}
-    assert peaks["detail"] == pytest.approx(peaks["base"] / 20)
-    static = model.settings.static_share
-    assert model.rate_of("means", 0, 0.0) == 1
-    # 3000 of 20,000 steps, and from the start.
-    assert model.rate_of("means", 0, static - 1e-9) == pytest.approx(0.01 ** (3 / 20), rel=0.01)
-    assert model.rate_of("planes", 0, static) == 1
-    assert model.rate_of("network", 0, 1.0) == pytest.approx(0.01)
-    assert model.rate_of("logits", 0, 1.0) == 1
-    views = ball_views(9, 0.6, distance=4.0)
-    places = views.camera_to_world[:, :3, 3].numpy()
-    farthest = max(np.linalg.norm(place - places.mean(axis=0)) for place in places)
-    site = Site(FRAME, views.times, 0, "32", views=views)
-    assert camera_extent(site) == pytest.approx(1.1 * farthest * FRAME.scale, rel=1e-5)
-    alone = replace(site, views=views.subset(torch.zeros(3, dtype=torch.long)))
-    assert camera_extent(alone) == 1.0
 
 
 def test_gradients_of_the_planes_terms_are_those_of_their_values():
@@ -466,6 +405,23 @@ def test_a_ply_of_a_timestep_shows_what_the_renderer_shows(tmp_path, degree):
         shown = run.module.renderer.view(field, FRAME, camera, time, torch.ones(3))
         torch.testing.assert_close(image.colour, shown["colour"], atol=2e-4, rtol=0)
         assert float(shown["opacity"].max()) > 0.3
+
+
+def test_the_points_of_a_page_are_the_more_opaque_gaussians(tmp_path):
+    field, run = gaussians(40), trained(gaussians(40))
+    with torch.no_grad():
+        field.logits.copy_(torch.linspace(-3, 3, 40)[torch.randperm(40)])
+    run.module.field, run.path = field, tmp_path / "run"
+    points, colours = field.cloud(0.75)
+    posed = field.at(0.75)
+    kept = posed.opacities >= posed.opacities.max() / 2
+    assert 5 < len(points) == kept.sum() < 40
+    assert torch.equal(points[0], posed.means[posed.opacities.argmax()])
+    assert set(map(tuple, points.tolist())) == set(map(tuple, posed.means[kept].tolist()))
+    assert ((colours >= 0) & (colours <= 1)).all()
+    folder = export(run, ExportOptions("web", times="3"), tmp_path / "web", say=print)
+    listed = json.loads((folder / "export.json").read_text())
+    assert (listed["vertices"], listed["triangles"]) == (3 * len(points), 0)
 
 
 def test_what_does_not_fit_is_refused(tmp_path, scenes):

@@ -11,11 +11,8 @@ from tests.baselines.runs import (
     KPLANES,
     OCCUPANCY,
     PROPOSAL,
-    TENSOR4D,
-    TINEUVOX,
     baseline_config,
 )
-from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
 from xplanes.models.initialisation import Method
@@ -36,7 +33,6 @@ def test_hybrid_run_learns_resumes_and_is_loaded(scenes, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "overrides",
     [
-        ("model=kplanes_explicit", *FAST, *PROPOSAL),
         ("model=kplanes", "model/sampler=occupancy", *FAST, *OCCUPANCY, "trainer.max_steps=60"),
         (
             "model/sampler=proposal",
@@ -46,24 +42,8 @@ def test_hybrid_run_learns_resumes_and_is_loaded(scenes, tmp_path, monkeypatch):
             "model.rays.per_batch=128",
             "trainer.max_steps=20",
         ),
-        (
-            "model=tineuvox_s",
-            "model/sampler=proposal",
-            "model.half_side=1.5",
-            *[o for o in TINEUVOX if not o.startswith("model.sampler")],
-            "model.network_learning_rate=0.004",
-            *PROPOSAL,
-        ),
-        (
-            "model=tensor4d_density",
-            "model/sampler=proposal",
-            *TENSOR4D,
-            *PROPOSAL,
-            "model.rays.per_batch=64",
-            "trainer.max_steps=24",
-        ),
     ],
-    ids=["explicit", "grid of cells", "X-Planes", "TiNeuVox", "Tensor4D"],
+    ids=["grid of cells", "X-Planes"],
 )
 def test_others_learn(scenes, tmp_path, overrides):
     config = baseline_config(scenes, "trainer.max_steps=30", *overrides)
@@ -103,13 +83,6 @@ def test_settings_that_do_not_go_together_are_refused(scenes):
         check_refused(scenes, words, "model=kplanes", override, *extra)
 
 
-def test_learning_rates_of_xplanes_are_refused():
-    with pytest.raises(ConfigError, match=r"model\.plane_lr belongs to .*model=six_planes"):
-        compose_plain("train", ["model=kplanes", "model.plane_lr=0.1"])
-    for model, key in (("six_planes", "plane_lr"), ("kplanes", "learning_rate")):
-        assert compose_plain("train", [f"model={model}", f"model.{key}=0.1"])["model"][key] == 0.1
-
-
 def test_cameras_out_of_range_are_refused(scenes):
     settings = Method.read(baseline_config(scenes, "model=kplanes")).model
     views = ball_views(4, 0.6, distance=12.0)
@@ -145,10 +118,3 @@ def test_two_cubes_are_refused(scenes):
     module = RadianceModule(baseline_config(scenes, "model=kplanes", "model.half_side=null"))
     module.build(ball_scene(), half_side=1.5)
     assert module.frame.scale == pytest.approx(1 / 1.5)
-
-
-def test_published_settings_have_the_published_number_of_parameters(scenes):
-    for model, count in [("kplanes", 36_467_008), ("kplanes_explicit", 36_551_936)]:
-        module = RadianceModule(baseline_config(scenes, f"model={model}"))
-        module.build(ball_scene(50))
-        assert sum(p.numel() for p in module.parameters() if p.requires_grad) == count, model

@@ -7,8 +7,8 @@ import torch
 
 from tests.baselines import oracles
 from tests.baselines.test_kplanes_field import products
+from xplanes.baselines.products import PlaneTerms
 from xplanes.baselines.proposal import UpdateSchedule
-from xplanes.fields.regularisers import PlaneTerms
 
 
 def test_values_equal_loops():
@@ -45,12 +45,6 @@ def test_gradients_equal_autograd():
             torch.testing.assert_close(plane.grad, wanted, msg=lambda m, c=variation: f"{c}: {m}")
 
 
-def test_weights_of_zero_leave_no_gradient():
-    planes = products(5)
-    PlaneTerms(0.0, "coded", 0.0, 0.0).add_gradients(planes)
-    assert all(plane.grad is None for _, plane in planes.planes())
-
-
 def test_density_fields_learn_at_the_published_steps():
     for every, warmup, steps in [(5, 5000, 9000), (3, 50, 200), (1, 1, 40)]:
         case = f"every={every}, warmup={warmup}, steps={steps}"
@@ -62,11 +56,3 @@ def test_density_fields_learn_at_the_published_steps():
         fresh = UpdateSchedule(every, warmup)
         assert fresh.learns(late), case
         assert fresh.learns(expected[3]), case
-
-
-def test_updates_grow_rare():
-    schedule = UpdateSchedule(5, 5000)
-    gaps = torch.tensor([s for s in range(9000) if schedule.learns(s)]).diff()
-    assert gaps[:9].unique().tolist() == [1]
-    assert gaps[20:100].unique().tolist() == [2]
-    assert gaps[-100:].unique().tolist() == [6]

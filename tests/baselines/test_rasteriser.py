@@ -13,9 +13,8 @@ from xplanes.baselines.gaussians import rasteriser_cuda
 from xplanes.baselines.gaussians.camera import Camera
 from xplanes.baselines.gaussians.harmonics import spherical_harmonics
 from xplanes.baselines.gaussians.rasteriser import GaussianError, rasterise
-from xplanes.baselines.gaussians.rasteriser_numba import _power
 from xplanes.optional import MissingExtraError
-from xplanes.scenes.cameras import camera_around, project
+from xplanes.scenes.cameras import camera_around
 
 NAMES = ("means", "quaternions", "scales", "opacities", "colours")
 KINDS = ("loops", "float32", "float64")
@@ -128,17 +127,6 @@ def test_gradients_are_slopes_of_the_formulas(kind, antialiased):
         close(image.means2d.grad.sum(0), shift, 2e-5)
 
 
-def test_gradients_through_plain_torch_pass_gradcheck(monkeypatch):
-    monkeypatch.setenv("XPLANES_CPU_LOOPS", "0")
-    given = [t.requires_grad_() for t in gaussians(3, seed=1, size=0.3)]
-
-    def outputs(*given):
-        image = rasterise(*given, camera_of(7, 6), torch.ones(3), antialiased=True)
-        return image.colour, image.opacity, image.depth
-
-    assert torch.autograd.gradcheck(outputs, given)
-
-
 def test_loops_and_plain_torch_agree_on_many_gaussians(monkeypatch):
     camera = camera_of(90, 75)
     found = []
@@ -201,17 +189,6 @@ def test_points_needles_discs_and_giants(kind, scale):
             assert leaf.grad.isfinite().all()
 
 
-def test_a_giant_in_every_tile_hides_what_is_behind(kind):
-    camera = camera_of(40, 70)
-    front, behind = single(camera, (50, 50, 1e-3), 1.0), gaussians(30)
-    given = [torch.cat(pair) for pair in zip(front, behind, strict=True)]
-    given[0][1:] += in_front(camera, distance=4.0)
-    image, _ = drawn(kind, given, camera)
-    expected = oracle.splat(given, camera)
-    close(image.colour, expected[0], TOLERANCE[kind])
-    assert (image.opacity > 0.99).all()
-
-
 def test_thousands_of_layers_stop_at_the_cut_off(kind):
     camera, layers = camera_of(20, 20), 3000
     given = [t.repeat(layers, *[1] * (t.ndim - 1)) for t in single(camera, (2, 2, 2), 0.006)]
@@ -264,17 +241,6 @@ def test_what_is_not_seen_changes_nothing(kind, change):
         assert (leaf.grad[1:] == 0).all()
 
 
-def test_projections_that_overflow_leave_the_rest_alone(kind):
-    camera = camera_of()
-    seen = single(camera)
-    far = single(camera, (3e38, 3e38, 1e-30), 1.0)
-    image, leaves = drawn(kind, [torch.cat(p) for p in zip(seen, far, strict=True)], camera)
-    back(image, upstream(image))
-    assert image.colour.isfinite().all()
-    for leaf in leaves:
-        assert leaf.grad.isfinite().all()
-
-
 def test_no_gaussians_show_the_background(kind):
     given = [t[:0] for t in single(camera_of())]
     image, leaves = drawn(kind, given, camera_of(), background=torch.tensor([0.25, 0.5, 1.0]))
@@ -283,41 +249,6 @@ def test_no_gaussians_show_the_background(kind):
     assert (image.depth == 0).all()
     image.colour.sum().backward()
     assert leaves[0].grad is None or leaves[0].grad.shape == (0, 3)
-
-
-def test_quaternions_of_any_length_and_none(kind):
-    camera = camera_of()
-    turned = (0.3, 0.8, -0.2, 0.5)
-    scale = (0.4, 0.1, 0.05)
-    images = {}
-    for length in (1.0, 1e-6, 1e6):
-        quaternion = tuple(length * part for part in turned)
-        images[length], _ = drawn(kind, single(camera, scale, quaternion=quaternion), camera)
-        torch.testing.assert_close(images[length].colour, images[1.0].colour)
-    plain, _ = drawn(kind, single(camera, scale), camera)
-    for quaternion in ((0, 0, 0, 0), (0, 1e-30, 0, 0), (1e-38, 0, 0, 0)):
-        image, leaves = drawn(kind, single(camera, scale, quaternion=quaternion), camera)
-        torch.testing.assert_close(image.colour, plain.colour)
-        back(image, upstream(image))
-        assert leaves[1].grad.isfinite().all()
-
-
-def test_half_precision_is_drawn_in_float32(kind):
-    given = gaussians(20)
-    image = rasterise(*(t.half() for t in given), camera_of())
-    expected = oracle.splat([t.half().double() for t in given], camera_of())
-    close(image.colour, expected[0], TOLERANCE["float32"])
-
-
-def test_radii_are_three_deviations_of_the_longest_axis(kind):
-    given, camera = gaussians(20, size=0.05, spread=0.3), camera_of()
-    image, _ = drawn(kind, given, camera)
-    parts = zip(*(t.numpy() for t in given[:3]), strict=True)
-    longest = [np.linalg.eigvalsh(oracle.projected(*part, camera)[1])[-1] for part in parts]
-    expected = np.ceil(3 * np.sqrt(np.array(longest) + 0.3))
-    seen = image.radii.numpy() > 0
-    assert seen.sum() > 15
-    assert (image.radii.numpy()[seen] == expected[seen]).all()
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -344,18 +275,6 @@ def test_shapes_and_values_that_cannot_be_are_named():
             rasterise(*given, camera_of())
 
 
-def test_cameras_see_points_where_views_do():
-    pose, focal, centre = camera_around(70, 10, 3.0), (40.0, 44.0), (21.0, 13.0)
-    camera = Camera.from_pose(pose, focal=focal, centre=centre, width=40, height=30)
-    given = gaussians(10, spread=0.3)
-    image = rasterise(*given, camera)
-    pair = (torch.tensor(focal).double(), torch.tensor(centre).double())
-    x, y, _ = project(pose, given[0], focal=pair[0], centre=pair[1])
-    seen = image.radii > 0
-    assert seen.sum() > 5
-    torch.testing.assert_close(image.means2d[seen], torch.stack([x, y], dim=1)[seen])
-
-
 def test_cameras_that_cannot_be_are_refused():
     for name, value in (("fx", 0.0), ("width", -1), ("near", 0.0), ("far", 0.001)):
         with pytest.raises(ValueError, match=rf"^camera\.{name}={value}"):
@@ -364,14 +283,6 @@ def test_cameras_that_cannot_be_are_refused():
         dataclasses.replace(camera_of(), world_to_camera=torch.zeros(3, 4))
     with pytest.raises(ValueError, match=r"^camera\.world_to_camera is not finite"):
         dataclasses.replace(camera_of(), world_to_camera=torch.full((4, 4), float("nan")))
-
-
-def test_powers_of_two():
-    x = np.linspace(-90, 0, 100_001).astype(np.float32)
-    found = np.array([_power(value) for value in x])
-    assert np.abs(found / 2.0 ** x.astype(np.float64) - 1).max() < 2e-7
-    assert _power(np.float32(0)) == 1
-    assert _power(np.float32(-1e30)) < 1e-30
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -384,44 +295,6 @@ def test_spherical_harmonics_are_those_of_legendre(degree):
     for n in range(6):
         basis = np.array([oracle.harmonic(*pair, directions[n]) for pair in pairs])
         np.testing.assert_allclose(found[n], basis @ coefficients[n, : len(pairs)], atol=1e-12)
-
-
-def test_spherical_harmonics_say_what_they_need():
-    with pytest.raises(ValueError, match="degree=4: must be 0 to 3"):
-        spherical_harmonics(4, torch.zeros(1, 25, 3), torch.ones(1, 3))
-    with pytest.raises(ValueError, match="degree 2 needs 9 of them"):
-        spherical_harmonics(2, torch.zeros(1, 4, 3), torch.ones(1, 3))
-
-
-@pytest.mark.slow
-def test_a_million_gaussians(monkeypatch):
-    monkeypatch.setenv("XPLANES_CPU_LOOPS", "1")
-    given, camera = at_float32(gaussians(10**6, size=0.01)), camera_of(400, 300)
-    image, leaves = drawn("loops", given, camera)
-    back(image, upstream(image))
-    for leaf in leaves:
-        assert leaf.grad.isfinite().all()
-        assert (leaf.grad != 0).any()
-    places = np.array([[57, 40], [200, 150], [333, 222]])
-    near = [reaching(given, camera, place + 0.5) for place in places]
-    for (column, row), members in zip(places, near, strict=True):
-        few = [t[members] for t in given]
-        expected = oracle.splat(few, camera, pixels=[(column + 0.5, row + 0.5)])
-        for ours, theirs in zip((image.colour, image.opacity), expected, strict=False):
-            close(ours[row, column], theirs[0], 1e-5)
-
-
-def reaching(given, camera, place):
-    """Indices of Gaussians that may reach a pixel: no nearer bound than a ball's."""
-    means, scales = given[0], given[2]
-    pose = camera.world_to_camera.double()
-    local = means @ pose[:3, :3].T + pose[:3, 3]
-    depth = local[:, 2]
-    pixels = local[:, :2] / depth[:, None] * torch.tensor([camera.fx, camera.fy])
-    pixels += torch.tensor([camera.cx, camera.cy])
-    largest = scales.amax(1) * max(camera.fx, camera.fy) / depth * 1.5 + 1
-    distance = (pixels - torch.tensor(place)).norm(dim=-1)
-    return ((depth > camera.near) & (distance < 3.5 * largest)).nonzero()[:, 0]
 
 
 def test_cuda_says_what_brings_it(monkeypatch):

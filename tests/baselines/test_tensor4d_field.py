@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.baselines import oracles
-from xplanes.baselines.tensor4d.field import SkipNetwork, Tensor4D, Tensor4DDensity
+from xplanes.baselines.tensor4d.field import SkipNetwork, Tensor4D
 from xplanes.baselines.tensor4d.hierarchy import (
     DYNAMIC,
     STATIC,
@@ -105,23 +105,6 @@ def test_planes_are_read_coarsely_at_first():
     assert all(torch.allclose(b[:, :2], torch.tensor(0.7)) for b in made(points, times))
 
 
-def test_planes_number_as_published():
-    canonical = HierarchicalPlanes(STATIC, [Level(128, 128, 32), Level(512, 128, 16)])
-    flow = HierarchicalPlanes(DYNAMIC, [Level(128, 128, 32)])
-    field = Tensor4D(canonical, flow)
-    assert sum(p.numel() for p in canonical.parameters()) == 3 * (128**2 * 32 + 512**2 * 16)
-    assert sum(p.numel() for p in flow.parameters()) == 9 * 128**2 * 32
-    assert field.features(torch.zeros(1, 3)).shape == (1, 144)
-    shapes = [tuple(layer.weight.shape) for layer in field.surface.layers]
-    assert shapes == [(256, 51), (256, 256 + 144 + 51), (256, 256), (257, 256)]
-    shapes = [tuple(layer.weight.shape) for layer in field.flow.layers]
-    assert shapes == [(256, 64), (256, 256 + 96 + 64), (256, 256), (3, 256)]
-    assert field.tint[0].weight.shape == (256, 3 + 21 + 3 + 256)
-    assert float(field.sharpness.detach()) == pytest.approx(math.exp(3))
-    nine = Tensor4DDensity(HierarchicalPlanes(DYNAMIC, [Level(128, 128, 32), Level(512, 128, 16)]))
-    assert nine.compression(nine.field_planes(torch.zeros(1, 3), torch.zeros(1))).shape == (1, 144)
-
-
 def test_initial_surface_is_a_sphere():
     field = surface(moves=False, width=256, filled=False)
     torch.manual_seed(1)
@@ -152,42 +135,6 @@ def test_slopes_are_the_distances_derivatives():
     with torch.no_grad():
         again = field.distance_and_slope(points, times)[1]
     torch.testing.assert_close(again, slope.detach())
-
-
-def test_nothing_flows_at_time_zero_and_something_later():
-    field = surface()
-    points = 2 * torch.rand(5, 3) - 1
-    assert torch.equal(field.canonical(points, torch.zeros(5)), points)
-    assert not torch.equal(field.canonical(points, torch.full((5,), 0.4)), points)
-    static = surface(moves=False)
-    assert static.canonical(points, torch.full((5,), 0.4)) is points
-    assert (field.moves, static.moves) == (True, False)
-
-
-def test_every_parameter_of_the_surface_gets_a_gradient():
-    field = surface()
-    renderer = NeusRenderer(field, samples=16, more=9, coarse_sharpness=64.0)
-    directions = torch.nn.functional.normalize(torch.randn(40, 3), dim=1)
-    origins = -3 * directions + 0.2 * torch.randn(40, 3)
-    image = renderer.render(field, origins, directions, torch.rand(40), torch.ones(3))
-    assert image.colour.shape == (40, 3)
-    assert len(image.samples) == 40 * 25
-    (image.colour.sum() + eikonal_error(image.slopes, len(image.samples))).backward()
-    for name, parameter in field.named_parameters():
-        assert parameter.grad is not None, name
-        assert parameter.grad.abs().sum() > 0, name
-
-
-def test_every_parameter_of_the_density_gets_a_gradient():
-    for groups in [STATIC, DYNAMIC]:
-        case = f"{len(groups)} groups"
-        field = Tensor4DDensity(planes(groups), 16, octaves=(4, 3, 2))
-        directions = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
-        colour, density = field(2 * torch.rand(200, 3) - 1, torch.rand(200), directions)
-        assert (colour.shape, density.shape) == ((200, 3), (200,)), case
-        (colour.sum() + density.sum()).backward()
-        assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in field.parameters()), case
-        assert field.moves == (groups is DYNAMIC), case
 
 
 def test_opacities_and_weights_equal_loops():
@@ -227,27 +174,6 @@ class Ball:
         return torch.tensor([[1.0, 0.0, 0.0]]).expand(len(points), 3)
 
 
-class TurnedHalf(Ball):
-    """A half space that fills z < 0.4 once a quarter turn of the flow has taken it there."""
-
-    def canonical(self, points, times):
-        x, y, z = points.unbind(dim=1)
-        return torch.stack([z, y, -x], dim=1)
-
-    def distance(self, places):
-        return places[:, 0] - 0.4, places
-
-
-def test_a_surface_that_the_flow_turns_is_seen_where_it_is():
-    field = TurnedHalf()
-    renderer = NeusRenderer(field, samples=64, more=65, coarse_sharpness=64.0)
-    rays = torch.tensor([[0.1, 0.2, 3.0]]), torch.tensor([[0.0, 0.0, -1.0]]), torch.ones(1)
-    image = renderer.render(field, *rays, torch.ones(3))
-    assert image.opacity.tolist() == pytest.approx([1], abs=0.01)
-    assert image.depth.tolist() == pytest.approx([2.6], abs=0.02)
-    torch.testing.assert_close(image.slopes[0], torch.tensor([0.0, 0.0, 1.0]))
-
-
 def test_a_ball_is_seen_where_it_is():
     ball = Ball()
     renderer = NeusRenderer(ball, samples=64, more=65, coarse_sharpness=64.0)
@@ -281,16 +207,6 @@ def test_only_what_lies_in_the_cube_is_asked(monkeypatch):
         ball, origins[2:], directions[2:], torch.zeros(1), torch.full((3,), 0.25)
     )
     assert past.colour.tolist() == [[0.25] * 3]
-
-
-def test_samples_ascend_and_gather_at_the_surface():
-    renderer = NeusRenderer(Ball(), samples=64, more=65, coarse_sharpness=64.0)
-    rays = torch.tensor([[0.0, 0.0, 3.0]]), torch.tensor([[0.0, 0.0, -1.0]]), torch.zeros(1)
-    for jitter in (None, torch.tensor([0.9])):
-        ends = renderer.place(Ball(), *rays, jitter)
-        assert ends.shape == (1, 129)
-        assert (ends.diff(dim=1) >= 0).all()
-        assert ((ends - 2.6).abs() < 0.1).sum() > 40
 
 
 def test_losses_equal_loops():

@@ -64,15 +64,6 @@ def test_fine_level_joins_and_planes_get_sharp_at_their_steps(scenes):
             assert (bool(part.fine), bool(part.blurred)) == (fine, blurred)
 
 
-def test_learning_rates_are_the_published_ones(scenes):
-    made = model(scenes)
-    rates = {group["name"]: group["lr"] for group in made.groups()}
-    assert rates.pop("canonical_planes") == rates.pop("flow_planes") == 0.0025
-    assert set(rates.values()) == {0.0005}
-    assert set(rates) == {"surface", "flow", "compression", "tint", "steepness"}
-    assert made.rate(10**6, 1.0) == pytest.approx(0.1)
-
-
 def test_other_samplers_triplanes_and_losses_that_lack_terms_are_refused(scenes):
     for override, words in (
         ("model/sampler=occupancy", r"model\.sampler\.name=occupancy: .* model/sampler=neus"),

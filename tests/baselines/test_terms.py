@@ -8,10 +8,10 @@ import torch
 
 from tests.balls import ball_scene
 from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX, baseline_config
+from xplanes.baselines.products import PlaneTerms
 from xplanes.baselines.proposal import histogram_loss
 from xplanes.baselines.tensor4d.model import eikonal_error, masked_colour_error, silhouette_error
 from xplanes.baselines.tineuvox.model import light_entropy, sample_colour_error
-from xplanes.fields.regularisers import PlaneTerms
 from xplanes.models.base import warm_cosine
 from xplanes.streams import TrainingState
 from xplanes.training.module import RadianceModule

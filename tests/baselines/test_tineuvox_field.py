@@ -26,26 +26,6 @@ def inside(count):
     return BOX[0] + (BOX[1] - BOX[0]) * torch.rand(count, 3)
 
 
-def test_size_is_the_published_one():
-    for resolution, channels, width in [(100, 4, 64), (160, 6, 256)]:
-        case = f"resolution={resolution}, channels={channels}, width={width}"
-        cube = torch.tensor([[-5.0] * 3, [5.0] * 3])
-        made = TiNeuVox(cube, resolution, channels, width)
-        megabytes = 2 * sum(p.numel() for p in made.parameters()) / 1e6
-        assert megabytes == pytest.approx({100: 8, 160: 48}[resolution], rel=0.05), case
-        networks = sum(p.numel() for p in made.parameters()) - made.grid.numel()
-        time_features, lookup = 5 * channels, 15 * channels
-        expected = (
-            (17 * width + width + width * time_features + time_features)
-            + ((63 + time_features) * width + width + width * width + width + 3 * width + 3)
-            + ((lookup + time_features + 63) * width + width)
-            + (width + 1)
-            + (width * width + width)
-            + ((width + 27) * (width // 2) + width // 2 + 3 * (width // 2) + 3)
-        )
-        assert networks == expected, case
-
-
 def test_grid_is_read_as_loops_read_it():
     made = field().double()
     points = inside(20).double()
@@ -54,13 +34,6 @@ def test_grid_is_read_as_loops_read_it():
     expected = np.stack([oracles.trilinear(filled, BOX.numpy(), p) for p in points.numpy()])
     np.testing.assert_allclose(made.read(points).detach().numpy(), expected, atol=1e-12)
     assert (made.read(BOX[1:].double() + 1) == 0).all()
-
-
-def test_cells_are_cubes_and_as_many_as_asked_for():
-    made = field(resolution=20)
-    cells = math.prod(made.grid.shape[2:])
-    assert 0.8 * 8000 < cells <= 8000
-    assert made.cell == pytest.approx(float((BOX[1] - BOX[0]).prod() / 8000) ** (1 / 3))
 
 
 def test_growing_keeps_what_the_grid_shows_at_its_corners():
@@ -74,14 +47,6 @@ def test_growing_keeps_what_the_grid_shows_at_its_corners():
         torch.testing.assert_close(after[0, :, -x, -y, -z], before[0, :, -x, -y, -z])
 
 
-def test_grown_grid_is_loaded_into_a_fresh_field():
-    grown, fresh = field(halvings=2), field(halvings=2)
-    grown.resize(8**3)
-    fresh.load_state_dict(grown.state_dict())
-    assert torch.equal(fresh.grid, grown.grid)
-    assert int(fresh.voxels) == 8**3
-
-
 def test_initial_opacity_of_a_cell():
     for alpha in [1e-2, 1e-3]:
         made = field(alpha=alpha, unit=2.0)
@@ -91,17 +56,6 @@ def test_initial_opacity_of_a_cell():
         density = made.geometry(torch.zeros(1, 3), torch.zeros(1))[0]
         # Published: 1 - exp(-softplus(shift)) over a full cell, half a cell is one step.
         assert 1 - math.exp(-density.item() * made.cell) == pytest.approx(alpha, rel=1e-4), alpha
-
-
-def test_every_parameter_gets_a_gradient_and_shapes_fit():
-    for moves in [True, False]:
-        made = field(moves=moves)
-        directions = torch.nn.functional.normalize(torch.randn(300, 3), dim=1)
-        colour, density = made(inside(300), torch.rand(300), directions)
-        assert (colour.shape, density.shape) == ((300, 3), (300,)), moves
-        (colour.sum() + density.sum()).backward()
-        assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in made.parameters()), moves
-        assert made.moves == moves, moves
 
 
 def test_samples_lie_in_the_box_at_equal_steps():

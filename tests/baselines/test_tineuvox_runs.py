@@ -5,7 +5,7 @@ import torch
 
 from tests.balls import ball_views
 from tests.baselines.checks import check_learns, check_refused, check_reload, check_resume
-from tests.baselines.runs import OCCUPANCY, TINEUVOX, baseline_config
+from tests.baselines.runs import TINEUVOX, baseline_config
 from xplanes.baselines.tineuvox.model import frusta_box
 from xplanes.models.initialisation import Method
 from xplanes.rendering.sampler import Site
@@ -20,20 +20,6 @@ def test_run_learns_grows_resumes_and_is_loaded(scenes, tmp_path, monkeypatch):
     check_resume(config, folder, tmp_path / "broken", monkeypatch, stop=23)
     trained = check_reload(folder)
     assert int(trained.module.field.voxels) == 20**3
-
-
-def test_grid_of_occupied_cells_serves_too(scenes, tmp_path):
-    config = baseline_config(
-        scenes,
-        "model=tineuvox_b",
-        "model/sampler=occupancy",
-        "model.half_side=1.5",
-        *[o for o in TINEUVOX if not o.startswith("model.sampler")],
-        *OCCUPANCY,
-        *FAST,
-        "trainer.max_steps=24",
-    )
-    check_learns(config, tmp_path / "run", gain=2)
 
 
 def test_box_holds_what_cameras_see_between_the_bounds(scenes):

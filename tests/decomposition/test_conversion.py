@@ -8,7 +8,6 @@ from torch.nn.functional import grid_sample
 from tests.refusals import assert_refused
 from xplanes.decomposition import space_planes, time_planes
 from xplanes.decomposition.conversion import frame_profiles, space_weights
-from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 
 
 def triplanes(frames=5, channels=3, size=8, seed=0):
@@ -45,14 +44,6 @@ def test_oblong_triplanes_become_square_planes():
     assert space_planes(low, resolution=8).shape == (3, 8, 8, 2)
     with pytest.raises(ValueError, match="name a resolution"):
         space_planes(low)
-
-
-def test_storage_order_and_rows_agree():
-    axes = {"xy": ("xt", "yt"), "xz": ("xt", "zt"), "yz": ("yt", "zt")}
-    for plane_set in ("six", "nine"):
-        names = [name.rstrip("'") for name in TIME_PLANES[plane_set]]
-        for pair, expected in zip(PLANE_SETS[plane_set], axes.values(), strict=True):
-            assert (names[pair[0]], names[pair[1]]) == expected
 
 
 def test_shapes_noise_and_seed():

@@ -39,16 +39,6 @@ def test_nine_planes_reach_the_best_rank_one_residual():
     assert torch.allclose(tall.norm(dim=1), values[..., 0].sqrt())
 
 
-def test_random_slices_of_any_scale():
-    for scale in [1e-12, 1.0, 1e6]:
-        generator = torch.Generator().manual_seed(0)
-        planes = scale * torch.randn(4, 2, 9, 11, generator=generator)
-        wide, tall = rank1_factors(planes)
-        best = torch.linalg.svdvals(planes)[..., 1:].double().square().sum()
-        left = (planes - products(wide, tall)).double().square().sum()
-        assert left <= best * 1.02, scale
-
-
 def test_zero_slices_stay_zero():
     planes = moving()[:, 0]
     planes[2] = 0
@@ -71,18 +61,6 @@ def loss(sparse, factors):
         (sparse[:, index] - products(factors[a], factors[b])).square().sum()
         for index, (a, b) in enumerate(pairs)
     )
-
-
-def test_six_planes_end_where_no_single_plane_can_be_improved():
-    sparse = moving()
-    factors = shared_factors(sparse, PLANE_SETS["six"])
-    value = loss(sparse, factors)
-    for index in range(3):
-        for _ in range(3):
-            moved = list(factors)
-            moved[index] = moved[index] + 1e-3 * torch.randn_like(moved[index])
-            assert loss(sparse, moved) > value * (1 - 1e-3)
-    assert value < 0.9 * sparse.square().sum()
 
 
 def test_six_planes_recover_shared_factors():

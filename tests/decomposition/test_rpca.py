@@ -144,52 +144,6 @@ def test_zeros():
     assert result.drift == result.sparsity == 0
 
 
-def test_a_constant_sequence_has_no_drift():
-    for columns in [1, 2, 40]:
-        matrix = torch.randn(500, 1, generator=torch.Generator().manual_seed(0)).repeat(1, columns)
-        result = robust_pca(matrix, sparsity_weight="auto", tolerance=1e-6)
-        low, _ = oracle(matrix, 500**-0.5)
-        assert result.converged, columns
-        assert result.drift < 1e-5, columns
-        assert (result.low_rank - torch.from_numpy(low)).norm() < 1e-4 * matrix.norm(), columns
-        if columns == 40:
-            assert result.rank == 1, columns
-            assert result.sparse.abs().max() < 1e-4, columns
-
-
-def test_a_single_column_goes_where_it_costs_less():
-    for weight, kept in [(0.03, 0.0), (0.09, 1.0)]:
-        case = f"weight={weight}, kept={kept}"
-        # For one column the two norms compete as a whole: all sparse, or all low-rank.
-        matrix = torch.linspace(-1, 1, 400, dtype=torch.float64)[:, None]
-        low, _ = oracle(matrix, weight)
-        result = robust_pca(matrix, sparsity_weight=weight, tolerance=1e-7, max_iterations=3000)
-        assert result.converged, case
-        assert result.low_rank_energy == pytest.approx(kept, abs=1e-4), case
-        assert (result.low_rank - torch.from_numpy(low)).norm() < 1e-4 * matrix.norm(), case
-
-
-def test_a_single_moving_entry_is_sparse():
-    matrix = torch.randn(600, 1, generator=torch.Generator().manual_seed(1)).repeat(1, 20)
-    original = matrix.clone()
-    matrix[17, 5] += 4
-    result = robust_pca(matrix, sparsity_weight="auto", tolerance=1e-6)
-    assert result.rank == 1
-    assert relative(result.low_rank, original.numpy()) < 1e-4
-    assert result.sparse.abs().argmax() == 17 * 20 + 5
-    assert result.sparse.abs().max() == pytest.approx(4, rel=1e-3)
-
-
-def test_a_corrupted_frame_is_split_as_the_oracle_does():
-    generator = torch.Generator().manual_seed(2)
-    matrix = torch.randn(200, 1, generator=generator).repeat(1, 20)
-    matrix[:, 7] = 5 * torch.randn(200, generator=generator)
-    low, sparse = oracle(matrix, 0.03)
-    result = robust_pca(matrix, sparsity_weight=0.03, tolerance=1e-6)
-    assert relative(result.low_rank, low) < 1e-3
-    assert relative(result.sparse, sparse) < 1e-3
-
-
 def refused(words, matrix, case, error=ValueError, **options):
     assert_refused(error, words, functools.partial(robust_pca, matrix, **options), case)
 
@@ -243,13 +197,6 @@ def test_the_residual_and_the_shares_are_measured_on_the_result():
     assert np.linalg.matrix_rank(low.numpy(), tol=1e-6 * norm.item()) == result.rank
 
 
-def test_the_report_holds_builtins_only():
-    report = robust_pca(mixture(), sparsity_weight=0.05).report()
-    assert {type(value) for value in report.values()} <= {int, float, bool, str}
-    assert "low_rank" not in report
-    assert {"rank", "iterations", "residual", "converged", "sparsity", "drift"} <= set(report)
-
-
 def test_reduced_precision_settings_do_not_leak_in_or_out():
     matrix = mixture(dtype=torch.float32)
     plain = robust_pca(matrix, sparsity_weight=0.05)
@@ -262,24 +209,6 @@ def test_reduced_precision_settings_do_not_leak_in_or_out():
     finally:
         torch.set_float32_matmul_precision(before)
     assert torch.equal(plain.low_rank, guarded.low_rank)
-
-
-def test_a_long_run_alone_shows_a_bar_unless_told_not_to(capfd, monkeypatch):
-    for progress in [True, False]:
-        robust_pca(mixture(), sparsity_weight=0.05, progress=progress)
-        assert capfd.readouterr() == ("", ""), progress
-
-    now = [0.0]
-
-    def tick():
-        now[0] += 1.0
-        return now[0]
-
-    monkeypatch.setattr("tqdm.std.time", tick)
-    robust_pca(mixture(), sparsity_weight=0.05)
-    assert "robust PCA" in capfd.readouterr().err
-    robust_pca(mixture(), sparsity_weight=0.05, progress=False)
-    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

@@ -1,10 +1,8 @@
 """A real browser before a field that trains: what it shows, and what its controls do."""
 
-import io
-import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.evaluation.browser import SECONDS, browser, canvas_of, needs_browser, until
 from tests.training.runs import small_config
 from xplanes.evaluation import live
 from xplanes.evaluation import viewer as module
@@ -19,22 +18,11 @@ from xplanes.evaluation.viewer import Viewer
 from xplanes.rendering.pictures import to_bytes
 from xplanes.run import run
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, needs_browser]
 
 pytest.importorskip("viser")
 webdriver: Any = pytest.importorskip("selenium.webdriver")
 ScrollOrigin = pytest.importorskip("selenium.webdriver.common.actions.wheel_input").ScrollOrigin
-
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chrome"))), None)
-DRIVER = shutil.which("chromedriver")
-if CHROMIUM is None or DRIVER is None:
-    pytest.skip(
-        "no chromium with chromedriver here: apt-get install chromium chromium-driver",
-        allow_module_level=True,
-    )
-
-SECONDS = 60.0
-"""How long anything may take."""
 
 
 class Recorded(Viewer):
@@ -84,39 +72,16 @@ def viewer(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[R
 @pytest.fixture(scope="module")
 def page(viewer: Recorded) -> Iterator[Any]:
     """A browser that shows a picture."""
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for word in (
-        "headless=new",
-        "no-sandbox",
-        "disable-dev-shm-usage",
-        "use-angle=swiftshader",
-        "enable-unsafe-swiftshader",
-        "window-size=900,600",
-    ):
-        options.add_argument(f"--{word}")
-    driver = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
-    try:
+    with browser() as driver:
         driver.get(f"http://localhost:{viewer.port}")
         until(lambda: viewer.pictures)
         until(lambda: np.ptp(screen(driver)) > 50)
         yield driver
-    finally:
-        driver.quit()
-
-
-def until(condition: Callable[[], Any]) -> None:
-    end = time.monotonic() + SECONDS
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 def screen(page: Any) -> np.ndarray:
     """What the page shows left of its controls and below its messages. [H, W, 3]"""
-    canvas = page.find_element("css selector", "canvas")
-    with Image.open(io.BytesIO(canvas.screenshot_as_png)) as picture:
-        return np.asarray(picture.convert("RGB"))[170:, :560].astype(int)
+    return canvas_of(page)[170:, :560]
 
 
 def settled(page: Any) -> np.ndarray:
@@ -183,13 +148,3 @@ def test_the_page_shows_and_steers_a_field_that_trains(viewer: Recorded, page: A
     click(page, "Continue training")
     until(lambda: viewer.step > step + 20)
     assert not viewer.paused
-
-
-def test_the_page_plays(viewer: Recorded, page: Any):
-    thumb = page.find_element("css selector", "[role=slider]")
-    before, time_before = len(viewer.pictures), float(thumb.get_attribute("aria-valuenow"))
-    click(page, "Play")
-    until(lambda: abs(float(thumb.get_attribute("aria-valuenow")) - time_before) > 0.05)
-    until(lambda: len(viewer.pictures) > before + 4)
-    click(page, "Stop")
-    until(lambda: not viewer.playing)

@@ -94,14 +94,6 @@ def test_sizes_rates_and_times_can_be_set(views: Views, tmp_path: Path):
     assert changed.times.tolist() == [0.5, 0.5]
 
 
-def test_a_video_is_named_after_its_path(trained: TrainedRun, views: Views, tmp_path: Path):
-    path = write(tmp_path / "flight.json", transforms(views, w=8, h=6))
-    video = render_video(trained, VideoOptions(path=str(path)))
-    assert video == trained.path / "media" / "render_flight.webp"
-    with Image.open(video) as picture:
-        assert (picture.n_frames, picture.size) == (3, (8, 6))  # type: ignore[attr-defined]
-
-
 def test_times_of_a_spline_that_overshoots_stay_in_range(views: Views, tmp_path: Path, caplog):
     content = nerfstudio(views)
     for entry, time in zip(content["camera_path"], (-0.03, 1.08), strict=True):

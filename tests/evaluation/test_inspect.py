@@ -32,7 +32,7 @@ from xplanes.evaluation.inspect import (
     next_command,
     table,
 )
-from xplanes.evaluation.inspect_picture import CUBE, HEIGHT, POINT, SCALE, WIDTH, _sample, draw
+from xplanes.evaluation.inspect_picture import HEIGHT, POINT, WIDTH, draw
 from xplanes.models.base import ModelSettings
 from xplanes.scenes.cameras import look_at
 from xplanes.scenes.frame import scene_frame
@@ -160,15 +160,6 @@ def test_a_capture_in_order_gets_no_warning(inspected, name):
     assert capture.findings == ()
     assert capture.problem == ""
     assert "no warnings" in table(capture)
-
-
-def test_a_demo_scene_is_in_order_by_its_name_and_as_a_folder(tmp_path):
-    small = ["data.resolution=24", "data.train_views=12", "data.val_views=3", "data.test_views=3"]
-    capture = inspect(choose(["data=demo", f"data.root={tmp_path}", "data.scene=balls", *small]))
-    assert capture.findings == ()
-    again = inspect(choose([str(next(tmp_path.glob("balls_*")))]))  # As a folder.
-    assert again.choice.scene.name == "blender"
-    assert facts(again)["splits"] == facts(capture)["splits"]
 
 
 def gap():
@@ -336,10 +327,8 @@ def test_cameras_that_look_at_no_one_thing_are_told_of():
         assert [each.kind for each in found] == expected
 
 
-def test_axes_that_diverge_leave_a_table_and_a_picture_and_end_in_an_error(inspected):
-    make, *_ = WRONG["other axes"]
-    capture = inspected(make())
-    assert capture.frame is None
+def test_axes_that_diverge_leave_a_table_and_a_picture(inspected):
+    capture = inspected(WRONG["other axes"][0]())
     assert "negate the second and third column" in capture.problem
     assert facts(capture)["cube"] is None
     assert draw(capture).size == (WIDTH, HEIGHT)
@@ -407,21 +396,6 @@ def test_distortion_is_how_far_the_oracle_moves_a_corner():
     assert "fisheye k1 k2" in lens_words(fisheye(ball()).splits["train"])
 
 
-def test_the_picture_shows_the_cameras(inspected):
-    capture = inspected(ball())
-    picture = np.asarray(draw(capture))
-    assert picture.shape == (HEIGHT, WIDTH, 3)
-    assert 0.2 < (picture == 255).all(axis=-1).mean() < 0.9
-    again = np.asarray(draw(inspected(ball())))
-    assert np.array_equal(picture, again)
-    others = np.asarray(draw(inspected(ball(poses=surrounding(COUNT, 4.0, seed=9)))))
-    plans = np.s_[100:580, 24:1088]
-    assert (picture[plans] != others[plans]).any(axis=-1).mean() > 0.01
-    # The strips of time are the same: no camera stands still.
-    strips = np.s_[80:370, 1120:1570]
-    assert np.array_equal(picture[strips], others[strips])
-
-
 def test_points_give_opaque_scenes_their_cube_and_are_drawn(inspected):
     bare = ball()
     for views in bare.splits.values():
@@ -440,31 +414,6 @@ def test_points_give_opaque_scenes_their_cube_and_are_drawn(inspected):
     dots = (np.abs(plans - ink).max(axis=-1) < 40).sum()
     # Twice 300 dots, of which some lie on one another, and none of those outside of the panels.
     assert 250 < dots < 2500
-
-
-def test_the_edges_of_the_cube_are_where_the_lens_shows_them():
-    views = fisheye(ball()).splits["train"]
-    frame = scene_frame(views)
-    index, side = 5, 256
-    image = np.asarray(_sample(views, index, (side, side), frame)).astype(int)
-    ink = [int(CUBE[i : i + 2], 16) for i in (1, 3, 5)]
-    drawn = np.abs(image - ink).max(axis=-1) < 40
-    assert 0.005 < drawn.mean() < 0.1
-    world_to_camera = views.camera_to_world[index].double().inverse()
-    k, focal = {"k1": 0.05, "k2": -0.01}, views.intrinsics.focal[index].tolist()
-    found = 0
-    for corner in torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3):
-        for axis in range(3):
-            place = corner.clone()
-            place[axis] *= 0.5  # A quarter of the way along an edge.
-            world = frame.to_world(place).double()
-            local = world_to_camera[:3, :3] @ world + world_to_camera[:3, 3]
-            x, y = pixel("fisheye", local.tolist(), k, focal, [SIZE / 2] * 2)
-            column, row = (round(value * SCALE * side / SIZE) for value in (x, y))
-            if 3 <= column < SCALE * side - 3 and 3 <= row < SCALE * side - 3:
-                assert drawn[row - 2 : row + 3, column - 2 : column + 3].any()
-                found += 1
-    assert found > 6
 
 
 def write_nerfstudio(folder: Path, views: Views, **more):

@@ -1,31 +1,26 @@
 """Rendered videos: camera paths, times and output files."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from tests.scenes.test_lenses import HEIGHT, WIDTH, intrinsics_of
 from xplanes.errors import ConfigError
 from xplanes.evaluation.render import (
     VideoOptions,
+    cameras,
     check_out,
-    pixels_with_rays,
-    poses,
+    find_view,
     render_video,
     times,
-    view_pose,
     write_video,
 )
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.optional import MissingExtraError
 from xplanes.rendering.pictures import to_bytes
-from xplanes.scenes.views import Views
 from xplanes.training.scores import render_view
 
 
@@ -46,6 +41,11 @@ def test_other_times_are_refused():
             times(name, 3)
 
 
+def poses(trained: TrainedRun, options: VideoOptions) -> torch.Tensor:
+    seen = cameras(options, trained.scene.splits, trained.frame)
+    return torch.stack([camera.camera_to_world for camera in seen])
+
+
 def test_camera_paths(trained: TrainedRun):
     centre = trained.frame.centre
     orbit = poses(trained, VideoOptions(frames=6, elevation=30))
@@ -61,9 +61,10 @@ def test_a_view_is_found_by_its_name(trained: TrainedRun):
     splits = trained.scene.splits
     expected = splits["test"].camera_to_world[1]
     for name in ("test/r_001.png", "test/r_001"):
-        assert torch.equal(view_pose(splits, name), expected)
+        views, index = find_view(splits, name)
+        assert torch.equal(views.camera_to_world[index], expected)
     with pytest.raises(ConfigError, match=r"test/r_00\d\.png"):
-        view_pose(splits, "test/r_0011")
+        find_view(splits, "test/r_0011")
 
 
 def test_the_camera_of_a_view_renders_that_view(trained: TrainedRun, tmp_path: Path):
@@ -85,47 +86,6 @@ def test_the_camera_of_a_view_renders_that_view(trained: TrainedRun, tmp_path: P
     assert VideoOptions("view:test/r_001", frames=3).written_to("a.png").count == 3
 
 
-def test_pictures_from_a_view_have_its_shape(trained: TrainedRun, tmp_path: Path):
-    views = trained.views
-    upper, focal = views.images[:, : views.height // 2], float(views.intrinsics.focal[0, 0])
-    wide = replace(views, images=upper, intrinsics=focal)
-    scene = replace(trained.scene, splits=trained.scene.splits | {"test": wide})
-    here = replace(trained, scene=scene)
-    path = render_video(here, VideoOptions("view:test/r_001"), str(tmp_path / "wide.png"))
-    parts = (trained.module.field, trained.module.renderer, trained.frame)
-    expected = render_view(*parts, wide, 1, torch.ones(3))["colour"]
-    assert np.array_equal(np.asarray(Image.open(path)), to_bytes(expected).numpy())
-    assert VideoOptions("view:test/r_001", size=10).shape(scene.splits) == (5, 10)
-    assert VideoOptions().shape(scene.splits) == (views.height, views.height)
-
-
-def test_the_corners_of_a_fisheye_view_stay_empty(trained: TrainedRun, tmp_path: Path):
-    intrinsics = intrinsics_of("equidistant", focal=(6.0, 6.0), centre=(22.0, 15.0))
-    known = intrinsics.has_ray(0)
-    pose, images = trained.views.camera_to_world[:1], torch.zeros(1, HEIGHT, WIDTH, 4)
-    views = Views(images.byte(), pose, torch.tensor([0.3]), intrinsics, ("test/fisheye.png",))
-    scene = replace(trained.scene, splits=trained.scene.splits | {"test": views})
-    grey = replace(scene, background=torch.full((3,), 0.5))
-    # Fog everywhere, so that what is rendered shows.
-    field = SimpleNamespace(background=None)
-    module = SimpleNamespace(field=field, renderer=Fog())
-    here = replace(trained, scene=grey, module=module)
-    options = VideoOptions("view:test/fisheye", "own", size=WIDTH)
-    path = render_video(here, options, str(tmp_path / "fisheye.png"))
-    shown = (np.asarray(Image.open(path)) < 100).all(axis=-1)
-    assert np.array_equal(shown, known.numpy())
-    twice = pixels_with_rays(scene.splits, "view:test/fisheye", (2 * HEIGHT, 2 * WIDTH))
-    assert torch.equal(twice, known.repeat_interleave(2, 0).repeat_interleave(2, 1))
-
-
-class Fog:
-    """Renders black everywhere."""
-
-    def view(self, field, frame, camera, time, background):
-        shape = (camera.height, camera.width)
-        return {"colour": torch.zeros(*shape, 3), "opacity": torch.ones(shape)}
-
-
 def test_a_webp_is_the_default(trained: TrainedRun):
     options = VideoOptions(frames=3, size=20, fps=10, time="sweep", what="depth")
     path = render_video(trained, options)
@@ -134,17 +94,6 @@ def test_a_webp_is_the_default(trained: TrainedRun):
         assert (picture.n_frames, picture.size) == (3, (20, 20))  # type: ignore[attr-defined]
         picture.load()
         assert picture.info["duration"] == 100
-
-
-def test_a_video_of_portrait_images_shows_their_full_height(trained: TrainedRun, tmp_path: Path):
-    train = trained.scene.splits["train"]
-    half, focal = train.images[:, :, : train.width // 2], float(train.intrinsics.focal[0, 0])
-    upright = replace(train, images=half, intrinsics=focal)
-    scene = replace(trained.scene, splits=trained.scene.splits | {"train": upright})
-    options = VideoOptions(frames=1, time="0.5")
-    narrow = render_video(replace(trained, scene=scene), options, str(tmp_path / "narrow.png"))
-    whole = render_video(trained, options, str(tmp_path / "whole.png"))
-    assert narrow.read_bytes() == whole.read_bytes()
 
 
 def test_a_folder_takes_a_png_per_frame_and_no_others(trained: TrainedRun, tmp_path: Path):

@@ -1,14 +1,12 @@
 """Two runs at once, and clocks that jump."""
 
 import json
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
-from tests.faults.conftest import ROOT, Nursery, config_of, outcome
+from tests.faults.conftest import Nursery, config_of, outcome
 from xplanes.files import read_rows
 from xplanes.locks import RUN_LOCK
 
@@ -43,19 +41,6 @@ def test_one_directory(tally, nursery, other, shared, whole, tmp_path: Path, res
     tally.recovered()
 
 
-def test_shared_scene_and_cache(tally, nursery, other, whole, tmp_path: Path) -> None:
-    """Two runs that render one scene and fill one cache at once"""
-    config = config_of(tmp_path, "tiny", tmp_path / "cache")
-    children = [
-        place.start(config, tmp_path / name, resume=False)
-        for name, place in (("one", nursery), ("two", other))
-    ]
-    for child in children:
-        assert child.finish() == 0, child.output()
-    assert outcome(tmp_path / "one") == outcome(tmp_path / "two") == whole["tiny"]
-    tally.recovered()
-
-
 @pytest.mark.parametrize("seconds", [-3600.0, 86_400.0, -86_400.0])
 def test_clock_jumps(tally, nursery, shared, whole, tmp_path: Path, seconds: float) -> None:
     """Wall clock set back or on at every reading"""
@@ -69,26 +54,3 @@ def test_clock_jumps(tally, nursery, shared, whole, tmp_path: Path, seconds: flo
     told = json.loads((tmp_path / "run" / "metrics.json").read_text())["seconds"]
     assert all(0 <= told[name] < 600 for name in ("load", "train", "evaluate", "total"))
     tally.recovered()
-
-
-def test_command_line(tally, shared, tmp_path: Path) -> None:
-    """`python train.py`: no place for the output, no run to go on with"""
-    (tmp_path / "file").write_text("kept")
-    refused = train(f"hydra.run.dir={tmp_path / 'file' / 'run'}")
-    assert refused.returncode == 1
-    tally.said(refused.stderr, "error: ", "file stands where a folder should be")
-    lost = train(f"resume={tmp_path / 'nothing'}")
-    assert lost.returncode == 1
-    tally.said(lost.stderr, "not a run directory")
-    tally.content["cases"] += 2
-
-
-def train(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, str(ROOT / "train.py"), *arguments],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )

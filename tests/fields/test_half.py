@@ -4,8 +4,8 @@ import itertools
 
 import torch
 
-from xplanes.fields.decoder import Decoder
-from xplanes.fields.networks import ROWS, PaddedMLP, half_rows
+from xplanes.baselines.networks import PaddedMLP
+from xplanes.fields.decoder import ROWS, Decoder, half_rows
 
 NETWORKS = {
     "decoder": lambda: Decoder(4, precision="bf16"),
@@ -62,17 +62,3 @@ def test_what_is_filled_up_changes_neither_values_nor_gradients():
                 rtol=0,
                 msg=lambda m, c=case: f"{c}: {m}",
             )
-
-
-def test_few_sizes_of_products_for_many_numbers_of_samples():
-    for precision in ["32", "bf16"]:
-        decoder = Decoder(4, precision=precision)
-        sizes = []
-        decoder.layers[1].register_forward_hook(
-            lambda _module, rows, _out, sizes=sizes: sizes.append(len(rows[0]))
-        )
-        for count in range(900, 1100, 7):
-            assert len(decoder(torch.randn(count, 12))[1]) == count, precision
-        assert len(set(sizes)) == (2 if precision == "bf16" else len(range(900, 1100, 7))), (
-            precision
-        )

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.oracles import plane_features as oracle
 from xplanes.fields import lookup_numba as cpu
-from xplanes.fields.lookup import plane_features, plane_features_reference, time_plane_axes
+from xplanes.fields.lookup import plane_features, plane_features_reference
 from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES
 
 SETS = ("three", "six", "nine")
@@ -87,18 +87,6 @@ def test_gradients_of_loops_and_twin_agree():
             assert theirs.abs().max() > 0.1, case
 
 
-def test_gradients_are_finite_differences():
-    for plane_set in SETS:
-        space, time = stacks(plane_set, size=3, time_rows=3, time_size=2, channels=2)
-        points, times = scattered(7)
-        planes = [p.requires_grad_() for p in (space, time) if p is not None]
-
-        def features(space, time=None, rest=(points, times, PLANE_SETS[plane_set])):
-            return plane_features(space, time, *rest)
-
-        assert torch.autograd.gradcheck(features, planes), plane_set
-
-
 def test_only_the_planes_that_ask_get_gradients():
     space, time = stacks("six")
     points, times = scattered(9)
@@ -110,25 +98,6 @@ def test_only_the_planes_that_ask_get_gradients():
         assert (space.grad is None) == (leaf is not space)
         assert (time.grad is None) == (leaf is not time)
         leaf.requires_grad_(False).grad = None
-
-
-def test_borders_and_beyond():
-    for coordinate, dtype in itertools.product(
-        [-1.0, 1.0, -0.8, 0.8, -1.2, 1.2, -1.2000001, 5.0, 1e30], [torch.float32, torch.float64]
-    ):
-        case = f"coordinate={coordinate}, dtype={dtype}"
-        # Five texels of width 0.4: centres at -0.8 .. 0.8, the last influence ends at 1.2.
-        space, time = stacks("six", dtype)
-        points = torch.zeros(6, 3, dtype=dtype)
-        points[:3] += coordinate * torch.eye(3, dtype=dtype)
-        points[3:] -= coordinate * torch.eye(3, dtype=dtype)
-        times = torch.linspace(0, 1, 6, dtype=dtype)
-        expected = oracle(named("six", space, time), "six", points, times)
-        for value, *gradients in both("six", space, time, points, times):
-            np.testing.assert_allclose(
-                value.numpy(), expected, atol=4 * TOLERANCE[dtype], err_msg=case
-            )
-            assert all(g.isfinite().all() for g in gradients), case
 
 
 def test_texel_centres_return_the_texels():
@@ -163,39 +132,6 @@ def test_infinite_points_are_outside_and_nan_stays_nan():
             assert value[5].isnan().all(), dtype
 
 
-def test_bad_points_leave_the_gradients_of_others_alone():
-    space, time = stacks("six")
-    points, times = scattered(5)
-    far = torch.cat([points, torch.tensor([[1e30, -1e30, 1e30], [9.0, 9.0, 9.0]]).double()])
-    late = torch.cat([times, torch.tensor([0.5, 0.5]).double()])
-    for which in (0, 1):
-        alone = [g * 1 for g in both_sum(space, time, points, times)[which]]
-        together = both_sum(space, time, far, late)[which]
-        for a, b in zip(alone, together, strict=True):
-            torch.testing.assert_close(a, b, atol=1e-12, rtol=0)
-
-
-def both_sum(space, time, points, times):
-    results = []
-    for function in (plane_features, plane_features_reference):
-        leaves = [space.clone().requires_grad_(), time.clone().requires_grad_()]
-        value = function(*leaves, points, times, PLANE_SETS["six"]).sum()
-        results.append(torch.autograd.grad(value, leaves))
-    return results
-
-
-def test_no_point_and_one_point():
-    for plane_set, count in itertools.product(SETS, [0, 1]):
-        case = f"plane_set={plane_set}, count={count}"
-        space, time = stacks(plane_set)
-        points, times = scattered(count)
-        compiled, reference = both(plane_set, space, time, points, times)
-        assert compiled[0].shape == (count, 3, 3), case
-        for ours, theirs in zip(compiled, reference, strict=True):
-            torch.testing.assert_close(ours, theirs, msg=lambda m, c=case: f"{c}: {m}")
-            assert count or (ours == 0).all(), case
-
-
 def test_planes_of_one_texel_or_one_row():
     for rows, size in itertools.product([1, 2], [1, 2]):
         case = f"rows={rows}, size={size}"
@@ -208,83 +144,6 @@ def test_planes_of_one_texel_or_one_row():
             torch.testing.assert_close(
                 ours, theirs, atol=1e-12, rtol=0, msg=lambda m, c=case: f"{c}: {m}"
             )
-
-
-def test_one_row_of_time_is_the_same_at_all_times():
-    space, time = stacks("six", time_rows=1)
-    points, _ = scattered(3)
-    early = plane_features(space, time, points, torch.zeros(3).double(), PLANE_SETS["six"])
-    late = plane_features(space, time, points, torch.ones(3).double(), PLANE_SETS["six"])
-    assert torch.equal(early, late)
-
-
-def test_nine_planes_with_equal_twins_are_six_planes():
-    space, time = stacks("six", torch.float32)
-    xt, yt, zt = time
-    twins = torch.stack([xt, yt, xt, zt, yt, zt])
-    points, times = scattered(200, torch.float32)
-    for function in (plane_features, plane_features_reference):
-        six = function(space, time, points, times, PLANE_SETS["six"])
-        nine = function(space, twins, points, times, PLANE_SETS["nine"])
-        assert torch.equal(six, nine)
-
-
-def test_a_static_scene_ignores_the_rows_of_its_set():
-    space, _ = stacks("six")
-    points, times = scattered(20)
-    static = plane_features(space, None, points, times, PLANE_SETS["three"])
-    assert torch.equal(static, plane_features(space, None, points, times, PLANE_SETS["six"]))
-
-
-def strided(space, time, points, times):
-    """The same planes and points, none of them contiguous."""
-    return (
-        space.permute(3, 0, 1, 2).contiguous().permute(1, 2, 3, 0),
-        time.repeat_interleave(2, dim=2)[:, :, ::2],
-        points.T.contiguous().T,
-        times.repeat_interleave(2)[::2],
-    )
-
-
-@pytest.mark.parametrize(
-    "planes_too",
-    [False, pytest.param(True, marks=pytest.mark.slow)],  # The loops are compiled for them again.
-)
-def test_points_and_planes_need_not_be_contiguous(planes_too):
-    given = *stacks("six"), *scattered(50)
-    turned = strided(*given)
-    planes = turned[:2] if planes_too else given[:2]
-    plain, other = (both("six", *inputs)[0] for inputs in (given, (*planes, *turned[2:])))
-    for a, b in zip(plain, other, strict=True):
-        assert torch.equal(a, b)
-
-
-def test_points_of_another_precision_are_taken_in_the_planes():
-    space, time = stacks("six", torch.float32)
-    points, times = scattered(20, torch.float64)
-    for function in (plane_features, plane_features_reference):
-        value = function(space, time, points, times, PLANE_SETS["six"])
-        assert value.dtype == torch.float32
-
-
-def test_without_the_loops_the_numbers_are_the_same(monkeypatch):
-    space, time = stacks("nine", torch.float32)
-    points, times = scattered(100, torch.float32)
-    compiled = plane_features(space, time, points, times, PLANE_SETS["nine"])
-    monkeypatch.setenv("XPLANES_CPU_LOOPS", "0")
-    plain = plane_features(space, time, points, times, PLANE_SETS["nine"])
-    reference = plane_features_reference(space, time, points, times, PLANE_SETS["nine"])
-    assert torch.equal(plain, reference)
-    torch.testing.assert_close(compiled, plain, atol=4e-6, rtol=1e-5)
-
-
-def test_half_precision_planes_take_the_torch_path():
-    space, time = stacks("six", torch.bfloat16)
-    points, times = scattered(20, torch.float32, reach=0.9)
-    value = plane_features(space, time, points, times, PLANE_SETS["six"])
-    full = plane_features(space.float(), time.float(), points, times, PLANE_SETS["six"])
-    assert value.dtype == torch.bfloat16
-    torch.testing.assert_close(value.float(), full, atol=0.4, rtol=0.1)
 
 
 MANY_THREADS = """
@@ -325,13 +184,6 @@ def test_tasks_that_share_a_plane_add_up_all_of_it(monkeypatch, tasks):
         loops, twin = both(plane_set, space, time, *scattered(300))
         for a, b in zip(loops, twin, strict=True):
             torch.testing.assert_close(a, b, atol=1e-12, rtol=1e-10)
-
-
-def test_axes_of_time_planes_are_those_of_their_names():
-    for plane_set, axes in [("three", []), ("six", [0, 1, 2]), ("nine", [0, 1, 0, 2, 1, 2])]:
-        case = f"plane_set={plane_set}, axes={axes}"
-        assert time_plane_axes(PLANE_SETS[plane_set]) == axes, case
-        assert ["xyz".index(name[0]) for name in TIME_PLANES[plane_set]] == axes, case
 
 
 @settings(max_examples=40, deadline=None)

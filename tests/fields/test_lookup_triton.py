@@ -2,12 +2,10 @@
 
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 
-from tests.fields.test_lookup import named, scattered, stacks
-from tests.oracles import plane_features as oracle
+from tests.fields.test_lookup import scattered, stacks
 from xplanes import backend
 from xplanes.errors import DeviceError
 from xplanes.fields import lookup
@@ -85,34 +83,6 @@ def test_values_and_gradients_are_the_twins():
     compare(found, 2e-5, "131 channels")
 
 
-def test_values_are_those_of_equation_15():
-    for plane_set in ["six", "nine", "three"]:
-        space, time = stacks(plane_set)
-        points, times = places(torch.float64)
-        expected = oracle(named(plane_set, space, time), plane_set, points, times)
-        found = both(plane_set, space, time, points, times)
-        np.testing.assert_allclose(found[0][0], expected, atol=1e-12, err_msg=str(plane_set))
-        compare(found, 1e-12, plane_set)
-
-
-def test_gradients_are_differences():
-    space, time = (plane.to(DEVICE) for plane in stacks("nine", channels=2))
-    points, times = (where.to(DEVICE) for where in scattered(9))
-
-    def total(space, time):
-        value = plane_features_gpu(space, time, points, times, PLANE_SETS["nine"])
-        return (value * torch.arange(value.numel(), device=DEVICE).view_as(value).cos()).sum()
-
-    leaves = [space.clone().requires_grad_(), time.clone().requires_grad_()]
-    slopes = torch.autograd.grad(total(*leaves), leaves)
-    ways = [torch.randn_like(leaf) for leaf in leaves]
-    # Values are quadratic in the planes, so central differences are exact at any distance.
-    rise = total(*(p + w for p, w in zip((space, time), ways, strict=True)))
-    rise = rise - total(*(p - w for p, w in zip((space, time), ways, strict=True)))
-    slope = sum((s * w).sum() for s, w in zip(slopes, ways, strict=True))
-    torch.testing.assert_close(rise / 2, slope)
-
-
 def test_any_number_of_points():
     for count in [0, 1, 16, 17]:
         # 32 channels make blocks of 16 points.
@@ -123,12 +93,6 @@ def test_any_number_of_points():
             torch.testing.assert_close(
                 a, b, atol=2e-5, rtol=2e-5, check_dtype=False, msg=lambda m, c=count: f"{c}: {m}"
             )
-
-
-def test_planes_of_one_texel_or_one_row():
-    for rows in [1, 2]:
-        space, time = stacks("six", size=rows, time_rows=rows, time_size=rows)
-        compare(both("six", space, time, *scattered(20)), 1e-12, rows)
 
 
 def test_half_precision_planes_are_added_up_in_float32():

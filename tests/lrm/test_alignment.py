@@ -11,7 +11,7 @@ from tests.lrm.reference import VERSIONS, arrays, compare, load_reduced
 from tests.lrm.test_oracles import FILL, openlrm_query, triposr_query
 from xplanes.fields import XPlanes
 from xplanes.lrm import LRMError
-from xplanes.lrm.alignment import align, focal_mismatch
+from xplanes.lrm.alignment import align
 from xplanes.lrm.canonical import OPENLRM_VIEW, TRIPOSR_VIEW
 from xplanes.lrm.images import Crop
 from xplanes.lrm.openlrm import turn_third_plane
@@ -72,21 +72,6 @@ def test_sizes_agree_at_the_target_where_focal_lengths_differ():
         assert alignment.half_side * alignment.field_frame.scale == pytest.approx(
             alignment.frame.scale, rel=1e-6
         ), name
-
-
-def test_mismatch_of_dnerf_cameras():
-    for name, radius, largest, mean in (
-        ("openlrm", 0.5, 0.015, 0.005),
-        ("openlrm", 0.8, 0.047, 0.012),
-        ("openlrm", 1.0, 0.088, 0.020),
-        ("triposr", 0.3, 0.0002, 0.0001),
-        ("triposr", 0.5, 0.0008, 0.0002),
-        ("triposr", 0.6, 0.0013, 0.0003),
-    ):
-        found = focal_mismatch(VIEWS[name], DNERF_FOCAL / 400, 400, radius=radius)
-        case, margin = f"{name}, radius {radius}", 0.0006 if name == "openlrm" else 6e-5
-        assert found.largest / 400 == pytest.approx(largest, abs=margin), case
-        assert found.mean / 400 == pytest.approx(mean, abs=margin), case
 
 
 def test_padding_makes_the_focal_lengths_agree():
@@ -247,21 +232,6 @@ def world_query(model, triplane, alignment):
         return [values.view(*points.shape[:-1], -1) for values in (colour, density, raw)]
 
     return query
-
-
-def test_recorded_triposr_image_by_way_of_the_world():
-    model = load_reduced("triposr_tiny")
-    truth = arrays("triposr_tiny/render_canonical.npz")
-    alignment, _ = source_rays(model.view)
-    query = world_query(model, truth["scene_code"], alignment)
-
-    def per_share(points):
-        colour, density, _ = query(points)
-        return colour, density * CHORD
-
-    rays = (truth[key].view(-1, 3) for key in ("rays_o", "rays_d"))
-    found = triposr_oracle.render(per_share, *rays, samples=24)
-    compare(found, truth["images"].view(-1, 3))
 
 
 def test_recorded_openlrm_images_by_way_of_the_world():

@@ -14,7 +14,13 @@ from safetensors.torch import save_file
 from tests.lrm.reduced import published_shapes, reduced
 from xplanes.lrm import LRMError
 from xplanes.lrm.config import parse_config, published_config
-from xplanes.lrm.weights import Probe, WeightSource, find_weights, load_weights, read_config
+from xplanes.lrm.weights import (
+    WeightSource,
+    answers,
+    find_weights,
+    load_weights,
+    read_config,
+)
 
 SOURCE = WeightSource(
     architecture="openlrm-small-1.1",
@@ -23,6 +29,8 @@ SOURCE = WeightSource(
     revision="main",
     licence="CC-BY-NC-4.0",
     megabytes=446,
+    weights=None,
+    config=None,
 )
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 NOWHERE = "http://127.0.0.1:9"
@@ -120,7 +128,7 @@ def test_downloaded_weights_of_other_sizes_need_their_configuration(hub, small, 
     address, handler = hub
     handler.content = (small / "model.safetensors").read_bytes()
     options = {"announce": lambda line: None, "endpoint": address, "cache": tmp_path / "cache"}
-    model = load_source(replace(SOURCE, config=small / "config.json"), **options)
+    model = load_source(replace(SOURCE, config=str(small / "config.json")), **options)
     assert model.config.channels == 6
     with pytest.raises(LRMError, match=r"does not fit openlrm-small-1\.1"):
         load_source(SOURCE, **options)
@@ -142,7 +150,7 @@ def test_silent_server_is_given_up_in_a_second(monkeypatch):
 
     monkeypatch.setattr("socket.create_connection", hang)
     start = time.monotonic()
-    assert not Probe("https://hub.example").answers()
+    assert not answers("https://hub.example")
     assert time.monotonic() - start < 1
 
 
@@ -150,7 +158,7 @@ def test_proxy_is_asked_instead(hub, monkeypatch):
     address, _ = hub
     monkeypatch.setenv("http_proxy", address)
     monkeypatch.setenv("no_proxy", "")
-    assert Probe("http://192.0.2.1").answers()
+    assert answers("http://192.0.2.1")
 
 
 def test_forbidden_download(monkeypatch, tmp_path):
@@ -167,15 +175,15 @@ def test_absent_repository(hub, tmp_path):
 
 def test_local_file_needs_no_hub(small, monkeypatch):
     monkeypatch.setattr("xplanes.lrm.weights.require", lambda *_, **__: 1 / 0)
-    source = replace(SOURCE, weights=small / "model.safetensors")
+    source = replace(SOURCE, weights=str(small / "model.safetensors"))
     assert find_weights(source) == small / "model.safetensors"
     with pytest.raises(LRMError, match=r"lrm\.weights=.*absent.*446 MB"):
-        find_weights(replace(SOURCE, weights=small / "absent"))
+        find_weights(replace(SOURCE, weights=str(small / "absent")))
 
 
 def test_local_file_brings_its_configuration(small):
     lines = []
-    source = replace(SOURCE, weights=small / "model.safetensors")
+    source = replace(SOURCE, weights=str(small / "model.safetensors"))
     assert load_source(source, announce=lines.append).config.channels == 6
     assert "config.json" in lines[0]
     (small / "config.json").unlink()
@@ -190,7 +198,7 @@ def test_another_published_size_is_refused_whatever_lies_beside(tmp_path, monkey
     state = published_state(settings)
     monkeypatch.setattr("xplanes.lrm.checkpoint.read_weights", lambda path: (state, {}))
     with pytest.raises(LRMError, match=r"It fits openlrm-base-1\.1 \(lrm=base\)"):
-        load_source(replace(SOURCE, weights=tmp_path / "model.safetensors"))
+        load_source(replace(SOURCE, weights=str(tmp_path / "model.safetensors")))
 
 
 def published_state(settings):

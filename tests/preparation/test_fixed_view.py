@@ -87,18 +87,6 @@ def test_all_timesteps_are_rendered_and_steps_alone_may_limit_training(tmp_path,
     assert made.words == "7 frames rendered by six_planes trained for 60 steps"
 
 
-def test_it_trains_on_the_runs_device_within_the_preparations_budget(tmp_path: Path, monkeypatch):
-    asked = {}
-    monkeypatch.setattr(module, "fit_quietly", lambda *_, **options: asked.update(options))
-    video_of(settings(tmp_path), ball_scene(), tmp_path / "cache", size=4)
-    assert asked == {
-        "device": torch.device("cpu"),
-        "max_steps": 60,
-        "max_seconds": 1000.0,
-        "checkpoint_every": module.CHECKPOINT_EVERY,
-    }
-
-
 def test_it_leaves_the_run_as_deterministic_as_it_was(tmp_path: Path, small_fields):
     method = settings(tmp_path, "preparation.fixed_view_steps=1")
     before = torch.are_deterministic_algorithms_enabled()
@@ -165,15 +153,6 @@ TINY_FIELDS = {
     "kplanes_explicit": {"resolution": 4, "scales": [1]},
     "tineuvox_s": {"resolution": 8, "grow_at": []},
 }
-
-
-def test_published_bounds_stay_where_they_fit(tmp_path: Path):
-    for name in ("kplanes", "kplanes_explicit", "tineuvox_s", "tineuvox_b"):
-        method = settings(tmp_path, f"preparation.fixed_view_model={name}")
-        published = default_settings(f"model={name}").model
-        for views in (elsewhere(), elsewhere(scale=1.3, distance=4.0311 / 1.3)):
-            found = rendering_method(method, views, None).model
-            assert found == replace(published, precision=method.model.precision), name
 
 
 def test_a_field_that_breaks_names_settings_that_the_user_has(tmp_path, small_fields, monkeypatch):
@@ -265,31 +244,6 @@ def test_kplanes_render(tmp_path: Path, small_fields):
     made, said = video_of(settings(tmp_path, *options), ball_scene(), tmp_path / "cache", size=12)
     assert "training kplanes for" in said[0]
     assert made.views.images.shape == (4, 12, 12, 4)
-
-
-@pytest.mark.slow
-def test_the_field_that_renders_has_the_users_cube(tmp_path: Path, monkeypatch):
-    frames = []
-    monkeypatch.setattr(
-        module, "trained_field", lambda method, place, *_, **__: frames.append(place)
-    )
-    monkeypatch.setattr(module, "_render", lambda *_: torch.zeros(4, 24, 24, 4, dtype=torch.uint8))
-    scene = Scene("ball", {"train": ball_views(6, 0.6)})
-    frame = scene_frame(scene.splits["train"], 0.9)
-    place = Place(scene, frame, torch.device("cpu"), say=lambda _: None, half_side=0.9)
-    fixed_view(settings(tmp_path), place, OPENLRM_VIEW, 24, StageCache(tmp_path))
-    assert [1 / place.frame.scale for place in frames] == [pytest.approx(0.9)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("place", [{}, {"scale": 3.0}, {"scale": 0.1}, {"shift": AWAY}])
-def test_kplanes_render_in_their_own_cube_or_the_scenes(tmp_path: Path, small_fields, place):
-    options = ("preparation.fixed_view_model=kplanes", "preparation.fixed_view_steps=200")
-    scene = Scene("ball", {"train": elsewhere(count=12, size=24, **place)})
-    made, _ = video_of(settings(tmp_path, *options), scene, tmp_path / "cache")
-    alpha = made.views.images[..., 3].float() / 255
-    # Coarse planes blur it.
-    assert alpha[:, 9:15, 9:15].mean() > 1.5 * alpha[:, :3, :3].mean() > 0
 
 
 def test_frames_are_picked_evenly():
@@ -391,13 +345,6 @@ def test_a_field_renders_the_scene_and_the_video_is_cached(
     assert said == []
     assert again.seconds == made.seconds
     assert torch.equal(again.views.images, made.views.images)
-
-
-def test_a_static_scene_is_rendered_once(tmp_path: Path, small_fields):
-    made, _ = video_of(
-        settings(tmp_path, "preparation.fixed_view_steps=5"), ball_scene(moving=False), tmp_path
-    )
-    assert len(made.views) == 1
 
 
 def test_an_interrupted_field_is_resumed(tmp_path: Path, small_fields, monkeypatch):

@@ -160,17 +160,6 @@ def test_the_report_is_whole(tmp_path: Path):
     assert made.picture.std() > 0.01
 
 
-def test_equal_frames_count_as_skipped(tmp_path: Path):
-    method = settings(tmp_path, "openlrm-1.1", "preparation.frames=4", "preparation.cache=null")
-    scene = video_scene()
-    images = scene.video.images.clone()
-    images[1:4] = images[0]
-    scene = replace(scene, video=replace(scene.video, images=images))
-    found = method.lrm.load(silent).initialise(method, place_of(scene))
-    assert found.lrm["frames"] == 4
-    assert found.skipped["frames"] == 1 - found.lrm["distinct"] / 4 > 0
-
-
 def test_one_crop_holds_the_object_at_all_times(tmp_path: Path):
     frames = video_scene(size=48).video.images
     crop = picture_crop(frames, crop=True)

@@ -115,7 +115,7 @@ WRONG = {
     ),
     "option type": (
         {"triplanes": GOOD, "decoder": {}, "decoder_config": OPTIONS | {"width": "12"}},
-        "decoder_config.width is '12'",
+        "decoder_config.width=12: must be a whole number",
     ),
     "huge decoder": (
         {"triplanes": GOOD, "decoder": {}, "decoder_config": OPTIONS | {"width": 10**9}},

@@ -7,8 +7,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from tests.oracles import composite as oracle
 from tests.oracles import composite_gradient
@@ -72,15 +70,6 @@ def test_values_equal_the_loops_of_the_oracle(merge):
         assert total.dtype == weights.dtype == dtype, case
 
 
-def test_thin_media_keep_their_digits():
-    depth = torch.full((4,), 1e-12, dtype=torch.float64)
-    colour, distances = torch.ones(4, 3).double(), torch.ones(4).double()
-    for dtype in FLOATS:
-        inputs = (t.to(dtype) for t in (depth, colour, distances))
-        total, _ = composite(*inputs, torch.zeros(4, dtype=torch.long), torch.zeros(1).long())
-        assert float(total[0, 3]) == pytest.approx(4e-12, rel=1e-6), dtype
-
-
 def test_gradients_follow_the_product_rule():
     for merge, scale in itertools.product(ALL, (1e-3, 1.0, 20.0)):
         depth, colour, *rest = rays_of(scale=scale)
@@ -104,14 +93,6 @@ def test_thick_media_keep_their_digits_in_the_gradient():
         assert float(depth.grad) == pytest.approx(math.exp(-20), rel=1e-5), merge.__name__
 
 
-def test_gradients_are_finite_differences():
-    depth, colour, *rest = rays_of((0, 2, 0, 4, 1))
-    depth.requires_grad_()
-    colour.requires_grad_()
-    for merge in PLAIN:
-        assert torch.autograd.gradcheck(lambda d, c, f=merge: f(d, c, *rest)[0], (depth, colour))
-
-
 def values_and_gradients(merge, depth, colour, *rest):
     """Sums, weights, and gradients of depths and colours."""
     leaves = [tensor.clone().requires_grad_() for tensor in (depth, colour)]
@@ -133,28 +114,6 @@ def doubled(inputs):
 
 
 DENSITIES = [0.0, 1e-30, 1e-8, 1e-3, 1.0, 30.0, 79.9, 80.1, 1e3, 1e8, 3e38, math.inf]
-
-
-@pytest.mark.parametrize("loops", ["1", "0"])
-def test_no_density_makes_a_nan(loops, monkeypatch):
-    monkeypatch.setenv("XPLANES_CPU_LOOPS", loops)
-    for dtype, value in itertools.product((torch.bfloat16, *FLOATS), DENSITIES):
-        case = f"{dtype}, density {value}"
-        depth, colour, distances, ray, starts = rays_of(dtype=dtype)
-        depth[1::2] = value
-        depth.requires_grad_()
-        colour.requires_grad_()
-        total, weights = composite(depth, colour, distances, ray, starts)
-        expected = torch.float64 if dtype == torch.float64 else torch.float32
-        assert total.dtype == expected, case
-        assert total.isfinite().all(), case
-        assert (weights >= 0).all(), case
-        sums = torch.zeros(len(starts), dtype=weights.dtype).index_add(0, ray, weights)
-        assert (sums <= 1 + 1e-6).all(), case
-        total.sum().backward()
-        for leaf in (depth, colour):
-            assert leaf.grad.isfinite().all(), case
-            assert leaf.grad.dtype == dtype, case
 
 
 @pytest.mark.parametrize("dtype", FLOATS)
@@ -193,16 +152,6 @@ def test_no_rays_and_rays_without_samples_see_nothing():
         assert weights.shape == (0,), merge.__name__
 
 
-def test_an_opaque_sample_hides_all_behind_it():
-    for merge in ALL:
-        inputs = list(rays_of((6,)))
-        inputs[0] = torch.tensor([0.0, 0.0, math.inf, 5.0, 1e8, 1.0]).double()
-        total, weights = merge(*inputs)
-        assert weights.tolist() == pytest.approx([0, 0, 1, 0, 0, 0], abs=1e-30), merge.__name__
-        torch.testing.assert_close(total[0, :3], inputs[1][2])
-        assert float(total[0, 4]) == pytest.approx(float(inputs[2][2])), merge.__name__
-
-
 def test_weights_carry_no_gradient_and_only_what_asks_gets_one():
     for merge in ALL:
         depth, colour, *rest = rays_of()
@@ -215,21 +164,6 @@ def test_weights_carry_no_gradient_and_only_what_asks_gets_one():
     assert depth.grad is None
 
 
-def test_strided_inputs_give_the_same():
-    depth, colour, distances, ray, starts = rays_of()
-    wide = torch.cat([colour, colour], dim=1)[:, ::2][:, [0, 2, 1]]
-    strided = composite(depth.repeat_interleave(2)[::2], wide, distances, ray, starts)[0]
-    plain = composite(depth, wide.contiguous(), distances, ray, starts)[0]
-    assert torch.equal(strided, plain)
-
-
-def test_without_the_loops_the_numbers_are_the_same(monkeypatch):
-    inputs = rays_of(dtype=torch.float32, scale=3.0)
-    compiled = composite(*inputs)[0]
-    monkeypatch.setenv("XPLANES_CPU_LOOPS", "0")
-    torch.testing.assert_close(compiled, composite(*inputs)[0], atol=1e-6, rtol=1e-6)
-
-
 def test_running_depths_keep_their_digits_behind_opaque_rays():
     counts = (3,) * 5000
     _, _, _, ray, starts = rays_of(counts)
@@ -237,30 +171,6 @@ def test_running_depths_keep_their_digits_behind_opaque_rays():
     depth[-3:] = torch.tensor([0.1, 0.2, 0.3])
     before = depth_before(depth, ray, starts)
     assert before[-3:].tolist() == pytest.approx([0, 0.1, 0.3], abs=1e-8)
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    depth=st.lists(
-        st.floats(0, 1e8, width=32) | st.sampled_from([0.0, 1e-30, 80.0, math.inf]),
-        min_size=1,
-        max_size=12,
-    ),
-    split=st.integers(0, 12),
-)
-def test_weights_are_shares_of_the_light(depth, split):
-    split = min(split, len(depth))
-    tau = torch.tensor(depth)
-    colour, distances = torch.ones(len(depth), 3), torch.arange(len(depth)).float()
-    ray = (torch.arange(len(depth)) >= split).long()
-    starts = torch.tensor([0, split])
-    for merge in PLAIN:
-        total, weights = merge(tau, colour, distances, ray, starts)
-        assert (weights >= 0).all()
-        assert (total[:, :4] <= 1 + 1e-6).all()
-        for r in (0, 1):
-            through = math.exp(-min(700.0, float(tau[ray == r].double().sum())))
-            assert float(total[r, 3]) == pytest.approx(1 - through, abs=1e-6)
 
 
 # Kernels alone
@@ -328,18 +238,6 @@ def test_kernels_agree_with_the_twin_at_every_density():
     expected = values_and_gradients(composite_reference, *doubled((depth, colour, *rest)))
     assert all(part.isfinite().all() for part in found)
     agree(found, expected, atol=1e-6, rtol=1e-6, case="all densities")
-
-
-@needs_triton
-def test_a_nan_stays_on_its_ray_in_the_gradients_too():
-    depth, colour, *rest = rays_of()
-    expected = values_and_gradients(kernels, depth, colour, *rest)
-    depth[5] = math.nan
-    found = values_and_gradients(kernels, depth, colour, *rest)
-    others = rest[1] != rest[1][5]
-    for ours, clean in zip(found[2:], expected[2:], strict=True):
-        assert torch.equal(ours[others], clean[others])
-        assert ours[~others].isnan().any()
 
 
 @pytest.fixture

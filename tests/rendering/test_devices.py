@@ -11,11 +11,10 @@ import torch
 from torch import nn
 
 from xplanes.baselines.kplanes.field import DensityField, ExplicitDecoder, HybridDecoder, KPlanes
+from xplanes.baselines.products import PlaneProducts, PlaneTerms
 from xplanes.baselines.proposal import ProposalRenderer
 from xplanes.decomposition.sparse_loss import SparseProduct
 from xplanes.fields import Decoder, XPlanes
-from xplanes.fields.products import PlaneProducts
-from xplanes.fields.regularisers import PlaneTerms
 from xplanes.fields.xplanes import PLANE_SETS, random_planes
 from xplanes.rendering.marching import _starts
 from xplanes.rendering.occupancy import OccupancyGrid

@@ -119,26 +119,6 @@ def test_samples_equal_the_loops_of_the_oracle():
         assert (counts[2] > 0) == (occlusion > 0), case
 
 
-def test_loops_and_twin_agree_on_many_rays():
-    for skip, occlusion in OPTIONS:
-        case = f"skip={skip}, occlusion={occlusion}"
-        grid, rays = grid_of(17, 5), rays_of(3000)
-        ours = march(*rays, grid, step=STEP, skip_empty=skip, occlusion=occlusion)
-        theirs = twin(rays, grid, skip_empty=skip, occlusion=occlusion)
-        for name in ("ray", "starts", "cells"):
-            assert torch.equal(getattr(ours, name), getattr(theirs, name)), (case, name)
-        for name in ("points", "distances"):
-            torch.testing.assert_close(
-                getattr(ours, name),
-                getattr(theirs, name),
-                atol=1e-12,
-                rtol=0,
-                msg=f"{case}, {name}",
-            )
-        for name in ("candidates", "empty", "occluded"):
-            assert getattr(ours, name) == getattr(theirs, name), (case, name)
-
-
 def test_in_float32_only_samples_on_borders_differ():
     grid, rays = grid_of(17, 5, filled=1.1), rays_of(3000, torch.float32)
     ours, theirs = march(*rays, grid, step=STEP), twin(rays, grid)
@@ -189,25 +169,6 @@ def test_counters_add_up_and_samples_are_in_order():
             assert not skip or grid.occupied[found.cells].all(), case
 
 
-def test_cells_are_those_that_hold_the_points_at_their_times():
-    grid, rays = grid_of(5, 4, filled=1.1), rays_of(300)
-    found = march(*rays, grid, step=STEP)
-    x, y, z = ((found.points + 1) * 2.5).floor().clamp(0, 4).long().unbind(dim=-1)
-    time_bin = (rays[2][found.ray] * 4).floor().long()
-    assert torch.equal(found.cells, ((time_bin * 5 + z) * 5 + y) * 5 + x)
-    assert len(time_bin.unique()) == 4
-
-
-def test_samples_lie_at_jitter_plus_whole_steps_from_the_entrance():
-    grid = grid_of(filled=1.1)
-    ray = torch.tensor([[0.0, 0, 3]]).double(), torch.tensor([[0.0, 0, -1]]).double()
-    for jitter in (0.0, 0.25, 1.0):
-        rays = (*ray, torch.zeros(1).double(), torch.tensor([jitter]).double())
-        for found in (march(*rays, grid, step=0.5), twin(rays, grid, step=0.5)):
-            expected = [2 + (n + jitter) * 0.5 for n in range(4) if (n + jitter) * 0.5 < 2]
-            assert found.distances.tolist() == expected
-
-
 def test_rays_that_miss_have_no_samples_and_do_not_shift_the_others():
     grid, rays = grid_of(filled=1.1), list(rays_of(9))
     rays[0][::3] = torch.tensor([0.0, 0, 5]).double()
@@ -239,31 +200,6 @@ def test_no_rays_or_no_hits():
             assert found.starts.tolist() == [0] * len(rays[0]), case
 
 
-def test_an_empty_grid_leaves_nothing():
-    grid, rays = grid_of(filled=-1), rays_of(20)
-    for found in (march(*rays, grid, step=STEP), twin(rays, grid)):
-        assert len(found) == 0
-        assert found.empty == found.candidates > 0
-
-
-def test_the_first_opaque_cell_hides_what_lies_behind_but_not_itself():
-    grid = OccupancyGrid(4, 1, step=STEP)
-    grid.least.view(4, 4, 4)[2] = 1e4  # a slab at 0 <= z < 0.5
-    rays = (
-        torch.tensor([[0.1, 0.1, 3.0]]).double(),
-        torch.tensor([[0.0, 0.0, -1.0]]).double(),
-        torch.zeros(1).double(),
-        torch.full((1,), 0.5).double(),
-    )
-    for found in (
-        march(*rays, grid, step=0.1, occlusion=0.001),
-        twin(rays, grid, step=0.1, occlusion=0.001),
-    ):
-        assert found.candidates == 20
-        assert len(found) == 6  # five in front, one in the slab
-        assert found.points[-1, 2] == pytest.approx(0.45)
-
-
 def test_huge_densities_on_one_ray_do_not_disturb_the_next():
     for huge in [1e8, 1e20, 1e30, 3e38, math.inf]:
         grid, rays = grid_of(8, 1, filled=1.1, dense=3.0), rays_of(400)
@@ -275,28 +211,6 @@ def test_huge_densities_on_one_ray_do_not_disturb_the_next():
         kept, counts = by_oracle(rays, grid, occlusion=0.2)
         assert ours.cells.tolist() == [row[2] for row in kept], huge
         assert (ours.candidates, ours.empty, ours.occluded) == counts, huge
-
-
-def test_time_decides_which_bin_is_looked_into():
-    grid = OccupancyGrid(2, 4, step=STEP)
-    grid.occupied.view(4, 8)[:] = torch.tensor([[True], [False], [True], [False]])
-    times = torch.tensor([0.0, 0.2499, 0.25, 0.5, 0.75, 0.9999, 1.0, 1.5, -0.1])
-    rays = (
-        torch.tensor([[0.1, 0.1, 3.0]]).expand(9, 3),
-        torch.tensor([[0.0, 0.0, -1.0]]).expand(9, 3),
-        times,
-        torch.full((9,), 0.5),
-    )
-    for found in (march(*rays, grid, step=STEP), twin(rays, grid)):
-        assert sorted(set(found.ray.tolist())) == [0, 1, 3, 8]
-
-
-def test_without_the_loops_the_twin_is_used(monkeypatch):
-    grid, rays = grid_of(), rays_of(50, torch.float32)
-    monkeypatch.setenv("XPLANES_CPU_LOOPS", "0")
-    ours, theirs = march(*rays, grid, step=STEP, occlusion=0.1), twin(rays, grid, occlusion=0.1)
-    for name in ("ray", "starts", "points", "distances", "cells"):
-        assert torch.equal(getattr(ours, name), getattr(theirs, name))
 
 
 @settings(max_examples=40, deadline=None)
@@ -358,31 +272,6 @@ def test_rays_without_room_are_left_out_whole():
         assert found.occluded == whole.occluded, room
 
 
-def test_no_samples_take_no_place():
-    grid = grid_of(filled=0.0)
-    found = into(rays_of(5), grid, 40)
-    assert found.count == 0
-    assert not found.live.any()
-    assert found.shown.all()
-    assert (found.starts == 0).all()
-
-
-@needs_triton
-@pytest.mark.parametrize(("skip_empty", "occlusion"), OPTIONS)
-def test_the_kernel_places_the_samples_of_the_oracle(skip_empty, occlusion):
-    grid, rays = grid_of(), rays_of(12)
-    given = {"skip_empty": skip_empty, "occlusion": occlusion}
-    kept, counts = by_oracle(rays, grid, **given)
-    found = by_kernel(rays, grid, **given)
-    assert found.ray.tolist() == [row[0] for row in kept]
-    assert found.cells.tolist() == [row[2] for row in kept]
-    np.testing.assert_allclose(found.distances, [row[1] for row in kept], atol=1e-12)
-    np.testing.assert_allclose(found.points, [row[3:] for row in kept], atol=1e-12)
-    assert (found.candidates, found.empty, found.occluded) == counts
-    assert torch.equal(found.starts, twin(rays, grid, **given).starts)
-    assert found.live is found.number is found.shown is None
-
-
 def same_places(found, expected):
     for name in ("starts", "live", "shown", "ray"):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
@@ -435,15 +324,6 @@ def test_the_kernel_finds_no_samples_on_impossible_rays():
     assert torch.equal(found.cells, expected.cells)
 
 
-@needs_triton
-def test_no_rays_and_no_samples_in_the_kernel():
-    for rays, room in ((rays_of(0), None), (rays_of(0), 5), (rays_of(3), None), (rays_of(3), 5)):
-        found = by_kernel(rays, grid_of(filled=-1), room=room)
-        assert found.count == 0
-        assert len(found.points) == (room or 0)
-        assert found.starts.tolist() == [0] * len(rays[0])
-
-
 @pytest.fixture
 def as_on_a_gpu(monkeypatch):
     """Tensors of this machine are taken for ones on a GPU."""
@@ -473,18 +353,3 @@ def test_the_kernel_is_used_once_it_has_proved_itself(as_on_a_gpu, monkeypatch, 
     assert rooms[1:] == [None, 90]
     assert rooms[0] not in (None, 90)  # The trial.
     assert not caplog.records
-
-
-@needs_triton
-def test_a_kernel_that_places_samples_elsewhere_is_not_used(as_on_a_gpu, monkeypatch, caplog):
-    def broken(*given, **options):
-        found = march_gpu(*given, **options)
-        return dataclasses.replace(found, points=found.points + 0.01)
-
-    monkeypatch.setattr(marching, "march_gpu", broken)
-    grid, rays = grid_of(), rays_of(5, torch.float32)
-    for _ in range(2):
-        found, expected = march(*rays, grid, step=STEP), twin(rays, grid)
-        assert torch.equal(found.points, expected.points)
-    assert [record.message for record in caplog.records] == [caplog.records[0].message]
-    assert "marching" in caplog.text

@@ -206,19 +206,6 @@ def test_many_looks_at_once_decay_once():
     assert grid.density[5] == pytest.approx(0.5 * start)
 
 
-def test_no_looks_change_nothing():
-    grid = grid_of()
-    grid.observe(torch.zeros(0, dtype=torch.long), torch.zeros(0))
-    assert torch.equal(grid.density, grid_of().density)
-
-
-def test_densities_in_bfloat16_are_taken():
-    grid = grid_of()
-    grid.observe(torch.tensor([1]), torch.tensor([5.0], dtype=torch.bfloat16))
-    assert grid.density[1] == 5
-    assert grid.density.dtype == torch.float32
-
-
 def test_a_cell_recovers_from_an_impossible_density():
     for bad in [math.nan, math.inf, -math.inf, 3e38]:
         grid, cell = grid_of(), torch.tensor([2])
@@ -274,18 +261,6 @@ def test_update_empties_an_empty_grid_and_finds_what_appears():
     assert grid.occupied_fraction == 1
 
 
-def test_equal_generators_keep_grids_equal():
-    grids = [grid_of(), grid_of(), grid_of()]
-
-    def field(points, times):
-        return points, (points.sum(dim=-1) * 20 * times).clamp_min(0)
-
-    for grid, seed in zip(grids, (4, 4, 5), strict=True):
-        grid.update(field, 64, generator(seed))
-    assert torch.equal(grids[0].density, grids[1].density)
-    assert not torch.equal(grids[0].density, grids[2].density)
-
-
 def test_cells_that_are_ruled_out_never_fill():
     grid = grid_of()
     allowed = torch.rand(2, 4, 4, 4, generator=generator()) < 0.5
@@ -302,16 +277,6 @@ def test_cells_that_are_ruled_out_never_fill():
         assert grid.occupied[~out].all()
 
 
-def test_a_second_ruling_only_takes_away():
-    grid = grid_of(bins=1)
-    first = torch.rand(1, 4, 4, 4, generator=generator(1)) < 0.5
-    second = torch.rand(1, 4, 4, 4, generator=generator(2)) < 0.5
-    grid.allow(first)
-    grid.allow(second)
-    assert torch.equal(grid.allowed, (first & second).flatten())
-    assert torch.equal(grid.occupied, (first & second).flatten())
-
-
 def test_allow_takes_axes_in_the_order_z_y_x():
     grid = grid_of(4, 2)
     allowed = torch.zeros(2, 4, 4, 4, dtype=torch.bool)
@@ -322,17 +287,6 @@ def test_allow_takes_axes_in_the_order_z_y_x():
         grid.occupied.nonzero().flatten().tolist()
         == cells_of(grid, point, torch.tensor([0.75])).tolist()
     )
-
-
-def test_nothing_allowed_asks_the_field_nothing():
-    grid = grid_of()
-    grid.allow(torch.zeros(2, 4, 4, 4, dtype=torch.bool))
-
-    def never(points, times):
-        raise AssertionError("asked")
-
-    grid.update(never, 10, generator())
-    assert grid.occupied_fraction == 0
 
 
 def ball(points, times):
@@ -373,30 +327,6 @@ def test_a_sweep_does_not_bring_empty_cells_back_and_asks_only_the_occupied():
     assert asked == [100, 100, 56]
     assert not grid.occupied[:256].any()
     assert grid.occupied[256:].all()
-
-
-def test_a_sweep_survives_impossible_densities():
-    for bad in [math.nan, math.inf]:
-        grid = grid_of(8, 1)
-
-        def field(points, times, bad=bad):
-            colour, density = ball(points, times)
-            return colour, torch.where(points[:, 0] > 0.75, bad, density)
-
-        grid.sweep(field, generator())
-        assert grid.density.isfinite().all(), bad
-        centre = grid.density.view(8, 8, 8)[4, 4, 4]
-        assert centre == 50, bad
-        assert grid.occupied.any(), bad
-
-
-def test_the_state_goes_round():
-    grid, other = grid_of(), grid_of()
-    grid.allow(torch.rand(2, 4, 4, 4, generator=generator()) < 0.5)
-    grid.update(constant(2.0), 30, generator())
-    other.load_state_dict(grid.state_dict())
-    for name in ("density", "occupied", "allowed"):
-        assert torch.equal(getattr(grid, name), getattr(other, name))
 
 
 def test_samples_that_do_not_count_change_nothing():

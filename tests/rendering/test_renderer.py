@@ -74,23 +74,6 @@ def test_depth_in_fog_is_the_mean_free_path_cut_at_the_far_side():
         assert seen.depth.tolist() == pytest.approx([near + mean] * 4, rel=1e-5), density
 
 
-def test_any_ray_through_fog_is_right_to_half_a_step():
-    renderer, rays = renderer_of(256, occlusion=0.0), rays_of(200)
-    seen = renderer.render(fog(1.0), *rays, WHITE)
-    from xplanes.rendering.box import ray_box
-
-    near, far = ray_box(*rays[:2])
-    wrong = (-(1 - seen.opacity).log() - (far - near)).abs()
-    assert wrong.max() <= 0.5 * renderer.step + 1e-9
-
-
-def test_the_derivative_by_density_is_that_of_the_closed_form():
-    density = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
-    seen = renderer_of(occlusion=0.0).render(fog(density), *diagonal_rays(), WHITE)
-    (slope,) = torch.autograd.grad(seen.opacity[0], density)
-    assert float(slope) == pytest.approx(DIAGONAL * math.exp(-0.7 * DIAGONAL))
-
-
 def test_dropping_what_lies_behind_costs_less_than_its_threshold():
     rays = rays_of(300)
     renderer = renderer_of(128, occlusion=0.0)
@@ -136,25 +119,6 @@ def test_each_ray_has_its_own_time_and_background():
     assert (clear.depth == 0).all()
 
 
-@pytest.mark.parametrize("loops", ["1", "0"])
-def test_no_density_makes_a_nan(loops, monkeypatch):
-    monkeypatch.setenv("XPLANES_CPU_LOOPS", loops)
-    for density, dtype in itertools.product(
-        [1e-30, 1e8, 1e20, 3e38, math.inf], [torch.float32, torch.float64]
-    ):
-        case = f"density={density}, dtype={dtype}"
-        renderer, rays = renderer_of(), rays_of(40, dtype)
-        level = torch.tensor(density, dtype=dtype, requires_grad=True)
-        for _ in range(2):
-            seen = renderer.render(fog(level), *rays, WHITE.to(dtype))
-            for value in (seen.colour, seen.opacity, seen.depth):
-                assert value.isfinite().all(), case
-            (slope,) = torch.autograd.grad(seen.colour.sum(), level)
-            assert slope.isfinite(), case
-            # The second time the grid knows of it.
-            renderer.grid.observe(seen.samples.cells, seen.density)
-
-
 def test_a_nan_of_the_field_stays_on_its_ray(monkeypatch):
     rays = rays_of(10)
 
@@ -166,40 +130,6 @@ def test_a_nan_of_the_field_stays_on_its_ray(monkeypatch):
         monkeypatch.setenv("XPLANES_CPU_LOOPS", loops)
         seen = renderer_of().render(field, *rays, WHITE)
         assert seen.colour.isnan().any(dim=-1).nonzero().flatten().tolist() == [4], loops
-
-
-def test_low_precision_fields_are_merged_in_float32():
-    rays = diagonal_rays(torch.float32)
-
-    def rough(points, times):
-        colour, density = fog(1.0)(points, times)
-        return colour.bfloat16(), density.bfloat16()
-
-    seen = renderer_of(occlusion=0.0).render(rough, *rays, WHITE.float())
-    assert seen.colour.dtype == torch.float32
-    assert float(seen.opacity[0]) == pytest.approx(-math.expm1(-DIAGONAL), rel=0.01)
-
-
-def test_rays_that_miss_see_the_background():
-    origins = torch.tensor([[0.0, 0, 5], [0, 3, 0]]).double()
-    directions = torch.tensor([[0.0, 0, 1], [1, 0, 0]]).double()
-    seen = renderer_of().render(fog(9.0), origins, directions, torch.zeros(2).double(), COLOUR)
-    assert torch.equal(seen.colour, COLOUR.expand(2, 3))
-    assert len(seen.samples) == 0
-
-
-def test_an_image_does_not_depend_on_its_chunks():
-    renderer = renderer_of()
-    origins, directions, _ = rays_of(100, torch.float32)
-
-    def field(points, times):
-        return points.abs(), points.square().sum(dim=-1) * 4
-
-    whole = renderer.image(field, origins, directions, 0.3, WHITE.float())
-    parts = renderer.image(field, origins, directions, 0.3, WHITE.float(), chunk=7)
-    for name, value in whole.items():
-        assert torch.equal(value, parts[name]), name
-        assert not value.requires_grad
 
 
 def clouds(points, times):
@@ -250,20 +180,6 @@ def test_an_image_does_not_ask_for_what_surfaces_hide(monkeypatch):
         assert sum(asked) == pytest.approx(share * along, rel=0.01)
 
 
-def test_images_of_fields_in_low_precision_and_with_a_nan():
-    origins, directions, _ = diagonal_rays(torch.float32)
-
-    def half(points, times):
-        bad = (points * directions[1]).sum(dim=-1).abs() > 1.5
-        density = torch.where(bad, math.nan, 2.0)
-        return points.abs().bfloat16(), density.bfloat16()
-
-    image = renderer_of().image(half, origins, directions, 0.0, WHITE.float())
-    assert image["colour"].dtype == torch.float32
-    assert image["opacity"].isnan().tolist() == [False, True, False, False]
-    assert image["opacity"][0] == pytest.approx(1 - math.exp(-2 * DIAGONAL), abs=1e-3)
-
-
 def test_an_image_takes_a_snapshot_of_the_field_at_its_time():
     taken = []
 
@@ -276,16 +192,6 @@ def test_an_image_takes_a_snapshot_of_the_field_at_its_time():
     image = renderer_of().image(Clock(), origins, directions, 0.3, WHITE.float(), chunk=7)
     assert taken == [0.3]
     assert (image["opacity"] > 0).any()
-
-
-def test_an_image_without_rays_is_empty():
-    none = torch.zeros(0, 3)
-    image = renderer_of().image(fog(1.0), none, none, 0.0, WHITE.float())
-    assert {name: tuple(value.shape) for name, value in image.items()} == {
-        "colour": (0, 3),
-        "opacity": (0,),
-        "depth": (0,),
-    }
 
 
 def test_jitter_moves_samples_within_their_steps():

@@ -125,25 +125,6 @@ def test_targets_are_the_pixels_that_the_rays_go_through():
             ), case
 
 
-def test_shapes_and_ranges():
-    batch = batches_of(background="random").draw(0)
-    shapes = {name: tuple(value.shape) for name, value in batch.items()}
-    vector, number = (64, 3), (64,)
-    assert shapes == {
-        "origins": vector,
-        "directions": vector,
-        "target": vector,
-        "background": vector,
-        "alpha": number,
-        "times": number,
-        "jitter": number,
-    }
-    for name in ("target", "background", "alpha", "jitter"):
-        assert batch[name].min() >= 0
-        assert batch[name].max() <= 1
-        assert batch[name].dtype == torch.float32
-
-
 def test_one_background_is_shared_by_a_batch_and_changes_between_batches():
     batches = batches_of(background="one")
     first, second = batches.draw(0), batches.draw(1)
@@ -197,18 +178,6 @@ def test_without_skipping_pixels_are_drawn_evenly():
         freedom = len(counts) - 1
         assert abs(chi_squared - freedom) < 5 * (2 * freedom) ** 0.5, options
         assert counts.min() > 0, options
-
-
-def test_images_that_are_all_background_or_all_content_are_drawn_evenly():
-    for alpha in (0, 255):
-        batches = batches_of(
-            replace(VIEWS, images=torch.full_like(VIEWS.images, alpha)), per_batch=2000
-        )
-        assert batches.skipped == 0, alpha
-        batch = batches.draw(0)
-        assert len(batch["times"].unique()) == 5, alpha
-        assert (batch["target"] == 1).all(), alpha
-        assert batch["directions"].unique(dim=0).shape[0] > 1000, alpha
 
 
 def floor_views(side=120):
@@ -266,12 +235,6 @@ def test_plain_pixels_have_the_share_of_the_background_and_their_own_times():
     )
     alike = batches_of(views, per_batch=20_000, skip_background=False)
     assert alike.skipped == 0
-
-
-def test_jitter_is_even():
-    jitter = torch.cat([batches_of(per_batch=1000).draw(step)["jitter"] for step in range(10)])
-    counts = torch.histc(jitter, bins=10, min=0, max=1)
-    assert ((counts - 1000).abs() < 150).all()
 
 
 def test_only_rays_far_from_silhouettes_move_in_time_and_not_far():

@@ -109,33 +109,6 @@ def test_pycolmaps_rays_through_every_camera_model():
         assert np.abs(directions.numpy() - np.stack(wanted, axis=1)).max() < 1e-8, image["model"]
 
 
-def test_models_written_by_pycolmap(tmp_path):
-    pycolmap = pytest.importorskip("pycolmap")
-    whole = pycolmap.Reconstruction()
-    whole.add_camera_with_trivial_rig(
-        pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=OPENCV, camera_id=3)
-    )
-    turns = np.random.default_rng(1).normal(size=(4, 4))
-    for index, turn in enumerate(turns / np.linalg.norm(turns, axis=1, keepdims=True)):
-        image = pycolmap.Image(name=f"a {index}.png", camera_id=3, image_id=index + 1)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(np.ones(2))] * index)
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.arange(3.0) + index)
-        whole.add_image_with_trivial_frame(image, pose)
-    whole.add_point3D(np.array([1.0, 2.0, 3.0]), pycolmap.Track())
-    for write in ("write_binary", "write_text"):
-        folder = tmp_path / write
-        folder.mkdir()
-        getattr(whole, write)(folder)
-        model = read_model(folder)
-        assert model.names == tuple(f"a {index}.png" for index in range(4))
-        for index, found in enumerate(model.camera_to_world):
-            world = np.linalg.inv(
-                np.vstack([whole.images[index + 1].cam_from_world().matrix(), [0, 0, 0, 1]])
-            )
-            assert np.abs(found - world @ np.diag([1, -1, -1, 1])).max() < 1e-12
-        assert model.points.tolist() == [[1, 2, 3]]
-
-
 def test_text_and_binary_models_are_the_same(tmp_path):
     names = ["b c/ d.png", "a.png", "é.png"]
     cameras = {4: CAMERA[1], 9: ("FOV", 20, 10, (9.0, 8.0, 7.0, 6.0, 0.5))}

@@ -15,22 +15,17 @@ from tests.captures import settings
 from tests.refusals import assert_refused
 from xplanes.baselines.tineuvox.model import frusta_box
 from xplanes.errors import SceneError
-from xplanes.evaluation.render import VideoOptions, lens
-from xplanes.metrics import psnr
 from xplanes.preparation.fixed_view import check_camera
-from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.carving import carve
 from xplanes.rendering.filling import fill
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.batches import RayBatches, RaySettings
-from xplanes.scenes.cameras import PosedCamera, focal_length
-from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.dnerf import BlenderSettings
-from xplanes.scenes.frame import cube_frame, optical_centre, scene_frame
+from xplanes.scenes.frame import cube_frame, scene_frame
 from xplanes.scenes.silhouettes import foreground, may_hold
 from xplanes.scenes.source import frames_are_equal
-from xplanes.scenes.views import Intrinsics, Scene, Views, joined
-from xplanes.training.scores import score_view
+from xplanes.scenes.views import Intrinsics, Views, joined
 
 RADIUS = 0.5
 COLOUR = [200, 100, 50, 255]
@@ -214,30 +209,6 @@ def test_rays_are_those_of_the_formula():
         assert np.abs(found[1].numpy() - directions).max() < 1e-6, index
 
 
-def test_rays_of_the_pixels_that_show_the_ball_meet_it_and_no_others():
-    views = mixed(6)
-    for index in range(6):
-        shown = (views.image(index)[..., 3] > 0).flatten()
-        assert 0.03 < shown.float().mean() < 0.9
-        origins, directions = (part.double() for part in views.image_rays(index))
-        along = -(origins * directions).sum(dim=1, keepdim=True)
-        apart = (origins + along * directions).norm(dim=1)
-        assert (apart[shown] < RADIUS + 1e-5).all(), index
-        assert (apart[~shown] > RADIUS - 1e-5).all(), index
-
-
-def test_a_cropped_image_keeps_its_rays():
-    whole = rendered([WIDE], surrounding(1, 4.0))
-    height, width, *focal, centre_x, centre_y = WIDE
-    cut = rendered(
-        [(height - 9, width - 15, *focal, centre_x - 11, centre_y - 5)], surrounding(1, 4.0)
-    )
-    left = torch.zeros(height, width, dtype=torch.bool)
-    left[5 : height - 4, 11 : width - 4] = True
-    torch.testing.assert_close(cut.image_rays(0)[1], whole.image_rays(0)[1][left.flatten()])
-    assert torch.equal(cut.image(0), whole.image(0)[5 : height - 4, 11 : width - 4])
-
-
 def test_batches_draw_all_pixels_and_no_padding():
     views = mixed(4)
     generator = torch.Generator().manual_seed(0)
@@ -251,12 +222,7 @@ def test_batches_draw_all_pixels_and_no_padding():
         drawn = torch.zeros(views.images.shape[:3], dtype=torch.long)
         for step in range(60):
             batch = batches.draw(step)
-            if step > 1:
-                pixel = batches_pixels(batch, views, frame)
-            else:  # Each ray by the formula.
-                pixel = [place_of(batch, views, frame, ray) for ray in range(len(batch["times"]))]
-                pixel = torch.tensor(pixel).T
-            view, row, column = pixel
+            view, row, column = batches_pixels(batch, views)
             assert views.valid()[view, row, column].all(), (skip, step)
             seen = views.images[view, row, column].float() / 255
             expected = seen[:, :3] + (1 - seen[:, 3:]) * batch["background"]
@@ -271,24 +237,8 @@ def test_batches_draw_all_pixels_and_no_padding():
             assert abs(chi_squared - views.pixels) < 5 * (2 * views.pixels) ** 0.5
 
 
-def place_of(batch, views, frame, ray):
-    """View, row and column of a ray."""
-    origin, point = (
-        frame.to_world(p[ray]) for p in (batch["origins"], batch["origins"] + batch["directions"])
-    )
-    (view,) = (views.times == batch["times"][ray]).nonzero().flatten().tolist()
-    torch.testing.assert_close(origin, views.camera_to_world[view, :3, 3], atol=1e-5, rtol=0)
-    camera = (WIDE, UPRIGHT)[view % 2]
-    row, column = pixel_of(point, views.camera_to_world[view], *camera[2:])
-    assert abs(row % 1 - 0.5) < 1e-2
-    assert abs(column % 1 - 0.5) < 1e-2
-    assert 0 <= row < camera[0]
-    assert 0 <= column < camera[1]
-    return view, int(row), int(column)
-
-
-def batches_pixels(batch, views, frame):
-    """The same for all rays: the pixels whose rays are the nearest."""
+def batches_pixels(batch, views):
+    """View, row and column of each ray: the pixels whose rays are the nearest."""
     found = torch.empty(3, len(batch["times"]), dtype=torch.long)
     for view, time in enumerate(views.times):
         mine = batch["times"] == time
@@ -316,10 +266,9 @@ def test_background_and_near_rays_are_shares_of_what_is_no_padding():
 # What is seen in them
 
 
-@pytest.mark.parametrize("value", [1, 255])
-def test_padding_is_nothing_whatever_it_holds(value):
+def test_padding_is_nothing_whatever_it_holds():
     views = mixed(8, times=torch.zeros(8))
-    dirty, frame = soiled(views, value), cube_frame(1.4, torch.zeros(3))
+    dirty, frame = soiled(views, 255), cube_frame(1.4, torch.zeros(3))
     assert not torch.equal(views.images, dirty.images)
     points = inside_ball(2000, 2.0)
     assert torch.equal(may_hold(dirty, points, radius=0.05), may_hold(views, points, radius=0.05))
@@ -361,113 +310,6 @@ def test_cameras_together_see_what_each_sees():
             assert bool(there) == bool(expected), (index, point)
 
 
-def test_carving_by_different_cameras_keeps_the_ball_and_empties_the_rest():
-    centre = (0.15, -0.1, 0.05)
-    # Views of neighbouring times are joined where there are enough of them.
-    for times in (torch.zeros(24), torch.linspace(0, 1, 60)):
-        views = mixed(len(times), times=times, centre=centre)
-        frame, grid = cube_frame(1.4, torch.zeros(3)), OccupancyGrid(24, 4, step=0.05)
-        carve(grid, views, frame)
-        x, y, z = (
-            ((frame.points(inside_ball(4000, RADIUS) + torch.tensor(centre)) + 1) / 2 * 24)
-            .floor()
-            .long()
-            .unbind(dim=-1)
-        )
-        for cells in (grid.allowed, grid.occupied):
-            assert cells.view(4, 24, 24, 24)[:, z, y, x].all()
-        assert grid.occupied.float().mean() < (0.2 if views.is_static else 0.35)
-
-
-def test_images_without_alpha_carve_nothing_though_padding_has_none():
-    views = mixed(6)
-    assert not views.is_opaque
-    assert opaque(views).is_opaque
-    grid = OccupancyGrid(12, 2, step=0.05)
-    carve(grid, opaque(views), cube_frame(1.4, torch.zeros(3)))
-    assert grid.allowed.all()
-
-
-def test_the_cube_of_different_cameras_holds_the_ball_closely():
-    for centre in ((0.0, 0.0, 0.0), (0.15, -0.2, 0.1)):
-        views = mixed(24, centre=centre)
-        frame = scene_frame(views)
-        points = frame.points(inside_ball(3000, RADIUS) + torch.tensor(centre))
-        assert points.abs().max() <= 1, centre
-        assert 1 / frame.scale < RADIUS + 0.45, centre
-    assert scene_frame(mixed(4), 2.0).scale == 0.5
-
-
-def test_without_alpha_the_cube_is_what_the_widest_camera_sees():
-    poses = surrounding(12, 3.0)
-    cameras = [(10, 10, 12.0, 12.0, 5.0, 5.0), (20, 24, 24.0, 21.0, 12.0, 10.0)] * 6
-    half = 1 / scene_frame(opaque(rendered(cameras, poses))).scale
-    assert half == pytest.approx(1.5)  # half of 24 pixels at a focal length of 24, 3 away
-
-
-def test_images_cropped_around_a_thing_look_at_it():
-    """Each optical axis passes the thing; the middle of each image shows it."""
-    place = torch.tensor([0.6, -0.5, 0.4])
-    cameras, poses = [], surrounding(20, 4.0)
-    for pose in poses:
-        row, column = pixel_of(place, pose, 90.0, 90.0, 50.0, 50.0)
-        top, left = round(row) - 16, round(column) - 16
-        cameras.append((32, 32, 90.0, 90.0, 50.0 - left, 50.0 - top))
-    views = rendered(cameras, poses, centre=tuple(place.tolist()))
-    assert (optical_centre(views) - place).norm() < 0.03
-    frame = scene_frame(views)
-    assert frame.points(inside_ball(3000, RADIUS) + place).abs().max() <= 1
-    assert 1 / frame.scale < RADIUS + 0.35
-
-
-def test_the_box_of_the_frusta_is_that_of_all_cameras():
-    views = mixed(4)
-    ends = []
-    for index, camera in enumerate([WIDE, UPRIGHT] * 2):
-        origins, directions = rays_of(views.camera_to_world[index], *camera)
-        ends += [origins + distance * directions for distance in (2.0, 6.0)]
-    low, high = np.concatenate(ends).min(axis=0), np.concatenate(ends).max(axis=0)
-    expected = np.stack([low - 0.05 * (high - low), high + 0.05 * (high - low)])
-    assert np.abs(frusta_box(views, 2.0, 6.0, 1.1).numpy() - expected).max() < 1e-5
-
-
-class Ball(RayRenderer):
-    """Stands for a renderer of a field that shows the ball."""
-
-    @property
-    def device(self):
-        return torch.device("cpu")
-
-    def render(self, *_arguments, **_options):
-        raise NotImplementedError
-
-    def image(self, field, origins, directions, time, background):
-        along = -(origins * directions).sum(dim=1, keepdim=True)
-        hit = (origins + along * directions).norm(dim=1) < RADIUS
-        colour = torch.where(hit[:, None], torch.tensor(COLOUR[:3]) / 255, background)
-        return {"colour": colour, "opacity": hit.float(), "depth": along[:, 0] * hit}
-
-
-def test_views_are_scored_at_their_own_size():
-    views, world = mixed(4), cube_frame(1.0, torch.zeros(3))
-    for index in range(4):
-        for those in (views, soiled(views, 255)):
-            score, images = score_view(None, Ball(), world, those, index, torch.ones(3))
-            assert images.truth.shape[:2] == images.depth.shape == views.size(index)
-            assert score.psnr == psnr(images.truth, images.truth) == 100, index
-            assert score.ssim == pytest.approx(1), index
-
-
-def test_the_data_module_serves_views_at_their_own_size():
-    views = mixed(6)
-    data = SceneDataModule.of(Scene("ball", {"train": views, "test": mixed(3)}))
-    assert len(data.train_dataloader()) == views.pixels // 1024
-    for index, batch in enumerate(data.test_dataloader()):
-        height, width = views.size(index)
-        assert batch["target"].shape == (height, width, 3)
-        assert [len(rays) for rays in batch["camera"].rays()] == [height * width] * 2
-
-
 def test_frames_with_different_intrinsics_are_not_static():
     views = rendered([WIDE] * 3, surrounding(1, 4.0).repeat(3, 1, 1))
     assert frames_are_equal(views)
@@ -477,36 +319,6 @@ def test_frames_with_different_intrinsics_are_not_static():
 
 
 # Pictures of them
-
-
-def test_a_video_has_the_field_of_view_of_the_training_views():
-    square = ball_views(3, RADIUS, size=20, angle=0.7)
-    assert square.intrinsics.focal_at(50) == pytest.approx(focal_length(0.7, 50))
-    assert square.intrinsics.fov_y == pytest.approx(0.7)
-    assert lens({"train": square}, "orbit", (50, 50)) == (
-        square.intrinsics.focal_at(50),
-        None,
-        None,
-    )
-    views = mixed(5)  # three of them wide
-    assert views.intrinsics.focal_at(88) == pytest.approx((41.0 + 36.5) / 2 * 2)
-    assert views.intrinsics.fov_y == pytest.approx(2 * math.atan(15 / 36.5))
-
-
-def test_an_image_from_a_view_shows_it_whole():
-    views = mixed(4)
-    for index in (0, 1):
-        height, width = views.size(index)
-        path = f"view:{views.files[index]}"
-        for factor in (1, 3):
-            size = VideoOptions(path, size=factor * max(height, width)).shape({"train": views})
-            assert size == (factor * height, factor * width)
-            focal, centre, own = lens({"train": views}, path, size)
-            assert own is None
-            _, found = PosedCamera(views.camera_to_world[index], focal, *size, centre).rays()
-            found = found.view(*size, 3)[factor // 2 :: factor, factor // 2 :: factor]
-            found = found.reshape(-1, 3)
-            torch.testing.assert_close(found, views.image_rays(index)[1], atol=1e-6, rtol=0)
 
 
 def test_a_video_that_models_cannot_take_is_refused():
@@ -652,42 +464,3 @@ def test_intrinsics_shrink_with_images_of_different_sizes(tmp_path):
     torch.testing.assert_close(views.intrinsics.focal, torch.tensor(expected, dtype=torch.float64))
     expected = [[5 / 3, 7 / 3], [2, 2], [2, 2.2]]
     torch.testing.assert_close(views.intrinsics.centre, torch.tensor(expected, dtype=torch.float64))
-
-
-def test_images_need_not_be_square_where_they_differ(tmp_path):
-    views = read(write(tmp_path, [(12, 6), (6, 10)], shared={"fl_x": 9.0, "cx": 5.0}))
-    assert views.images.shape == (2, 10, 12, 4)
-    assert views.intrinsics.size.tolist() == [[6, 12], [10, 6]]
-    assert views.intrinsics.centre.tolist() == [[5, 3], [5, 5]]
-    assert views.intrinsics.focal.tolist() == [[9, 9], [9, 9]]
-
-
-def test_harmless_keys_refuse_no_scene(tmp_path):
-    plain = read(write(tmp_path / "plain", [(12, 12)] * 3))
-    harmless = {
-        "w": 900,
-        "h": "auto",
-        "fl_x": None,
-        "cx": None,
-        "k1": 0,
-        "k2": 0.0,
-        "p1": None,
-        "camera_model": "OPENCV",
-        "is_fisheye": False,
-        "camera_angle_y": "wide",
-        "aabb_scale": 16,
-        "rotation": 0.01,
-        "colmap_im_id": 3,
-        "sharpness": 30.5,
-        "applied_transform": [[1, 0, 0, 0]],
-        "ply_file_path": "sparse_pc.ply",
-    }
-    shared = {"camera_angle_x": ANGLE, **harmless}
-    for name, folder in {
-        "file": write(tmp_path / "file", [(12, 12)] * 3, shared=shared),
-        "frames": write(tmp_path / "frames", [(12, 12)] * 3, frames=[harmless] * 3),
-    }.items():
-        views = read(folder)
-        assert torch.equal(views.images, plain.images), name
-        assert torch.equal(views.intrinsics.focal, plain.intrinsics.focal), name
-        assert torch.equal(views.intrinsics.centre, plain.intrinsics.centre), name

@@ -7,18 +7,17 @@ import numpy as np
 import pytest
 import torch
 
-from tests.balls import ball_views, inside_ball, surrounding
+from tests.balls import inside_ball, surrounding
 from tests.lens_oracle import direction, pixel
 from xplanes.errors import SceneError
-from xplanes.evaluation.render import lens as lens_of_picture
 from xplanes.preparation.fixed_view import check_camera
 from xplanes.scenes.batches import RayBatches
-from xplanes.scenes.cameras import PosedCamera, ball_extent, cast_rays, look_at, project
+from xplanes.scenes.cameras import ball_extent, cast_rays, look_at, project
 from xplanes.scenes.datamodule import UNIFORM
-from xplanes.scenes.frame import backwards, cube_frame, scene_frame
+from xplanes.scenes.frame import cube_frame
 from xplanes.scenes.lenses import COEFFICIENTS, WIDEST, Lenses, LensModel
 from xplanes.scenes.silhouettes import may_hold
-from xplanes.scenes.views import Intrinsics, Views, joined
+from xplanes.scenes.views import Intrinsics, Views
 
 HEIGHT, WIDTH = 30, 44
 FOCAL, CENTRE = (35.0, 37.0), (20.5, 16.25)
@@ -113,16 +112,6 @@ def test_points_on_rays_are_seen_at_their_pixels(name):
     assert expected == pytest.approx((float(x[7]), float(y[7])), abs=1e-9)
 
 
-def test_single_precision_rays_are_as_exact_as_they_can_be():
-    rows, columns = grid()
-    pose = look_at(torch.tensor([[1.0, -3.0, 2.0]], dtype=torch.float64))[0]
-    for name in LENSES:
-        _, exact = cast(name, rows, columns, pose)
-        _, found = cast(name, rows.float(), columns.float(), pose.float())
-        assert found.dtype == torch.float32
-        assert float((found - exact).abs().max()) < 3e-7, name
-
-
 def test_lenses_of_one_batch_do_not_mix():
     names = [name for name in LENSES for _ in range(3)]
     lenses = lenses_of(*names)
@@ -135,23 +124,6 @@ def test_lenses_of_one_batch_do_not_mix():
     for index, name in enumerate(names):
         alone = cast(name, rows[index : index + 1], columns[index : index + 1])[1][0]
         torch.testing.assert_close(found[index], alone, atol=1e-12, rtol=0)
-
-
-def test_lenses_that_distort_nothing_cost_nothing():
-    square = ball_views(3, 0.5, size=20)
-    plain = replace(square.intrinsics, lenses=Lenses.pinholes(3))
-    assert plain.lenses is None
-    weak = intrinsics_of("barrel", "barrel")
-    weak = replace(weak, lenses=replace(weak.lenses, coefficients=weak.lenses.coefficients * 1e-12))
-    assert weak.lenses is not None
-    rays = [
-        PosedCamera(torch.eye(4), weak.focal[0], HEIGHT, WIDTH, weak.centre[0], lens).rays()[1]
-        for lens in (weak.lens(0), None)
-    ]
-    torch.testing.assert_close(rays[0], rays[1], atol=2e-7, rtol=0)
-    assert torch.tensor([weak.fov_y]) == pytest.approx(
-        2 * math.atan(0.5 * HEIGHT / FOCAL[1]), rel=0.01
-    )
 
 
 def test_intrinsics_keep_their_lenses():
@@ -282,18 +254,6 @@ def test_fisheye_lenses_see_beside_and_behind_themselves():
         assert not may_hold(views, empty, radius=0.02).any()
 
 
-def test_the_cube_holds_the_ball_through_any_lens():
-    for name in LENSES:
-        views = seen_ball([name] * 20, surrounding(20, 4.0), 0.5)
-        frame = scene_frame(views)
-        assert frame.points(inside_ball(2000, 0.5)).abs().max() <= 1, name
-        assert 1 / frame.scale < 0.95, name
-        # The principal point is not in the middle: the middle's ray is not the camera's axis.
-        middle = cast(name, torch.tensor([HEIGHT / 2 - 0.5]), torch.tensor([WIDTH / 2 - 0.5]))[1]
-        expected = views.camera_to_world[0, :3, :3] @ -middle[0].float()
-        torch.testing.assert_close(backwards(views)[0], expected, atol=1e-6, rtol=0)
-
-
 def test_pinholes_that_stand_for_lenses_see_as_wide():
     for name, angle in (("barrel", None), ("equidistant", 44 / 35)):
         intrinsics = intrinsics_of(name, focal=(35.0, 35.0), centre=(22.0, 15.0))
@@ -314,17 +274,6 @@ def test_pinholes_that_stand_for_lenses_see_as_wide():
     assert wide.fov_y == pytest.approx(WIDEST)
 
 
-def test_a_picture_from_a_view_has_its_lens():
-    views = seen_ball(["barrel", "fisheye"], surrounding(2, 4.0), 0.5, skew=0.5)
-    for index in (0, 1):
-        size = (2 * HEIGHT, 2 * WIDTH)
-        focal, centre, lens = lens_of_picture({"train": views}, f"view:{index}", size)
-        _, found = PosedCamera(views.camera_to_world[index], focal, *size, centre, lens).rays()
-        # The middle of four pixels is the centre of one of the view.
-        found = found.view(HEIGHT, 2, WIDTH, 2, 3).mean(dim=(1, 3)).reshape(-1, 3)
-        torch.testing.assert_close(found, views.image_rays(index)[1], atol=1e-3, rtol=0)
-
-
 def test_a_distorted_video_is_refused_where_pinholes_are_needed():
     centre = (WIDTH / 2, HEIGHT / 2)
     views = seen_ball(
@@ -334,12 +283,3 @@ def test_a_distorted_video_is_refused_where_pinholes_are_needed():
         check_camera(views)
     weak = replace(views.intrinsics.lenses, coefficients=views.intrinsics.lenses.coefficients / 50)
     check_camera(replace(views, intrinsics=replace(views.intrinsics, lenses=weak)))
-
-
-def test_views_with_and_without_lenses_are_joined():
-    first = seen_ball(["fisheye"], surrounding(1, 4.0), 0.5)
-    second = ball_views(2, 0.5, size=20)
-    both = joined(first, second)
-    for index, (views, own) in enumerate([(first, 0), (second, 0), (second, 1)]):
-        for mine, theirs in zip(both.image_rays(index), views.image_rays(own), strict=True):
-            torch.testing.assert_close(mine, theirs, atol=2e-7, rtol=0)

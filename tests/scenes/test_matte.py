@@ -105,24 +105,12 @@ def test_opaque_specks_are_left_out_and_what_is_larger_is_not():
 def test_wires_are_kept_at_every_angle():
     body = disc(30, centre=(0.25, 0.25))
     for width in (0.25, 0.5, 1.0, 2.0):
-        for step in range(24):
-            angle = math.pi * step / 24
+        for step in range(8):
+            angle = math.pi * step / 8
             for alpha in (line(angle, width), line(angle, width, length=12)):
                 assert silhouette_of(alpha)[alpha >= VISIBLE].all(), (width, angle)
                 beside = torch.maximum(alpha, body)
                 assert torch.equal(silhouette_of(beside), beside >= VISIBLE), (width, angle)
-
-
-def test_a_small_thing_that_is_far_away_is_kept():
-    # Alone in its image, whatever its size; beside something large from 1% of the image on.
-    for radius in (0.4, 1.0, 2.0, 5.0):
-        for centre in ((0.5, 0.5), (0.1, 0.8)):
-            alpha = disc(radius, 400, centre)
-            assert torch.equal(silhouette_of(alpha), alpha >= FAINT), radius
-    pair = torch.maximum(disc(2.4, 400, (0.1, 0.1)), disc(1.0, 400, (0.2, 0.2)))
-    assert torch.equal(silhouette_of(pair), pair >= FAINT)
-    pair = torch.maximum(disc(80, 400, (0.6, 0.6)), disc(2.4, 400, (0.1, 0.1)))
-    assert torch.equal(silhouette_of(pair), pair >= VISIBLE)
 
 
 def test_what_is_faint_all_over_is_kept_without_its_noise():
@@ -188,12 +176,8 @@ def blurred(images):
 
 
 MATTES = {
-    "noise on 0.01%": noisy(1e-4),
-    "noise on 1%": noisy(0.01),
-    "stronger noise on 1%": noisy(0.01, alpha=12),
+    "strong noise on 1%": noisy(0.01, alpha=12),
     "noise everywhere": noisy(1.0, alpha=8),
-    "specks": speckled,
-    "soft edges": blurred,
     "all of it": lambda images: noisy(0.01)(speckled(blurred(images))),
 }
 
@@ -293,13 +277,6 @@ def test_a_wire_stays_in_the_cube_and_in_the_grid(thickness):
         assert frame.points(points).abs().max() <= 1
         assert may_hold(seen, points, radius=0.5 * pixel).all()
     assert half_side(views) < 1.1 * WIRE
-
-
-def test_a_faint_sphere_is_not_carved_away():
-    for peak in (0.04, 0.1):
-        views = painted(clean(), lambda images, peak=peak: (peak * images.float()).round().byte())
-        assert half_side(views) == pytest.approx(half_side(clean()), rel=0.02)
-        assert occupied_share(views) == pytest.approx(occupied_share(clean()), abs=0.02)
 
 
 def test_images_are_opaque_where_the_silhouette_is_all_of_them():

@@ -19,14 +19,9 @@ from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.evaluation.inspect import choose
-from xplanes.lrm.canonical import OPENLRM_VIEW
-from xplanes.models.initialisation import Method, Place
 from xplanes.optional import MissingExtraError
-from xplanes.preparation.cache import StageCache
-from xplanes.preparation.fixed_view import fixed_view
 from xplanes.scenes import store
 from xplanes.scenes import videos as recordings
-from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.multicamera import MultiCameraSettings, read_cameras
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Views
@@ -166,8 +161,9 @@ def test_folders_of_images_keep_every_pixel(tmp_path: Path) -> None:
         assert torch.equal(again.splits["train"].in_memory(), scene.splits["train"].in_memory())
 
 
-@pytest.mark.parametrize("inner", ["images", "4x", "rgb/full"])
-@pytest.mark.parametrize("name", ["cam{:02d}", "{:04d}", "view_{}"])
+@pytest.mark.parametrize(
+    ("inner", "name"), [("images", "{:04d}"), ("4x", "view_{}"), ("rgb/full", "cam{:02d}")]
+)
 def test_folders_of_cameras_may_have_other_names_and_levels(tmp_path, inner, name) -> None:
     plain = neural_3d_video(tmp_path / "plain", write_images, "")
     folder = tmp_path / "deeper"
@@ -288,18 +284,6 @@ def test_the_video_is_that_of_a_training_camera(videos: Path) -> None:
         read(videos, video_camera="cam00")
     with pytest.raises(SceneError, match=r"video_camera=cam9: there is no such.*cam01, cam02"):
         read(videos, video_camera="cam9")
-
-
-def test_the_lrm_sees_that_video_as_it_is_if_it_is_asked_for(videos: Path) -> None:
-    scene = read(videos, video_camera="cam02")
-    settings = ["lrm=tiny", "preparation.frames=3", "preparation.fixed_view=video"]
-    method = Method.read(compose_plain("train", settings))
-    place = Place(scene, scene_frame(scene.splits["train"]), torch.device("cpu"))
-    made = fixed_view(method, place, OPENLRM_VIEW, 24, StageCache(None))
-    assert made.seconds == 0
-    assert [file[:5] for file in made.views.files] == ["cam02"] * 3
-    assert made.views.times.tolist() == pytest.approx([0, 0.4, 1])
-    assert torch.equal(made.views.image(2), scene.video.image(FRAMES - 1))
 
 
 def test_large_captures_are_kept_on_disk(videos: Path, tmp_path: Path, monkeypatch, capsys) -> None:

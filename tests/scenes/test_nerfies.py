@@ -88,24 +88,6 @@ def test_the_smallest_images_that_are_large_enough(capture):
     refused(capture, "resolution", resolution=40)
 
 
-def test_the_world_is_turned_upright(capture):
-    np.save(capture.path / "points.npy", np.array([[1.0, 2.0, 3.0]]))
-    plain, turned = read(capture, "train"), read(capture, "train", orient=True)
-    assert plain.points.numpy() == pytest.approx((np.array([[1, 2, 3]]) - CENTRE) * SCALE)
-    before, after = (scene.splits["train"].camera_to_world for scene in (plain, turned))
-    torch.testing.assert_close(
-        before[0].inverse() @ before, after[0].inverse() @ after, atol=1e-5, rtol=0
-    )
-    seen = [
-        (scene.points[0] - poses[0, :3, 3]) @ poses[0, :3, :3]
-        for scene, poses in ((plain, before), (turned, after))
-    ]
-    torch.testing.assert_close(*seen, atol=1e-5, rtol=0)
-    whole = read(capture, "train", "val", orient=True).splits
-    up = torch.cat([whole[name].camera_to_world[:, :3, 1] for name in whole]).mean(dim=0)
-    assert up[:2].abs().max() < 1e-6
-
-
 def test_both_names_of_tangential_distortion(capture):
     first = read(capture, "train").splits["train"].image_rays(0)[1]
     for name in capture.ids:
@@ -162,18 +144,6 @@ def test_splits(capture):
     assert [len(splits[name]) for name in ("train", "val")] == [4, 2]
     with pytest.raises(MissingSplitError, match=r"has no test split.*train, val"):
         read(capture, "test")
-
-
-def test_masks_are_used_when_they_are_named(capture):
-    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
-    mask[:, :10] = 0
-    for name in capture.ids:
-        save(capture.path / "masks" / "1x" / f"{name}.png", mask)
-    assert read(capture).splits["train"].image(0)[..., 3].min() == 255
-    image = read(capture, masks="masks", mask_use="alpha").splits["val"].image(1)
-    assert not image[:, :10].any()
-    assert np.array_equal(image[:, 10:, :3], picture(3)[:, 10:])
-    refused(capture, r"data\.masks: .*other does not exist", masks="other")
 
 
 def test_captures_that_are_not_whole(capture):

@@ -4,7 +4,6 @@ import json
 import logging
 import math
 import unicodedata
-import warnings
 from functools import partial
 from pathlib import Path
 
@@ -17,15 +16,12 @@ from tests.balls import ball_views, surrounding
 from tests.captures import settings
 from tests.lens_oracle import direction
 from tests.refusals import assert_refused
-from xplanes.components import build
-from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.scenes import store
 from xplanes.scenes.batches import RayBatches, ViewBatches, ViewSettings
 from xplanes.scenes.datamodule import UNIFORM, SceneDataModule, whole_view
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.nerfstudio import NerfstudioSettings
-from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import joined
 from xplanes.streams import step_generator
 from xplanes.training.scores import score_image
@@ -211,30 +207,6 @@ def test_times_from_0_to_1_stay(capture, caplog):
     capture.refused("time is 'soon'; it must be a number in any unit")
 
 
-def test_images_of_several_sizes_and_widths(capture):
-    for index in (1, 4):
-        path = capture.path / capture.frames[index]["file_path"]
-        with Image.open(path) as picture:
-            picture.resize((48, 36)).save(path)
-    assert "another aspect ratio" in capture.refused("cropped or turned", resolution=12)
-    for index in (1, 4):
-        capture.frames[index] |= {"h": 18, "cy": 9.0}
-    views = capture.read(resolution=12, eval_every=100).splits["train"]
-    assert [views.size(index) for index in range(3)] == [(12, 12), (9, 12), (12, 12)]
-    assert views.intrinsics.focal[1].tolist() == pytest.approx([FOCAL / 2, FOCAL / 2])
-
-
-def test_masks_bound_the_scene(capture):
-    mask = Image.fromarray(np.tri(SIZE, dtype=np.uint8) * 255)
-    mask.save(capture.path / "mask.png")
-    for frame in capture.frames:
-        frame["mask_path"] = "mask.png"
-    views = capture.read(eval_every=100, mask_use="alpha").splits["train"]
-    for index in range(10):
-        expected = capture.views.image(index) * torch.ones(SIZE, SIZE).tril()[..., None]
-        assert torch.equal(views.image(index), expected.byte())
-
-
 def label_masks():
     """Masks as programs write them; all mean the lower triangle."""
     inside = np.tri(SIZE, dtype=np.uint8)
@@ -264,20 +236,6 @@ def test_masks_of_labels_colours_and_alpha_mean_what_they_show(capture, kind):
     views = capture.read(eval_every=100, mask_use="alpha").splits["train"]
     expected = capture.views.image(0) * torch.ones(SIZE, SIZE).tril()[..., None]
     assert torch.equal(views.image(0), expected.byte())
-
-
-def test_soft_masks_stay_soft(capture):
-    values = np.linspace(0, 255, SIZE * SIZE).reshape(SIZE, SIZE).astype(np.uint8)
-    Image.fromarray(values).convert("RGB").save(capture.path / "mask.jpg", quality=100)
-    for frame in capture.frames:
-        frame["mask_path"] = "mask.jpg"
-    read = capture.read(eval_every=100, mask_use="alpha").splits["train"]
-    alpha = read.image(0)[..., 3].float()
-    expected = torch.from_numpy(values) * (capture.views.image(0)[..., 3] > 0)
-    off = (alpha - expected).abs()
-    # Nearly black and white are black and white in a lossy format.
-    assert float(off.max()) <= 11
-    assert float(off[(expected > 11) & (expected < 244)].max()) <= 3
 
 
 def masked(capture, values, ending="png", of=lambda index: True, **options):
@@ -454,27 +412,11 @@ def test_all_masks_of_a_capture_have_one_scale(capture):
     assert views.image(0)[SIZE // 2, SIZE // 2, 3] == 255
 
 
-def test_numbers_of_many_things_are_labels(capture):
-    values = disc() // 255 * np.arange(1, SIZE + 1, dtype=np.uint8)
-    masked(capture, values)
-    views = capture.read(eval_every=100).splits["train"]
-    solid = capture.views.image(0)[..., 3] > 0
-    assert torch.equal(views.image(0)[..., 3] > 0, solid & torch.from_numpy(disc() > 0))
-
-
 @pytest.mark.parametrize("count", [1, 2])
 def test_of_very_few_frames_none_can_be_held_out(tmp_path, count):
     capture = Capture(tmp_path / "few", count)
     message = capture.refused("never held out", splits=("val",), error=MissingSplitError)
     assert "data.eval_every" not in message
-
-
-def test_names_without_ending_find_upper_case_files(capture):
-    for frame in capture.frames:
-        path = capture.path / frame["file_path"]
-        path.rename(path.with_suffix(".PNG"))
-        frame["file_path"] = frame["file_path"].removesuffix(".png")
-    assert len(capture.read(eval_every=100).splits["train"]) == 10
 
 
 def test_a_mark_at_the_start_and_a_missing_last_row_are_read(tmp_path):
@@ -539,13 +481,6 @@ def test_the_command_lines_settings_read_a_capture(capture):
     assert {name: len(views) for name, views in data.scene.splits.items()} == {"train": 8, "val": 2}
     assert data.test_split == "val"
     assert data.scene.splits["train"].outline == "12x12 px"
-
-
-def test_blender_is_the_reader_of_dnerf():
-    dnerf, blender = (
-        compose_plain("train", [f"data={name}"])["data"] for name in ("dnerf", "blender")
-    )
-    assert {key for key in dnerf if dnerf[key] != blender[key]} == {"name", "root"}
 
 
 def test_lenses_and_poses_of_many_cameras_stay_with_their_images(capture):
@@ -640,21 +575,6 @@ def test_images_elsewhere_or_one_folder_deeper(capture):
     assert found == tuple(f"images/{file}" for file in expected)
 
 
-def test_keys_that_say_nothing_are_not_named(capture):
-    capture.content |= {"rolling_shutter": [0, 0.0, [0]], "black_transparent": False, "sharpen": 0}
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        capture.read()
-
-
-def test_where_times_come_from_is_told(capture):
-    capture.timed([7 + 2 * i for i in range(10)], "timestamp")
-    assert capture.read().notes["times"] == (
-        '"timestamp" of transforms.json, from 7 to 25: images/frame_00000.png -> 7, '
-        "images/frame_00004.png -> 15, images/frame_00009.png -> 25"
-    )
-
-
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-32"])
 def test_a_file_in_another_encoding_is_read(capture, encoding):
     (capture.path / "images").rename(capture.path / "bildér")
@@ -705,18 +625,3 @@ def test_a_name_that_several_images_have_is_none_of_them(capture):
     # The one of the same name but for case is the one.
     path.with_suffix(".tif").rename(path.with_suffix(".pNg"))
     assert len(capture.read(eval_every=100).splits["train"]) == 10
-
-
-@pytest.mark.parametrize("count", [1, 5])
-def test_a_few_images_are_trained_on_and_scored(tmp_path, count):
-    few = Capture(tmp_path / "few", count)
-    few.read()
-    settings = {**compose_plain("train", ["data=nerfstudio"])["data"], "resolution": None}
-    settings |= {"root": str(tmp_path), "scene": "few"}
-    read = build(settings, SceneSettings, "data").read
-    if count == 1:
-        with pytest.warns(UserWarning, match="1 images are too few to hold some out"):
-            splits = read().splits
-        assert splits["val"].files == splits["train"].files
-    else:
-        assert len(read().splits["train"]) + len(read().splits["val"]) >= count

@@ -115,19 +115,3 @@ def test_images_of_nothing_rule_out_what_they_see():
     assert not silhouette_hull(empty, inside_ball(50, 0.3), radius=0.02).any()
     full = replace(views, images=torch.full_like(views.images, 255))
     assert silhouette_hull(full, inside_ball(50, 0.3), radius=0.02).all()
-
-
-def test_the_order_of_the_views_does_not_matter():
-    views = ball_views(40, 0.4, centre=swinging(0.6, 1), size=24)
-    order = torch.randperm(40, generator=torch.Generator().manual_seed(1))
-    points = grid_points(cells=6)
-    straight = silhouette_hull(views, points, radius=0.05)
-    assert torch.equal(silhouette_hull(views.subset(order), points, radius=0.05), straight[order])
-
-
-def test_images_need_not_be_square():
-    views = ball_views(8, 0.5, size=30, times=torch.zeros(8))
-    middle = views.images[:, 5:25]  # rows: same focal length
-    cut = replace(views, images=middle, intrinsics=focal_of(views))
-    points = inside_ball(300, 0.5)
-    assert silhouette_hull(cut, points, radius=0.05).all()

@@ -1,27 +1,16 @@
-"""Fast compositing in float64 NumPy, checked against tests.oracles."""
+"""Planes of every size, and errors as shares of the largest expected value."""
 
 import numpy as np
+import torch
 
 
-def composite(optical_depth, colour, distances, upstream):
-    """One ray by Beer and Lambert, and the gradient of ``sum(total * upstream)``.
-
-    Args:
-        optical_depth: [N]
-        colour: [N, 3]
-        distances: [N]
-        upstream: [5]
-
-    Returns:
-        total [5], weights [N], gradients of depth [N] and of colour [N, 3]
-    """
-    before = np.cumsum(optical_depth) - optical_depth
-    weights = np.exp(-before) * -np.expm1(-optical_depth)
-    values = np.concatenate([colour, np.ones_like(distances)[:, None], distances[:, None]], axis=1)
-    value = values @ upstream
-    behind = np.cumsum((weights * value)[::-1])[::-1] - weights * value
-    d_depth = np.exp(-before - optical_depth) * value - behind
-    return weights @ values, weights, d_depth, weights[:, None] * upstream[:3]
+def spread(shape, value, generator):
+    """Random planes of a size; "mixed" holds zeros and 1e-30 to 1e15 of both signs at once."""
+    planes = torch.randn(shape, generator=generator, dtype=torch.float64)
+    if value == "mixed":
+        exponents = torch.randint(-30, 16, shape, generator=generator).double()
+        return planes.sign() * 10.0**exponents * (planes.abs() > 0.1)
+    return planes * value
 
 
 def worst(ours, theirs, least=1e-12):

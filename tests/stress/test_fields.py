@@ -4,14 +4,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import settings as options
-from hypothesis import strategies as st
 
 from tests.stress.models import settings, trained
-from tests.stress.references import worst
+from tests.stress.references import spread
 from tests.stress.scenes import write_scene
-from tests.stress.test_lookup import spread
 from xplanes.fields import Decoder, XPlanes
 from xplanes.fields.xplanes import SPACE_PLANES, TIME_PLANES
 from xplanes.preparation.sequence import TriplaneSequence, save_triplanes
@@ -60,41 +56,6 @@ def test_planes_of_every_size(tally, plane_set, precision, density) -> None:
             field = field_of(value, plane_set, number, density, dtype)
             rendering, gradients = seen(field, samples)
             tally.finite(rendering.colour, rendering.opacity, rendering.depth, *gradients)
-
-
-def test_bfloat16_stays_near_float64(tally) -> None:
-    """Fields: colours of the bfloat16 decoder against float64"""
-    for value in (0.0, 1e-30, 0.1, 1.0):
-        half, _ = seen(field_of(value, "six", "bf16", "softplus"), 64)
-        exact, _ = seen(field_of(value, "six", "32", "softplus", torch.float64), 64)
-        tally.finite(half.colour)
-        tally.error(worst(half.colour.detach(), exact.colour.detach()), 0.02)
-
-
-def test_float32_stays_near_float64(tally) -> None:
-    """Fields: colours and gradients of float32 against float64"""
-    for value in (0.0, 1e-30, 0.1, 1.0, 10.0):
-        for plane_set in ("three", "six", "nine"):
-            single, gradients = seen(field_of(value, plane_set, "32", "softplus"), 64)
-            exact, expected = seen(field_of(value, plane_set, "32", "softplus", torch.float64), 64)
-            tally.finite(single.colour, *gradients)
-            tally.error(worst(single.colour.detach(), exact.colour.detach()), 1e-4)
-            for ours, theirs in zip(gradients, expected, strict=True):
-                tally.error(worst(ours, theirs, 1e-20), 2e-3)
-
-
-def test_drawn_fields(tally) -> None:
-    """Fields: drawn sizes of planes, density scales and samples"""
-
-    @options(max_examples=150, deadline=None, derandomize=True, database=None)
-    @given(st.floats(-30, 4), st.floats(-30, 8), st.integers(1, 1024))
-    def case(exponent, scale, samples):
-        field = field_of(10**exponent, "six", "32", "softplus")
-        field.decoder.density_scale = 10**scale
-        rendering, gradients = seen(field, samples, rays=4)
-        tally.finite(rendering.colour, rendering.depth, *gradients)
-
-    case()
 
 
 @pytest.mark.parametrize("frames", [1, 6, 300])

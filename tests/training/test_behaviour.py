@@ -2,9 +2,7 @@
 
 import csv
 import json
-import shutil
 import signal
-import time
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,15 +16,12 @@ from tests.training.runs import small_config
 from xplanes.errors import ConfigError
 from xplanes.files import read_rows
 from xplanes.models.initialisation import STAGES
-from xplanes.rendering import warming
-from xplanes.rendering.grid_renderer import OccupancySampler
 from xplanes.run import run
 from xplanes.scenes import store
-from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.batches import RayBatches
 from xplanes.training import evaluation, fit
 from xplanes.training.checkpoints import AtomicCheckpointIO
 from xplanes.training.clock import TrainingClock
-from xplanes.training.diagnosis import TrainingError
 from xplanes.training.evaluation import Evaluation
 from xplanes.training.module import RadianceModule
 
@@ -49,11 +44,6 @@ def exact(folder: Path) -> dict:
     content = metrics(folder)
     kept = ("test", "views", "step", "skipped", "samples_per_ray", "parameters")
     return {name: content[name] for name in kept}
-
-
-@pytest.fixture
-def trained(trained_run: Path) -> Path:
-    return trained_run
 
 
 @dataclass
@@ -88,138 +78,92 @@ def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Watched:
     return notes
 
 
-def test_run_directory_holds_what_it_promises(trained: Path) -> None:
+def test_run_directory_holds_what_it_promises(trained_run: Path) -> None:
     for name in (
         "config.yaml overrides.txt run.json metrics.json curve.csv train.log "
         "checkpoints/last.ckpt checkpoints/best.ckpt media/planes.png"
     ).split():
-        assert (trained / name).is_file(), name
-    events = EventAccumulator(str(trained / "tb"))
+        assert (trained_run / name).is_file(), name
+    events = EventAccumulator(str(trained_run / "tb"))
     events.Reload()
     scored = [(str(e.step), f"{e.value:.4f}") for e in events.Scalars("val/psnr")]
-    rows = read_rows(trained / "curve.csv")
+    rows = read_rows(trained_run / "curve.csv")
     assert scored == [(row["step"], row["psnr"]) for row in rows]
-    content = metrics(trained)
+    content = metrics(trained_run)
     assert content["split"] == "test"
-    assert len(content["views"]) == 3
+    scores = [view["psnr"] for view in content["views"]]
+    assert len(scores) == 3
+    assert content["test"]["psnr"] == pytest.approx(sum(scores) / len(scores), abs=1e-9)
     assert "warm_up" in content["seconds"]
     assert set(content["seconds"]["prepare"]) == set(STAGES)
     assert content["seconds"]["prepare"]["fill"] == 0  # Random initialisation fills nothing.
     assert set(content["skipped"]) >= {"empty", "occluded", "background"}
     assert all(0 <= share <= 1 for share in content["skipped"].values())
     # Validation views on the way, test views at the end.
-    assert {row["split"] for row in curve(trained)} == {"val"}
+    assert {row["split"] for row in curve(trained_run)} == {"val"}
     assert [view["file"].split("/")[-2] for view in content["views"]] == ["test"] * 3
-    record = status(trained)
+    record = status(trained_run)
     assert record["status"] == "finished"
     assert len(record["files"]["train"]) == 10
 
 
-def test_score_is_the_mean_of_the_views_scores(trained: Path) -> None:
-    content = metrics(trained)
-    scores = [view["psnr"] for view in content["views"]]
-    assert content["test"]["psnr"] == pytest.approx(sum(scores) / len(scores), abs=1e-9)
+def stopped_at(
+    steps: tuple[int, ...], config: dict, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run that fails after each of these steps, and is resumed each time."""
+    original = TrainingClock.on_train_batch_end
+    stop = 0
+
+    def break_down(self, trainer, module, *rest) -> None:
+        original(self, trainer, module, *rest)
+        if trainer.global_step == stop:
+            raise OSError("power cut")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingClock, "on_train_batch_end", break_down)
+        for stop in steps:
+            with pytest.raises(OSError, match="power cut"):
+                run(config, folder, [], resume=stop != steps[0])
+            assert status(folder)["status"] == "failed"
 
 
-def test_same_seed_gives_the_same_numbers(trained: Path, watched: Watched) -> None:
-    assert exact(watched.folder) == exact(trained)
-
-
-def test_another_seed_gives_other_numbers(trained: Path, scenes: Path, tmp_path: Path) -> None:
-    config = small_config(scenes, "seed=1", "trainer.max_steps=2", "callbacks.evaluation.at=[0]")
-    run(config, tmp_path / "other", [], resume=False)
-    assert curve(tmp_path / "other")[0]["psnr"] != curve(trained)[0]["psnr"]
+def same(folder: Path, whole: Path) -> None:
+    """Two runs have the same numbers; the seconds of their curves are the clock's."""
+    assert status(folder)["status"] == "finished"
+    assert exact(folder) == exact(whole)
+    assert [(r["step"], r["psnr"]) for r in curve(folder)] == [
+        (r["step"], r["psnr"]) for r in curve(whole)
+    ]
 
 
 def test_a_run_resumed_after_failures_equals_an_uninterrupted_one(
-    trained: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    trained_run: Path, watched: Watched, scenes: Path, tmp_path: Path, monkeypatch
 ) -> None:
     """It fails between checkpoints, at one with an evaluation, and between later ones."""
-    original = TrainingClock.on_train_batch_end
-    stop = 0
-
-    def break_down(self, trainer, module, *rest) -> None:
-        original(self, trainer, module, *rest)
-        if trainer.global_step == stop:
-            raise OSError("power cut")
-
-    folder = tmp_path / "broken"
-    with monkeypatch.context() as patch:
-        patch.setattr(TrainingClock, "on_train_batch_end", break_down)
-        for stop in (13, 20, 27):
-            with pytest.raises(OSError, match="power cut"):
-                run(small_config(scenes), folder, [], resume=stop > 13)
-            assert status(folder)["status"] == "failed"
-    run(small_config(scenes), folder, [], resume=True)
-    assert status(folder)["status"] == "finished"
-    assert exact(folder) == exact(trained)
-    # Seconds are the clock's; all else of the curve must agree.
-    assert [(r["step"], r["psnr"]) for r in curve(folder)] == [
-        (r["step"], r["psnr"]) for r in curve(trained)
-    ]
+    folder, config = tmp_path / "broken", small_config(scenes)
+    stopped_at((13, 20, 27), config, folder, monkeypatch)
+    run(config, folder, [], resume=True)
+    same(folder, trained_run)
+    same(watched.folder, trained_run)
 
 
-def test_a_run_resumed_in_a_later_epoch_equals_an_uninterrupted_one(
+def test_a_run_on_images_from_disk_resumes_in_a_later_epoch(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An epoch is ten batches here. It fails at the end of one, and in the middle of another."""
-    config = small_config(scenes, "model.rays.per_batch=1024", "callbacks.checkpoints.every=6")
-    run(config, tmp_path / "whole", [], resume=False)
-    original = TrainingClock.on_train_batch_end
-    epochs, stop = set(), 0
-
-    def break_down(self, trainer, module, *rest) -> None:
-        original(self, trainer, module, *rest)
-        epochs.add(trainer.current_epoch)
-        if trainer.global_step == stop:
-            raise OSError("power cut")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(TrainingClock, "on_train_batch_end", break_down)
-        for stop in (20, 31):
-            with pytest.raises(OSError, match="power cut"):
-                run(config, tmp_path / "broken", [], resume=stop > 20)
-        stop = 0
-        run(config, tmp_path / "broken", [], resume=True)
-    assert epochs == {0, 1, 2, 3}
-    assert exact(tmp_path / "broken") == exact(tmp_path / "whole")
-
-
-def test_a_resumed_run_on_images_from_disk_equals_an_uninterrupted_one(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """After the second failure the decoded images are gone, and are decoded again."""
+    """An epoch is ten batches; the decoded images are gone and are decoded again."""
     monkeypatch.setattr(store, "IN_MEMORY", 0)
-    cache = tmp_path / "cache"
-    config = small_config(scenes, f"data.cache={cache}", "trainer.max_steps=30")
-    run(config, tmp_path / "whole", [], resume=False)
-    tiles = sorted(cache.glob("*.tiles"))
-    assert [path.stat().st_size for path in tiles]
-    original = TrainingClock.on_train_batch_end
-    stop = 0
-
-    def break_down(self, trainer, module, *rest) -> None:
-        original(self, trainer, module, *rest)
-        assert trainer.datamodule.scene.splits["train"].is_stored
-        if trainer.global_step == stop:
-            raise OSError("power cut")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(TrainingClock, "on_train_batch_end", break_down)
-        for stop in (13, 21):
-            with pytest.raises(OSError, match="power cut"):
-                run(config, tmp_path / "broken", [], resume=stop > 13)
-        for path in tiles:
-            path.unlink()
-        stop = 0
-        run(config, tmp_path / "broken", [], resume=True)
-    assert sorted(cache.glob("*.tiles")) == tiles
-    assert exact(tmp_path / "broken") == exact(tmp_path / "whole")
-    rows = [
-        [(row["step"], row["psnr"]) for row in curve(tmp_path / name)]
-        for name in ("broken", "whole")
-    ]
-    assert rows[0] == rows[1]
+    cache, folder, whole = (tmp_path / name for name in ("cache", "broken", "whole"))
+    every = ("model.rays.per_batch=1024", "callbacks.checkpoints.every=6")
+    config = small_config(scenes, f"data.cache={cache}", *every)
+    run(config, whole, [], resume=False)
+    files = sorted(cache.glob("*.pixels"))
+    assert [path.stat().st_size for path in files]
+    stopped_at((20, 31), config, folder, monkeypatch)
+    for path in files:
+        path.unlink()
+    run(config, folder, [], resume=True)
+    assert sorted(cache.glob("*.pixels")) == files
+    same(folder, whole)
 
 
 def interrupt_where(
@@ -268,7 +212,7 @@ def test_an_interrupt_waits_for_the_update_of_its_batches(
 
 
 def test_interrupt_saves_the_step_it_stopped_at_and_its_evaluation_is_done_again(
-    trained: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    trained_run: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The evaluation at step 20 is due then.
     interrupt_where(lambda module: module.global_step == 20, monkeypatch)
@@ -285,31 +229,12 @@ def test_interrupt_saves_the_step_it_stopped_at_and_its_evaluation_is_done_again
     monkeypatch.undo()
     run(config, folder, [], resume=True)
     assert [row["step"] for row in curve(folder)] == ["0", "21", "40"]
-    assert exact(folder) == exact(trained)
+    assert exact(folder) == exact(trained_run)
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
 
 
-def test_an_interrupt_after_an_evaluation_leaves_the_best(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    original = Evaluation.on_validation_end
-
-    def press(self, trainer, *rest) -> None:
-        original(self, trainer, *rest)
-        if trainer.global_step == 20:
-            signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(Evaluation, "on_validation_end", press)
-    folder = tmp_path / "stopped"
-    with pytest.raises(KeyboardInterrupt):
-        run(small_config(scenes), folder, [], resume=False)
-    for name in ("last", "best"):
-        state = torch.load(folder / "checkpoints" / f"{name}.ckpt", weights_only=True)
-        assert state["global_step"] == (21 if name == "last" else 20), name
-
-
 def test_a_final_evaluation_that_was_interrupted_is_made_up_for(
-    trained: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    trained_run: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Though not a step is left to train."""
     original = Evaluation.on_validation_start
@@ -326,14 +251,11 @@ def test_a_final_evaluation_that_was_interrupted_is_made_up_for(
     assert [row["step"] for row in curve(folder)] == ["0", "20"]
     monkeypatch.undo()
     run(small_config(scenes), folder, [], resume=True)
-    assert [(r["step"], r["psnr"]) for r in curve(folder)] == [
-        (r["step"], r["psnr"]) for r in curve(trained)
-    ]
-    assert exact(folder) == exact(trained)
+    same(folder, trained_run)
     for name in ("last", "best"):
         ours, theirs = (
             torch.load(place / "checkpoints" / f"{name}.ckpt", weights_only=True)
-            for place in (folder, trained)
+            for place in (folder, trained_run)
         )
         assert ours["global_step"] == theirs["global_step"], name
         for key, value in theirs["state_dict"].items():
@@ -398,16 +320,11 @@ def test_more_gpus_than_there_are_are_refused_at_once(
         run(small_config(scenes, "trainer=ddp"), tmp_path / "run", [], resume=False)
 
 
-def test_folder_with_a_run_is_refused_without_resume(trained: Path, scenes: Path) -> None:
-    before = (trained / "metrics.json").read_bytes()
+def test_folder_with_a_run_is_refused_without_resume(trained_run: Path, scenes: Path) -> None:
+    before = (trained_run / "metrics.json").read_bytes()
     with pytest.raises(ConfigError, match="holds a run already"):
-        run(small_config(scenes), trained, [], resume=False)
-    assert (trained / "metrics.json").read_bytes() == before
-
-
-def test_checkpoint_holds_only_tensors_and_builtins(trained: Path) -> None:
-    state = torch.load(trained / "checkpoints" / "last.ckpt", weights_only=True)
-    assert state["progress"]["batches"] == 40
+        run(small_config(scenes), trained_run, [], resume=False)
+    assert (trained_run / "metrics.json").read_bytes() == before
 
 
 def test_few_shot_run_names_its_views_and_accumulated_batches_make_one_step(
@@ -429,88 +346,10 @@ def test_few_shot_run_names_its_views_and_accumulated_batches_make_one_step(
     assert (state["global_step"], state["progress"]["batches"]) == (4, 8)
 
 
-def test_non_finite_loss_is_skipped_then_diagnosed(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    original = RadianceModule.on_train_batch_start
-
-    def spoil(self, batch, batch_idx) -> None:
-        original(self, batch, batch_idx)
-        if self.global_step == 5:
-            with torch.no_grad():
-                self.field.space.fill_(float("nan"))
-
-    monkeypatch.setattr(RadianceModule, "on_train_batch_start", spoil)
-    folder = tmp_path / "spoiled"
-    with pytest.raises(TrainingError, match=r"at step 10: field\.space\..*model\.plane_lr"):
-        run(small_config(scenes, "callbacks.evaluation.at=[]"), folder, [], resume=False)
-    assert status(folder)["status"] == "failed"
-    assert "field" not in status(folder)["reason"].split(":")[0]
-
-
-@pytest.fixture
-def bad_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One of the pixels of the fourth batch is not a number."""
-    from xplanes.scenes.batches import RayBatches
-
-    original = RayBatches.draw
-
-    def spoil(self, step: int, *rest):
-        batch = original(self, step, *rest)
-        if step == 3:
-            batch["target"][0] = float("nan")
-        return batch
-
-    monkeypatch.setattr(RayBatches, "draw", spoil)
-
-
-def test_one_bad_batch_costs_one_step(scenes: Path, tmp_path: Path, bad_batch) -> None:
-    config = small_config(scenes, "trainer.max_steps=6", "callbacks.evaluation.at=[]")
-    run(config, tmp_path / "one", [], resume=False)
-    content = metrics(tmp_path / "one")
-    assert (content["steps_skipped"], content["step"]) == (1, 6)
-
-
-def test_a_bad_batch_takes_those_of_its_update_along(
-    scenes: Path, tmp_path: Path, bad_batch
-) -> None:
-    config = small_config(
-        scenes,
-        "trainer.accumulate_grad_batches=2",
-        "trainer.max_steps=3",
-        "callbacks.evaluation.at=[]",
-    )
-    run(config, tmp_path / "run", [], resume=False)
-    content = metrics(tmp_path / "run")
-    assert (content["steps_skipped"], content["step"]) == (1, 3)
-    state = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
-    assert {float(each["step"]) for each in state["optimizer_states"][0]["state"].values()} == {2}
-
-
-def test_scene_of_one_timestep_trains_without_time_planes(scenes: Path, tmp_path: Path) -> None:
-    config = small_config(tmp_path, "trainer.max_steps=2", "callbacks.evaluation.at=[]")
-    original = SceneDataModule(config["data"] | {"root": str(scenes)}).settings.folder
-    folder = Path(shutil.copytree(original, tmp_path / original.name))
-    for path in folder.glob("transforms_*.json"):
-        content = json.loads(path.read_text())
-        for frame in content["frames"]:
-            del frame["time"]
-        path.write_text(json.dumps(content))
-    dnerf = {"_target_": "xplanes.scenes.dnerf.BlenderSettings", "name": "dnerf"}
-    static = dict(config, data=config["data"] | dnerf)
-    for name in ("seed", "train_views", "test_views", "val_views"):
-        del static["data"][name]
-    static["data"].update(scene=folder.name)
-    run(static, tmp_path / "static", [], resume=False)
-    state = torch.load(tmp_path / "static" / "checkpoints" / "last.ckpt", weights_only=True)
-    assert "field.time" not in state["state_dict"]
-
-
 def test_a_scene_without_motion_has_no_time_planes(scenes: Path, tmp_path: Path) -> None:
     cases = {
         ("data.scene=still_life",): "frames are equal",
         ("data.scene=still_life", "data.static=false"): None,
-        ("data.scene=excavator",): None,
         ("data.scene=excavator", "data.static=true"): "data.static=true",
     }
     for overrides, reason in cases.items():
@@ -527,18 +366,26 @@ def test_a_scene_without_motion_has_no_time_planes(scenes: Path, tmp_path: Path)
         assert reason is None or reason in text, overrides
 
 
-def test_a_slow_warm_up_says_what_it_does(
-    scenes: Path, tmp_path: Path, monkeypatch, capsys
+def test_a_bad_batch_takes_those_of_its_update_along(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    render = OccupancySampler.render
+    original = RayBatches.draw
 
-    def slow(*args):
-        time.sleep(0.3)
-        return render(*args)
+    def spoil(self, step: int, *rest):
+        batch = original(self, step, *rest)
+        if step == 3:
+            batch["target"][0] = float("nan")
+        return batch
 
-    monkeypatch.setattr(warming, "PATIENCE", 0.05)
-    warming.say_why.cache_clear()
-    monkeypatch.setattr(OccupancySampler, "render", slow)
-    config = small_config(scenes, "trainer.max_steps=1", "callbacks.evaluation.at=[]")
+    monkeypatch.setattr(RayBatches, "draw", spoil)
+    config = small_config(
+        scenes,
+        "trainer.accumulate_grad_batches=2",
+        "trainer.max_steps=3",
+        "callbacks.evaluation.at=[]",
+    )
     run(config, tmp_path / "run", [], resume=False)
-    assert capsys.readouterr().out.count("compiling the inner loops") == 1
+    content = metrics(tmp_path / "run")
+    assert (content["steps_skipped"], content["step"]) == (1, 3)
+    state = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
+    assert {float(each["step"]) for each in state["optimizer_states"][0]["state"].values()} == {2}

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.baselines.runs import KPLANES, PROPOSAL, baseline_config
 from tests.training.runs import small_config
 from xplanes.errors import ConfigError
 from xplanes.models.base import background_opacity, opacity_error, opacity_shortfall
@@ -112,16 +111,6 @@ def test_a_dead_field_starts_again_once_and_then_a_warning_is_enough(
     assert fields[0].model.opacity == 1.0
 
 
-def test_a_baseline_is_left_as_published(
-    scenes: Path, tmp_path: Path, dead: None, caplog: pytest.LogCaptureFixture
-) -> None:
-    config = baseline_config(scenes, "model=kplanes", *KPLANES, *PROPOSAL, "trainer.max_steps=11")
-    run(config, tmp_path / "run", [], resume=False)
-    words = [r.getMessage() for r in caplog.records if "field shows nothing" in r.getMessage()]
-    assert ["again" in line for line in words] == [False]
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["restarts"] == 0
-
-
 def test_a_run_that_began_again_resumes_to_the_same_numbers(
     scenes: Path, tmp_path: Path, dead: None
 ) -> None:
@@ -176,20 +165,6 @@ def test_a_run_that_shows_nothing_says_so(
     assert metrics["test"]["floaters"] == 0
     with (tmp_path / "run" / "curve.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 2
-
-
-@pytest.mark.parametrize(("share", "said"), [(0.3, True), (0.1, False), (math.nan, False)])
-def test_a_run_full_of_floaters_says_so(
-    scenes: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    share: float,
-    said: bool,
-) -> None:
-    monkeypatch.setattr("xplanes.training.scores.floaters", lambda *_: share)
-    run(small_config(scenes, "trainer.max_steps=1"), tmp_path / "run", [], resume=False)
-    assert ("30% of the background is not empty" in capsys.readouterr().out) == said
 
 
 def test_blank_images_are_the_background() -> None:

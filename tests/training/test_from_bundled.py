@@ -1,7 +1,6 @@
 """Runs initialised from the bundled model, the default of `python train.py`."""
 
 import json
-import time
 from pathlib import Path
 
 import pytest
@@ -10,11 +9,7 @@ from tests.training.runs import composed, small_config
 from xplanes.evaluation.runs import load_run
 from xplanes.files import read_rows
 from xplanes.lrm.bundled import bundled_models
-from xplanes.rendering import grid_renderer
 from xplanes.run import run
-
-LONG = 10_000.0
-"""Seconds that no stage of a test takes."""
 
 SETTINGS = (
     "model.channels=32",
@@ -60,31 +55,6 @@ def test_it_knows_the_scene_before_the_first_step(train, random, tmp_path: Path,
     assert content["lrm"]["mismatch_pixels"]["largest"] < 0.1
     assert content["seconds"]["prepare"]["lrm"] > 0
     assert content["seconds"]["prepare"]["fill"] > 0
-
-
-def test_filling_the_grid_counts_once_and_as_preparation(train, tmp_path: Path, monkeypatch):
-    clock, ahead, fill = time.perf_counter, [0.0], grid_renderer.fill
-
-    def slow(*args, **named) -> None:
-        fill(*args, **named)
-        ahead[0] += LONG
-
-    monkeypatch.setattr(time, "perf_counter", lambda: clock() + ahead[0])
-    monkeypatch.setattr(grid_renderer, "fill", slow)
-    train(tmp_path / "run", "lrm=tiny", "trainer.max_steps=1")
-    seconds = told(tmp_path / "run")["seconds"]
-    named = seconds | seconds.pop("prepare")
-    total, filling = named.pop("total"), named.pop("fill")
-    assert LONG < filling < 2 * LONG
-    assert all(0 <= value < LONG for value in named.values()), named
-    # Nothing is counted twice, and nothing is left out.
-    assert sum(named.values()) + filling == pytest.approx(total, abs=0.01)
-
-
-def test_a_scene_of_one_timestep_needs_one_triplane(train, tmp_path: Path):
-    train(tmp_path / "run", "lrm=tiny", "data.views=1", "trainer.max_steps=1")
-    assert told(tmp_path / "run")["lrm"]["frames"] == 1
-    assert told(tmp_path / "run")["decomposition"] == {}
 
 
 def test_a_scene_without_motion_trains_as_a_static_one(train, tmp_path: Path):

@@ -21,8 +21,8 @@ from xplanes.run import run
 from xplanes.training import building, module
 from xplanes.training.checkpoints import find_resumable, load_checkpoint
 from xplanes.training.clock import TrainingClock
-from xplanes.training.diagnosis import TrainingError
-from xplanes.training.finite import (
+from xplanes.training.diagnosis import (
+    TrainingError,
     broken_flag,
     not_finite,
     unusable_gradients,
@@ -80,14 +80,11 @@ def spoil_gradient(monkeypatch: pytest.MonkeyPatch, value: float, steps: range) 
 
 
 def test_one_bad_gradient_costs_one_step(scenes, tmp_path, monkeypatch) -> None:
-    for value in (math.nan, math.inf, 1e25):
-        folder = tmp_path / f"{value}"
-        with monkeypatch.context() as patch:
-            spoil_gradient(patch, value, range(3, 4))
-            run(small_config(scenes, *FEW, "trainer.max_steps=6"), folder, [], resume=False)
-        content = json.loads((folder / "metrics.json").read_text())
-        assert (content["steps_skipped"], content["step"]) == (1, 6), value
-        assert not_finite(state(folder)["state_dict"].items()) == [], value
+    spoil_gradient(monkeypatch, 1e25, range(3, 4))
+    run(small_config(scenes, *FEW, "trainer.max_steps=6"), tmp_path, [], resume=False)
+    content = json.loads((tmp_path / "metrics.json").read_text())
+    assert (content["steps_skipped"], content["step"]) == (1, 6)
+    assert not_finite(state(tmp_path)["state_dict"].items()) == []
 
 
 def test_gradients_that_stay_bad_end_training_with_a_message(scenes, tmp_path, monkeypatch) -> None:
@@ -172,7 +169,9 @@ def test_an_added_loss_that_is_not_finite_is_named(scenes, tmp_path, first, more
 
 def test_a_term_of_the_loss_must_be_one_number(scenes, tmp_path, monkeypatch) -> None:
     for form in ("one", "number"):
-        run(with_loss(scenes, form=form), tmp_path / form, [], resume=False)
+        config = with_loss(scenes, form=form)
+        config["trainer"]["max_steps"] = 2
+        run(config, tmp_path / form, [], resume=False)
     said = refused(with_loss(scenes, form="rays"), tmp_path / "rays")
     words = r"losses\.mine: returned a tensor of shape \[\d+\]; return one number, such as its mean"
     assert re.fullmatch(words, said)

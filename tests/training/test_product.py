@@ -1,7 +1,5 @@
 """L_r in training: a gradient in closed form, unbiased from random frames, equal on all ranks."""
 
-import copy
-
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -86,36 +84,3 @@ def test_a_gradient_over_all_frames_makes_nothing_near_the_size_of_the_sparse_pa
     assert closed.largest < sparse.numel() / 8
     assert value.largest < sparse.numel() / 8
     assert twin.largest >= sparse.numel() / 3
-
-
-def test_copies_share_the_sparse_part():
-    product, planes, sparse = case()
-    twin = copy.deepcopy(product)
-    assert twin.sparse.data_ptr() == sparse.data_ptr()
-    assert twin.value(planes) == product.value(planes)
-
-
-def test_it_adds_to_what_is_there_and_leaves_the_planes_alone():
-    product, planes, _ = case()
-    parameter = torch.nn.Parameter(planes.clone())
-    first = torch.zeros_like(planes)
-    product.add_gradient(first, parameter, 1.0, step_generator(0, 3, 7))
-    second = torch.ones_like(planes)
-    product.add_gradient(second, parameter, 1.0, step_generator(0, 3, 7))
-    torch.testing.assert_close(second - 1, first, atol=1e-6, rtol=0)
-    assert parameter.grad is None
-    assert torch.equal(parameter, planes)
-
-
-def test_it_works_where_gradients_are_switched_off():
-    product, planes, _ = case()
-    gradient = torch.zeros_like(planes)
-    with torch.no_grad():
-        product.add_gradient(gradient, planes, 1.0, step_generator(0, 0, 7))
-    assert gradient.abs().max() > 0
-
-
-def test_the_value_is_the_same_at_each_call_and_exact_over_all_frames():
-    product, planes, sparse = case(count=FRAMES)
-    whole = sparse_product_loss(planes, sparse, torch.arange(FRAMES), rows=PLANE_SETS["six"])
-    assert product.value(planes) == product.value(planes) == pytest.approx(float(whole))

@@ -14,20 +14,19 @@ from tests.balls import ball_scene
 from tests.baselines.runs import KPLANES, PROPOSAL
 from tests.preparation.sequences import moving_sequence
 from tests.training.runs import SMALL, changed
+from xplanes.baselines.products import PlaneProducts, PlaneTerms
 from xplanes.baselines.tensor4d.model import FeatureSmoothness
 from xplanes.config import compose_plain
 from xplanes.decomposition import decompose, time_planes
 from xplanes.decomposition.sparse_loss import SparseProduct
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
-from xplanes.fields.products import PlaneProducts
-from xplanes.fields.regularisers import PlaneTerms
 from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 from xplanes.models.base import InitialValues
 from xplanes.models.initialisation import Initialisation
 from xplanes.preparation import TriplaneSequence, fixed_view, save_triplanes
 from xplanes.preparation.cache import StageCache
-from xplanes.preparation.stages import convert_stage, decompose_stage
+from xplanes.preparation.stages import convert_stage, decompose_stage, named_planes
 from xplanes.run import run
 from xplanes.streams import TrainingState
 from xplanes.training.module import RadianceModule
@@ -317,10 +316,7 @@ def test_a_run_logs_every_term_in_its_loss(model: str, scenes: Path, tmp_path: P
 
 
 SCENES = {
-    "ordinary": (),
-    "the user's cube": ("data.half_side=1.2",),
     "off centre": ("data=suite", "data.scene=off_centre"),
-    "ten times as large": ("data=suite", "data.scene=scale"),
 }
 NAMED = tuple(text for text in TINY if text != "lrm=none")
 
@@ -388,8 +384,9 @@ def test_its_conversion_keeps_the_middle_frame(tmp_path: Path) -> None:
     model = compose_plain("train", ["recipe=paper", "model=nine_planes", "model.time_resolution=4"])
     model["model"]["resolution"] = size
     settings = Experiment.read(model).method.model
-    planes = convert_stage(parts, settings, method.decomposition, 0, cache, device).planes
-    middle = parts.low_rank[len(sequence) // 2]
+    stage = convert_stage(parts, settings, method.decomposition, 0, cache, device)
+    planes = named_planes(stage, "nine")
+    middle = parts.content["low_rank"][len(sequence) // 2]
     for index, name in enumerate(("xy", "xz", "yz")):
         torch.testing.assert_close(planes[name], middle[index], rtol=0, atol=0)
     assert all((planes[name] == 1).all() for name in TIME_PLANES["nine"])

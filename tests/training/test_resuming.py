@@ -18,7 +18,7 @@ from xplanes.process import resume_command
 from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.dnerf import BlenderSettings
-from xplanes.training import scoring
+from xplanes.training import scores
 from xplanes.training.checkpoints import AtomicCheckpointIO
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import KEPT, RunRecord, require_same_settings
@@ -70,32 +70,6 @@ def test_a_run_is_not_resumed_with_other_settings(scenes: Path, folder: Path) ->
     assert (metrics["step"], len(metrics["views"])) == (8, 2)
 
 
-def test_what_planes_and_frame_depend_on_is_kept(tmp_path: Path) -> None:
-    for key in KEPT:
-        *groups, name = key.split(".")
-
-        before, now, without = {name: "this"}, {name: "that"}, {}
-        for group in reversed(groups):
-            before, now, without = {group: before}, {group: now}, {group: without}
-        with pytest.raises(ConfigError, match=rf"{key}=that: .* {key}=this"):
-            require_same_settings(tmp_path, before, now)
-        require_same_settings(tmp_path, before, before)
-        for values in ((before, None), (None, now)):  # null is a value like others.
-            pair = [_nested(groups, name, None) if v is None else v for v in values]
-            with pytest.raises(ConfigError, match=rf"{key}="):
-                require_same_settings(tmp_path, *pair)
-        # A setting that an older version did not have.
-        require_same_settings(tmp_path, without, now)
-        require_same_settings(tmp_path, {}, now)
-
-
-def _nested(groups: list[str], name: str, value: object) -> dict[str, Any]:
-    found: dict[str, Any] = {name: value}
-    for group in reversed(groups):
-        found = {group: found}
-    return found
-
-
 def test_a_run_is_not_resumed_with_other_images(scenes: Path, folder: Path) -> None:
     record = json.loads((folder / "run.json").read_text())
     record["files"]["train"].reverse()
@@ -109,14 +83,14 @@ def test_the_best_is_chosen_by_the_same_views_throughout(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One view is scored on the way, and the others are harder by 10 dB."""
-    original = scoring.score_image
+    original = scores.score_image
     improved: list[tuple[str, dict]] = []
 
     def score(image, item):
         found = original(image, item)
         return replace(found, psnr=found.psnr - 10 * (item["index"] != 0))
 
-    monkeypatch.setattr(scoring, "score_image", score)
+    monkeypatch.setattr(scores, "score_image", score)
     note_checkpoints(improved, monkeypatch)
     few = (
         "trainer.limit_val_batches=1",
@@ -181,16 +155,6 @@ def test_a_fault_of_ones_own_says_how_to_go_on(scenes: Path, tmp_path: Path, cap
     run(config, tmp_path / "run", [], resume=True)
 
 
-def test_a_limit_that_a_run_has_passed_is_refused(scenes: Path, tmp_path: Path) -> None:
-    config = small_config(scenes, *FEW, "media=false", "lrm=none", "trainer.max_steps=4")
-    run(config, tmp_path / "run", [], resume=False)
-    before = (tmp_path / "run" / "config.yaml").read_bytes()
-    config["trainer"]["max_steps"] = 3
-    with pytest.raises(ConfigError, match=r"max_steps=3: .*has done 4 steps already"):
-        run(config, tmp_path / "run", [], resume=True)
-    assert (tmp_path / "run" / "config.yaml").read_bytes() == before
-
-
 def test_another_start_in_a_folder_begins_its_own_record(tmp_path: Path) -> None:
     first = RunRecord(tmp_path, 0, resume=False)
     first.note(files={"train": ["a.png"]})
@@ -205,60 +169,66 @@ def test_another_start_in_a_folder_begins_its_own_record(tmp_path: Path) -> None
     assert "files" not in again.content
 
 
-def test_a_scene_of_training_views_alone_is_scored_on_views_held_out(
-    scenes: Path, tmp_path: Path
+def nested(key: str, value: object) -> dict[str, Any]:
+    """A configuration that sets this key alone."""
+    found = value
+    for name in reversed(key.split(".")):
+        found = {name: found}
+    return found  # type: ignore[return-value]
+
+
+def test_what_planes_and_frame_depend_on_is_kept(tmp_path: Path) -> None:
+    for key in KEPT:
+        this, that, null = (nested(key, value) for value in ("this", "that", None))
+        for before, now in ((this, that), (this, null), (null, this)):
+            with pytest.raises(ConfigError, match=rf"{key}="):
+                require_same_settings(tmp_path, before, now)
+        with pytest.raises(ConfigError, match=rf"{key}=that: .* {key}=this"):
+            require_same_settings(tmp_path, this, that)
+        require_same_settings(tmp_path, this, this)
+        # A setting that an older version did not have.
+        for without in (nested(key.rpartition(".")[0], {}) if "." in key else {}, {}):
+            require_same_settings(tmp_path, without, that)
+
+
+def test_a_limit_that_a_run_has_passed_is_refused(scenes: Path, folder: Path) -> None:
+    before = (folder / "config.yaml").read_bytes()
+    with pytest.raises(ConfigError, match=r"max_steps=3: .*has done 6 steps already"):
+        run(small_config(scenes, *FEW, "trainer.max_steps=3"), folder, [], resume=True)
+    assert (folder / "config.yaml").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("views", "missing", "scored"),
+    [(10, ("val", "test"), 10), (20, ("val", "test"), 2), (10, ("val",), 1)],
+)
+def test_a_missing_split_is_held_out_of_training_or_nothing_is_the_best(
+    scenes: Path, tmp_path: Path, views: int, missing: tuple[str, ...], scored: int
 ) -> None:
-    few = (*FEW, "callbacks.evaluation.at=[0]", "media=false", "lrm=none")
-    for count in (10, 20):
-        options = (f"data.train_views={count}", "data.val_views=1", "data.test_views=1")
-        demo = small_config(scenes, *few, *options)
-        made = SceneDataModule(demo["data"]).settings.folder
-        folder = Path(shutil.copytree(made, tmp_path / "scenes" / str(count)))
-        for split in ("val", "test"):
-            (folder / f"transforms_{split}.json").unlink()
-        known = {field.name for field in fields(BlenderSettings)}
-        data = {name: value for name, value in demo["data"].items() if name in known}
-        target = "xplanes.scenes.dnerf.BlenderSettings"
-        data |= {"_target_": target, "root": str(tmp_path / "scenes"), "scene": str(count)}
-        done = tmp_path / f"run{count}"
-        if count == 10:
-            run(demo | {"data": data}, done, [], resume=False)
-            assert "10 images are too few to hold some out" in (done / "train.log").read_text()
-            metrics = json.loads((done / "metrics.json").read_text())
-            assert (metrics["split"], len(metrics["views"])) == ("val", 10)
-            continue
-        run(demo | {"data": data}, done, [], resume=False)
-        metrics = json.loads((done / "metrics.json").read_text())
-        assert (metrics["split"], len(metrics["views"])) == ("val", 2)
-        trained = load_run(done)
-        assert (len(trained.scene.splits["train"]), trained.split) == (18, "val")
+    options = (f"data.train_views={views}", "data.val_views=1", "data.test_views=1")
+    demo = small_config(scenes, *FEW, "callbacks.evaluation.at=[0]", *options)
+    made = SceneDataModule(demo["data"]).settings.folder
+    folder = Path(shutil.copytree(made, tmp_path / "scenes" / "few"))
+    for split in missing:
+        (folder / f"transforms_{split}.json").unlink()
+    known = {field.name for field in fields(BlenderSettings)}
+    data = {name: value for name, value in demo["data"].items() if name in known}
+    target = "xplanes.scenes.dnerf.BlenderSettings"
+    data |= {"_target_": target, "root": str(tmp_path / "scenes"), "scene": "few"}
+    done = tmp_path / "run"
+    run(demo | {"data": data}, done, [], resume=False)
+    metrics = json.loads((done / "metrics.json").read_text())
+    split = "val" if "test" in missing else "test"
+    assert (metrics["split"], len(metrics["views"])) == (split, scored)
+    assert {row["split"] for row in read_rows(done / "curve.csv")} == {split}
+    assert (done / "checkpoints" / "best.ckpt").is_file() == (split == "val")
+    log = (done / "train.log").read_text()
+    held_out = scored if views == 20 else 0
+    assert ("10 images are too few to hold some out" in log) == (scored == 10)
+    assert ("(held out of train)" in log) == bool(held_out)
+    loaded = load_run(done)
+    assert (len(loaded.scene.splits["train"]), loaded.split) == (views - held_out, split)
+    if held_out:
         alone = SceneDataModule(data)
         alone.setup("test")
         assert len(alone.scene.splits["val"]) == 2
-
-
-def test_without_a_validation_split_training_views_are_held_out_or_nothing_is_the_best(
-    scenes: Path,
-    tmp_path: Path,
-) -> None:
-    few = (*FEW, "callbacks.evaluation.at=[0]", "media=false", "lrm=none")
-    for views, held_out in ((10, 0), (20, 2)):
-        options = (f"data.train_views={views}", "data.val_views=1", "data.test_views=1")
-        demo = small_config(scenes, *few, *options)
-        made = SceneDataModule(demo["data"]).settings.folder
-        folder = Path(shutil.copytree(made, tmp_path / "scenes" / str(views)))
-        (folder / "transforms_val.json").unlink()
-        target = "xplanes.scenes.dnerf.BlenderSettings"
-        known = {field.name for field in fields(BlenderSettings)}
-        data = {name: value for name, value in demo["data"].items() if name in known}
-        data |= {"_target_": target, "root": str(tmp_path / "scenes"), "scene": str(views)}
-        done = tmp_path / f"run{views}"
-        run(demo | {"data": data}, done, [], resume=False)
-        assert {row["split"] for row in read_rows(done / "curve.csv")} == {
-            "val" if held_out else "test"
-        }
-        assert (done / "checkpoints" / "best.ckpt").is_file() == bool(held_out)
-        trained = load_run(done)
-        assert (len(trained.scene.splits["train"]), trained.split) == (views - held_out, "test")
-        header = (done / "train.log").read_text()
-        assert ("(held out of train)" in header) == bool(held_out)

@@ -1,11 +1,9 @@
 """Scenes in a world: a background joins where images show one, and nothing changes elsewhere."""
 
 import functools
-import math
 from dataclasses import replace
 from pathlib import Path
 
-import lightning
 import pytest
 import torch
 
@@ -122,6 +120,32 @@ def test_a_world_gets_a_background_and_the_planes_are_initialised_as_ever():
     assert set(terms) == {"colour"}
 
 
+def test_light_that_passes_the_cube_costs_until_the_field_has_taken_shape():
+    module = built("world", "model.loss.passing=0.5", "model.loss.passing_steps=200")
+    batch = SceneDataModule.of(scene("world")).batches_for(module, 0).draw(0)
+    rendering = module.sampler.render(module.field, batch, module.state)
+    passed = float((1 - rendering.opacity.detach()).mean())
+    for step, weight in ((0, 0.5), (50, 0.375), (199, 0.0025), (200, None), (900, None)):
+        terms = module.model.losses(rendering, batch, replace(module.state, step=step))
+        found = terms.get("passing")
+        assert (found is None) == (weight is None), step
+        if weight is not None:
+            assert float(found) == pytest.approx(weight * passed)
+
+
+@pytest.mark.parametrize("kind", ["world", "white"])
+def test_before_a_background_planes_are_less_smooth_in_time_and_cells_stay_longer(kind):
+    module = built(kind, "model.sampler.sweep_at=[20,40]", "model.loss.world_time=0.25")
+    loss, world = module.model.settings.loss, kind == "world"
+    used = module.model.weights
+    for name in ("time_variation", "time_smoothness", "time_magnitude"):
+        assert getattr(used, name) == getattr(loss, name) * (0.25 if world else 1)
+    if world:
+        assert module.sampler.settings.sweep_at == [40]
+    else:
+        assert len(module.sampler.settings.sweep_at) == 2
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("world")
@@ -149,20 +173,6 @@ def test_training_learns_what_lies_behind(trained):
         torch.testing.assert_close(found["colour"][clear], behind[clear], atol=1e-3, rtol=0)
 
 
-def test_the_sparsity_prior_leaves_a_world_alone():
-    for kind, kept in (("alpha", True), ("world", False)):
-        module = built(kind)
-        assert bool(module.sampler.regularisers(module.field, module.state)) is kept
-
-
-def test_nothing_is_known_of_opacity(trained):
-    module, _, _ = trained
-    assert "foreground" not in module.last
-    assert "background" not in module.last
-    assert module.restarts == 0
-    assert math.isfinite(module.last["loss"])
-
-
 def test_a_checkpoint_brings_the_background_back(trained):
     module, _, path = trained
     again = RadianceModule.load_from_checkpoint(path)
@@ -170,31 +180,8 @@ def test_a_checkpoint_brings_the_background_back(trained):
     assert torch.equal(picture(again.eval())["colour"], picture(module)["colour"])
 
 
-class SaveHalfway(lightning.Callback):
-    """Writes a checkpoint after half of the steps."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def on_train_batch_end(self, trainer, *rest):
-        if trainer.global_step == STEPS // 2:
-            trainer.save_checkpoint(self.path)
-
-
-def test_a_resumed_training_ends_with_the_same_numbers(trained, tmp_path):
-    straight = built("world")
-    fitted(straight, "world", tmp_path, STEPS)
-    half = built("world")
-    fitted(half, "world", tmp_path, STEPS, callbacks=[SaveHalfway(tmp_path / "half.ckpt")])
-    resumed = built("world")
-    fitted(resumed, "world", tmp_path, STEPS, checkpoint=tmp_path / "half.ckpt")
-    for name, value in straight.state_dict().items():
-        assert torch.equal(value, resumed.state_dict()[name]), name
-
-
 BASELINES = {
     "kplanes": (*KPLANES, *PROPOSAL),
-    "kplanes_explicit": (*KPLANES, *PROPOSAL),
     "tineuvox_s": (*TINEUVOX, "model.background.samples=4"),
 }
 
@@ -252,13 +239,3 @@ def test_samples_of_contracted_space_are_even_in_distance_then_in_its_inverse():
     torch.testing.assert_close(distances[near], 2 * places[near])
     step = (1 / distances[far]).diff()
     torch.testing.assert_close(step, step[:1].expand_as(step))
-
-
-def test_samplers_of_proposals_see_the_background_too():
-    small = ("lrm=none", "model.resolution=16", "model.channels=8", "model.background.samples=4")
-    module = RadianceModule.compose("model/sampler=proposal", *small)
-    module.build(scene("world"))
-    batch = SceneDataModule.of(scene("world")).batches_for(module, 0).draw(0)
-    rendering = module.sampler.render(module.field, batch, module.state)
-    rendering.colour.sum().backward()
-    assert module.field.background.planes.grad.abs().sum() > 0

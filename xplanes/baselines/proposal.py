@@ -8,11 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from xplanes.baselines.kplanes.field import DensityField
+from xplanes.baselines.products import PlaneProducts, PlaneTerms
 from xplanes.baselines.resampling import covering_weights, ray_weights, resample, uniform_edges
 from xplanes.errors import ConfigError
 from xplanes.fields.base import RadianceField
-from xplanes.fields.products import PlaneProducts
-from xplanes.fields.regularisers import PlaneTerms
 from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.rendering.behind import behind
 from xplanes.rendering.box import ray_box, shade

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from xplanes.decomposition.admm import (
     CHANGE_OVER_TOLERANCE,
@@ -115,35 +116,79 @@ def robust_pca(
             option is out of range.
         TypeError: If the matrix is not of a floating-point type.
     """
-    _check_options(sparsity_weight, penalty, tolerance, max_iterations, method, scale)
+    if isinstance(sparsity_weight, str) and sparsity_weight != "auto":
+        raise ValueError(f"sparsity_weight is {sparsity_weight!r}: allowed are 'auto' or a number")
+    numbers = {"sparsity_weight": sparsity_weight, "penalty": penalty, "tolerance": tolerance}
+    for name, value in numbers.items():
+        if not isinstance(value, str) and not 0 < value < math.inf:
+            raise ValueError(f"{name} is {value}: it must be positive and finite")
+    if max_iterations < 1:
+        raise ValueError(f"max_iterations is {max_iterations}: it must be at least 1")
+    for name, value, allowed in (("method", method, METHODS), ("scale", scale, SCALES)):
+        if value not in allowed:
+            raise ValueError(f"{name} is {value!r}: allowed are {', '.join(allowed)}")
     peak = _check_matrix(matrix)
     work = _computable(matrix.detach())
-    rows, columns = work.shape
-    weight = (
-        1 / math.sqrt(max(rows, columns)) if isinstance(sparsity_weight, str) else sparsity_weight
-    )
+    weight = sparsity_weight
+    if isinstance(weight, str):
+        weight = 1 / math.sqrt(max(work.shape))
     low_rank, sparse = out or (_like(work), _like(work))
+    adaptive, unit, factor = method == "adaptive", 1.0, 1.0
     if peak == 0:
         low_rank.zero_()
         sparse.zero_()
         end = Progress(0, 0, penalty, 0.0, 0.0)
-        return _result(work, low_rank, sparse, end, weight, 1.0, method, tolerance, 1.0)
+    else:
+        # Squares of extreme values overflow or underflow: take a copy scaled by a power of two.
+        factor = 1.0 if 1e-12 < peak < 1e12 else 2.0 ** -math.frexp(peak)[1]
+        if factor != 1:
+            work = work * factor
+        unit = (_norm(work) / math.sqrt(work.numel())) if scale == "rms" else factor
+        with (
+            _full_precision(work.device),
+            tqdm(None, "robust PCA", max_iterations, False, delay=2, disable=not progress) as bar,
+        ):
 
-    # Squares of extreme values overflow or underflow: compute on a copy scaled by a power of two.
-    factor = 1.0 if 1e-12 < peak < 1e12 else 2.0 ** -math.frexp(peak)[1]
+            def show(state: Progress) -> None:
+                bar.set_postfix(residual=f"{state.residual:.0e}", rank=state.rank, refresh=False)
+                bar.update()
+
+            end = minimise(
+                work,
+                low_rank,
+                sparse,
+                sparsity_weight=weight,
+                penalty=penalty * math.sqrt(work.numel()) / _norm(work)
+                if adaptive
+                else penalty / unit,
+                schedule=SCHEDULES[method],
+                tolerance=tolerance,
+                max_iterations=max_iterations,
+                on_iteration=show,
+            )
+    whole, low_energy, sparse_energy, gap, drift, count = _energies(work, low_rank, sparse)
     if factor != 1:
-        work = work * factor
-    unit = (_norm(work) / math.sqrt(work.numel())) if scale == "rms" else factor
-    with _full_precision(work.device), _bar(max_iterations, progress) as show:
-        begin = penalty / unit
-        if method == "adaptive":
-            begin = penalty * math.sqrt(work.numel()) / _norm(work)
-        end = minimise(
-            work, low_rank, sparse, sparsity_weight=weight, penalty=begin,
-            schedule=SCHEDULES[method], tolerance=tolerance, max_iterations=max_iterations,
-            on_iteration=show,
-        )  # fmt: skip
-    result = _result(work, low_rank, sparse, end, weight, unit, method, tolerance, factor)
+        low_rank /= factor
+        sparse /= factor
+    residual = math.sqrt(gap / whole) if whole else 0.0
+    settled = not adaptive or end.change <= CHANGE_OVER_TOLERANCE * tolerance
+    result = RobustPCA(
+        low_rank=low_rank,
+        sparse=sparse,
+        rank=end.rank,
+        iterations=end.iterations,
+        residual=residual,
+        converged=residual <= tolerance and settled,
+        change=end.change,
+        sparsity=count / matrix.numel(),
+        low_rank_energy=low_energy / whole if whole else 0.0,
+        sparse_energy=sparse_energy / whole if whole else 0.0,
+        drift=math.sqrt(drift / low_energy) if low_energy else 0.0,
+        sparsity_weight=weight,
+        penalty=end.penalty * unit,
+        unit=unit / factor,
+        method=method,
+    )
     if not result.converged:
         warnings.warn(
             f"robust PCA stopped at {end.iterations} iterations with residual "
@@ -152,31 +197,6 @@ def robust_pca(
             stacklevel=2,
         )
     return result
-
-
-def _check_options(
-    sparsity_weight: float | str,
-    penalty: float,
-    tolerance: float,
-    limit: int,
-    method: str,
-    scale: str,
-) -> None:
-    if isinstance(sparsity_weight, str):
-        if sparsity_weight != "auto":
-            raise ValueError(
-                f"sparsity_weight is {sparsity_weight!r}: allowed are 'auto' or a number"
-            )
-    elif not 0 < sparsity_weight < math.inf:
-        raise ValueError(f"sparsity_weight is {sparsity_weight}: it must be positive and finite")
-    for name, value in (("penalty", penalty), ("tolerance", tolerance)):
-        if not 0 < value < math.inf:
-            raise ValueError(f"{name} is {value}: it must be positive and finite")
-    if limit < 1:
-        raise ValueError(f"max_iterations is {limit}: it must be at least 1")
-    for name, value, allowed in (("method", method, METHODS), ("scale", scale, SCALES)):
-        if value not in allowed:
-            raise ValueError(f"{name} is {value!r}: allowed are {', '.join(allowed)}")
 
 
 def _check_matrix(matrix: Tensor) -> float:
@@ -218,52 +238,20 @@ def _norm(matrix: Tensor) -> float:
     )
 
 
-def _result(
-    matrix: Tensor,
-    low_rank: Tensor,
-    sparse: Tensor,
-    end: Progress,
-    weight: float,
-    unit: float,
-    method: str,
-    tolerance: float,
-    factor: float,
-) -> RobustPCA:
-    """Measure the parts in one pass, undo the scale ``factor`` and check convergence."""
+def _energies(matrix: Tensor, low_rank: Tensor, sparse: Tensor) -> list[float]:
+    """Squared norms of Y, L, S, ``L + S - Y`` and ``L - L(T/2)``, and entries of S that are not 0.
+
+    All in one pass.
+    """
     middle = matrix.shape[1] // 2
     sums = torch.zeros(6, dtype=torch.float64, device=matrix.device)
-    rows = block_rows(matrix)
-    for y, low, part in zip(
-        matrix.split(rows), low_rank.split(rows), sparse.split(rows), strict=True
-    ):
+    blocks = (part.split(block_rows(matrix)) for part in (matrix, low_rank, sparse))
+    for y, low, part in zip(*blocks, strict=True):
         measured = (y, low, part, low + part - y, low - low[:, middle : middle + 1])
         for index, block in enumerate(measured):
             sums[index] += torch.linalg.vector_norm(block).double().square()
         sums[5] += part.count_nonzero()
-    whole, low_energy, part_energy, gap, drift, count = sums.tolist()
-    if factor != 1:
-        low_rank /= factor
-        sparse /= factor
-    residual = math.sqrt(gap / whole) if whole else 0.0
-    adaptive = method == "adaptive"
-    return RobustPCA(
-        low_rank=low_rank,
-        sparse=sparse,
-        rank=end.rank,
-        iterations=end.iterations,
-        residual=residual,
-        converged=residual <= tolerance
-        and (not adaptive or end.change <= CHANGE_OVER_TOLERANCE * tolerance),
-        change=end.change,
-        sparsity=count / matrix.numel(),
-        low_rank_energy=low_energy / whole if whole else 0.0,
-        sparse_energy=part_energy / whole if whole else 0.0,
-        drift=math.sqrt(drift / low_energy) if low_energy else 0.0,
-        sparsity_weight=weight,
-        penalty=end.penalty * unit,
-        unit=unit / factor,
-        method=method,
-    )
+    return sums.tolist()
 
 
 @contextmanager
@@ -276,19 +264,6 @@ def _full_precision(device: torch.device) -> Iterator[None]:
             yield
     finally:
         torch.set_float32_matmul_precision(before)
-
-
-@contextmanager
-def _bar(limit: int, wanted: bool):
-    from tqdm import tqdm
-
-    with tqdm(total=limit, desc="robust PCA", delay=2, leave=False, disable=not wanted) as bar:
-
-        def show(state: Progress) -> None:
-            bar.set_postfix(residual=f"{state.residual:.0e}", rank=state.rank, refresh=False)
-            bar.update()
-
-        yield show
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from xplanes.decomposition.conversion import frame_profiles
+from xplanes.scenes.views import spread
 
 Rows = Sequence[tuple[int, int]]
 
@@ -125,7 +126,7 @@ class SparseProduct:
         """The loss, estimated from ``count`` evenly spaced frames; deterministic."""
         self._follow(planes)
         total = len(self.sparse)
-        frames = _spread(self.count or total, total)
+        frames = torch.tensor(spread(self.count or total, total))
         # One at a time: their errors have the size of the sparse part.
         errors = [
             sparse_product_loss(planes, self.sparse, frame, rows=self.rows)
@@ -152,10 +153,3 @@ class SparseProduct:
 def _per_slice(profiles: Tensor, places: Sequence[int]) -> Tensor:
     """Profiles of some planes in the order of a triplane's slices. [P, B, N, C] -> [B 3 C, N]"""
     return torch.stack([profiles[place].mT for place in places], dim=1).flatten(0, 2)
-
-
-def _spread(count: int, total: int) -> Tensor:
-    """``count`` frames spread evenly over ``total``, both ends included."""
-    if count >= total:
-        return torch.arange(total)
-    return torch.linspace(0, total - 1, count).round().long()

@@ -72,26 +72,24 @@ def read_camera_path(path: Path) -> CameraPath:
     if not path.is_file():
         raise SceneError(f"{path}: there is no such camera path")
     content = read_object(path, '"camera_path" (nerfstudio) or "frames"')
-    if "camera_path" in content:
-        return _read_nerfstudio(path, content)
-    entries = _entries(path, content, "frames")
-    tangents = []
-    for label, entry in entries.items():
-        holder, where = (entry, label) if "camera_angle_x" in entry else (content, path)
-        angle = holder.get("camera_angle_x")
-        if not is_positive(angle) or angle >= math.pi:
-            raise SceneError(
-                f"{where}: camera_angle_x is {short(angle)}; it must lie between 0 and pi radians"
-            )
-        tangents.append(math.tan(0.5 * angle))
+    nerfstudio = "camera_path" in content
+    if nerfstudio and (kind := content.get("camera_type", "perspective")) != "perspective":
+        raise SceneError(
+            f"{path}: camera_type is {short(kind)}; only perspective cameras are rendered"
+        )
+    entries = _entries(path, content, "camera_path" if nerfstudio else "frames")
+    fps, seconds = _count(path, content, "fps"), content.get("seconds")
+    if fps is None and nerfstudio and is_positive(seconds):
+        fps = max(1, round(len(entries) / seconds))
+    height, width = ("render_height", "render_width") if nerfstudio else ("h", "w")
     return CameraPath(
-        poses=_poses(entries, "transform_matrix"),
-        times=_times(path, entries, ("time",)),
-        tangents=torch.tensor(tangents),
-        upright=False,
-        height=_count(path, content, "h"),
-        width=_count(path, content, "w"),
-        fps=_count(path, content, "fps"),
+        poses=_poses(entries, "camera_to_world" if nerfstudio else "transform_matrix"),
+        times=_times(path, entries, ("render_time", "time") if nerfstudio else ("time",)),
+        tangents=_tangents(path, content, entries, nerfstudio=nerfstudio),
+        upright=nerfstudio,
+        height=_count(path, content, height),
+        width=_count(path, content, width),
+        fps=fps,
     )
 
 
@@ -164,32 +162,6 @@ Entries = dict[str, Mapping[str, Any]]
 """Cameras of a path by what messages call them."""
 
 
-def _read_nerfstudio(path: Path, content: Mapping[str, Any]) -> CameraPath:
-    if (kind := content.get("camera_type", "perspective")) != "perspective":
-        raise SceneError(
-            f"{path}: camera_type is {short(kind)}; only perspective cameras are rendered"
-        )
-    entries = _entries(path, content, "camera_path")
-    tangents = []
-    for label, entry in entries.items():
-        fov = entry.get("fov")
-        if not is_positive(fov) or fov >= 180:
-            raise SceneError(f"{label}: fov is {short(fov)}; it must lie between 0 and 180 degrees")
-        tangents.append(math.tan(0.5 * math.radians(fov)))
-    fps, seconds = _count(path, content, "fps"), content.get("seconds")
-    if fps is None and is_positive(seconds):
-        fps = max(1, round(len(entries) / seconds))
-    return CameraPath(
-        poses=_poses(entries, "camera_to_world"),
-        times=_times(path, entries, ("render_time", "time")),
-        tangents=torch.tensor(tangents),
-        upright=True,
-        height=_count(path, content, "render_height"),
-        width=_count(path, content, "render_width"),
-        fps=fps,
-    )
-
-
 def _entries(path: Path, content: Mapping[str, Any], key: str) -> Entries:
     found = content.get(key)
     if not isinstance(found, list) or not found:
@@ -202,6 +174,26 @@ def _entries(path: Path, content: Mapping[str, Any], key: str) -> Entries:
         if not isinstance(entry, dict):
             raise SceneError(f"{label} is {short(entry)}, not an object with keys")
     return entries
+
+
+def _tangents(
+    path: Path, content: Mapping[str, Any], entries: Entries, *, nerfstudio: bool
+) -> Tensor:
+    """Tangent of half the field of view of each camera. [F]"""
+    name, most, words = "camera_angle_x", math.pi, "pi radians"
+    if nerfstudio:
+        name, most, words = "fov", 180.0, "180 degrees"
+    tangents = []
+    for label, entry in entries.items():
+        # A transforms file may have one angle for all frames.
+        holder, where = (entry, label) if nerfstudio or name in entry else (content, path)
+        angle = holder.get(name)
+        if not is_positive(angle) or angle >= most:
+            raise SceneError(
+                f"{where}: {name} is {short(angle)}; it must lie between 0 and {words}"
+            )
+        tangents.append(math.tan(0.5 * math.pi * angle / most))
+    return torch.tensor(tangents)
 
 
 def _poses(entries: Entries, key: str) -> Tensor:

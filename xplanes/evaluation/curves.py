@@ -50,7 +50,7 @@ def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> boo
             (("seconds", "seconds (preparation included)"), ("step", "steps"))
         ):
             panel = panels[row][scenes.index(scene)]
-            # Models of unlike speed fill a logarithmic axis evenly; it has no place for 0.
+            # Models differ in speed by orders of magnitude; a logarithmic axis has no 0.
             points = np.transpose(_mean_curve(runs, axis))
             points = points[points[:, 0] > 0]
             colour = f"C{labels.index(label)}"

@@ -21,7 +21,7 @@ from xplanes.training.scores import VISIBLE
 MODES = ("colour", "depth", "opacity", "floaters")
 
 NEAREST = 4
-"""Training images, those nearest in time, that tell floaters."""
+"""Training images, the nearest in time, that decide what a floater is."""
 
 SLACK = 0.02
 """Distance from a silhouette, in the field's frame, at which something may still belong to it."""
@@ -105,7 +105,7 @@ def draw(
         stop: Whether the picture is no longer wanted.
 
     Returns:
-        The picture on the CPU; None once ``stop`` says so.
+        The picture on the CPU; None once ``stop`` returns true.
     """
     device, box = renderer.device, shot.box
     field = snapshot(field, shot.time)
@@ -155,7 +155,7 @@ def _seen(
     shot: Shot,
     background: Tensor,
 ) -> dict[str, Tensor]:
-    """What rays of a shot see, which are all of them where a renderer takes no single rays."""
+    """What rays of a shot see; a renderer that takes no single rays renders the whole picture."""
     if isinstance(renderer, RayRenderer):
         return renderer.image(field, origins, directions, shot.time, background)
     frame = Frame(1.0, torch.eye(3), torch.zeros(3))
@@ -167,7 +167,7 @@ def shift(renderer: Renderer, position: Tensor, views: Views, frame: Frame) -> f
     """How far along its rays a camera must be moved for a renderer with near and far bounds.
 
     These bounds hold for cameras as far from the scene as the training cameras; from elsewhere they
-    would cut it off. A camera among things stays where its near bound begins behind it.
+    would cut it off. A camera inside the scene is moved back by no more than its near bound.
 
     Args:
         renderer: Has ``near``, in the field's frame, if it has such bounds.
@@ -195,12 +195,12 @@ def mark(colours: Tensor, share: Tensor) -> Tensor:
 
 
 def in_box(box: Tensor) -> Callable[[Tensor], Tensor]:
-    """Tells of points [N, 3] whether they lie in a box [2, 3]."""
+    """A function that tells which points [N, 3] lie in a box [2, 3]."""
     return lambda points: ((points >= box[0]) & (points <= box[1])).all(dim=-1)
 
 
 def ruled_out(views: Views, frame: Frame, time: float) -> Callable[[Tensor], Tensor]:
-    """Tells of points of the field's frame [N, 3] whether training images show them to be empty.
+    """A function that tells which points [N, 3] of the field's frame training images show empty.
 
     These are the images nearest in time, of a static scene some from all over it. What lies out of
     their sight, or within `SLACK` of a silhouette, is not ruled out.

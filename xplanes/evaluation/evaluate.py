@@ -12,7 +12,7 @@ from tqdm import tqdm
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.files import is_there, write_json
 from xplanes.optional import require
-from xplanes.training.scores import ViewImages, ViewScore, mean, score_view
+from xplanes.training.scores import mean, score_view
 
 DEFAULT_NETWORK = "vgg"
 WEIGHTS = {
@@ -40,20 +40,23 @@ def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
         What `write_scores` writes: the keys of metrics.json as far as they are scores, and
         ``not_computed``, from a score's name to the reason.
     """
-    views, module = trained.views, trained.module
-    tag, metric, missing = _lpips(trained, network)
+    views, parts = trained.views, (trained.module.field, trained.module.renderer, trained.frame)
+    name = network or DEFAULT_NETWORK
+    tag, metric, missing = f"lpips_{name}", None, {}
+    if network != "none":
+        side, device = int(views.intrinsics.size.min()), str(trained.module.device)
+        try:
+            metric = lpips(name, side, device, download=network is not None)
+        except UnavailableError as reason:
+            missing = {tag: str(reason)}
     began = time.perf_counter()
-    rows = []
+    rows: list[dict[str, Any]] = []
     for index in tqdm(range(len(views)), "views", leave=False, delay=2, disable=None):
-        score, images = score_view(
-            module.field,
-            module.renderer,
-            trained.frame,
-            views,
-            index,
-            trained.scene.background,
-        )
-        rows.append(_row(score, images, tag, metric))
+        score, images = score_view(*parts, views, index, trained.scene.background)
+        row = {"file": score.file, "time": score.time, **score.scores}
+        if metric is not None:
+            row[tag] = metric(images["colour"], images["truth"])
+        rows.append(row)
     names = dict.fromkeys(name for row in rows for name in row if name not in ("file", "time"))
     return {
         "split": trained.split,
@@ -64,25 +67,6 @@ def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
         "not_computed": missing,
         "seconds": time.perf_counter() - began,
     }
-
-
-def _lpips(trained: TrainedRun, network: str | None) -> tuple[str, Metric | None, dict[str, str]]:
-    """The tag of LPIPS, the metric if it can be had, and else the reason under the tag."""
-    if network == "none":
-        return "", None, {}
-    name = network or DEFAULT_NETWORK
-    tag = f"lpips_{name}"
-    side = int(trained.views.intrinsics.size.min())
-    device = str(trained.module.device)
-    try:
-        return tag, lpips(name, side, device, download=network is not None), {}
-    except UnavailableError as reason:
-        return tag, None, {tag: str(reason)}
-
-
-def _row(score: ViewScore, images: ViewImages, tag: str, metric: Metric | None) -> dict[str, Any]:
-    row = {"file": score.file, "time": score.time, **score.scores}
-    return row if metric is None else {**row, tag: metric(images.colour, images.truth)}
 
 
 def write_scores(run: Path, scores: dict[str, Any]) -> Path:

@@ -1,4 +1,4 @@
-"""Meshes, points, planes and camera paths for other programs: `xplanes export`."""
+"""Meshes, points, planes, camera paths and a web page: `xplanes export`."""
 
 import json
 import math
@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from xplanes.errors import ConfigError
 from xplanes.evaluation.camera_path import nerfstudio_content, path_of, transforms_content
+from xplanes.evaluation.export_web import Shape, write_page
 from xplanes.evaluation.render import FPS
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.fields.base import SurfaceField, ViewDependentField
@@ -25,12 +26,21 @@ from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.box import ray_box
 from xplanes.rendering.grid_renderer import GridRenderer
 
-KINDS = ("mesh", "points", "planes", "path")
+KINDS = ("mesh", "points", "planes", "path", "web")
 """What is written of every field, or of X-Planes; a field may have more in its `exports`."""
 FORMATS = ("ply", "glb")
 
-TIMES = 10
-"""Timesteps of a dynamic scene where none are named."""
+TIMES, WEB_TIMES = 10, 24
+"""Timesteps of a dynamic scene where none are named: as files, and in a page that plays them."""
+
+POINTS = 100_000
+"""Points of a point cloud where no number is named."""
+
+PAGE = "index.html"
+"""The file of a web page."""
+
+COARSEST = 8
+"""Least grid points along each side of the cube."""
 
 LARGEST = 1024
 """Grid points along each side of the cube; as many as that take 4 GB."""
@@ -54,12 +64,14 @@ class ExportOptions:
     """What to export.
 
     Attributes:
-        what: ``mesh``, ``points``, ``planes``, ``path``, or a name in the field's `exports`.
+        what: ``mesh``, ``points``, ``planes``, ``path``, ``web``, or a name in the field's
+            `exports`.
         times: A number of times spread evenly from 0 to 1, or times separated by commas; None for
-            10, or for 1 in a static scene.
+            10, 24 in a web page, or 1 in a static scene.
         resolution: Grid points along each side of the field's cube.
         threshold: Density of the surface, per unit length of the field's frame; found when None.
-        count: Points of a point cloud.
+        count: Points of a point cloud, 100,000 when None; a web page has points in place of a mesh
+            if it is given.
         form: File format of meshes and point clouds: ``ply`` or ``glb``.
     """
 
@@ -67,7 +79,7 @@ class ExportOptions:
     times: str | None = None
     resolution: int = 128
     threshold: float | None = None
-    count: int = 100_000
+    count: int | None = None
     form: str = "ply"
 
     def check(self) -> None:
@@ -80,8 +92,8 @@ class ExportOptions:
         if self.form not in FORMATS:
             raise ConfigError(f"--format {self.form}: must be {' or '.join(FORMATS)}")
         for name, value, least, most in (
-            ("resolution", self.resolution, 8, LARGEST),
-            ("points", self.count, 1, 10**8),
+            ("resolution", self.resolution, COARSEST, LARGEST),
+            ("points", POINTS if self.count is None else self.count, 1, 10**8),
         ):
             if not least <= value <= most:
                 raise ConfigError(f"--{name} {value}: must lie between {least} and {most}")
@@ -95,14 +107,15 @@ class ExportOptions:
             require("trimesh", extra="export")
 
     def _refuse_what_is_not_used(self) -> None:
-        surface = self.what in ("mesh", "points")
+        files = self.what in ("mesh", "points")
+        surface = files or self.what == "web"
         default = ExportOptions()
         for name, value, ordinary, used in (
             ("times", self.times, default.times, self.what not in ("planes", "path")),
             ("resolution", self.resolution, default.resolution, surface),
             ("threshold", self.threshold, default.threshold, surface),
-            ("points", self.count, default.count, self.what == "points"),
-            ("format", self.form, default.form, surface),
+            ("points", self.count, default.count, self.what in ("points", "web")),
+            ("format", self.form, default.form, files),
         ):
             if value != ordinary and not used:
                 raise ConfigError(
@@ -174,7 +187,8 @@ def export(
     if getattr(field, "background", None) is not None:
         facts["left_out"] = "what lies behind the field's cube"
         say(f"left out    {facts['left_out']}, which has no surface; --what planes has it")
-    times = export_times(options.times or str(1 if trained.is_static else TIMES))
+    ordinary = WEB_TIMES if options.what == "web" else TIMES
+    times = export_times(options.times or str(1 if trained.is_static else ordinary))
     if (write_own := field.exports.get(options.what)) is not None:
         paths = [folder / f"{options.what}_{number:04d}" for number in range(len(times))]
         written = [
@@ -183,23 +197,13 @@ def export(
         names = [path.name for path in written]
         write_json(folder / "export.json", {**facts, "files": names, "times": times})
         return folder
-    if not isinstance(trained.module.renderer, RayRenderer):
-        others = " or ".join((*field.exports, "path"))
-        raise ConfigError(
-            f"--what {options.what}: {name} has neither a density nor a surface; set --what "
-            f"{others}"
-        )
-    threshold = options.threshold
-    if isinstance(field, SurfaceField):
-        if threshold is not None:
-            raise ConfigError(
-                f"--threshold {threshold:g}: this field has a surface of its own and no density; "
-                "leave it out"
-            )
-    elif threshold is None:
-        threshold = find_threshold(trained, options.resolution, times[len(times) // 2])
+    threshold = _threshold(trained, options, times)
     if threshold is not None:
         say(f"threshold   density {threshold:.4g}")
+    if options.what == "web":
+        facts |= _write_web(folder, trained, options, threshold, times, say)
+        write_json(folder / "export.json", facts)
+        return folder
     names = [f"{options.what}_{number:04d}.{options.form}" for number in range(len(times))]
     files = [folder / name for name in names]
     written = _write_each(trained, options, threshold, times, files)
@@ -210,17 +214,39 @@ def export(
         for path in files:  # So that the way out, another threshold, may write here.
             path.unlink(missing_ok=True)
         raise
-    write_json(
-        folder / "export.json",
-        {
-            **facts,
-            "files": names,
-            "times": times,
-            "resolution": options.resolution,
-            "threshold": threshold,
-        },
-    )
+    facts |= {"files": names, "times": times}
+    facts |= {"resolution": options.resolution, "threshold": threshold}
+    write_json(folder / "export.json", facts)
     return folder
+
+
+def _threshold(trained: TrainedRun, options: ExportOptions, times: list[float]) -> float | None:
+    """Density of the surface; None where the field has a surface or points of its own.
+
+    Raises:
+        ConfigError: If the field has none of these, or does not use a threshold that was given.
+        MissingExtraError: For a surface without the extra ``export``.
+    """
+    field, threshold = trained.module.field, options.threshold
+    if options.what == "web" and field.cloud(times[0]) is not None:
+        own = "points of its own"
+    elif not isinstance(trained.module.renderer, RayRenderer):
+        others = " or ".join((*field.exports, "path"))
+        raise ConfigError(
+            f"--what {options.what}: {trained.experiment.method.model.name} has neither a density "
+            f"nor a surface; set --what {others}"
+        )
+    else:
+        require("skimage.measure", extra="export")
+        require("trimesh", extra="export")
+        if not isinstance(field, SurfaceField):
+            return threshold or find_threshold(trained, options.resolution, times[len(times) // 2])
+        own = "a surface of its own"
+    if threshold is not None:
+        raise ConfigError(
+            f"--threshold {threshold:g}: this field has {own} and no density; leave it out"
+        )
+    return None
 
 
 def check_folder(folder: Path) -> None:
@@ -235,6 +261,38 @@ def check_folder(folder: Path) -> None:
         raise ConfigError(f"{folder} holds files already: empty it, or name another with --out")
 
 
+def shape_at(
+    trained: TrainedRun, time: float, resolution: int, threshold: float | None, count: int | None
+) -> Shape:
+    """The coloured surface of one timestep, in the world.
+
+    Args:
+        trained: The run.
+        time: From 0 to 1.
+        resolution: Grid points along each side of the field's cube.
+        threshold: Density of the surface; None for a field of signed distances.
+        count: Points on it in place of triangles.
+
+    Raises:
+        ConfigError: If there is no surface.
+    """
+    mesh, trimesh = (
+        surface(trained, time, resolution, threshold),
+        require("trimesh", extra="export"),
+    )
+    if count is None:
+        places, normals = mesh.vertices, mesh.vertex_normals
+    else:
+        places, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
+        normals = mesh.face_normals[faces]
+    points = torch.tensor(places, dtype=torch.float32)
+    outward = torch.tensor(normals, dtype=torch.float32)
+    # What one sees of a soft surface lies a little below it.
+    depth = 0 if threshold is None else 2 / resolution
+    colours = surface_colours(trained, points - depth * outward, outward, time)
+    return Shape(trained.frame.to_world(points), colours, mesh.faces if count is None else None)
+
+
 def _write_each(
     trained: TrainedRun,
     options: ExportOptions,
@@ -243,31 +301,67 @@ def _write_each(
     files: Iterable[Path],
 ) -> Iterable[Path]:
     trimesh = require("trimesh", extra="export")
+    count = None if options.what == "mesh" else POINTS if options.count is None else options.count
     for time, path in zip(times, files, strict=True):
-        mesh = surface(trained, time, options.resolution, threshold)
-        if options.what == "points":
-            places, faces = trimesh.sample.sample_surface(mesh, options.count, seed=0)
-            normals = mesh.face_normals[faces]
-        else:
-            places, normals = mesh.vertices, mesh.vertex_normals
-        points = torch.tensor(places, dtype=torch.float32)
-        outward = torch.tensor(normals, dtype=torch.float32)
-        # What one sees of a soft surface lies a little below it.
-        depth = 0 if threshold is None else 2 / options.resolution
-        colours = surface_colours(trained, points - depth * outward, outward, time)
-        if options.form == "glb":
-            colours = _linear(colours)  # As its standard has it; PLY files are in sRGB.
+        shape = shape_at(trained, time, options.resolution, threshold, count)
+        # GLB has linear colours as its standard says; PLY files are in sRGB.
+        colours = _linear(shape.colours) if options.form == "glb" else shape.colours
         pixels = (255 * colours).round().byte().numpy()
-        world = trained.frame.to_world(points).numpy()
-        if options.what == "points":
+        world = shape.places.numpy()
+        if shape.faces is None:
             found = trimesh.PointCloud(world, colors=pixels)
         else:
-            found = trimesh.Trimesh(world, mesh.faces, vertex_colors=pixels, process=False)
+            found = trimesh.Trimesh(world, shape.faces, vertex_colors=pixels, process=False)
         with replacing(path) as temporary:
             temporary.write_bytes(
                 _glb(found) if options.form == "glb" else found.export(file_type="ply")
             )
         yield path
+
+
+def _write_web(
+    folder: Path,
+    trained: TrainedRun,
+    options: ExportOptions,
+    threshold: float | None,
+    times: list[float],
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """Write the page of all timesteps; what `export.json` says of it."""
+    field = trained.module.field
+
+    def coarser(share: float) -> int:
+        # The number of triangles grows with the square of the resolution.
+        return max(COARSEST, int(options.resolution * share**0.5))
+
+    def make(time: float, share: float) -> Shape:
+        if (cloud := field.cloud(time)) is not None:
+            points, colours = cloud
+            kept = int(share * min(len(points), options.count or len(points)))
+            return Shape(trained.frame.to_world(points[:kept].cpu()), colours[:kept].cpu())
+        if options.count is not None:
+            count = max(1, int(share * options.count))
+            return shape_at(trained, time, options.resolution, threshold, count)
+        return shape_at(trained, time, coarser(share), threshold, None)
+
+    written = write_page(
+        folder / PAGE,
+        make,
+        times,
+        title=trained.path.name,
+        background=trained.scene.background,
+        eye=trained.scene.splits["train"].camera_to_world[0, :3, 3],
+    )
+    share = written.pop("share")
+    facts = {"files": [PAGE], "times": times, **written, "threshold": threshold}
+    if written["triangles"]:
+        facts["resolution"] = coarser(share)
+        shown = f"{written['triangles']:,} triangles at resolution {coarser(share)}"
+    else:
+        shown = f"{written['vertices']:,} points"
+    fitted = "" if share == 1 else f"; {share:.0%} of what was wanted, to stay below 20 MB"
+    say(f"page        {len(times)} timesteps, {shown}{fitted}; {written['bytes'] / 1e6:.1f} MB")
+    return facts
 
 
 def _glb(geometry: Any) -> bytes:

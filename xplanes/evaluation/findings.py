@@ -1,21 +1,22 @@
-"""What may be wrong with a capture: each finding in words, with its numbers and the way out."""
+"""What may be wrong with a capture: findings, each with its numbers and the way out."""
 
 import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from xplanes.rendering.box import ray_box
-from xplanes.scenes.cameras import cast_rays, project
+from xplanes.scenes.cameras import project
 from xplanes.scenes.entries import some
 from xplanes.scenes.frame import Frame, axes_meet, backwards, optical_centre
 from xplanes.scenes.matte import silhouette_of
 from xplanes.scenes.silhouettes import count_in_squares
-from xplanes.scenes.views import Scene, Views
+from xplanes.scenes.views import Scene, Views, spread
 
 GAP_SPACINGS, GAP_SPAN = 12.0, 0.05
 """Least length of a gap in time: in median spacings, and as a share of the whole span."""
@@ -36,7 +37,8 @@ CUT = 0.02
 """Share of the foreground that may lie outside of the cube."""
 
 PALE_STEPS, PALE = 16, 0.15
-"""Opaque pixels at most so far from the background look like it; share that may, at silhouettes."""
+"""Opaque pixels fewer of 255 steps from the background's colour look like it; share of a silhouette
+that may."""
 
 HALO = 0.03
 """Squares in which soft edges fade around silhouettes, as a share of the image's longer side."""
@@ -48,13 +50,13 @@ FULL = 0.98
 """Share of opaque pixels above which a mask masks nothing."""
 
 MOST_VIEWS = 300
-"""Views of a split whose pixels are looked at, spread evenly."""
+"""Images of a split that are read at most, spread evenly."""
 
 AT_START = 32
 """The same at the start of a run, whose images may lie on the disk."""
 
 MOST_RAYS = 4096
-"""Foreground pixels of an image whose rays are held against the cube."""
+"""Foreground pixels of an image whose rays are tested against the cube."""
 
 
 @dataclass(frozen=True)
@@ -71,44 +73,46 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Look:
+class ImageFacts:
     """What the pixels of one image tell.
 
     Attributes:
+        index: Number of the image in its split.
+        file: Its name.
         coverage: Share of the pixels that are opaque.
         border: The same along the image's edges.
         middle: The same in the middle, a tenth as wide and high as the image.
         pale_edge: Share of the opaque pixels next to transparent ones that look like the
             background; None where there are too few to say.
-        cut: Share of the foreground whose rays miss the cube.
+        outside: Share of the foreground whose rays miss the cube.
         stray: Pixels with alpha away from the silhouette.
         digest: Hash of the pixels; None where all are alike.
     """
 
+    index: int
+    file: str
     coverage: float
     border: float
     middle: float
     pale_edge: float | None
-    cut: float
+    outside: float
     stray: int
     digest: bytes | None
 
 
-def looked_at(views: Views, most: int = MOST_VIEWS) -> list[int]:
-    """Numbers of the views whose pixels are looked at."""
-    count = min(len(views), most)
-    return [round(i * (len(views) - 1) / max(count - 1, 1)) for i in range(count)]
-
-
-def look(views: Views, index: int, background: Tensor, frame: Frame | None) -> Look:
-    """Look at the pixels of one image.
+def image_facts(views: Views, background: Tensor, frame: Frame | None) -> list[ImageFacts]:
+    """What the pixels of a split's images tell, of at most `MOST_VIEWS` of them.
 
     Args:
         views: The images.
-        index: Which of them.
-        background: What lies behind the scene, from 0 to 1. [3]
-        frame: The field's frame; None where none was found.
+        background: Colour behind the scene, from 0 to 1. [3]
+        frame: The field's frame; None where the cameras see no common volume.
     """
+    chosen = spread(MOST_VIEWS, len(views))
+    return [_facts_of(views, index, background, frame) for index in chosen]
+
+
+def _facts_of(views: Views, index: int, background: Tensor, frame: Frame | None) -> ImageFacts:
     image = views.image(index)
     alpha = image[..., 3]
     height, width = alpha.shape
@@ -124,15 +128,17 @@ def look(views: Views, index: int, background: Tensor, frame: Frame | None) -> L
     # Half-transparent pixels lie between, so that the opaque ones are two pixels away.
     near_clear = F.max_pool2d(clear.float()[None], 5, stride=1, padding=2)[0] > 0
     edge = near_clear & (alpha >= 250)
-    plain = bool((image == image[0, 0]).all())
-    return Look(
+    uniform = bool((image == image[0, 0]).all())
+    return ImageFacts(
+        index=index,
+        file=views.files[index],
         coverage=_share(opaque, valid),
         border=_share(opaque, ring),
         middle=_share(opaque[rows, columns], valid[rows, columns]),
         pale_edge=_share(pale, edge) if int(edge.sum()) >= 0.1 * (height + width) else None,
-        cut=0.0 if frame is None else _cut(views, index, opaque, frame),
+        outside=0.0 if frame is None else _outside(views, index, opaque, frame),
         stray=_stray_pixels(alpha),
-        digest=None if plain else hashlib.sha256(image.contiguous().numpy().data).digest(),
+        digest=None if uniform else hashlib.sha256(image.contiguous().numpy().data).digest(),
     )
 
 
@@ -140,21 +146,13 @@ def _share(what: Tensor, among: Tensor) -> float:
     return float(what[among].float().mean()) if among.any() else 0.0
 
 
-def _cut(views: Views, index: int, opaque: Tensor, frame: Frame) -> float:
+def _outside(views: Views, index: int, opaque: Tensor, frame: Frame) -> float:
     """Share of an image's foreground whose rays miss the cube."""
     pixels = opaque.nonzero()
     if not len(pixels):
         return 0.0
     rows, columns = pixels[:: -(-len(pixels) // MOST_RAYS)].float().T
-    intrinsics = views.intrinsics
-    rays = cast_rays(
-        views.camera_to_world[index],
-        rows,
-        columns,
-        focal=intrinsics.focal[index],
-        centre=intrinsics.centre[index],
-        lenses=intrinsics.lens(index),
-    )
+    rays = views.pixel_rays(torch.full_like(rows, index, dtype=torch.long), rows, columns)
     far = ray_box(*frame.rays(*rays))[1]
     return float((far <= 0).float().mean())
 
@@ -185,25 +183,24 @@ def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
         yield from _scale(train, frame)
 
 
-def image_findings(scene: Scene, looks: Mapping[str, list[Look]]) -> Iterator[Finding]:
+def image_findings(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iterator[Finding]:
     """What the images' pixels tell.
 
     Args:
         scene: The scene.
-        looks: Looks at the images of each split, of those that `looked_at` names.
+        images: What `image_facts` gives of each split.
     """
-    masks = list(_masks(scene, looks))
+    seen = [each for split in images.values() for each in split]
+    masks = list(_masks(seen))
     yield from masks
-    yield from _shared_images(scene, looks)
-    named = _named(scene, looks)
-    yield from _stray([(file, each.stray) for file, each in named])
+    yield from _shared_images(scene, images)
+    yield from _stray([(each.file, each.stray) for each in seen])
     if masks:
         return  # What silhouettes tell means little then.
-    seen = [each for split in looks.values() for each in split]
     transparent = [each for each in seen if each.coverage < FULL]
     if 2 * len(transparent) > len(seen):
         yield from _white_edges(transparent)
-        share = _mean([each.cut for each in transparent])
+        share = fmean(each.outside for each in transparent)
         if share > CUT:
             yield Finding(
                 "cut",
@@ -225,10 +222,10 @@ def opaque_findings(scene: Scene) -> Iterator[Finding]:
 
 
 def stray_findings(scene: Scene) -> Iterator[Finding]:
-    """Whether training images have alpha away from their silhouettes; looks at some of them."""
+    """Whether training images, of which some are read, have alpha away from their silhouettes."""
     views = scene.splits["train"]
     if not views.is_opaque:
-        chosen = looked_at(views, AT_START)
+        chosen = spread(AT_START, len(views))
         yield from _stray([(views.files[i], _stray_pixels(views.image(i)[..., 3])) for i in chosen])
 
 
@@ -336,27 +333,23 @@ def _shared(scene: Scene) -> Iterator[Finding]:
             yield _shared_finding(split, len(views), found, "file, or the same camera and time")
 
 
-def _shared_images(scene: Scene, looks: Mapping[str, list[Look]]) -> Iterator[Finding]:
+def _shared_images(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iterator[Finding]:
     """Scored views whose pixels are those of a training view with another camera or file."""
     if any(_shared(scene)):
         return
     train = scene.splits["train"]
-    known = {
-        each.digest: index
-        for index, each in zip(looked_at(train), looks["train"], strict=True)
-        if each.digest is not None
-    }
+    known = {each.digest: each.index for each in images["train"] if each.digest is not None}
     for split, views in scene.splits.items():
         if split == "train":
             continue
         found = []
-        for index, each in zip(looked_at(views), looks[split], strict=True):
+        for each in images[split]:
             other = known.get(each.digest) if each.digest is not None else None
             # One camera shows the same again as long as nothing moves.
             if other is not None and not torch.equal(
-                views.camera_to_world[index], train.camera_to_world[other]
+                views.camera_to_world[each.index], train.camera_to_world[other]
             ):
-                found.append((views.files[index], train.files[other]))
+                found.append((each.file, train.files[other]))
         if found:
             yield _shared_finding(split, len(views), found, "pixels")
 
@@ -415,18 +408,23 @@ def _outward(views: Views) -> Finding | None:
     )
 
 
+def pixels_of(views: Views, index: int, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Where an image shows world points [N, 3]: what `project` gives for its camera. [N] each"""
+    intrinsics = views.intrinsics
+    return project(
+        views.camera_to_world[index],
+        points,
+        focal=intrinsics.focal[index],
+        centre=intrinsics.centre[index],
+        lenses=intrinsics.lens(index),
+    )
+
+
 def sees_centre(views: Views, frame: Frame) -> Tensor:
     """Which cameras have the centre of the cube in their image. bool [V]"""
     found = torch.zeros(len(views), dtype=torch.bool)
-    for index, pose in enumerate(views.camera_to_world):
-        intrinsics = views.intrinsics
-        column, row, seen = project(
-            pose,
-            frame.centre[None],
-            focal=intrinsics.focal[index],
-            centre=intrinsics.centre[index],
-            lenses=intrinsics.lens(index),
-        )
+    for index in range(len(views)):
+        column, row, seen = pixels_of(views, index, frame.centre[None])
         height, width = views.size(index)
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         found[index] = seen & inside
@@ -459,34 +457,28 @@ def _scale(views: Views, frame: Frame) -> Iterator[Finding]:
         )
 
 
-def _masks(scene: Scene, looks: Mapping[str, list[Look]]) -> Iterator[Finding]:
+def _masks(images: Sequence[ImageFacts]) -> Iterator[Finding]:
     """Masks that hide everything, nothing, or the wrong side."""
-    named = _named(scene, looks)
-    count = len(named)
-    empty = [file for file, each in named if each.coverage < EMPTY]
+    count = len(images)
+    empty = [each.file for each in images if each.coverage < EMPTY]
     if len(empty) > 0.05 * count:
         yield Finding(
             "empty",
             f"{len(empty)} of {count} images show next to nothing (under {EMPTY:.1%} of their "
             f"pixels are opaque), such as {empty[0]}. Check alpha and masks, or leave them out",
         )
-    inside_out = [
-        file
-        for file, each in named
-        if each.border > 0.9 and each.middle < 0.1 and 0.3 < each.coverage < 1
-    ]
-    if 2 * len(inside_out) > count:
-        coverage = _mean([each.coverage for _, each in named])
+    inverted = [e for e in images if e.border > 0.9 and e.middle < 0.1 and 0.3 < e.coverage < 1]
+    if 2 * len(inverted) > count:
         yield Finding(
             "inverted",
-            f"{len(inside_out)} of {count} images are opaque at their edges and transparent in the "
-            f"middle; {coverage:.0%} of all pixels are opaque. The masks seem inverted: they must "
-            "be white, or alpha opaque, where the scene is",
+            f"{len(inverted)} of {count} images are opaque at their edges and transparent in the "
+            f"middle; {fmean(each.coverage for each in images):.0%} of all pixels are opaque. The "
+            "masks seem inverted: they must be white, or alpha opaque, where the scene is",
         )
         return
-    full = [file for file, each in named if each.coverage >= 0.9995]
-    masked = [each for _, each in named if each.coverage < 0.9995]
-    hardly = [each for each in masked if each.coverage > FULL]
+    full = [each.file for each in images if each.coverage >= 0.9995]
+    masked = [each.coverage for each in images if each.coverage < 0.9995]
+    hardly = [coverage for coverage in masked if coverage > FULL]
     if 2 * len(hardly) > count:
         yield Finding(
             "opaque",
@@ -494,26 +486,17 @@ def _masks(scene: Scene, looks: Mapping[str, list[Look]]) -> Iterator[Finding]:
             f"{1 - FULL:.0%} of the pixels. Check the masks: they must hide the background, or be "
             "left out",
         )
-    elif full and _mean([each.coverage for each in masked] or [1.0]) < 0.5:
+    elif full and masked and fmean(masked) < 0.5:
         yield Finding(
             "opaque",
             f"{len(full)} of {count} images are opaque all over, such as {full[0]}, while the "
-            f"others hide {1 - _mean([each.coverage for each in masked]):.0%} of their pixels. "
-            "Their masks are missing: add them, or leave the images out",
+            f"others hide {1 - fmean(masked):.0%} of their pixels. Their masks are missing: add "
+            "them, or leave the images out",
         )
 
 
-def _named(scene: Scene, looks: Mapping[str, list[Look]]) -> list[tuple[str, Look]]:
-    """Looks at images, with the images' names."""
-    return [
-        (scene.splits[split].files[index], each)
-        for split, found in looks.items()
-        for index, each in zip(looked_at(scene.splits[split]), found, strict=True)
-    ]
-
-
 def _stray(counts: Sequence[tuple[str, int]]) -> Iterator[Finding]:
-    """Images with alpha away from their silhouettes, by their names and the numbers of pixels."""
+    """Images with alpha away from their silhouettes, by file and number of such pixels."""
     found = sorted([each for each in counts if each[1]], key=lambda each: -each[1])
     if found:
         names = some([f"{file} ({count})" for file, count in found])
@@ -527,18 +510,13 @@ def _stray(counts: Sequence[tuple[str, int]]) -> Iterator[Finding]:
         )
 
 
-def _white_edges(seen: list[Look]) -> Iterator[Finding]:
+def _white_edges(images: Sequence[ImageFacts]) -> Iterator[Finding]:
     """Silhouettes that look like the background."""
-    edges = [each.pale_edge for each in seen if each.pale_edge is not None]
-    pale = _mean(edges) if edges else 0.0
-    if pale > PALE:
+    edges = [each.pale_edge for each in images if each.pale_edge is not None]
+    if edges and (pale := fmean(edges)) > PALE:
         yield Finding(
             "white",
             f"{pale:.0%} of the silhouettes have the background's colour: colour alone cannot tell "
             "the scene from empty space there. Keep model.loss.opacity above 0, which learns them "
             "from alpha, or set model.rays.background=random",
         )
-
-
-def _mean(values: list[float]) -> float:
-    return math.fsum(values) / len(values)

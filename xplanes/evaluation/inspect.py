@@ -14,12 +14,11 @@ from xplanes.config import compose_plain, group_options, quoted
 from xplanes.errors import ConfigError, SceneError
 from xplanes.evaluation.findings import (
     Finding,
-    Look,
+    ImageFacts,
     calibrations,
     camera_findings,
+    image_facts,
     image_findings,
-    look,
-    looked_at,
     texel_findings,
     time_gaps,
     time_steps,
@@ -27,7 +26,7 @@ from xplanes.evaluation.findings import (
 from xplanes.evaluation.tabulate import markdown
 from xplanes.models.base import ModelSettings
 from xplanes.process import train_command
-from xplanes.scenes.cameras import cast_rays, image_plane
+from xplanes.scenes.cameras import image_plane
 from xplanes.scenes.entries import some
 from xplanes.scenes.frame import Frame, pixels_across
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
@@ -65,14 +64,14 @@ class Choice:
 
 @dataclass(frozen=True)
 class Capture:
-    """A capture that was read and looked at.
+    """A capture that was read.
 
     Attributes:
         choice: What it was read with.
         scene: What was read.
         frame: The field's frame; None where none can be found.
         problem: Why none can be found; empty where one was.
-        looks: Looks at the images of each split.
+        images: What the pixels of each split's images tell.
         findings: What may be wrong.
         texels: Texels along an axis of the planes; None for fields without planes.
     """
@@ -81,7 +80,7 @@ class Capture:
     scene: Scene
     frame: Frame | None
     problem: str
-    looks: Mapping[str, list[Look]]
+    images: Mapping[str, list[ImageFacts]]
     findings: tuple[Finding, ...]
     texels: int | None
 
@@ -175,7 +174,7 @@ def _recognised(folder: Path, changed: Sequence[str]) -> str:
 
 
 def inspect(choice: Choice) -> Capture:
-    """Read a capture and look at all of it.
+    """Read a capture and check all of it.
 
     Raises:
         SceneError: If it cannot be used.
@@ -188,11 +187,10 @@ def inspect(choice: Choice) -> Capture:
         frame = model.frame(train, choice.scene.half_side, scene.points)
     except SceneError as error:
         problem = str(error)
-    looks = {
-        split: [look(views, index, scene.background, frame) for index in looked_at(views)]
-        for split, views in scene.splits.items()
+    images = {
+        split: image_facts(views, scene.background, frame) for split, views in scene.splits.items()
     }
-    findings = [*camera_findings(scene, frame), *image_findings(scene, looks)]
+    findings = [*camera_findings(scene, frame), *image_findings(scene, images)]
     texels = None
     if frame is not None:
         pixels = pixels_across(train, frame)
@@ -201,7 +199,7 @@ def inspect(choice: Choice) -> Capture:
             findings += texel_findings(pixels / texels, train, texels)
     follows = {kind for each in findings for kind in CONSEQUENCES.get(each.kind, ())}
     findings = [each for each in findings if each.kind not in follows]
-    return Capture(choice, scene, frame, problem, looks, tuple(findings), texels)
+    return Capture(choice, scene, frame, problem, images, tuple(findings), texels)
 
 
 def cameras_of(views: Views) -> list[CameraGroup]:
@@ -282,20 +280,12 @@ def distortion(views: Views) -> float:
 
 def field_of_view(views: Views) -> tuple[float, float]:
     """Angles in degrees between the middles of opposite edges, across and down; the first view."""
-    intrinsics = views.intrinsics
     height, width = views.size(0)
     rows = torch.tensor([height / 2 - 0.5] * 2 + [-0.5, height - 0.5], dtype=torch.float64)
     columns = torch.tensor([-0.5, width - 0.5] + [width / 2 - 0.5] * 2, dtype=torch.float64)
-    looks = cast_rays(
-        torch.eye(4, dtype=torch.float64),
-        rows,
-        columns,
-        focal=intrinsics.focal[0],
-        centre=intrinsics.centre[0],
-        lenses=intrinsics.lens(0),
-    )[1]
+    _, ends = views.pixel_rays(torch.zeros(4, dtype=torch.long), rows, columns)
     across, down = (
-        math.degrees(math.acos(max(-1.0, min(1.0, float(looks[i] @ looks[i + 1]))))) for i in (0, 2)
+        math.degrees(math.acos(max(-1.0, min(1.0, float(ends[i] @ ends[i + 1]))))) for i in (0, 2)
     )
     return across, down
 
@@ -310,7 +300,7 @@ def facts(capture: Capture) -> dict[str, Any]:
         "folder": str(capture.choice.scene.folder),
         "overrides": list(capture.choice.overrides),
         "splits": {
-            split: _split_facts(views, capture.looks[split])
+            split: _split_facts(views, capture.images[split])
             for split, views in scene.splits.items()
         },
         "video_frames": None if scene.video is None else len(scene.video),
@@ -341,14 +331,14 @@ def _rounded(value: float, frame: Frame) -> float:
     return round(value * frame.scale, 6) / frame.scale + 0.0
 
 
-def _split_facts(views: Views, looks: Sequence[Look]) -> dict[str, Any]:
+def _split_facts(views: Views, images: Sequence[ImageFacts]) -> dict[str, Any]:
     groups = cameras_of(views)
     times = time_steps(views)
     spacing = times.diff()
-    coverage = sorted(each.coverage for each in looks)
+    coverage = sorted(each.coverage for each in images)
     return {
         "views": len(views),
-        "looked_at": len(looks),
+        "looked_at": len(images),
         "sizes": sorted({views.size(index) for index in range(len(views))}),
         "cameras": len(groups),
         "cameras_fixed": groups[0].fixed,
@@ -368,20 +358,8 @@ def _split_facts(views: Views, looks: Sequence[Look]) -> dict[str, Any]:
 def table(capture: Capture) -> str:
     """What was read, as text."""
     known = facts(capture)
-    rows = {
-        "views": lambda each: str(each["views"]),
-        "pixels": lambda each: _size_words(each["sizes"]),
-        "cameras": _camera_words,
-        "lens": lambda each: each["lens"],
-        "distortion": _distortion_words,
-        "field of view": lambda each: "{:.0f} x {:.0f} degrees".format(*each["field_of_view"]),
-        "times": _time_words,
-        "longest gap": _gap_words,
-        "opaque pixels": _cover_words,
-        "memory": lambda each: f"{each['bytes'] / 2**20:.1f} MB",
-    }
-    splits = known["splits"]
-    lines = [[name, *(words(each) for each in splits.values())] for name, words in rows.items()]
+    splits = {split: _split_rows(each) for split, each in known["splits"].items()}
+    lines = [[name, *(rows[name] for rows in splits.values())] for name in splits["train"]]
     text = [
         f"scene   {known['scene']}, read from {known['folder']} as {known['format']}",
         "",
@@ -412,6 +390,31 @@ def table(capture: Capture) -> str:
     return "\n".join(text)
 
 
+def _split_rows(each: Mapping[str, Any]) -> dict[str, str]:
+    """The rows of the table for one split."""
+    sizes = [f"{width}x{height}" for height, width in each["sizes"]]
+    distortion, gap = each["distortion_pixels"], each["largest_gap"]
+    first, last = each["times"]
+    low, middle, high = each["opaque"]
+    opaque = "all" if low >= 0.9995 else f"{low:.0%} to {high:.0%}, median {middle:.0%}"
+    if each["looked_at"] < each["views"]:
+        opaque += f", {each['looked_at']} views"
+    return {
+        "views": str(each["views"]),
+        "pixels": sizes[0] if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}",
+        "cameras": f"{each['cameras']} {'fixed' if each['cameras_fixed'] else 'moving'}",
+        "lens": each["lens"],
+        "distortion": f"{distortion:.1f} px at a corner" if distortion else "none",
+        "field of view": "{:.0f} x {:.0f} degrees".format(*each["field_of_view"]),
+        "times": f"all {first:g}"
+        if first == last
+        else f"{each['timesteps']} from {first:.3g} to {last:.3g}",
+        "longest gap": "none" if gap is None else f"{gap:.3g}, median {each['median_spacing']:.3g}",
+        "opaque pixels": opaque,
+        "memory": f"{each['bytes'] / 2**20:.1f} MB",
+    }
+
+
 def next_command(capture: Capture) -> str:
     """The command that trains on the capture, at the usual width where images are wider.
 
@@ -426,38 +429,6 @@ def next_command(capture: Capture) -> str:
     if capture.scene.is_surrounded and len(poses) >= MANY_POSES and "recipe" not in chosen:
         overrides = [*overrides, "recipe=capture"]
     return f"{train_command()} {shlex.join(overrides)}"
-
-
-def _size_words(sizes: Sequence[tuple[int, int]]) -> str:
-    words = [f"{width}x{height}" for height, width in sizes]
-    return words[0] if len(words) == 1 else f"{words[0]} to {words[-1]}"
-
-
-def _camera_words(each: Mapping[str, Any]) -> str:
-    return f"{each['cameras']} {'fixed' if each['cameras_fixed'] else 'moving'}"
-
-
-def _distortion_words(each: Mapping[str, Any]) -> str:
-    pixels = each["distortion_pixels"]
-    return f"{pixels:.1f} px at a corner" if pixels else "none"
-
-
-def _gap_words(each: Mapping[str, Any]) -> str:
-    gap = each["largest_gap"]
-    return "none" if gap is None else f"{gap:.3g}, median {each['median_spacing']:.3g}"
-
-
-def _time_words(each: Mapping[str, Any]) -> str:
-    first, last = each["times"]
-    if first == last:
-        return f"all {first:g}"
-    return f"{each['timesteps']} from {first:.3g} to {last:.3g}"
-
-
-def _cover_words(each: Mapping[str, Any]) -> str:
-    low, middle, high = each["opaque"]
-    words = "all" if low >= 0.9995 else f"{low:.0%} to {high:.0%}, median {middle:.0%}"
-    return words if each["looked_at"] == each["views"] else f"{words}, {each['looked_at']} views"
 
 
 def check_out(out: Path, settings: SceneSettings) -> None:

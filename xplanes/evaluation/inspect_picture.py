@@ -10,12 +10,11 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from xplanes.evaluation.findings import sees_centre, time_gaps
+from xplanes.evaluation.findings import pixels_of, sees_centre, time_gaps
 from xplanes.evaluation.inspect import CameraGroup, Capture, cameras_of
 from xplanes.files import replacing
-from xplanes.scenes.cameras import cast_rays, project
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.views import Views
+from xplanes.scenes.views import Views, spread
 
 WIDTH, HEIGHT, MARGIN = 1600, 960, 24
 SCALE = 2
@@ -186,7 +185,7 @@ def _cameras(side: int, title: str, axes: str, capture: Capture) -> Image.Image:
         sees = torch.ones(len(views), dtype=torch.bool)
         if frame is not None:
             sees = sees_centre(views, frame)
-        chosen = set(_spread(len(views), MOST_FRUSTA))
+        chosen = set(spread(MOST_FRUSTA, len(views)))
         for index in range(len(views)):
             colour = _colour(split) if sees[index] else ASTRAY
             place = views.camera_to_world[index, :3, 3]
@@ -206,25 +205,13 @@ def _cameras(side: int, title: str, axes: str, capture: Capture) -> Image.Image:
     return sheet.image
 
 
-def _spread(total: int, most: int) -> list[int]:
-    count = min(total, most)
-    return [round(i * (total - 1) / max(count - 1, 1)) for i in range(count)]
-
-
 def _corners(views: Views, index: int, reach: float) -> Tensor:
     """Points at a distance on the rays through an image's corners, around the image. [4, 3]"""
     height, width = views.size(index)
     rows = torch.tensor([-0.5, -0.5, height - 0.5, height - 0.5])
     columns = torch.tensor([-0.5, width - 0.5, width - 0.5, -0.5])
-    intrinsics = views.intrinsics
-    origins, directions = cast_rays(
-        views.camera_to_world[index],
-        rows,
-        columns,
-        focal=intrinsics.focal[index],
-        centre=intrinsics.centre[index],
-        lenses=intrinsics.lens(index),
-    )
+    number = torch.full((4,), index)
+    origins, directions = views.pixel_rays(number, rows, columns)
     return origins + reach * directions
 
 
@@ -294,7 +281,7 @@ def _coverage(sheet: _Sheet, box: Box, capture: Capture) -> None:
         y = below - share * (below - above)
         sheet.line([(start, y), (end, y)], "#d9dee4", 1)
         sheet.text((start - 8, y), f"{share:.0%}", anchor="rm", size=13)
-    bars = [(split, each.coverage) for split, looks in capture.looks.items() for each in looks]
+    bars = [(split, each.coverage) for split, images in capture.images.items() for each in images]
     pitch = min(24.0, (end - start) / len(bars))
     for number, (split, share) in enumerate(bars):
         x = start + number * pitch
@@ -359,15 +346,8 @@ def _sample(views: Views, index: int, size: tuple[int, int], frame: Frame | None
     image = Image.fromarray((255 * picture.clip(0, 1)).astype(np.uint8))
     if frame is None:
         return image
-    pen, intrinsics = ImageDraw.Draw(image), views.intrinsics
-    edges = _cube_edges(frame)
-    x, y, seen = project(
-        views.camera_to_world[index],
-        edges.flatten(0, 1),
-        focal=intrinsics.focal[index],
-        centre=intrinsics.centre[index],
-        lenses=intrinsics.lens(index),
-    )
+    pen, edges = ImageDraw.Draw(image), _cube_edges(frame)
+    x, y, seen = pixels_of(views, index, edges.flatten(0, 1))
     places = torch.stack([x * wide / width, y * high / height], dim=1).view(*edges.shape[:2], 2)
     # Beyond the picture by far, Pillow's coordinates overflow.
     near = seen.view(edges.shape[:2]) & (places.abs().amax(dim=-1) < 20 * max(wide, high))

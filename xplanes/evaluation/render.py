@@ -23,7 +23,6 @@ from xplanes.rendering.base import Renderer, leave_empty
 from xplanes.rendering.pictures import colour_map, to_bytes
 from xplanes.scenes.cameras import PosedCamera, orbit
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.lenses import Lenses
 from xplanes.scenes.views import Scene, Views
 from xplanes.training.module import RadianceModule
 
@@ -37,23 +36,13 @@ def orbit_poses(views: Views, frame: Frame, count: int, elevation: float = ELEVA
     return orbit(count, radius=float(distance), elevation=elevation, target=frame.centre)
 
 
-def video_times(frames: int) -> Tensor:
-    """Times from 0 to 1 and back to 0, so that a looped video has no jump. [frames]"""
-    phase = torch.arange(frames) / max(frames, 1)
-    return 1 - (2 * phase - 1).abs()
-
-
 def render_path(
     field: Any,
     renderer: Renderer,
     frame: Frame,
-    poses: Tensor,
+    cameras: Iterable[PosedCamera],
     times: Tensor,
     *,
-    focal: float | Tensor,
-    size: int | tuple[int, int],
-    centre: Tensor | None = None,
-    lens: Lenses | None = None,
     background: Tensor,
     what: str = "colour",
     shown: Tensor | None = None,
@@ -64,13 +53,8 @@ def render_path(
         field: What the renderer takes as a field.
         renderer: Renders it.
         frame: The field's frame.
-        poses: Camera-to-world matrices. [F, 4, 4]
+        cameras: The camera of each frame, in the world.
         times: Time of each frame, from 0 to 1. [F]
-        focal: Focal length in pixels of these frames, those along x and y [2], or those of each
-            frame. [F, 2]
-        size: Pixels per side of a square, or rows and columns.
-        centre: Principal point in pixels; the middle when None. [2]
-        lens: Lens of these frames; a pinhole when None.
         background: Colour behind the scene. [3]
         what: ``colour``, or ``depth`` as colours whose scale is the same in all frames.
         shown: Pixels that the lens has rays for, the others stay empty; all when None. bool
@@ -79,16 +63,13 @@ def render_path(
     Yields:
         Pictures. uint8 [rows, columns, 3]
     """
-    rows, columns = (size, size) if isinstance(size, int) else size
-    focals = torch.as_tensor(focal).expand(len(poses), 2)
-    for pose, each, time in zip(poses, focals, times.tolist(), strict=True):
-        camera = PosedCamera(pose, each, rows, columns, centre, lens)
+    for camera, time in zip(cameras, times.tolist(), strict=True):
         image = renderer.view(field, frame, camera, time, background)
         if shown is not None:
             leave_empty(image, ~shown, background)
         picture = image["colour"]
         if what == "depth":
-            picture = _depth(image, float(frame.points(pose[:3, 3]).norm()))
+            picture = _depth(image, float(frame.points(camera.camera_to_world[:3, 3]).norm()))
         yield to_bytes(picture)
 
 
@@ -150,12 +131,21 @@ def write_video(path: Path, frames: Iterable[Tensor], *, fps: int, folder: bool 
     if folder:
         for number, frame in enumerate(frames):
             _write_image(path / f"frame_{number:04d}.png", frame)
-    elif path.suffix == ".mp4":
-        _write_mp4(path, frames, fps)
     elif path.suffix in IMAGES:
         _write_image(path, next(iter(frames)))
+    elif path.suffix == ".mp4":
+        imageio = require("imageio.v2", extra="video")
+        # imageio would resize frames to multiples of 16 if it were not told otherwise.
+        options = {"fps": fps, "macro_block_size": 2, "quality": 8}
+        with replacing(path) as temporary, imageio.get_writer(temporary, **options) as writer:
+            for frame in frames:
+                height, width = (side // 2 * 2 for side in frame.shape[:2])
+                writer.append_data(frame[:height, :width].numpy())
     else:
-        _write_webp(path, frames, fps)
+        first, *rest = [Image.fromarray(frame.numpy()) for frame in frames]
+        video = {"save_all": True, "append_images": rest, "duration": round(1000 / fps), "loop": 0}
+        with replacing(path) as temporary:
+            first.save(temporary, format="WEBP", quality=85, method=2, **video)
     return path
 
 
@@ -163,31 +153,6 @@ def _write_image(path: Path, frame: Tensor) -> None:
     with replacing(path) as temporary:
         # The quality is that of JPEG files.
         Image.fromarray(frame.numpy()).save(temporary, format=IMAGES[path.suffix], quality=95)
-
-
-def _write_webp(path: Path, frames: Iterable[Tensor], fps: int) -> None:
-    first, *rest = [Image.fromarray(frame.numpy()) for frame in frames]
-    with replacing(path) as temporary:
-        first.save(
-            temporary,
-            format="WEBP",
-            save_all=True,
-            append_images=rest,
-            duration=round(1000 / fps),
-            loop=0,
-            quality=85,
-            method=2,
-        )
-
-
-def _write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> None:
-    imageio = require("imageio.v2", extra="video")
-    # imageio would resize frames to multiples of 16 if it were not told otherwise.
-    options = {"fps": fps, "macro_block_size": 2, "quality": 8}
-    with replacing(path) as temporary, imageio.get_writer(temporary, **options) as writer:
-        for frame in frames:
-            height, width = (side // 2 * 2 for side in frame.shape[:2])
-            writer.append_data(frame[:height, :width].numpy())
 
 
 IMAGES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
@@ -352,27 +317,19 @@ def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = N
     check_out(out, options)
     target, folder = destination(trained.path, options, out, trained.checkpoint)
     require_writable(target.parent)
-    size = options.shape(trained.scene.splits)
+    splits, module = trained.scene.splits, trained.module
     if options.time == OWN:
-        views, index = find_view(trained.scene.splits, options.path.removeprefix("view:"))
+        views, index = find_view(splits, options.path.removeprefix("view:"))
         options = replace(options, time=str(float(views.times[index])))
-    if options.cameras is None:
-        focal, centre, distortion = lens(trained.scene.splits, options.path, size)
-    else:
-        focal, centre, distortion = options.cameras.focal(*size)[:, None], None, None
     frames = render_path(
-        trained.module.field,
-        trained.module.renderer,
+        module.field,
+        module.renderer,
         trained.frame,
-        poses(trained, options),
+        cameras(options, splits, trained.frame),
         options.times,
-        focal=focal,
-        size=size,
-        centre=centre,
-        lens=distortion,
         background=trained.scene.background,
         what=options.what,
-        shown=pixels_with_rays(trained.scene.splits, options.path, size),
+        shown=pixels_with_rays(options, splits),
     )
     counted = tqdm(frames, "frames", options.count, leave=False, delay=2, disable=None)
     return write_video(target, counted, fps=options.rate, folder=folder)
@@ -406,68 +363,49 @@ def destination(
     return run / "media" / ("_".join(parts) + ending), False
 
 
-def poses(trained: TrainedRun, options: VideoOptions) -> Tensor:
-    """Camera of each frame. [F, 4, 4]"""
-    if options.cameras is not None:
-        return options.cameras.poses
-    views = trained.scene.splits["train"]
-    if options.path == "orbit":
-        return orbit_poses(views, trained.frame, options.count, options.elevation)
-    if options.path == "fixed":
-        pose = orbit_poses(views, trained.frame, 1, options.elevation)
-    else:
-        pose = view_pose(trained.scene.splits, options.path.removeprefix("view:"))[None]
-    return pose.expand(options.count, 4, 4)
+def cameras(options: VideoOptions, splits: dict[str, Views], frame: Frame) -> list[PosedCamera]:
+    """The camera of each frame.
 
-
-def lens(
-    splits: dict[str, Views], path: str, size: tuple[int, int]
-) -> tuple[float | Tensor, Tensor | None, Lenses | None]:
-    """Focal length, principal point and lens of pictures along a path, for `render_path`.
-
-    Those of a view show exactly what it shows; the others show as much as the training views.
+    That of a view shows exactly what the view shows; the others show as much as the training views.
 
     Args:
+        options: What to render.
         splits: The views of the scene.
-        path: As in `VideoOptions`, but no file.
-        size: Rows and columns of the pictures.
+        frame: The field's frame.
     """
-    if not path.startswith("view:"):
-        return splits["train"].intrinsics.focal_at(max(size)), None, None
-    views, index = find_view(splits, path.removeprefix("view:"))
-    height, width = views.size(index)
-    intrinsics, scale = views.intrinsics, torch.tensor([size[1] / width, size[0] / height])
-    own = intrinsics.lens(index)
-    if own is not None:
-        own = replace(own, skew=own.skew * scale[0])
-    return intrinsics.focal[index] * scale, intrinsics.centre[index] * scale, own
+    rows, columns = options.shape(splits)
+    if (path := options.cameras) is not None:
+        focal = path.focal(rows, columns).tolist()
+        return [PosedCamera(p, f, rows, columns) for p, f in zip(path.poses, focal, strict=True)]
+    if options.path.startswith("view:"):
+        views, index = find_view(splits, options.path.removeprefix("view:"))
+        own, intrinsics = views.camera(index), views.intrinsics
+        scale = torch.tensor([columns / own.width, rows / own.height])
+        lens = None if own.lens is None else replace(own.lens, skew=own.lens.skew * scale[0])
+        focal, centre = intrinsics.focal[index] * scale, intrinsics.centre[index] * scale
+        camera = PosedCamera(own.camera_to_world, focal, rows, columns, centre, lens)
+        return [camera] * options.count
+    views, count = splits["train"], options.count
+    poses = orbit_poses(views, frame, count if options.path == "orbit" else 1, options.elevation)
+    focal = views.intrinsics.focal_at(max(rows, columns))
+    return [PosedCamera(pose, focal, rows, columns) for pose in poses.expand(count, 4, 4)]
 
 
-def pixels_with_rays(splits: dict[str, Views], path: str, size: tuple[int, int]) -> Tensor | None:
-    """Pixels of a picture that its lens has rays for; None for all. bool [rows, columns]
+def pixels_with_rays(options: VideoOptions, splits: dict[str, Views]) -> Tensor | None:
+    """Pixels of a frame that its lens has rays for; None for all. bool [rows, columns]
 
     Args:
+        options: What to render.
         splits: The views of the scene.
-        path: As in `VideoOptions`.
-        size: Rows and columns of the pictures.
     """
-    if not path.startswith("view:"):
+    if not options.path.startswith("view:"):
         return None
-    views, index = find_view(splits, path.removeprefix("view:"))
+    views, index = find_view(splits, options.path.removeprefix("view:"))
     known = views.intrinsics.has_ray(index)
     if known is None:
         return None
+    size = options.shape(splits)
     return F.interpolate(known[None, None].float(), size, mode="nearest-exact")[0, 0] > 0
-
-
-def view_pose(splits: dict[str, Views], name: str) -> Tensor:
-    """Camera of the view whose file is called ``name``, with or without ending. [4, 4]
-
-    Raises:
-        ConfigError: If there is none, with similar names.
-    """
-    views, index = find_view(splits, name)
-    return views.camera_to_world[index]
 
 
 def find_view(splits: dict[str, Views], name: str) -> tuple[Views, int]:
@@ -497,8 +435,8 @@ def times(name: str, count: int) -> Tensor:
     """
     if name == "sweep":
         return torch.linspace(0, 1, count)
-    if name == "back-and-forth":
-        return video_times(count)
+    if name == "back-and-forth":  # So that a looped video has no jump.
+        return 1 - (2 * torch.arange(count) / max(count, 1) - 1).abs()
     try:
         time = float(name)
     except ValueError:
@@ -508,8 +446,8 @@ def times(name: str, count: int) -> Tensor:
     return torch.full((count,), time)
 
 
-VIDEO_FRAMES, VIDEO_FPS, VIDEO_SIZE = 48, 16, 200
-"""Frames of a run's own video, those of a second, and the longer side of its pictures."""
+VIDEO_SIZE = 200
+"""Pixels of the longer side of a run's own video."""
 
 
 def write_orbit(module: RadianceModule, scene: Scene, run: Path) -> Path:
@@ -522,15 +460,13 @@ def write_orbit(module: RadianceModule, scene: Scene, run: Path) -> Path:
     """
     views, frame = scene.splits["train"], module.frame
     assert frame is not None
-    size = min(VIDEO_SIZE, max(views.height, views.width))
+    options = VideoOptions(frames=FRAMES, size=min(VIDEO_SIZE, max(views.height, views.width)))
     frames = render_path(
         module.field,
         module.renderer,
         frame,
-        orbit_poses(views, frame, VIDEO_FRAMES),
-        video_times(VIDEO_FRAMES),
-        focal=views.intrinsics.focal_at(size),
-        size=size,
+        cameras(options, scene.splits, frame),
+        options.times,
         background=scene.background,
     )
-    return write_video(run / "media" / "orbit.webp", frames, fps=VIDEO_FPS)
+    return write_video(run / "media" / "orbit.webp", frames, fps=options.rate)

@@ -1,7 +1,8 @@
-"""What a run says of itself: its first lines, metrics.json, TensorBoard, its last lines."""
+"""What a run reports: its first lines, metrics.json, hyperparameters, its last lines."""
 
 import math
 import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,14 @@ from torch.utils.tensorboard.summary import hparams
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from xplanes import __version__, backend
+from xplanes.evaluation.render import FRAMES, VIDEO_SIZE
 from xplanes.experiment import Experiment
 from xplanes.process import resume_command
 from xplanes.rendering.pictures import write_png
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.training.checkpoints import LAST
 from xplanes.training.clock import training_seconds
-from xplanes.training.evaluation import device_memory, log_image
+from xplanes.training.evaluation import log_image
 from xplanes.training.fit import Estimate, Trainer
 from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore, blank_psnr, mean_colour, mean_scores
@@ -28,10 +30,7 @@ LITTLE = 0.5
 """PSNR in dB above that of empty images below which a run shows nothing."""
 
 CLUTTERED = 0.2
-"""Share of floaters above which a run says so; scenes that succeed have less than a tenth."""
-
-VIDEO_PIXELS = 48 * 200 * 200
-"""Pixels of the video at the end."""
+"""Share of floaters above which a run warns; successful scenes have less than a tenth."""
 
 
 def header(
@@ -85,7 +84,7 @@ def header(
 
 
 def _estimated(experiment: Experiment, data: SceneDataModule, expected: Estimate) -> str:
-    """Seconds that the run is going to take, in words."""
+    """How long the run is going to take, as text."""
     trainer = experiment.trainer
     steps = float(trainer.get("max_steps", -1)) if trainer.get("max_steps", -1) > 0 else math.inf
     train = min(steps * expected.step, trainer.get("max_seconds") or math.inf)
@@ -97,7 +96,7 @@ def _estimated(experiment: Experiment, data: SceneDataModule, expected: Estimate
     if final is not views or count < len(views):
         pixels += final.height * final.width * len(final)
     if experiment.media:
-        pixels += VIDEO_PIXELS
+        pixels += FRAMES * VIDEO_SIZE**2
     images = pixels / expected.image_rays
     whole = f"{train + images:.0f} s" if train < math.inf else "no end of training"
     return f"at most {whole}, {images:.0f} s of it for scores and images"
@@ -222,8 +221,8 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
     if (share := metrics["test"].get("floaters", 0)) > CLUTTERED:
         warnings.append(
             f"warning  {100 * share:.0f}% of the background is not empty (floaters): train longer, "
-            "or check the cameras and times; what is too\n         thin or too fast for the views "
-            "comes out so as well"
+            "or check the cameras and times; content that\n         is too thin or too fast for "
+            "the views shows up as floaters as well"
         )
     place = shlex.quote(str(run))
     named = "".join(f" --plugin {name}" for name in experiment.config.get("plugins") or [])
@@ -256,3 +255,17 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             *(f"{'next' if line is steps[0] else '':<9}{line}" for line in steps),
         ]
     )
+
+
+def device_memory(device: torch.device) -> int:
+    """Most bytes held so far: on the device if it is a GPU, else by this process."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    if sys.platform == "win32":
+        from psutil import Process
+
+        return Process().memory_info().peak_wset
+    import resource
+
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else most * 1024  # Only macOS counts in bytes.

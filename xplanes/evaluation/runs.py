@@ -126,7 +126,7 @@ def load_run(
     experiment = read_experiment(run, plugins)
     data = replace(experiment.data, root=found_root(run, experiment.data.root))
     if device is None:
-        # Trained on a GPU, looked at where there may be none.
+        # A run that was trained on a GPU may be loaded on a machine without one.
         wanted = str(experiment.trainer.get("accelerator", "auto"))
         device = str(find_device("cpu" if wanted == "cpu" else "auto"))
     path = run / "checkpoints" / f"{checkpoint}.ckpt"
@@ -184,7 +184,7 @@ def read_experiment(run: Path, plugins: Sequence[str] = ()) -> Experiment:
 
 
 def _record(run: Path) -> dict[str, Any]:
-    """run.json, or nothing if it is missing or damaged: it only helps here."""
+    """run.json; empty if it is missing or damaged, since only messages need it here."""
     try:
         return read_json(run / "run.json")
     except (OSError, ValueError):

@@ -4,7 +4,7 @@ Everything comes from the pictures that runs write while they train (``media/``)
 """
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -171,17 +171,15 @@ def _views(
     lines = []
     for scene, paths in scenes.items():
         name = _view(scene, [pictures[path] for path in paths], view)
-        cut = _cutter(size, STRIP.index(show))
-        truth = _cutter(size, 0)
         tiles: list[Tile] = []
         for path in paths:
             shown = _steps(path, pictures[path], name, steps, last=what == "runs")
             if what == "steps" or not tiles:
-                tiles = [Tile(truth(shown[max(shown)]), f"{name}, true")]
+                tiles = [Tile(_part(shown[max(shown)], 0, size), f"{name}, true")]
             for step, strip in shown.items():
                 score = f"{_score(strip):.2f} dB"
-                words = f"step {step}" if what == "steps" else run_label(found[path], over)
-                tiles.append(Tile(cut(strip), f"{words}\n{score}"))
+                label = f"step {step}" if what == "steps" else run_label(found[path], over)
+                tiles.append(Tile(_part(strip, STRIP.index(show), size), f"{label}\n{score}"))
             if what == "steps":
                 lines.append((_title(found[path], over), tiles))
         if what == "runs":
@@ -234,24 +232,19 @@ def _steps(
     return {step: Image.open(taken[step][name]).convert("RGB") for step in chosen}
 
 
-def _cutter(size: int, place: int) -> Callable[[Image.Image], Image.Image]:
-    """Cuts one picture out of a strip, and enlarges or reduces it."""
-
-    def cut(strip: Image.Image) -> Image.Image:
-        width = strip.width // len(STRIP)
-        tile = strip.crop((place * width, 0, (place + 1) * width, strip.height))
-        factor = size / max(tile.size)
-        shape = (max(1, round(tile.width * factor)), max(1, round(tile.height * factor)))
-        return tile.resize(shape, Image.Resampling.LANCZOS)
-
-    return cut
+def _part(strip: Image.Image, place: int, size: int) -> Image.Image:
+    """One picture of a strip, its longer side enlarged or reduced to ``size`` pixels."""
+    width = strip.width // len(STRIP)
+    tile = strip.crop((place * width, 0, (place + 1) * width, strip.height))
+    factor = size / max(tile.size)
+    shape = (max(1, round(tile.width * factor)), max(1, round(tile.height * factor)))
+    return tile.resize(shape, Image.Resampling.LANCZOS)
 
 
 def _score(strip: Image.Image) -> float:
     """PSNR of the second picture of a strip against the first."""
     width = strip.width // len(STRIP)
-    flat = torch.frombuffer(bytearray(strip.tobytes()), dtype=torch.uint8)
-    both = flat.view(strip.height, strip.width, 3).float() / 255
+    both = torch.from_numpy(np.array(strip)).float() / 255
     return psnr(both[:, width : 2 * width], both[:, :width])
 
 

@@ -1,4 +1,4 @@
-"""What the runs of a sweep say of themselves, whatever state they are in.
+"""Reads the runs of a sweep, whatever state they are in.
 
 Must stay quick, and a damaged file must not hide the other runs: every problem ends as a run's
 status.
@@ -17,6 +17,7 @@ import yaml
 
 from xplanes.files import natural
 from xplanes.files import read_rows as read_csv
+from xplanes.settings import flatten
 
 SCORES = {
     "psnr": ("test", "psnr"),
@@ -218,15 +219,6 @@ def _scores(metrics: dict[str, Any]) -> dict[str, float]:
 def is_number(value: Any) -> bool:
     """Whether a setting or score is a number, which true and false are not."""
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by dotted name."""
-    flat: dict[str, Any] = {}
-    for key, value in config.items():
-        name = f"{prefix}{key}"
-        flat.update(flatten(value, f"{name}.") if isinstance(value, dict) else {name: value})
-    return flat
 
 
 def run_overrides(run: Path) -> list[str]:

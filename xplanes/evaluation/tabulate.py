@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from statistics import fmean, stdev
 from typing import Any
 
 from xplanes.evaluation.sweep import RunRow
@@ -138,10 +139,10 @@ def seed_table(groups: Sequence[Sequence[RunRow]], names: Sequence[str]) -> list
         line = _settings(group[0], names) | {"seeds": len(group)}
         for name in _measures(row for group in groups for row in group):
             values = [row.scores[name] for row in group if name in row.scores]
-            # The mean of those that got there would be best where most did not.
+            # A mean of those that reached it alone would favour settings where most did not.
             line[name] = mean(values) if len(values) == len(group) else None
             if name in SPREAD:
-                line[f"{name}_std"] = _deviation(values)
+                line[f"{name}_std"] = stdev(values) if len(values) > 1 else None
         lines.append(line)
     return lines
 
@@ -178,15 +179,7 @@ def mean_rank(rows: Sequence[RunRow]) -> float:
 
 def mean(values: Sequence[float]) -> float:
     """Arithmetic mean; NaN of no values."""
-    return math.fsum(values) / len(values) if values else math.nan
-
-
-def _deviation(values: Sequence[float]) -> float | None:
-    """Standard deviation of the population that the values are a sample of; None for one value."""
-    if len(values) < 2:
-        return None
-    middle = mean(values)
-    return math.sqrt(math.fsum((value - middle) ** 2 for value in values) / (len(values) - 1))
+    return fmean(values) if values else math.nan
 
 
 def shown(lines: Sequence[Line]) -> str:

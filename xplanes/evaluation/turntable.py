@@ -20,7 +20,7 @@ from xplanes.preparation.reconstruct import ImageLRMSettings, picture_crop
 from xplanes.preparation.sequence import TriplaneSequence, save_triplanes
 from xplanes.rendering.grid_renderer import DIAGONAL, GridRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.scenes.cameras import camera_around
+from xplanes.scenes.cameras import PosedCamera, camera_around
 from xplanes.scenes.formats import ENDINGS, is_image
 from xplanes.scenes.frame import cube_frame
 from xplanes.scenes.images import load_images
@@ -139,13 +139,6 @@ def turntable(triplanes: Tensor, model: LRM, device: torch.device) -> Iterator[T
         assert renderer is not None
         azimuth = math.degrees(math.atan2(first[1], first[0])) + 360 * number / FRAMES
         pose = camera_around(azimuth, 0.0, view.distance).float()
-        yield from render_path(
-            field,
-            renderer,
-            frame,
-            pose[None],
-            torch.zeros(1),
-            focal=view.focal * SIDE,
-            size=SIDE,
-            background=torch.ones(3),
-        )
+        camera = PosedCamera(pose, view.focal * SIDE, SIDE, SIDE)
+        white = torch.ones(3)
+        yield from render_path(field, renderer, frame, [camera], torch.zeros(1), background=white)

@@ -50,16 +50,10 @@ ABOUT_CAMERAS = "Training cameras, from dark to light in the order of their time
 
 def camera_pose(wxyz: Tensor, position: Tensor) -> Tensor:
     """Pose of a viser camera (x right, y down, looking along +z) in our axes. [4], [3] -> [4, 4]"""
-    w, x, y, z = (wxyz / wxyz.norm()).tolist()
+    rotation = require("viser.transforms", extra="viewer").SO3(wxyz.numpy()).normalize()
     pose = torch.eye(4)
     # The second and third column change sign: our y is up, and we look along -z.
-    pose[:3, :3] = torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), -2 * (x * y - w * z), -2 * (x * z + w * y)],
-            [2 * (x * y + w * z), -(1 - 2 * (x * x + z * z)), -2 * (y * z - w * x)],
-            [2 * (x * z - w * y), -2 * (y * z + w * x), -(1 - 2 * (x * x + y * y))],
-        ]
-    )
+    pose[:3, :3] = torch.from_numpy(rotation.as_matrix()) * torch.tensor([1, -1, -1])
     pose[:3, 3] = position
     return pose
 

@@ -1,4 +1,4 @@
-"""What lies behind the field's cube: a static world without end, in a ball of radius 2."""
+"""What lies behind the field's cube: static and unbounded, contracted to a ball of radius 2."""
 
 import torch
 from torch import Tensor, nn
@@ -39,23 +39,6 @@ def contract(points: Tensor) -> Tensor:
     outside = largest * length > 1
     unit = share / torch.where(outside, length, 1)
     return torch.where(outside, (RADIUS - 1 / length / largest) * unit, points)
-
-
-def contract_cube(points: Tensor) -> Tensor:
-    """Draw all of space into the cube [-2, 2]^3; the cube [-1, 1]^3 stays as it is.
-
-    As `contract`, with the largest coordinate in place of the length.
-
-    Args:
-        points: Positions in the field's frame, finite. [..., 3]
-
-    Returns:
-        [..., 3]
-
-    Source: K-Planes, released code; Mip-NeRF 360, Eq. 10.
-    """
-    largest = points.abs().amax(dim=-1, keepdim=True).clamp_min(1)
-    return (RADIUS - 1 / largest) * (points / largest)
 
 
 def expand(points: Tensor) -> Tensor:

@@ -49,6 +49,17 @@ class Representation(nn.Module, ABC):
         """Files of its own that `xplanes export --what NAME` writes, by name."""
         return {}
 
+    def cloud(self, time: float) -> tuple[Tensor, Tensor] | None:
+        """Points that stand for a field without a density, the most visible first.
+
+        Args:
+            time: From 0 to 1.
+
+        Returns:
+            Points in the field's frame [N, 3] and their colours from 0 to 1 [N, 3], or None.
+        """
+        return None
+
     def masked(self, keep: Callable[[Tensor], Tensor]) -> Any:
         """The same, empty in some places, for a renderer of this field.
 

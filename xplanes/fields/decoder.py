@@ -7,8 +7,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from xplanes.fields.networks import half_rows
-
 Activation = Literal["relu", "silu"]
 DensityActivation = Literal["softplus", "exp"]
 Precision = Literal["32", "bf16"]
@@ -17,6 +15,26 @@ MOST_EXPONENT = 60.0
 """Logits beyond it give the density of this one: an infinite density has gradients that are NaN."""
 
 _ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"relu": torch.relu_, "silu": F.silu}
+
+
+ROWS = 256
+"""On the CPU the rows of products are padded to a multiple of this; to a larger one for many rows.
+
+There each number of rows has a kernel that is compiled at its first use and kept, and every batch
+has another number of samples.
+"""
+
+
+def half_rows(values: Tensor) -> Tensor:
+    """The values in bfloat16, on the CPU with rows of zeros below. [N, C] -> [at least N, C]
+
+    Those are fewer than `ROWS` or than a sixteenth of the values.
+    """
+    values = values.to(torch.bfloat16)
+    if values.device.type != "cpu":
+        return values
+    step = max(ROWS, 2 ** (len(values).bit_length() - 1) // 16)
+    return F.pad(values, (0, 0, 0, -len(values) % step))
 
 
 class Decoder(nn.Module):

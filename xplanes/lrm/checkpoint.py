@@ -1,6 +1,7 @@
 """Strict loading of published weights."""
 
 import pickle
+import zipfile
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -12,7 +13,7 @@ from torch import Tensor
 from xplanes.errors import LRMError
 from xplanes.files import stand_in
 from xplanes.lrm.config import PUBLISHED, LRMConfig, parse_config, published_config
-from xplanes.lrm.keys import translator
+from xplanes.lrm.keys import translate
 from xplanes.lrm.model import LRM
 from xplanes.lrm.openlrm import OpenLRM
 from xplanes.lrm.triposr import TripoSR
@@ -97,7 +98,11 @@ def fill(model: LRM, state: Mapping[str, Tensor]) -> None:
         choices = " or ".join(f"{name} ({PUBLISHED[name].choice})" for name in fits)
         advice = f". It fits {choices or 'no published model'}"
         raise MismatchError("; ".join(problems) + advice, fits)
-    model.load_state_dict(_translated(model, state), assign=True)
+    translated = {}
+    for published, tensor in state.items():
+        if names := translate(model.config.architecture, published):
+            translated.update(zip(names, tensor.float().chunk(len(names)), strict=True))
+    model.load_state_dict(translated, assign=True)
     model.requires_grad_(False)
 
 
@@ -108,11 +113,10 @@ def _finite(values: Tensor) -> bool:
 
 def mismatches(model: LRM, state: Mapping[str, Tensor]) -> list[str]:
     """Differences between published tensors and a model, for messages; empty if they match."""
-    translate = translator(model.config.architecture)
     expected = {name: list(tensor.shape) for name, tensor in model.state_dict().items()}
     unknown, shapes, found = [], [], set()
     for published, tensor in state.items():
-        names = translate(published)
+        names = translate(model.config.architecture, published)
         if names is None or any(name not in expected or name in found for name in names):
             unknown.append(published)
             continue
@@ -124,14 +128,8 @@ def mismatches(model: LRM, state: Mapping[str, Tensor]) -> list[str]:
                 shapes.append(f"{published} is {list(tensor.shape)} and should be {wanted}")
                 break
     missing = [name for name in expected if name not in found]
-    problems = []
-    if shapes:
-        problems.append(_some(shapes))
-    if unknown:
-        problems.append(f"it has unknown tensors: {_some(unknown)}")
-    if missing:
-        problems.append(f"it lacks tensors: {_some(missing)}")
-    return problems
+    problems = {"": shapes, "it has unknown tensors: ": unknown, "it lacks tensors: ": missing}
+    return [f"{what}{_some(names)}" for what, names in problems.items() if names]
 
 
 def fitting(state: Mapping[str, Tensor]) -> list[str]:
@@ -156,7 +154,7 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise LRMError(f"{path} is not a file: give the downloaded weights")
     if (other := stand_in(path)) is not None:
         raise LRMError(f"{path} {other}")
-    content = _read_safetensors(path) if path.suffix == ".safetensors" else _read_pickle(path)
+    content = _content(path)
     carried: Any = {}
     if isinstance(content, dict) and "weights" in content:
         content, carried = content["weights"], content.get("kwargs") or {}
@@ -170,24 +168,20 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return {str(name): tensor for name, tensor in content.items()}, carried
 
 
-def _read_safetensors(path: Path) -> Any:
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
+def _content(path: Path) -> Any:
+    """What a file of weights holds.
 
+    Raises:
+        LRMError: If it is damaged, or holds code.
+    """
     try:
-        return load_file(path)
-    except (SafetensorError, OSError, ValueError) as problem:
-        raise LRMError(f"{path} is damaged or incomplete: {problem}") from problem
+        if path.suffix == ".safetensors":
+            from safetensors.torch import load_file
 
-
-def _read_pickle(path: Path) -> Any:
-    try:
-        try:
-            return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-        except RuntimeError as problem:
-            if "mmap" not in str(problem):
-                raise
-            return torch.load(path, map_location="cpu", weights_only=True)
+            return load_file(path)
+        # Only files of newer versions of torch, which are archives, can be mapped.
+        mapped = zipfile.is_zipfile(path)
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
     except pickle.UnpicklingError as problem:
         raise LRMError(
             f"{path} is not a file of weights, or contains code, which is never run: use the "
@@ -195,16 +189,6 @@ def _read_pickle(path: Path) -> Any:
         ) from problem
     except Exception as problem:  # Files that are no weights fail in many ways.
         raise LRMError(f"{path} is damaged or incomplete: {problem}") from problem
-
-
-def _translated(model: LRM, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    translate = translator(model.config.architecture)
-    result = {}
-    for published, tensor in state.items():
-        names = translate(published)
-        if names:
-            result.update(zip(names, tensor.float().chunk(len(names)), strict=True))
-    return result
 
 
 def _same_size(config: Mapping[str, Any], carried: Mapping[str, Any]) -> bool:

@@ -2,15 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from xplanes.errors import LRMError
 from xplanes.lrm.canonical import OPENLRM_VIEW
 from xplanes.lrm.reader import Reader
 
 
-@dataclass(frozen=True)
-class Published:
+class Published(NamedTuple):
     """A published model.
 
     Attributes:
@@ -22,7 +21,7 @@ class Published:
     choice: str
 
 
-def _published_openlrm(width: int, layers: int, channels: int, **other: Any) -> dict[str, Any]:
+def _sizes(width: int, layers: int, channels: int, encoder: dict[str, Any]) -> dict[str, Any]:
     return {
         "camera_embed_dim": 1024,
         "rendering_samples_per_ray": 128 if channels == 80 else 96,
@@ -32,25 +31,18 @@ def _published_openlrm(width: int, layers: int, channels: int, **other: Any) -> 
         "triplane_low_res": 32,
         "triplane_high_res": 64,
         "triplane_dim": channels,
-        **other,
+        **encoder,
     }
 
 
-def _openlrm_1_1(letter: str, encoder_width: int, *sizes: int) -> dict[str, Any]:
-    return _published_openlrm(
-        *sizes,
-        encoder_type="dinov2",
-        encoder_model_name=f"dinov2_vit{letter}14_reg",
-        encoder_feat_dim=encoder_width,
-        encoder_freeze=False,
-    )
-
-
-def _openlrm_1_0(*sizes: int) -> dict[str, Any]:
-    return _published_openlrm(
-        *sizes, encoder_model_name="facebook/dino-vitb16", encoder_feat_dim=768, encoder_freeze=True
-    )
-
+_FREE = {"encoder_type": "dinov2", "encoder_freeze": False}
+_DINOV2_S = {**_FREE, "encoder_model_name": "dinov2_vits14_reg", "encoder_feat_dim": 384}
+_DINOV2_B = {**_FREE, "encoder_model_name": "dinov2_vitb14_reg", "encoder_feat_dim": 768}
+_DINO = {
+    "encoder_freeze": True,
+    "encoder_model_name": "facebook/dino-vitb16",
+    "encoder_feat_dim": 768,
+}
 
 _TRIPOSR = {
     "cond_image_size": 512,
@@ -64,12 +56,7 @@ _TRIPOSR = {
         "cross_attention_dim": 768,
     },
     "post_processor": {"in_channels": 1024, "out_channels": 40},
-    "decoder": {
-        "in_channels": 120,
-        "n_neurons": 64,
-        "n_hidden_layers": 9,
-        "activation": "silu",
-    },
+    "decoder": {"in_channels": 120, "n_neurons": 64, "n_hidden_layers": 9, "activation": "silu"},
     "renderer": {
         "radius": 0.87,
         "feature_reduction": "concat",
@@ -85,14 +72,14 @@ def _old(size: str, choice: str) -> str:
 
 
 PUBLISHED: dict[str, Published] = {
-    "openlrm-small-1.1": Published(_openlrm_1_1("s", 384, 512, 12, 32), "lrm=small"),
-    "openlrm-base-1.1": Published(_openlrm_1_1("b", 768, 768, 12, 48), "lrm=base"),
-    "openlrm-large-1.1": Published(_openlrm_1_1("b", 768, 1024, 16, 80), "lrm=xlarge"),
+    "openlrm-small-1.1": Published(_sizes(512, 12, 32, _DINOV2_S), "lrm=small"),
+    "openlrm-base-1.1": Published(_sizes(768, 12, 48, _DINOV2_B), "lrm=base"),
+    "openlrm-large-1.1": Published(_sizes(1024, 16, 80, _DINOV2_B), "lrm=xlarge"),
     # Version 1.0 has its configuration in model.pth, which takes precedence; camera_embed_dim and
     # transformer_heads are assumed here.
-    "openlrm-small-1.0": Published(_openlrm_1_0(768, 12, 32), _old("small", "small")),
-    "openlrm-base-1.0": Published(_openlrm_1_0(1024, 12, 40), _old("base", "base")),
-    "openlrm-large-1.0": Published(_openlrm_1_0(1024, 16, 80), _old("large", "xlarge")),
+    "openlrm-small-1.0": Published(_sizes(768, 12, 32, _DINO), _old("small", "small")),
+    "openlrm-base-1.0": Published(_sizes(1024, 12, 40, _DINO), _old("base", "base")),
+    "openlrm-large-1.0": Published(_sizes(1024, 16, 80, _DINO), _old("large", "xlarge")),
     "triposr": Published(_TRIPOSR, "lrm=large"),
 }
 """Published models by name."""

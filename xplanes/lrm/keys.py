@@ -8,16 +8,16 @@ a checkpoint may contain and that are not needed.
 
 import re
 from collections.abc import Mapping
+from functools import cache
+from typing import Any
 
 from xplanes.lrm.config import Architecture
 
 Names = Mapping[str, str | tuple[str, ...] | None]
 
-QKV = ("query", "key", "value")
-
 
 def _packed(place: str, suffix: str) -> tuple[str, ...]:
-    return tuple(f"{place}.{part}.{suffix}" for part in QKV)
+    return tuple(f"{place}.{part}.{suffix}" for part in ("query", "key", "value"))
 
 
 def _dino(prefix: str) -> Names:
@@ -125,41 +125,25 @@ NAMES: dict[Architecture, Names] = {
 _PLACEHOLDERS = {"i": r"\d+", "e": r"\d*[02468]", "p": r"weight|bias"}
 
 
-def translator(architecture: Architecture) -> "Translator":
-    """The name translation of a family."""
-    return Translator(NAMES[architecture])
-
-
-class Translator:
-    """Translates published names to the names in this package.
-
-    Args:
-        names: Published name to ours, with placeholders.
-    """
-
-    def __init__(self, names: Names) -> None:
-        self.patterns = [(_pattern(name), ours) for name, ours in names.items()]
-
-    def __call__(self, name: str) -> tuple[str, ...] | None:
-        """Names of a published tensor in this package; empty if not needed, None if unknown."""
-        for pattern, ours in self.patterns:
-            match = pattern.fullmatch(name)
-            if match is None:
-                continue
-            if ours is None:
-                return ()
+def translate(architecture: Architecture, name: str) -> tuple[str, ...] | None:
+    """Names of a published tensor in this package; empty if not needed, None if unknown."""
+    for pattern, ours in _patterns(architecture):
+        if (match := pattern.fullmatch(name)) is not None:
             values = match.groupdict()
             if "e" in values:
                 values["h"] = str(int(values["e"]) // 2)
-            templates = (ours,) if isinstance(ours, str) else ours
+            templates = (ours,) if isinstance(ours, str) else ours or ()
             return tuple(template.format(**values) for template in templates)
-        return None
+    return None
 
 
-def _pattern(name: str) -> re.Pattern[str]:
-    parts = re.split(r"\{(\w)\}", name)
-    expression = "".join(
-        f"(?P<{part}>{_PLACEHOLDERS[part]})" if index % 2 else re.escape(part)
-        for index, part in enumerate(parts)
-    )
-    return re.compile(expression)
+@cache
+def _patterns(architecture: Architecture) -> list[tuple[re.Pattern[str], Any]]:
+    """A regular expression for each published name of a family, and our names."""
+    found = []
+    for name, ours in NAMES[architecture].items():
+        parts = re.split(r"\{(\w)\}", name)
+        parts[::2] = map(re.escape, parts[::2])
+        parts[1::2] = [f"(?P<{part}>{_PLACEHOLDERS[part]})" for part in parts[1::2]]
+        found.append((re.compile("".join(parts)), ours))
+    return found

@@ -1,6 +1,7 @@
 """Base class of the Large Reconstruction Models."""
 
 import copy
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -18,23 +19,25 @@ class LRM(nn.Module):
     Args:
         config: Sizes of the model.
         view: The model's canonical camera and bounding cube.
-        decoder: Maps features [N, 3 C] to colour [N, 3] and density per unit length of the model's
-            frame [N].
+        **decoder: Options of the decoder beyond its size.
 
     Attributes:
         config: As given.
         view: As given.
-        decoder: As given.
+        decoder: Maps features [N, 3 C] to colour [N, 3] and density per unit length of the model's
+            frame [N].
         encoder: The image encoder.
     """
 
-    def __init__(self, config: LRMConfig, view: CanonicalView, decoder: Decoder) -> None:
+    def __init__(self, config: LRMConfig, view: CanonicalView, **decoder: Any) -> None:
         super().__init__()
+        sizes = {"width": config.decoder_width, "hidden": config.decoder_hidden}
+        last = Decoder(config.channels, **sizes, **decoder)
         self.config = config
         self.view = view
         self.encoder = VisionTransformer(config.encoder)
         self.upsample = nn.ConvTranspose2d(config.width, config.channels, kernel_size=2, stride=2)
-        self.decoder = decoder
+        self.decoder = last
 
     @property
     def image_size(self) -> int:

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor, nn
 
 from xplanes.errors import LRMError
-from xplanes.fields.decoder import Decoder
 from xplanes.lrm.canonical import OPENLRM_VIEW, canonical_vector
 from xplanes.lrm.config import LRMConfig
 from xplanes.lrm.model import LRM
@@ -66,17 +65,15 @@ class OpenLRM(LRM):
     """
 
     def __init__(self, config: LRMConfig) -> None:
-        decoder = Decoder(
-            config.channels,
-            width=config.decoder_width,
-            hidden=config.decoder_hidden,
+        view = replace(OPENLRM_VIEW, distance=config.source_distance, focal=config.source_focal)
+        super().__init__(
+            config,
+            view,
             activation="relu",
             density="softplus",
             density_scale=config.density_scale,
             colour_margin=0.001,
         )
-        view = replace(OPENLRM_VIEW, distance=config.source_distance, focal=config.source_focal)
-        super().__init__(config, view, decoder)
         self.camera = nn.Sequential(
             nn.Linear(16, config.camera_width),
             nn.SiLU(),

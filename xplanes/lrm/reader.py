@@ -32,63 +32,54 @@ class Reader:
 
     def integer(self, key: str, default: int | None = None) -> int:
         """A positive integer."""
-        value = self._resolve(self.values.get(key, default))
+        value = self._value(key, default)
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise LRMError(
-                f"the model's configuration has {self.place}{key}={value!r}: must be a whole "
-                f"number above zero"
-            )
+            raise self._error(key, value, "must be a whole number above zero")
         return value
 
     def number(self, key: str, default: float) -> float:
         """A number."""
-        value = self._resolve(self.values.get(key, default))
+        value = self._value(key, default)
         try:
             return float(value)  # YAML 1.1 reads 1e-12 as text
         except (TypeError, ValueError):
-            raise LRMError(
-                f"the model's configuration has {self.place}{key}={value!r}: must be a number"
-            ) from None
+            raise self._error(key, value, "must be a number") from None
 
     def positive(self, key: str, default: float) -> float:
         """A finite positive number."""
         value = self.number(key, default)
         if not 0 < value < math.inf:
-            raise LRMError(
-                f"the model's configuration has {self.place}{key}={value!r}: must be above zero"
-            )
+            raise self._error(key, value, "must be above zero")
         return value
 
     def require(self, key: str, value: Any) -> None:
         """Refuse any value other than the supported one."""
-        found = self._resolve(self.values.get(key, value))
-        if found != value:
-            raise LRMError(
-                f"the model's configuration has {self.place}{key}={found!r}: only {value!r} is "
-                f"supported"
-            )
+        if (found := self._value(key, value)) != value:
+            raise self._error(key, found, f"only {value!r} is supported")
 
     def triple(self, key: str, default: tuple[float, ...]) -> tuple[float, ...]:
         """Three numbers."""
         values = self.values.get(key, default)
         if not isinstance(values, list | tuple) or len(values) != 3:
-            raise LRMError(
-                f"the model's configuration has {self.place}{key}={values!r}: must be three numbers"
-            )
+            raise self._error(key, values, "must be three numbers")
         return tuple(float(value) for value in values)
 
-    def _resolve(self, value: Any) -> Any:
-        """Follow ``${a.b}``, as TripoSR's YAML uses it."""
+    def _error(self, key: str, value: Any, wanted: str) -> LRMError:
+        return LRMError(f"the model's configuration has {self.place}{key}={value!r}: {wanted}")
+
+    def _value(self, key: str, default: Any) -> Any:
+        """A value, with references ``${a.b}`` followed, as TripoSR's YAML uses them."""
+        value = self.values.get(key, default)
         for _ in range(8):
             match = re.fullmatch(r"\$\{([\w.]+)\}", value) if isinstance(value, str) else None
             if match is None:
                 return value
             found: Any = self.root or self.values
-            for key in match[1].split("."):
-                if not isinstance(found, Mapping) or key not in found:
+            for name in match[1].split("."):
+                if not isinstance(found, Mapping) or name not in found:
                     raise LRMError(
                         f"the model's configuration refers to {value}, which does not exist"
                     )
-                found = found[key]
+                found = found[name]
             value = found
         raise LRMError(f"the model's configuration refers to {value} in a circle")

@@ -4,7 +4,6 @@ import torch
 from torch import Tensor, nn
 
 from xplanes.errors import LRMError
-from xplanes.fields.decoder import Decoder
 from xplanes.lrm.canonical import TRIPOSR_VIEW
 from xplanes.lrm.config import LRMConfig
 from xplanes.lrm.images import resize_triposr
@@ -53,16 +52,8 @@ class TripoSR(LRM):
     """
 
     def __init__(self, config: LRMConfig) -> None:
-        decoder = Decoder(
-            config.channels,
-            width=config.decoder_width,
-            hidden=config.decoder_hidden,
-            activation="silu",
-            density="exp",
-            density_scale=1 / CHORD,
-            colour_margin=0.0,
-        )
-        super().__init__(config, TRIPOSR_VIEW, decoder)
+        decoder = {"activation": "silu", "density": "exp", "colour_margin": 0.0}
+        super().__init__(config, TRIPOSR_VIEW, density_scale=1 / CHORD, **decoder)
         side, width = config.low_resolution, config.width
         inner = config.heads * config.head_width
         self.tokens = nn.Parameter(torch.zeros(3, width, side, side))

@@ -10,8 +10,8 @@ from xplanes.lrm.config import EncoderConfig
 def attend(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
     """Scaled dot-product attention. [N, H, T, E], [N, H, K, E], [N, H, K, E] -> [N, H, T, E]
 
-    In bfloat16 on the CPU, plain products, one sequence at a time so that its scores stay in the
-    cache, take a third of the fused kernel's time (768 tokens, 2 heads of 64 channels).
+    In bfloat16 on the CPU, separate matrix products, one sequence at a time so that its scores stay
+    in the cache, take a third of the fused kernel's time (768 tokens, 2 heads of 64 channels).
     """
     if query.device.type != "cpu" or query.dtype != torch.bfloat16:
         return F.scaled_dot_product_attention(query, key, value)
@@ -29,7 +29,6 @@ class Attention(nn.Module):
     Args:
         width: Channels D of the tokens, in and out.
         heads: Number of heads.
-        head_width: Channels of each head; width / heads when None.
         context_width: Channels E of the context tokens; ``width`` when None.
         bias: Whether query, key and value have biases.
         out_bias: Whether the output has one.
@@ -40,18 +39,16 @@ class Attention(nn.Module):
         width: int,
         heads: int,
         *,
-        head_width: int | None = None,
         context_width: int | None = None,
         bias: bool = False,
         out_bias: bool = False,
     ) -> None:
         super().__init__()
-        inner = heads * (head_width or width // heads)
         self.heads = heads
-        self.query = nn.Linear(width, inner, bias=bias)
-        self.key = nn.Linear(context_width or width, inner, bias=bias)
-        self.value = nn.Linear(context_width or width, inner, bias=bias)
-        self.out = nn.Linear(inner, width, bias=out_bias)
+        self.query = nn.Linear(width, width, bias=bias)
+        self.key = nn.Linear(context_width or width, width, bias=bias)
+        self.value = nn.Linear(context_width or width, width, bias=bias)
+        self.out = nn.Linear(width, width, bias=out_bias)
 
     def forward(self, tokens: Tensor, context: Tensor | None = None) -> Tensor:
         """Attend to ``context``, or to the tokens themselves. [N, T, D], [N, K, E] -> [N, T, D]"""

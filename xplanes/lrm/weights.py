@@ -5,6 +5,7 @@ import os
 import socket
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,70 +19,53 @@ from xplanes.files import stand_in
 from xplanes.lrm.checkpoint import MismatchError, load
 from xplanes.lrm.model import LRM
 from xplanes.optional import require
+from xplanes.settings import Count, Location, Settings
 
 PATIENCE_SECONDS = 0.8
 
 
-class Probe:
-    """A connection attempt in the background.
+def answers(url: str) -> bool:
+    """Whether a server, or the environment's proxy to it, accepts a connection in time.
 
     The hub's own client retries for half a minute.
 
     Args:
-        url: Address of the server, http or https. A proxy from the environment is used.
+        url: Address of the server, http or https.
     """
+    parts = urlsplit(url)
+    proxy = getproxies().get(parts.scheme)
+    if proxy and not proxy_bypass(parts.hostname or ""):
+        parts = urlsplit(proxy if "//" in proxy else f"//{proxy}")
+    port = parts.port or (443 if parts.scheme == "https" else 80)
+    accepted = threading.Event()
 
-    def __init__(self, url: str) -> None:
-        self._answered = False
-        self._thread = threading.Thread(target=self._connect, args=(url,), daemon=True)
-        self._thread.start()
+    def connect() -> None:
+        address = (parts.hostname or "", port)
+        with suppress(OSError), socket.create_connection(address, PATIENCE_SECONDS):
+            accepted.set()
 
-    def answers(self) -> bool:
-        """Whether the server, or the proxy, accepted the connection in time."""
-        self._thread.join(PATIENCE_SECONDS)
-        return self._answered
-
-    def _connect(self, url: str) -> None:
-        parts = urlsplit(url)
-        proxy = getproxies().get(parts.scheme)
-        if proxy and not proxy_bypass(parts.hostname or ""):
-            parts = urlsplit(proxy if "//" in proxy else f"//{proxy}")
-        port = parts.port or (443 if parts.scheme == "https" else 80)
-        try:
-            # The name lookup has no time limit, hence the thread.
-            with socket.create_connection((parts.hostname or "", port), PATIENCE_SECONDS):
-                self._answered = True
-        except OSError:
-            pass
+    # The name lookup has no time limit, hence the thread.
+    thread = threading.Thread(target=connect, daemon=True)
+    thread.start()
+    thread.join(PATIENCE_SECONDS)
+    return accepted.is_set()
 
 
 CONFIG_FILES = ("config.json", "config.yaml")
 
 
-@dataclass(frozen=True)
-class WeightSource:
-    """Source of the weights of a model.
+@dataclass(frozen=True, kw_only=True)
+class WeightSource(Settings):
+    """Where the weights of a published model come from: the Hugging Face hub, or a local file."""
 
-    Attributes:
-        architecture: A name of `xplanes.lrm.config.PUBLISHED`.
-        repository: On the Hugging Face hub, owner/name.
-        file: Name of the file in the repository.
-        revision: Branch, tag or commit of the repository.
-        licence: Licence of the weights.
-        megabytes: Size of the file in MB.
-        weights: A local file to use instead; None for the hub.
-        config: A local config.json or config.yaml for weights of other sizes; None for the
-            published sizes.
-    """
-
-    architecture: str
-    repository: str
-    file: str
-    revision: str
-    licence: str
-    megabytes: int
-    weights: Path | None = None
-    config: Path | None = None
+    architecture: str  # One of openlrm-{small,base,large}-{1.0,1.1} and triposr.
+    repository: str  # Repository on the Hugging Face hub.
+    file: str  # File name of the weights in the repository.
+    revision: str  # Branch, tag or commit of the repository.
+    licence: str  # Licence of the weights.
+    megabytes: Count  # Size of the file in MB.
+    weights: Location | None  # Local file of weights; null: downloaded or bundled weights.
+    config: Location | None  # A config.json or config.yaml for weights of another model size.
 
     @property
     def url(self) -> str:
@@ -101,7 +85,7 @@ def load_weights(
         LRMError: If they do not fit the architecture.
     """
     if source.config is not None:
-        return load(read_config(source.config), path)
+        return load(read_config(Path(source.config)), path)
     try:
         return load({"architecture": source.architecture}, path)
     except MismatchError as problem:
@@ -135,9 +119,9 @@ def find_weights(
         LRMError: If the local file is missing, the hub cannot be reached, or the hub lacks it.
     """
     if source.weights is not None:
-        if not source.weights.is_file():
-            raise LRMError(f"lrm.weights={source.weights} is not a file. {_advice(source)}")
-        return source.weights
+        if not (path := Path(source.weights)).is_file():
+            raise LRMError(f"lrm.weights={path} is not a file. {_advice(source)}")
+        return path
     hub = require("huggingface_hub", extra="lrm")
     place = {"repo_id": source.repository, "filename": source.file, "revision": source.revision}
     cached = hub.try_to_load_from_cache(**place, cache_dir=cache)
@@ -146,7 +130,7 @@ def find_weights(
     if hub.constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").upper() in _YES:
         raise LRMError(f"HF_HUB_OFFLINE forbids the download of {source.url}. {_advice(source)}")
     server = endpoint or hub.constants.ENDPOINT
-    if not Probe(server).answers():
+    if not answers(server):
         raise LRMError(f"{server} cannot be reached for {source.file}. {_advice(source)}")
     announce(
         f"Downloading {source.repository}/{source.file} ({source.megabytes} MB, licence "

@@ -1,4 +1,4 @@
-"""The world behind a field: its settings, learning rates and smoothness, for any model."""
+"""The background behind a field: its settings, learning rates and smoothness, for any model."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ class BackgroundSettings(Settings):
     decoder_lr: Positive  # Learning rate of its decoder.
 
     def build(self, site: Site) -> Background | None:
-        """What lies behind the field; None where images show no world."""
+        """The background; None where the images show no surroundings."""
         if not site.surrounded:
             return None
         with initial_values(site.seed, Stream.BACKGROUND):

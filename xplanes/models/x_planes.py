@@ -92,9 +92,15 @@ class XPlanesLoss(Settings):
     variation: Literal["mean", "coded"]
     total_variation: Weight  # Weight of the space planes' total variation.
     world_variation: Weight  # Replaces `model.loss.total_variation` if a background is learnt.
+    world_time: Share  # Factor on the three weights of time planes below if one is learnt.
     time_variation: Weight  # Weight of the time planes' total variation.
     time_smoothness: Weight  # Weight of time smoothness (squared second differences).
     time_magnitude: Weight  # Weight of the time planes' mean square.
+    # Weight of the light that passes the cube, if a background is learnt. It falls to 0 over
+    # `model.loss.passing_steps`: until the cube has taken shape, the background, which learns
+    # faster, must not take over what lies in it.
+    passing: Weight
+    passing_steps: Steps  # Steps over which `model.loss.passing` falls to 0.
     time_identity: Weight  # Weight of the time planes' mean distance from 1, as in K-Planes.
     sparse_weight: Weight  # Weight of L_r (X-Planes, Eq. 17).
     sparse_reduction: Literal["mean", "sum"]  # Reduction of L_r over entries; the paper: sum.
@@ -104,6 +110,14 @@ class XPlanesLoss(Settings):
     # of training views; null: never.
     initial_steps: Count | None
     every: Count  # Steps between evaluations of the regularisers; weights are scaled to match.
+
+    def before_background(self) -> "XPlanesLoss":
+        """The same with the weights of time planes in scenes where a background is learnt."""
+        weights = {
+            name: self.world_time * getattr(self, name)
+            for name in ("time_variation", "time_smoothness", "time_magnitude")
+        }
+        return replace(self, **weights)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,7 +231,7 @@ class XPlanesSettings(ModelSettings):
         else:
             with torch.no_grad():
                 decoder.layers[-1].bias[0] += options.density_bias  # type: ignore[index]
-                if background is None:  # White fog before a world would thin out to nothing.
+                if background is None:  # White fog in front of it would fade to nothing.
                     decoder.layers[-1].bias[1:] += options.colour_bias  # type: ignore[index]
         decoder.requires_grad_(not options.freeze)
         return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set, background=background)
@@ -244,6 +258,7 @@ class XPlanesModel(Model):
         self.fine = None if field.fine is None else settings.fine
         self.total_variation = self.weights.total_variation
         if field.background is not None:
+            self.weights = settings.loss.before_background()
             self.total_variation = self.weights.world_variation
         elif self.fine is not None:
             self.total_variation = self.fine.coarse_variation
@@ -301,7 +316,10 @@ class XPlanesModel(Model):
     def losses(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
         terms = super().losses(rendering, rays, state)
         if self._field.background is not None:
-            return terms  # Neither alpha nor a known background says what is opaque.
+            # Neither alpha nor a known background says what is opaque.
+            if weight := self._passing(state.step):
+                terms["passing"] = weight * (1 - rendering.opacity).mean()
+            return terms
         if self.opacity:
             error = opacity_shortfall if self._opaque else opacity_error
             terms["opacity"] = self.opacity * error(rendering, rays)
@@ -398,6 +416,11 @@ class XPlanesModel(Model):
         return sum(
             float((plane - initial.to(plane.device)).square().mean()) for plane, initial in pairs
         )
+
+    def _passing(self, step: int) -> float:
+        """Weight of the light that passes the cube in a scene with a background."""
+        steps = self.weights.passing_steps
+        return self.weights.passing * max(0.0, 1 - step / steps) if steps else 0.0
 
     def _fading(self, step: int) -> float:
         """Factor on the regularisers that keep the field near its initialisation."""

@@ -55,8 +55,12 @@ class StageCache:
 
     def __init__(self, folder: Path | None) -> None:
         self.folder = folder
-        self.writable = folder is not None and _takes_files(folder)
-        if folder is not None and not self.writable:
+        self.writable = folder is not None
+        try:
+            if folder is not None:
+                require_writable(folder)
+        except OSError:
+            self.writable = False
             logger.warning("preparation.cache=%s cannot be written: stages are not cached", folder)
 
     def stage(
@@ -88,7 +92,8 @@ class StageCache:
             began = time.perf_counter() - warm_up.seconds
             content = make()
             seconds = time.perf_counter() - warm_up.seconds - began
-            self._put(path, key, content, seconds)
+            if path is not None and self.writable:
+                _write(path, key, content, seconds)
         return Stage(content, seconds, False, key)
 
     def find(self, name: str, inputs: Any) -> Stage | None:
@@ -98,9 +103,6 @@ class StageCache:
     def keep(self, name: str, inputs: Any, content: dict[str, Any], seconds: float) -> None:
         """Store a stage that was just computed."""
         path, key = self._path(name, inputs)
-        self._put(path, key, content, seconds)
-
-    def _put(self, path: Path | None, key: str, content: dict[str, Any], seconds: float) -> None:
         if path is not None and self.writable:
             _write(path, key, content, seconds)
 
@@ -125,48 +127,26 @@ class StageCache:
         return self.folder / f"{name}-{key[:32]}.pt", key
 
 
-def _takes_files(folder: Path) -> bool:
-    try:
-        require_writable(folder)
-    except OSError:
-        return False
-    return True
-
-
 def _find(path: Path | None, key: str) -> Stage | None:
+    """The entry in a file, or None where there is none that can be used."""
     if path is None or not path.exists():
         return None
     try:
-        content, seconds = _read(path, key)
-    except _UnusableError as reason:
-        logger.warning("%s is %s: making it again", path, reason)
-        return None
-    return Stage(content, seconds, True, key)
-
-
-class _UnusableError(Exception):
-    """An entry that cannot be used; the message completes "the file is ..."."""
-
-
-def _read(path: Path, key: str) -> tuple[dict[str, Any], float]:
-    try:
         payload = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(payload, dict):
+            problem = "no entry of this cache"
+        elif payload.get("version") != VERSION:
+            problem = f"of version {payload.get('version')}, not {VERSION}"
+        elif payload.get("key") != key:
+            problem = "that of other inputs"
+        elif payload["checksum"] != fingerprint([payload["content"], payload["seconds"]]):
+            problem = "damaged (wrong checksum)"
+        else:
+            return Stage(payload["content"], payload["seconds"], True, key)
     except Exception as error:  # A damaged file raises many kinds of errors.
-        raise _UnusableError(f"damaged ({type(error).__name__})") from error
-    if not isinstance(payload, dict):
-        raise _UnusableError("no entry of this cache")
-    if payload.get("version") != VERSION:
-        raise _UnusableError(f"of version {payload.get('version')}, not {VERSION}")
-    content, seconds = payload.get("content"), payload.get("seconds")
-    if payload.get("key") != key:
-        raise _UnusableError("that of other inputs")
-    try:
-        same = payload.get("checksum") == fingerprint([content, seconds])
-    except TypeError:
-        same = False
-    if not same or not isinstance(content, dict) or not isinstance(seconds, float):
-        raise _UnusableError("damaged (wrong checksum)")
-    return content, seconds
+        problem = f"damaged ({type(error).__name__})"
+    logger.warning("%s is %s: making it again", path, problem)
+    return None
 
 
 def _write(path: Path, key: str, content: dict[str, Any], seconds: float) -> None:

@@ -1,12 +1,12 @@
 """LRM encoding of the fixed-view video: one forward pass per distinct frame."""
 
-import sys
 import time
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from xplanes.errors import LRMError
 from xplanes.lrm.images import Crop
@@ -64,10 +64,14 @@ def encode(
     for number, frame in enumerate(frames):
         places.setdefault(fingerprint(frame), []).append(number)
     shown = [crop.top, crop.left, crop.side, list(crop.kept or ())]
+
+    def inputs(frame_key: str) -> list[Any]:
+        return [key, frame_key, shown, device.type, bf16]
+
     found: dict[str, Tensor] = {}
     seconds, missing = 0.0, []
     for frame_key in places:
-        stage = cache.find("triplane", _inputs(key, frame_key, shown, device, bf16))
+        stage = cache.find("triplane", inputs(frame_key))
         if stage is None:
             missing.append(frame_key)
         else:
@@ -76,7 +80,9 @@ def encode(
     cached = len(found)
     if missing:
         model = model.to(device)
-    for chunk in _progress(missing, batch):
+    chunks = [missing[start : start + batch] for start in range(0, len(missing), batch)]
+    # On a terminal only: in a pipe a progress bar would fill the log.
+    for chunk in tqdm(chunks, "triplanes", unit="batch", leave=False, disable=None):
         began = time.perf_counter()
         first = torch.tensor([places[frame_key][0] for frame_key in chunk])
         pictures = model.prepare(crop.apply(straight_alpha(frames[first])))
@@ -89,20 +95,13 @@ def encode(
             )
         share = (time.perf_counter() - began) / len(chunk)
         for frame_key, triplane in zip(chunk, planes, strict=True):
-            inputs = _inputs(key, frame_key, shown, device, bf16)
-            cache.keep("triplane", inputs, {"triplane": triplane.clone()}, share)
+            cache.keep("triplane", inputs(frame_key), {"triplane": triplane.clone()}, share)
             found[frame_key] = triplane
             seconds += share
     triplanes = torch.empty(len(frames), *next(iter(found.values())).shape)
     for frame_key, numbers in places.items():
         triplanes[numbers] = found.pop(frame_key)
     return Encoded(triplanes, len(places), cached, seconds)
-
-
-def _inputs(
-    key: str, frame_key: str, shown: list[Any], device: torch.device, bf16: bool
-) -> list[Any]:
-    return [key, frame_key, shown, device.type, bf16]
 
 
 def straight_alpha(frames: Tensor) -> Tensor:
@@ -118,12 +117,3 @@ def straight_alpha(frames: Tensor) -> Tensor:
     alpha = whole[:, 3:]
     colour = torch.where(alpha > 0, whole[:, :3] / alpha.clamp_min(1e-6), 0.0).clamp(0, 1)
     return torch.cat([colour, alpha], dim=1)
-
-
-def _progress(missing: list[str], batch: int) -> Any:
-    from tqdm import tqdm
-
-    chunks = [missing[start : start + batch] for start in range(0, len(missing), batch)]
-    # Show the progress bar on a terminal only; in a pipe it would fill the log.
-    wanted = sys.stderr.isatty()
-    return tqdm(chunks, desc="triplanes", unit="batch", leave=False, disable=not wanted)

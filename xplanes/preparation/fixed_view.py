@@ -32,9 +32,6 @@ OBLONG = 0.01
 OFF_CENTRE = 0.02
 """Largest offset of the principal point from the image centre, as a share of the width."""
 
-CHECKPOINT_EVERY = 250
-"""Steps between checkpoints of the field that renders the fixed-view video."""
-
 
 def rendering_method(
     method: Method, views: Views, half_side: float | None, points: Tensor | None = None
@@ -103,7 +100,7 @@ def fixed_view(
         )
     times = scene.splits["train"].times
     count = 1 if scene.splits["train"].is_static else options.frames or len(times.unique())
-    # A video without alpha shows a world around the thing, which LRMs would take for a part of it.
+    # Without alpha a video shows surroundings, which LRMs would take for part of the object.
     whole = scene.video is not None and scene.is_surrounded and scene.video.is_opaque
     if scene.video is not None and (
         options.fixed_view == "video" or (options.fixed_view == "auto" and not whole)
@@ -115,8 +112,8 @@ def fixed_view(
         place = replace(place, scene=replace(scene, splits=scene.splits | {"train": scene.cut}))
     elif scene.is_surrounded:
         place.say(
-            f"fixed view: the images of {scene.name} have no silhouettes, so the LRM is shown all "
-            "that is found in the cube, the ground included; masks would show it the thing alone "
+            f"fixed view: the images of {scene.name} have no silhouettes, so the LRM is shown "
+            "everything in the cube, the ground included; with masks it is shown the object alone "
             "(data.mask_use=lrm)"
         )
     return _rendered(method, place, view, size, count, cache)
@@ -246,7 +243,7 @@ def _rendered(
     def make() -> dict[str, Any]:
         place.say(
             f"fixed view: training {options.fixed_view_model} for {_budget(options)} to render "
-            f"{count} frames from where the LRM's camera stands"
+            f"{count} frames from the LRM's camera"
         )
         with cache.workshop("fixed_view", inputs) as folder:
             module = trained_field(
@@ -273,7 +270,7 @@ def _rendered(
 
 
 def _budget(options: PreparationSettings) -> str:
-    """How long the field that renders the video is trained, in words."""
+    """How long the field that renders the video is trained, for messages."""
     steps, seconds = options.fixed_view_steps, options.fixed_view_seconds
     return f"{steps} steps" if seconds is None else f"up to {steps} steps or {seconds:g} s"
 
@@ -319,7 +316,6 @@ def trained_field(
         device=place.device,
         max_steps=steps,
         max_seconds=seconds,
-        checkpoint_every=CHECKPOINT_EVERY,
     )
     return module.eval()
 
@@ -339,7 +335,7 @@ def _render(
     assert isinstance(renderer, RayRenderer)
     device = renderer.device
     if isinstance(module.field, XPlanes):
-        module.field.background = None  # What is in the cube is cut out of the world behind it.
+        module.field.background = None  # The video shows only what is in the cube.
     origins, directions = PosedCamera(pose, focal, side, side).rays()
     origins, directions = frame.rays(origins - back * directions, directions)
     rays = origins.to(device), directions.to(device)

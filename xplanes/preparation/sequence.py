@@ -13,6 +13,7 @@ from xplanes.errors import ConfigError
 from xplanes.fields import Decoder
 from xplanes.files import replacing, stand_in
 from xplanes.scenes.frame import Frame, check_frame, frame_content, read_frame
+from xplanes.settings import check_arguments
 
 MARK = "xplanes"
 """Metadata key of a safetensors file for values that are not tensors."""
@@ -69,14 +70,7 @@ def _apart(content: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, rest
 
 
-DECODER_OPTIONS: dict[str, tuple[type, ...]] = {
-    "width": (int,),
-    "hidden": (int,),
-    "activation": (str,),
-    "density": (str,),
-    "density_scale": (int, float),
-    "colour_margin": (int, float),
-}
+DECODER_OPTIONS = ("width", "hidden", "activation", "density", "density_scale", "colour_margin")
 """Options of a decoder that its weights require, as in the group ``model.decoder``."""
 
 _KEYS = {"triplanes", "decoder", "decoder_config", "frame"}
@@ -196,10 +190,10 @@ def _check_decoder(sequence: TriplaneSequence, name: str) -> None:
             f"{name}: decoder_config has the keys {', '.join(map(str, options)) or '(none)'}, but "
             f"must have {', '.join(DECODER_OPTIONS)}"
         )
-    for key, kinds in DECODER_OPTIONS.items():
-        value = options[key]
-        if isinstance(value, bool) or not isinstance(value, kinds):
-            raise ConfigError(f"{name}: decoder_config.{key} is {value!r}: wrong type")
+    try:
+        check_arguments(Decoder.__init__, options)
+    except ConfigError as error:
+        raise ConfigError(f"{name}: decoder_config.{error}") from error
     # Further constraints are checked with the settings that they replace.
     if not (1 <= options["width"] <= 65536 and 0 <= options["hidden"] <= 256):
         raise ConfigError(

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from xplanes.errors import ConfigError, LRMError
 from xplanes.lrm.bundled import load_bundled
@@ -21,12 +21,17 @@ from xplanes.models.initialisation import (
     nothing_skipped,
 )
 from xplanes.models.x_planes import XPlanesSettings
-from xplanes.preparation.cache import StageCache
+from xplanes.preparation.cache import Stage, StageCache
 from xplanes.preparation.reconstruct import ImageLRMSettings, LoadedLRM, loaded, reconstruct
 from xplanes.preparation.sequence import TriplaneSequence, load_triplanes
-from xplanes.preparation.stages import Parts, convert_stage, decompose_stage
+from xplanes.preparation.stages import (
+    convert_stage,
+    decompose_stage,
+    named_planes,
+    parts_sheet,
+)
 from xplanes.scenes.views import Views
-from xplanes.settings import Count, Location
+from xplanes.settings import Location
 
 logger = logging.getLogger(__name__)
 
@@ -56,35 +61,13 @@ class BundledLRMSettings(ImageLRMSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PublishedLRMSettings(ImageLRMSettings):
+class PublishedLRMSettings(WeightSource, ImageLRMSettings):
     """A published LRM."""
 
-    architecture: str  # One of openlrm-{small,base,large}-{1.0,1.1} and triposr.
-    repository: str  # Repository on the Hugging Face hub.
-    file: str  # File name of the weights in the repository.
-    revision: str  # Branch, tag or commit of the repository.
-    licence: str  # Licence of the weights.
-    megabytes: Count  # Size of the file in MB.
-    config: Location | None  # A config.json or config.yaml for weights of another model size.
-
-    @property
-    def source(self) -> WeightSource:
-        """Where the weights come from."""
-        return WeightSource(
-            architecture=self.architecture,
-            repository=self.repository,
-            file=self.file,
-            revision=self.revision,
-            licence=self.licence,
-            megabytes=self.megabytes,
-            weights=None if self.weights is None else Path(self.weights),
-            config=None if self.config is None else Path(self.config),
-        )
-
     def load_model(self, say: Callable[[str], None]) -> LoadedLRM:
-        path = find_weights(self.source, announce=say)
+        path = find_weights(self, announce=say)
         began = time.perf_counter()
-        return loaded(load_weights(self.source, path, announce=say), path, began)
+        return loaded(load_weights(self, path, announce=say), path, began)
 
     def load(self, say: Callable[[str], None] = print) -> "LRMInitialiser":
         return LRMInitialiser(self, self.load_model(say))
@@ -199,30 +182,24 @@ def from_sequence(
         )
     device = place.device
     parts = decompose_stage(sequence.triplanes, method.decomposition, cache, device)
-    _warn(parts, method)
+    low_rank, sparse, report = (parts.content[name] for name in ("low_rank", "sparse", "report"))
+    _warn(report, method)
     planes = convert_stage(parts, model, method.decomposition, method.seed, cache, device)
     regularised = model.plane_set != "three" and model.loss.sparse_weight > 0
-    values = InitialValues(planes.planes, sequence.decoder, parts.sparse if regularised else None)
+    target, unexplained = sparse if regularised else None, planes.content["unexplained"]
+    spent = {"decomposition": parts.seconds if report else 0.0, "convert": planes.seconds}
+    kept = sum(each["rank"] for each in report.values())
+    left_out = 1 - kept / (len(report) * len(low_rank)) if report else 0.0
     return Initialisation(
         model=model,
         frame=sequence.frame or place.frame,
-        values=values,
-        report=parts.report | ({"unexplained": planes.unexplained} if planes.unexplained else {}),
-        seconds=no_time()
-        | dict(seconds)
-        | {"decomposition": parts.seconds, "convert": planes.seconds},
-        words=_words(sequence, method, parts, planes.unexplained, source),
-        pictures={} if parts.picture is None else {"decomposition": parts.picture},
-        skipped=nothing_skipped() | {"directions": _left_out(parts)},
+        values=InitialValues(named_planes(planes, model.plane_set), sequence.decoder, target),
+        report=report | ({"unexplained": unexplained} if unexplained else {}),
+        seconds=no_time() | dict(seconds) | spent,
+        words=_words(sequence, method, parts, unexplained, source),
+        pictures={} if sparse is None else {"decomposition": parts_sheet(low_rank, sparse)},
+        skipped=nothing_skipped() | {"directions": left_out},
     )
-
-
-def _left_out(parts: Parts) -> float:
-    """Fraction of singular vectors below the threshold, over all orientations."""
-    if not parts.report:
-        return 0.0
-    kept = sum(report["rank"] for report in parts.report.values())
-    return 1 - kept / (len(parts.report) * len(parts.low_rank))
 
 
 def _settled(
@@ -245,12 +222,12 @@ def _settled(
     return model
 
 
-def _warn(parts: Parts, method: Method) -> None:
+def _warn(report: Mapping[str, Mapping[str, Any]], method: Method) -> None:
     """Warn once about all orientations that did not converge."""
     open_ones = [
-        f"{name} (residual {report['residual']:.1e}, last step {report['change']:.1e})"
-        for name, report in parts.report.items()
-        if not report["converged"]
+        f"{name} (residual {each['residual']:.1e}, last step {each['change']:.1e})"
+        for name, each in report.items()
+        if not each["converged"]
     ]
     if open_ones:
         logger.warning(
@@ -265,7 +242,7 @@ def _warn(parts: Parts, method: Method) -> None:
 def _words(
     sequence: TriplaneSequence,
     method: Method,
-    parts: Parts,
+    parts: Stage,
     unexplained: Mapping[str, float],
     source: str,
 ) -> str:
@@ -274,9 +251,9 @@ def _words(
     own = cast(XPlanesSettings, method.model).channels
     if channels != own:
         words[0] += f" (not model.channels={own})"
-    if parts.report:
-        ranks = "/".join(str(report["rank"]) for report in parts.report.values())
-        share = max(report["sparsity"] for report in parts.report.values())
+    if report := parts.content["report"]:
+        ranks = "/".join(str(each["rank"]) for each in report.values())
+        share = max(each["sparsity"] for each in report.values())
         words.append(
             f"rank {ranks}, up to {100 * share:.0f}% sparse" + (", cached" if parts.cached else "")
         )

@@ -2,8 +2,6 @@
 
 import sys
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -21,7 +19,7 @@ from xplanes.lrm.images import Crop
 from xplanes.lrm.model import LRM
 from xplanes.models.initialisation import DecompositionSettings
 from xplanes.models.x_planes import XPlanesSettings
-from xplanes.preparation.cache import StageCache
+from xplanes.preparation.cache import Stage, StageCache
 from xplanes.preparation.encode import straight_alpha
 from xplanes.scenes.views import spread
 from xplanes.streams import Stream, step_generator
@@ -100,49 +98,9 @@ REPORTED = (
 """Entries of metrics.json for each orientation."""
 
 
-@dataclass(frozen=True)
-class Parts:
-    """Low-rank and sparse part of a sequence.
-
-    Attributes:
-        low_rank: The static part, on the CPU. [T, 3, C, H, H]
-        sparse: The dynamic part, on the CPU. [T, 3, C, H, H]
-        report: For each of "xy", "xz" and "yz" the entries of `REPORTED`; empty for a single
-            triplane.
-        picture: Both parts at a few timesteps; None for a single triplane.
-        seconds: Time to compute it.
-        cached: Whether they came from the cache.
-        key: Hash of the inputs.
-    """
-
-    low_rank: Tensor
-    sparse: Tensor | None
-    report: dict[str, dict[str, Any]]
-    picture: Tensor | None
-    seconds: float
-    cached: bool
-    key: str
-
-
-@dataclass(frozen=True)
-class Planes:
-    """Initial planes.
-
-    Attributes:
-        planes: By name. [C, rows, columns] each
-        unexplained: Fraction of the sparse part's energy that products of time planes do not
-            explain: ``before`` for random planes, ``after`` for these; empty without time planes.
-        seconds: Time to compute it.
-    """
-
-    planes: Mapping[str, Tensor]
-    unexplained: dict[str, float]
-    seconds: float
-
-
 def decompose_stage(
     triplanes: Tensor, config: DecompositionSettings, cache: StageCache, device: torch.device
-) -> Parts:
+) -> Stage:
     """Robust PCA of a sequence; a single triplane has no sparse part.
 
     Args:
@@ -150,6 +108,11 @@ def decompose_stage(
         config: Its settings.
         cache: Cache of the stage.
         device: Device of the computation.
+
+    Returns:
+        The static part ``low_rank`` and the dynamic part ``sparse`` [T, 3, C, H, H] on the CPU, and
+        ``report``, for each of "xy", "xz" and "yz" the entries of `REPORTED`. Of a single triplane
+        ``sparse`` is None and the report empty.
     """
     triplanes = triplanes.float()
     options = {
@@ -163,10 +126,11 @@ def decompose_stage(
             "max_iterations",
         )
     }
+    if len(triplanes) == 1:
+        content = {"low_rank": triplanes, "sparse": None, "report": {}}
+        return cache.stage("decomposition", [triplanes, options], lambda: content, keep=False)
 
     def make() -> dict[str, Any]:
-        if len(triplanes) == 1:
-            return {"low_rank": triplanes, "sparse": None, "report": {}}
         with warnings.catch_warnings():
             # The caller warns once for all orientations, also when the parts are cached.
             warnings.filterwarnings("ignore", message="robust PCA stopped")
@@ -176,48 +140,37 @@ def decompose_stage(
         report = {
             name: {key: whole[key] for key in REPORTED} for name, whole in parts.reports.items()
         }
-        return {
-            "low_rank": parts.low_rank.cpu(),
-            "sparse": parts.sparse.cpu(),
-            "report": report,
-        }
+        return {"low_rank": parts.low_rank.cpu(), "sparse": parts.sparse.cpu(), "report": report}
 
-    keep = config.cache and len(triplanes) > 1
-    stage = cache.stage("decomposition", [triplanes, options], make, keep=keep)
-    content = stage.content
-    sparse = content["sparse"]
-    picture = None if sparse is None else parts_sheet(content["low_rank"], sparse)
-    return Parts(
-        content["low_rank"],
-        sparse,
-        content["report"],
-        picture,
-        stage.seconds if sparse is not None else 0.0,
-        stage.cached,
-        stage.key,
-    )
+    return cache.stage("decomposition", [triplanes, options], make, keep=config.cache)
 
 
 def convert_stage(
-    parts: Parts,
+    parts: Stage,
     model: XPlanesSettings,
     config: DecompositionSettings,
     seed: int,
     cache: StageCache,
     device: torch.device,
-) -> Planes:
+) -> Stage:
     """Space planes from the low-rank part, time planes from the sparse part.
 
     Args:
-        parts: The two parts.
+        parts: What `decompose_stage` gave.
         model: The model's settings, as the field is to be built.
         config: Settings of the conversion.
         seed: The run's seed, for the noise.
         cache: Cache of the stage.
         device: Device of the computation.
+
+    Returns:
+        The planes ``space`` [3, R, R, C] and ``time`` [P, Rt, R, C], on the CPU; and as
+        ``unexplained`` the share of the sparse part's energy that products of time planes do not
+        explain: ``before`` for random planes, ``after`` for these. Without time planes ``time`` is
+        None and ``unexplained`` empty.
     """
     moving = model.plane_set != "three"
-    sparse = parts.sparse if moving else None
+    sparse = parts.content["sparse"] if moving else None
 
     def begin(dynamic: str, moved: Tensor) -> Tensor:
         rows = model.time_resolution
@@ -233,7 +186,7 @@ def convert_stage(
         )
 
     def make() -> dict[str, Any]:
-        low_rank = parts.low_rank.to(device)
+        low_rank = parts.content["low_rank"].to(device)
         space = space_planes(low_rank, static=config.static, resolution=model.resolution)
         content: dict[str, Any] = {"space": space.cpu(), "time": None, "unexplained": {}}
         if sparse is not None:
@@ -249,13 +202,15 @@ def convert_stage(
     of_time = [config.dynamic, config.noise, model.plane_set, model.time_resolution]
     of_time += [model.texels_of_time, seed]
     inputs = [parts.key, config.static, model.resolution, of_time if moving else []]
-    stage = cache.stage("planes", inputs, make)
-    planes = _named(stage.content["space"], SPACE_PLANES)
-    if stage.content["time"] is not None:
-        planes |= _named(stage.content["time"], TIME_PLANES[model.plane_set])
-    return Planes(planes, stage.content["unexplained"], stage.seconds)
+    return cache.stage("planes", inputs, make)
 
 
-def _named(stack: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
-    """Planes by name, channels first. [P, rows, columns, C] -> [C, rows, columns] each"""
-    return {name: plane.permute(2, 0, 1) for name, plane in zip(names, stack, strict=True)}
+def named_planes(planes: Stage, plane_set: str) -> dict[str, Tensor]:
+    """The planes of `convert_stage` by name. [C, rows, columns] each"""
+    names = {"space": SPACE_PLANES, "time": TIME_PLANES[plane_set]}
+    return {
+        name: plane.permute(2, 0, 1)
+        for part, known in names.items()
+        if planes.content[part] is not None
+        for name, plane in zip(known, planes.content[part], strict=True)
+    }

@@ -175,7 +175,9 @@ class OccupancySettings(SamplerSettings):
     # no training ray sees, such as the space below a ground plate. 0 if a background is learnt,
     # which would take over what it empties.
     sparsity: Weight
-    sweep_at: list[int]  # Steps at which all occupied cells are updated.
+    # Steps at which all occupied cells are updated; only the last one if a background is learnt,
+    # which would take over what lies in cells that are only late.
+    sweep_at: list[int]
     sweep_every: Count  # Steps between updates of all occupied cells afterwards.
     update_every: Count  # Steps between updates of random cells.
     update_cells: Count  # Maximum number of cells per update.
@@ -218,7 +220,7 @@ class OccupancySettings(SamplerSettings):
                 carve(grid, site.views, site.frame)
             if site.initialised and self.fill:
                 fill_seconds = _fill(renderer, field, site)
-        settings = self.scaled(site) if plain else replace(self.scaled(site), sparsity=0.0)
+        settings = self.scaled(site) if plain else self.before_background()
         return OccupancySampler(renderer, settings, site.samples_per_batch, fill_seconds)
 
     def scaled(self, site: Site) -> "OccupancySettings":
@@ -231,6 +233,10 @@ class OccupancySettings(SamplerSettings):
             sweep_at=[site.steps(step) for step in self.sweep_at],
             sweep_every=site.steps(self.sweep_every),
         )
+
+    def before_background(self) -> "OccupancySettings":
+        """What leaves cells to the field until it has taken shape; large batches start small."""
+        return replace(self, sweep_at=self.sweep_at[-1:], sparsity=0.0)
 
     def for_video(self) -> "OccupancySettings":
         samples = FEWEST_SAMPLES if self.samples == "auto" else self.samples

@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 MaskUse = Literal["auto", "alpha", "ignore", "lrm"]
 """What the black parts of masks mean.
 
-alpha: empty space; ignore: pixels to ignore; lrm: cropped from the LRM's input alone; auto: empty
+alpha: empty space; ignore: pixels to ignore; lrm: removed from the LRM's input alone; auto: empty
 space where masks look like silhouettes, else pixels to ignore.
 """
 

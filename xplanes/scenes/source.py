@@ -211,7 +211,7 @@ class CaptureSettings(SceneSettings, ABC):
     # name; never the first or last.
     eval_every: Count
     # What masks leave out. alpha: is empty; ignore: is neither trained on nor scored; auto: alpha
-    # where they look like silhouettes, else ignore; lrm: is cropped from the LRM's input alone.
+    # where they look like silhouettes, else ignore; lrm: is removed from the LRM's input alone.
     mask_use: MaskUse
 
     def capture(

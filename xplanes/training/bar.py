@@ -1,4 +1,4 @@
-"""One line that says how far training is."""
+"""A progress line."""
 
 import sys
 import time
@@ -28,10 +28,9 @@ class StepBar(ProgressBar):
         super().__init__()
         self.stream = stream or sys.stdout
         self.live = self.stream.isatty()
-        self._shown = True
-        self._due = 0.0
-        self._width = 0
-        self._seen = (0.0, 0)
+        self._every = LIVE_SECONDS if self.live else PIPED_SECONDS
+        self._shown, self._due, self._width = True, 0.0, 0
+        self._began = (0.0, 0)
 
     def disable(self) -> None:
         self._shown = False
@@ -40,15 +39,16 @@ class StepBar(ProgressBar):
         self._shown = True
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, RadianceModule)
         self._due = time.monotonic() + (0 if self.live else PIPED_SECONDS)
-        self._seen = _clock_and_rays(trainer, pl_module)
+        self._began = training_seconds(trainer), pl_module.counts["rays"]
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         if not self._shown or not trainer.is_global_zero or time.monotonic() < self._due:
             return
-        self._due = time.monotonic() + (LIVE_SECONDS if self.live else PIPED_SECONDS)
+        self._due = time.monotonic() + self._every
         self._write(self.line(trainer, pl_module))
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -64,10 +64,10 @@ class StepBar(ProgressBar):
     def line(self, trainer: Trainer, module: LightningModule) -> str:
         """The line for the present state."""
         assert isinstance(module, RadianceModule)
-        seconds, rays = _clock_and_rays(trainer, module)
+        seconds, rays = training_seconds(trainer), module.counts["rays"]
         clock = find_callback(trainer, TrainingClock)
         most = None if clock is None else clock.max_seconds
-        rate = (rays - self._seen[1]) / max(seconds - self._seen[0], 1e-9)
+        rate = (rays - self._began[1]) / max(seconds - self._began[0], 1e-9)
         left = seconds * (1 / max(module.progress, 1e-6) - 1)
         parts = [
             f"step {trainer.global_step}" + f"/{trainer.max_steps}" * (trainer.max_steps >= 0),
@@ -90,8 +90,3 @@ class StepBar(ProgressBar):
             self.stream.write("\r" + line.ljust(self._width) + ("\n" if last else ""))
             self._width = len(line)
         self.stream.flush()
-
-
-def _clock_and_rays(trainer: Trainer, module: LightningModule) -> tuple[float, int]:
-    assert isinstance(module, RadianceModule)
-    return training_seconds(trainer), module.counts["rays"]

@@ -1,18 +1,20 @@
-"""What a training run is built of: the field with its model, sampler and initialisation."""
+"""What a training run is built of: the field with its model and sampler, of a scene or a file."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 
+from xplanes import __version__
 from xplanes.backend import fast_bf16
+from xplanes.components import build, plugins
 from xplanes.errors import ConfigError
 from xplanes.fields.base import Representation
 from xplanes.models.base import Model, ModelSettings
 from xplanes.models.initialisation import Initialisation, Method, Place
 from xplanes.rendering.sampler import Sampler, Site
-from xplanes.scenes.frame import Frame, pixels_across
+from xplanes.scenes.frame import Frame, frame_content, pixels_across, read_frame
 from xplanes.scenes.views import Scene
 
 ANOTHER_SEED = 1_000_003
@@ -59,7 +61,12 @@ class Parts:
         if initialisation is not None and values is not None:
             # It is large, and of use for some steps only.
             initialisation = replace(initialisation, values=replace(values, sparse=None))
-        field = require_field(model)
+        field: Any = model.field
+        if not isinstance(field, Representation):
+            raise ConfigError(
+                f"{type(model).__name__}.field: {type(field).__name__} must be derived from "
+                "xplanes.fields.base.RadianceField"
+            )
         settings.sampler.require_kind(type(field))
         sampler = settings.sampler.build(field, site)
         require_groups(model, sampler)
@@ -132,26 +139,110 @@ def build_parts(
     return replace(parts, initialisation=replace(parts.initialisation, seconds=seconds))
 
 
+def site_content(parts: Parts) -> dict[str, Any]:
+    """What data and LRM determine about a field, as plain values and tensors."""
+    site = parts.site
+    return {
+        "model": parts.settings.plain(),
+        "frame": frame_content(site.frame),
+        "times": site.times,
+        "bounds": site.bounds,
+        "initialised": site.initialised,
+        "pixels": site.pixels,
+        "surrounded": site.surrounded,
+    }
+
+
+def parts_from(
+    content: Mapping[str, Any], method: Method, modules: Sequence[str], samples: int | None
+) -> Parts:
+    """Build a field without its data, for weights that are about to be loaded.
+
+    Args:
+        content: What `site_content` gave.
+        method: All settings except those of the data and the Trainer.
+        modules: The user's modules whose classes ``content`` may name.
+        samples: Samples per training batch.
+
+    Raises:
+        ConfigError: If the content names a class that may not stand there.
+    """
+    with plugins(modules):
+        settings = build(content["model"], ModelSettings, "model")
+    if not content["initialised"] or settings.name != method.model.name:
+        settings = method.model  # Weights of another one will not fit.
+    site = Site(
+        frame=read_frame(content["frame"], "the checkpoint"),
+        times=content["times"],
+        seed=method.seed,
+        precision=precision_of(settings, torch.device("cpu")),
+        bounds=content["bounds"],
+        pixels=content["pixels"],
+        surrounded=content["surrounded"],
+        samples_per_batch=samples,
+    )
+    return Parts.assemble(settings, site)
+
+
+def require_frame(parts: Parts, content: Mapping[str, Any]) -> None:
+    """Refuse planes that were trained in another frame than the initialisation lies in now.
+
+    Raises:
+        ConfigError: Naming what differs.
+    """
+    trained = read_frame(content["frame"], "the checkpoint")
+    if not (parts.site.initialised and content["initialised"]):
+        return
+    for name, now in frame_content(parts.site.frame).items():
+        before = torch.as_tensor(getattr(trained, name))
+        if not torch.allclose(before, torch.as_tensor(now), rtol=1e-4, atol=1e-5):
+            raise ConfigError(
+                f"the initialisation was computed again, and its frame is not the checkpoint's "
+                f"({name} {before.tolist()}, now {torch.as_tensor(now).tolist()}): what "
+                "preparation.cache kept is gone. Bring it back, or start a new run "
+                "in another folder"
+            )
+
+
 def precision_of(settings: ModelSettings, device: torch.device) -> str:
-    """The precision of products, settled for a device where the settings say auto."""
+    """Precision of matrix products; ``auto`` is resolved for the device."""
     if settings.precision == "auto":
         return "bf16" if fast_bf16(device) else "32"
     return settings.precision
 
 
-def require_field(model: Model) -> Representation:
-    """The field of a model, if it is one.
+def require_version(path: Any) -> None:
+    """Refuse a checkpoint of a version whose settings were others.
+
+    Args:
+        path: The file; what is no local file, or cannot be read, is left to others.
 
     Raises:
-        ConfigError: If it is of another class.
+        ConfigError: With the version.
     """
-    field: Any = model.field
-    if not isinstance(field, Representation):
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        made = str(content.get("xplanes", "0.2 or older"))
+    except Exception:  # Whoever loads it says what is wrong.
+        return
+    if made.split(".")[:2] != __version__.split(".")[:2]:
         raise ConfigError(
-            f"{type(model).__name__}.field: {type(field).__name__} must be derived from "
-            "xplanes.fields.base.RadianceField"
+            f"{path} was made by xplanes {made}, whose settings are not those of {__version__}: "
+            "load it with that version, or start a new run"
         )
-    return field
+
+
+def require_whole_floats(precision: str) -> None:
+    """Refuse a Trainer that changes the precision: the model sets its own.
+
+    Raises:
+        ConfigError: With what to set instead.
+    """
+    if precision not in ("32", "32-true"):
+        raise ConfigError(
+            f"precision={precision}: a field computes in model.precision (auto, 32 or bf16), and "
+            "its planes are float32; leave it out"
+        )
 
 
 def require_groups(model: Model, sampler: Sampler) -> None:

@@ -15,12 +15,12 @@ C = TypeVar("C", bound=Callback)
 
 
 SHARED = 8
-"""Batches from one agreement of processes that train together to the next: on the time, and on
+"""Batches between two synchronisations of processes that share a run: of their clocks, and of
 whether to stop."""
 
 
 def agreeing(trainer: Trainer) -> bool:
-    """Whether all processes come to an agreement after this batch; one alone always does."""
+    """Whether the processes synchronise after this batch; true at each batch of a single one."""
     # An epoch may have fewer batches, so that their number in it would never be reached.
     batches = trainer.fit_loop.epoch_loop.total_batch_idx + 1 if trainer.world_size > 1 else 0
     return batches % SHARED == 0
@@ -29,8 +29,8 @@ def agreeing(trainer: Trainer) -> bool:
 class TrainingClock(Callback):
     """Counts the seconds spent on training, and ends training when they are used up.
 
-    Drawing rays counts; validation, scores, images and checkpoints do not: whoever does such work
-    does it inside `off_clock`. Work that a GPU still has to do counts, too. Works in any Trainer.
+    Drawing rays counts; validation, scores, images and checkpoints do not: such work is done inside
+    `off_clock`. Work queued on a GPU counts as well. Works in any Trainer.
 
     Args:
         max_seconds: Seconds after which training ends; None for no limit.

@@ -1,4 +1,4 @@
-"""Fields that show nothing, or fog: noticed within seconds, and trained again once."""
+"""Detects fields that collapse to nothing or to fog, and restarts them once."""
 
 import logging
 import math
@@ -30,14 +30,14 @@ class CollapseWatch(Callback):
 
     The field is then re-initialised with another seed and the model's settings for this case
     (`ModelSettings.stronger`). If that does not help, or the model has none, like the published
-    baselines, a warning says so, and training continues to the end of its budget.
+    baselines, it warns, and training continues to the end of its budget.
 
     Args:
         restarts: Maximum number of re-initialisations; 0 for a warning only.
 
     Attributes:
         restarted: Steps of re-initialisations.
-        collapsed: What was detected last, in words; empty if nothing was.
+        collapsed: Description of what was detected last; empty if nothing was.
     """
 
     def __init__(self, restarts: int = 1) -> None:
@@ -94,7 +94,7 @@ class CollapseWatch(Callback):
 
 
 def verdict(seen: list[tuple[float, float]], *, fog: bool) -> str:
-    """What mean opacities of foreground and background rays say of a field; empty if it is sound.
+    """Diagnosis of a field by mean opacities of foreground and background rays; empty if sound.
 
     Args:
         seen: One pair for each step, from 0 to 1; NaN where a batch had no such rays.

@@ -1,63 +1,29 @@
 """When views are scored during training, and the curve of their scores."""
 
-import logging
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
 from xplanes.errors import ConfigError
-from xplanes.files import read_rows, write_rows
+from xplanes.files import write_rows
 from xplanes.rendering.pictures import plane_sheet, strip, write_png
 from xplanes.training.clock import off_clock, training_seconds
 from xplanes.training.logs import forget_later
 from xplanes.training.module import RadianceModule
-from xplanes.training.scores import ViewScore, mean
-
-logger = logging.getLogger(__name__)
+from xplanes.training.scores import mean
 
 SHOWN = 4
 """Views whose images go to the logger at each evaluation."""
 
 
-class Curve:
-    """curve.csv: one row per evaluation, rewritten whole at each.
-
-    Args:
-        path: The file.
-        until: Rows of later steps are dropped, as when a run goes on from a checkpoint.
-    """
-
-    HEADER = ("seconds", "step", "split", "psnr", "ssim")
-
-    def __init__(self, path: Path, until: int) -> None:
-        self.path = path
-        self.rows: list[tuple[str, ...]] = []
-        for row in read_rows(path):
-            values = tuple(row.get(name) or "" for name in self.HEADER)
-            if not all(values) or not values[1].isdecimal():
-                logger.warning("%s is damaged: a row without all its numbers is dropped", path)
-            elif int(values[1]) <= until:
-                self.rows.append(values)
-
-    def add(self, seconds: float, step: int, split: str, scores: Sequence[ViewScore]) -> None:
-        """Append the means over views; a row of the same step is replaced."""
-        row = (
-            f"{seconds:.3f}",
-            str(step),
-            split,
-            f"{mean([s.psnr for s in scores]):.4f}",
-            f"{mean([s.ssim for s in scores]):.5f}",
-        )
-        self.rows = [old for old in self.rows if old[1] != row[1]]
-        self.rows.append(row)
-        write_rows(self.path, self.HEADER, self.rows)
+CURVE = ("seconds", "step", "split", "psnr", "ssim")
+"""Columns of curve.csv."""
 
 
 class Evaluation(Callback):
@@ -65,7 +31,8 @@ class Evaluation(Callback):
 
     The views are those of `SceneDataModule.val_dataloader`; ``trainer.limit_val_batches`` of them
     are scored each time. Writes curve.csv and images into the trainer's ``default_root_dir``, and
-    gives images to its loggers. All rows of the curve score the same views.
+    gives images to its loggers. All rows of the curve score the same views; a checkpoint holds the
+    rows until then.
 
     Args:
         at: Shares of the budget, from 0 to 1; 1 is always scored.
@@ -82,7 +49,7 @@ class Evaluation(Callback):
         self.step = -1
         self.seconds = 0.0
         self._passed: int | None = None
-        self._curve: Curve | None = None
+        self._rows: list[list[str]] = []
         self._pictures: dict[str, Tensor] = {}
         self._began = 0.0
 
@@ -145,9 +112,10 @@ class Evaluation(Callback):
         data: Any = trainer.datamodule  # type: ignore[attr-defined]
         split, step = data.validation_split or data.test_split, trainer.global_step
         run = Path(trainer.default_root_dir)
-        if self._curve is None:
-            self._curve = Curve(run / "curve.csv", until=step)
-        self._curve.add(training_seconds(trainer), step, split, module.scores)
+        psnr, ssim = (mean([getattr(s, name) for s in module.scores]) for name in CURVE[3:])
+        row = [f"{training_seconds(trainer):.3f}", str(step), split, f"{psnr:.4f}", f"{ssim:.5f}"]
+        self._rows = [*(old for old in self._rows if old[1] != row[1]), row]
+        write_rows(run / "curve.csv", CURVE, self._rows)
         pictures = {
             file if file.startswith(f"{split}/") else f"{split}/{file}": picture
             for file, picture in self._pictures.items()
@@ -167,10 +135,11 @@ class Evaluation(Callback):
                 )
 
     def state_dict(self) -> dict[str, Any]:
-        return {"seconds": self.seconds, "passed": self._passed}
+        return {"seconds": self.seconds, "passed": self._passed, "rows": self._rows}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.seconds, self._passed = state_dict["seconds"], state_dict["passed"]
+        self._rows = list(state_dict.get("rows", []))
 
 
 def log_image(trainer: Trainer, tag: str, picture: Tensor, step: int) -> None:
@@ -189,17 +158,3 @@ def log_image(trainer: Trainer, tag: str, picture: Tensor, step: int) -> None:
             writer.add_image(tag, picture, step, dataformats="HWC")
         elif hasattr(log, "log_image"):
             log.log_image(tag, [picture.cpu().numpy()], step=step)  # type: ignore[attr-defined]
-
-
-def device_memory(device: torch.device) -> int:
-    """Most bytes held so far: on the device if it is a GPU, else by this process."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    if sys.platform == "win32":
-        from psutil import Process
-
-        return Process().memory_info().peak_wset
-    import resource
-
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most if sys.platform == "darwin" else most * 1024  # Only macOS counts in bytes.

@@ -1,14 +1,13 @@
-"""Lightning's Trainer with our budget, and fields that are trained on the way to something else."""
+"""Lightning's Trainer with a time budget, its warm-up, and short trainings during preparation."""
 
 import copy
 import logging
 import sys
 import time
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import lightning
 import torch
@@ -23,12 +22,12 @@ from xplanes.scenes.batches import Batch
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Scene
 from xplanes.settings import Count, Positive, Steps
+from xplanes.training.building import require_whole_floats
 from xplanes.training.checkpoints import AtomicCheckpointIO, Checkpoints, find_resumable
 from xplanes.training.clock import TrainingClock, find_callback
 from xplanes.training.collapse import CollapseWatch
 from xplanes.training.evaluation import Evaluation
 from xplanes.training.interrupt import Interrupt
-from xplanes.training.loading import require_whole_floats
 from xplanes.training.losses import loss_terms
 from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore
@@ -75,7 +74,12 @@ class Trainer(lightning.Trainer):
                 "leave it out, and set data.views for a field of few images"
             )
         require_whole_floats(str(others.get("precision") or "32-true"))
-        _refuse_callbacks(callbacks)
+        for callback in callbacks:
+            if isinstance(callback, StochasticWeightAveraging):
+                raise ConfigError(
+                    f"callbacks: {type(callback).__name__}: the model's schedules would overrule "
+                    "its learning rates; use lightning.pytorch.callbacks.EMAWeightAveraging"
+                )
         device = find_device(accelerator)
         if device.type == "cuda":
             if deterministic:
@@ -153,16 +157,6 @@ class Trainer(lightning.Trainer):
         return [by_file[file] for file in views.files if file in by_file]
 
 
-def _refuse_callbacks(callbacks: Sequence[Callback]) -> None:
-    for callback in callbacks:
-        name = type(callback).__name__
-        if isinstance(callback, StochasticWeightAveraging):
-            raise ConfigError(
-                f"callbacks: {name}: the model's schedules would overrule its learning rates; use "
-                "lightning.pytorch.callbacks.EMAWeightAveraging"
-            )
-
-
 def find_device(accelerator: str) -> torch.device:
     """The device of ``trainer.accelerator``: a CUDA GPU where there is one, else the CPU.
 
@@ -188,7 +182,6 @@ def fit_quietly(
     device: torch.device,
     max_steps: int,
     max_seconds: float | None,
-    checkpoint_every: int,
 ) -> None:
     """Train a field that is built on a scene, from its last checkpoint in a folder on.
 
@@ -199,7 +192,6 @@ def fit_quietly(
         device: Where to train.
         max_steps: Steps at most.
         max_seconds: Seconds at most; None for no limit.
-        checkpoint_every: Steps between checkpoints.
     """
     trainer = Trainer(
         accelerator="gpu" if device.type == "cuda" else "cpu",
@@ -208,7 +200,7 @@ def fit_quietly(
         # A Trainer sets these for the whole process, and the run's own was there first.
         deterministic=device.type == "cpu" and torch.are_deterministic_algorithms_enabled(),
         tf32=torch.backends.cudnn.allow_tf32,
-        callbacks=[CollapseWatch(), Checkpoints(checkpoint_every)],
+        callbacks=[CollapseWatch(), Checkpoints(every=250)],
         default_root_dir=folder,
         logger=False,
         enable_progress_bar=False,
@@ -220,7 +212,7 @@ def fit_quietly(
 
 
 def warm_up(module: RadianceModule, data: SceneDataModule, device: torch.device) -> None:
-    """Run all loops once on a few rays, so that compiling them is not on the training clock."""
+    """Run all loops once on a few rays, so that the training clock does not count compiling."""
     if device.type != "cpu":
         # The kernels are tried where they will run; Lightning would move the module a little later.
         module.to(device)
@@ -256,9 +248,8 @@ def rehearse(module: RadianceModule, rays: Batch) -> None:
     sampler.update(model.field, state)
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """What a run is going to take, from its first rays.
+class Estimate(NamedTuple):
+    """How long a run is going to take, measured on its first rays.
 
     Attributes:
         step: Seconds of a step.
@@ -276,35 +267,41 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
         module: The module, its loops compiled.
         data: Its data.
     """
-    assert module.frame is not None
-    device = next(module.field.parameters()).device
+    frame, field, renderer = module.frame, module.field, module.renderer
+    assert frame is not None
+    device = next(field.parameters()).device
     rays = _moved(data.batches_for(module, 0).draw(0, module.rays), device)
-    seconds = []
-    for _ in range(2):
-        began = time.perf_counter()
-        rendering = module.sampler.render(module.field, rays, module.state)
-        rendering.colour.sum().backward()
+    views = data.scene.splits[data.test_split]
+    camera, seen_at = views.camera(0), (float(views.times[0]), data.scene.background.to(device))
+    pixels = camera.height * camera.width
+    chosen = torch.linspace(0, pixels - 1, min(2048, pixels)).long()
+    origins, directions = (part[chosen].to(device) for part in frame.rays(*camera.rays()))
+
+    def step() -> None:
+        module.sampler.render(field, rays, module.state).colour.sum().backward()
         module.zero_grad(set_to_none=True)
-        synchronize(device)
-        seconds.append(time.perf_counter() - began)
-    views, renderer = data.scene.splits[data.test_split], module.renderer
-    shown_at, background = float(views.times[0]), data.scene.background.to(device)
-    camera = views.camera(0)
-    if not isinstance(renderer, RayRenderer):
-        began = time.perf_counter()
-        renderer.view(module.field, module.frame, camera, shown_at, background)
-        pixels = camera.height * camera.width
-        return Estimate(min(seconds), pixels / (time.perf_counter() - began))
-    ends = module.frame.rays(*camera.rays())
-    chosen = torch.linspace(0, len(ends[0]) - 1, min(2048, len(ends[0]))).long()
-    origins, directions = (part[chosen].to(device) for part in ends)
+
+    def image() -> None:
+        if isinstance(renderer, RayRenderer):
+            renderer.image(field, origins, directions, *seen_at)
+        else:
+            renderer.view(field, frame, camera, *seen_at)
+
+    count = len(chosen) if isinstance(renderer, RayRenderer) else pixels
+    # On a GPU the first image compiles kernels.
+    whole = _seconds(image, device, times=1 if device.type == "cpu" else 2)
+    return Estimate(_seconds(step, device, times=2), count / whole)
+
+
+def _seconds(work: Callable[[], Any], device: torch.device, times: int) -> float:
+    """The least time that some work takes, done several times."""
     spent = []
-    for _ in range(1 if device.type == "cpu" else 2):  # On a GPU the first compiles kernels.
+    for _ in range(times):
         began = time.perf_counter()
-        renderer.image(module.field, origins, directions, shown_at, background)
+        work()
         synchronize(device)
         spent.append(time.perf_counter() - began)
-    return Estimate(min(seconds), len(chosen) / min(spent))
+    return min(spent)
 
 
 def _moved(batch: Batch, device: torch.device) -> Batch:
@@ -312,7 +309,7 @@ def _moved(batch: Batch, device: torch.device) -> Batch:
 
 
 def quiet_lightning() -> None:
-    """Hide, by name, what Lightning says that a user of this program cannot act on."""
+    """Hide messages of Lightning that a user of this program cannot act on."""
     for name in (
         "utilities.rank_zero",
         "trainer.connectors.checkpoint_connector",

@@ -18,7 +18,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class Interrupt(Callback):
-    """Turns the first SIGINT or SIGTERM into a stop after the step; a second one is at once."""
+    """Turns the first SIGINT or SIGTERM into a stop after the step; the second stops at once."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -60,7 +60,10 @@ class Interrupt(Callback):
     on_validation_batch_end = on_test_batch_end
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        self._listen()
+        if self._before or threading.current_thread() is not threading.main_thread():
+            return  # Only the main thread can take signals.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._note)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         self._restore()
@@ -80,13 +83,6 @@ class Interrupt(Callback):
             raise KeyboardInterrupt from None
         finally:
             self._restore()
-
-    def _listen(self) -> None:
-        """Take the signals; threads other than the main one cannot, and leave them be."""
-        if self._before or threading.current_thread() is not threading.main_thread():
-            return
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._before[number] = signal.signal(number, self._note)
 
     def _restore(self) -> None:
         for number, handler in self._before.items():

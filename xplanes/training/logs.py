@@ -1,4 +1,4 @@
-"""What a training step tells the loggers."""
+"""What a training step logs."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 def logs_now(trainer: Trainer) -> bool:
     """Whether a Trainer wants logs of the last batch."""
     every = trainer.log_every_n_steps  # type: ignore[attr-defined]
-    # As the Trainer counts, for which a module that was loaded begins again.
+    # The Trainer's count, which starts again from 0 when a module was loaded.
     batch = trainer.fit_loop.epoch_loop.total_batch_idx + 1
     return bool(every and not batch % every and trainer.loggers)
 
 
 def forget_later(trainer: Trainer, step: int) -> None:
-    """Let TensorBoard drop the points after a step, which a run that was cut off has left.
+    """Make TensorBoard drop the points after a step, which an interrupted run has left.
 
     Args:
         trainer: Has the loggers.

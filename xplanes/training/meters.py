@@ -1,4 +1,4 @@
-"""What training steps show: sums that a GPU's host reads now and then, and opacities."""
+"""Statistics of training steps: sums on the device, which the host reads now and then."""
 
 import math
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from xplanes.rendering.base import Rendering
 from xplanes.scenes.batches import Batch
 
 EVERY = 32
-"""Batches from one look at the sums to the next; at first the gaps are shorter."""
+"""Batches between two reads of the sums; fewer at first."""
 
 
 def due(batches: int) -> bool:
@@ -28,7 +28,7 @@ class Meters:
         self._known: dict[str, float] = {}
 
     def add(self, values: Mapping[str, Tensor | float]) -> None:
-        """Add what a batch shows: numbers or tensors without axes.
+        """Add the numbers of a batch: floats, or tensors without axes.
 
         Each time the same names, and tensors of the same types.
         """
@@ -60,13 +60,13 @@ and rays left out for want of room on a GPU."""
 
 
 class Tally:
-    """What a run has counted, and what its last batches showed.
+    """Counts of a run, and the loss and opacities of its last batches.
 
     Attributes:
         counts: Numbers since the start of the run, by the names in `COUNTS`.
         last: Loss and PSNR of the last batches, mean opacities, and the last scores of views.
-        done: Updates that were not left out.
-        skipped: Updates that were left out.
+        done: Updates that were not skipped.
+        skipped: Updates that were skipped.
         skipped_in_a_row: The same, since the last one that was not.
         opacities: Mean opacities of a recent batch, on its device.
     """
@@ -79,17 +79,17 @@ class Tally:
         self._batches, self._updates = Meters(), Meters()
 
     def add_batch(self, values: Mapping[str, Tensor | float]) -> None:
-        """Take in a batch: its number of ``batches``, ``all_rays``, ``loss``, ``error``, counts."""
+        """Add a batch: its number of ``batches``, ``all_rays``, ``loss``, ``error``, counts."""
         self._batches.add(values)
 
     def add_update(self, broken: Tensor) -> None:
-        """Take in an update, which was left out where the flag is 1. []"""
+        """Add an update, which was skipped where the flag is 1. []"""
         self._updates.add({"updates": 1, "skipped": broken})
         if broken.device.type == "cpu":
             self._read_updates()
 
     def read(self, trainer: Trainer) -> tuple[int, int] | None:
-        """Look at what was taken in since the last look, by all processes.
+        """Read the sums since the last read, over all processes.
 
         Args:
             trainer: Whose processes they are.
@@ -146,7 +146,7 @@ def _of_all(values: dict[str, float], trainer: Trainer) -> dict[str, float]:
 
 
 def batch_values(rendering: Rendering, rays: Batch, loss: Tensor) -> dict[str, Tensor | float]:
-    """What a `Tally` takes in of a batch."""
+    """What a `Tally` adds up of a batch."""
     count, samples = len(rays["times"]), rendering.samples
     shown: Tensor | None = getattr(samples, "shown", None)
     values = {name: getattr(samples, name) for name in ("candidates", "empty", "occluded")}
@@ -174,5 +174,5 @@ def mean_opacities(rendering: Rendering, rays: Batch) -> dict[str, Tensor]:
 
 
 def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
-    """Mean of some values, without a list of which; NaN for none. [N], bool [N] -> []"""
+    """Mean of the values under a mask, without indexing; NaN for none. [N], bool [N] -> []"""
     return values.mean() if mask is None else (values * mask).sum() / mask.sum()

@@ -4,6 +4,7 @@ import functools
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,6 +15,7 @@ from xplanes import __version__
 from xplanes.components import plugins
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
+from xplanes.files import stand_in
 from xplanes.models.base import Model
 from xplanes.models.initialisation import Initialisation, Method
 from xplanes.rendering.base import Renderer, Rendering
@@ -22,27 +24,32 @@ from xplanes.scenes.batches import Batch, BatchSettings
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene
 from xplanes.streams import TrainingState
-from xplanes.training.building import Parts, build_parts
-from xplanes.training.diagnosis import TrainingError, diagnosis
-from xplanes.training.finite import broken_flag, leave_out, unusable_gradients
-from xplanes.training.loading import (
+from xplanes.training.building import (
+    Parts,
+    build_parts,
     parts_from,
-    require_fetched,
     require_frame,
     require_version,
     require_whole_floats,
     site_content,
 )
+from xplanes.training.diagnosis import (
+    TrainingError,
+    broken_flag,
+    diagnosis,
+    leave_out,
+    unusable_gradients,
+)
 from xplanes.training.logs import log_terms, logs_now
 from xplanes.training.losses import loss_terms
 from xplanes.training.meters import Tally, batch_values, due, mean_opacities
-from xplanes.training.scoring import ViewScoring
+from xplanes.training.scores import ViewScoring
 
 PATIENCE = 20
-"""Updates in a row with a loss or gradient that is not finite after which training gives up."""
+"""Training gives up after this number of updates in a row without finite loss and gradients."""
 
 OPACITIES = 5
-"""Batches from one look at the rays' opacity to the next."""
+"""Batches between two measurements of the rays' opacity."""
 
 
 class RadianceModule(ViewScoring):
@@ -53,7 +60,7 @@ class RadianceModule(ViewScoring):
     ``RadianceModule.load_from_checkpoint(path)`` needs only the file (and ``plugins``, if used).
 
     A step is `training_step` (render the rays, add up the loss), `on_before_optimizer_step`
-    (gradients of regularisers without rays; a step that is not finite is left out) and
+    (gradients of regularisers without rays; a step that is not finite is skipped) and
     `optimizer_step` (the optimiser, then the upkeep of the occupancy grid).
 
     Args:
@@ -76,7 +83,7 @@ class RadianceModule(ViewScoring):
         self.save_hyperparameters({"config": kept})
         self._plugins = tuple(plugins)
         self.ray_settings: BatchSettings = self.method.model.rays
-        """What a training step gets to see; once the field is built, on its device."""
+        """Sizes of training batches; once the field is built, those for its device."""
         self.batches = 0
         """Batches that training has drawn."""
         self.rays = 0
@@ -124,7 +131,9 @@ class RadianceModule(ViewScoring):
         Raises:
             ConfigError: If the checkpoint needs a plug-in that is not named, or does not fit.
         """
-        require_fetched(checkpoint_path)
+        local = isinstance(checkpoint_path, str | Path)
+        if local and (other := stand_in(Path(checkpoint_path))) is not None:
+            raise ConfigError(f"{checkpoint_path} {other}")
         try:
             return super().load_from_checkpoint(
                 checkpoint_path, *args, weights_only=weights_only, **kwargs
@@ -231,7 +240,7 @@ class RadianceModule(ViewScoring):
 
     @property
     def _ddp_params_and_buffers_to_ignore(self) -> list[str]:
-        """What torch is not to send from the first process to all others before each step.
+        """Buffers that DDP does not send from the first process to all others before each step.
 
         The occupancy grid is 20 MB; processes agree on it now and then.
         """
@@ -242,13 +251,13 @@ class RadianceModule(ViewScoring):
 
     @property
     def progress(self) -> float:
-        """Share of training that is done: of its steps, or as callbacks with ``progress`` say."""
+        """Share of training that is done: of its steps, or of a budget that a callback counts."""
         share = self.global_step / self._steps
         return min(1.0, max([share, *(callback.progress for callback in self._schedules)]))
 
     @property
     def state(self) -> TrainingState:
-        """How far training is."""
+        """Seed and progress of training, for schedules and random streams."""
         done = (self.global_step, self.batches, self.global_rank)
         return TrainingState(self.method.seed, *done, progress=self.progress)
 
@@ -264,7 +273,7 @@ class RadianceModule(ViewScoring):
 
     @property
     def unusable(self) -> int:
-        """Steps that were left out because a loss or gradient was not finite."""
+        """Steps that were skipped because a loss or gradient was not finite."""
         return self.tally.skipped
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -307,7 +316,7 @@ class RadianceModule(ViewScoring):
         self._count(rendering, batch, loss)
         log_terms(self, terms, state)
         if self.trainer.world_size > 1:
-            # Processes wait for the gradient of every parameter, also of one that no ray met.
+            # DDP waits for the gradient of every parameter, also of one that no ray reached.
             loss = loss + 0 * sum(p.sum() for p in self.parameters() if p.requires_grad)
         return loss
 
@@ -322,7 +331,7 @@ class RadianceModule(ViewScoring):
         broken = broken_flag(self.parameters(), self._losses)
         self._losses = []
         if self.trainer.world_size > 1:
-            # All processes must leave a step out together, for their planes must stay equal.
+            # All processes must skip a step together, for their planes must stay equal.
             torch.distributed.all_reduce(broken, op=torch.distributed.ReduceOp.MAX)
         unusable: list[str] = []
         if broken.device.type == "cpu" and broken:
@@ -350,7 +359,7 @@ class RadianceModule(ViewScoring):
         self._read_tally()
 
     def _count(self, rendering: Rendering, rays: Batch, loss: Tensor) -> None:
-        """Take in what a batch showed; on a GPU the host looks at it later."""
+        """Record the statistics of a batch; on a GPU the host reads them later."""
         # Before a background that is learnt, no pixel is known to need opacity or to lack it.
         known = getattr(self.field, "background", None) is None
         if known and self.batches % OPACITIES == 0:
@@ -362,7 +371,7 @@ class RadianceModule(ViewScoring):
                 self._give_up()
 
     def _read_tally(self) -> None:
-        """Look at what the batches since the last look showed, and draw as many rays as fit."""
+        """Read the statistics since the last read, and set the number of rays that fits."""
         if (found := self.tally.read(self.trainer)) is None:
             return
         rays, samples = found
@@ -429,7 +438,7 @@ class RadianceModule(ViewScoring):
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
-        """As torch does, with words for a state of other settings.
+        """As torch does, with a clear error for a state of other settings.
 
         Raises:
             ConfigError: If it does not fit.

@@ -21,6 +21,7 @@ from xplanes.files import read_json, replacing, write_json, write_text
 from xplanes.lrm import LRMError
 from xplanes.process import resume_command
 from xplanes.scenes.views import Views
+from xplanes.settings import flatten
 from xplanes.training.checkpoints import LAST, load_checkpoint
 
 logger = logging.getLogger(__name__)
@@ -29,7 +30,7 @@ KEPT = """model.name lrm.name model.sampler.name data.name data.scene data.seed 
 data.views data.train_views data.train_on_video data.static data.half_side data.eval_split
 data.eval_every data.test_cameras data.frames data.protocol data.masks data.mask_use data.model
 data.images data.orient data.times data.time_pattern""".split()
-"""Settings on which the planes, their frame and what they show depend. Files may have moved."""
+"""Settings on which the planes, their frame and what they show depend; not where files lie."""
 
 
 def require_same_settings(run: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -43,10 +44,10 @@ def require_same_settings(run: Path, before: Mapping[str, Any], now: Mapping[str
     Raises:
         ConfigError: Naming the first that differs.
     """
+    before, now = flatten(before), flatten(now)
     for key in KEPT:
-        was, wanted = (_value(content, key) for content in (before, now))
-        if _ABSENT not in (was, wanted) and was != wanted:
-            was, wanted = ("null" if value is None else value for value in (was, wanted))
+        if key in before and key in now and before[key] != now[key]:
+            was, wanted = ("null" if each[key] is None else each[key] for each in (before, now))
             raise ConfigError(
                 f"resume={run} with {key}={wanted}: its checkpoint was trained with {key}={was}. "
                 "Leave it out, or start a new run in another folder"
@@ -73,16 +74,6 @@ def require_same_views(run: Path, record: Mapping[str, Any], views: Views) -> No
         )
 
 
-_ABSENT = object()
-"""Stands for a setting that a configuration lacks; one that is null is there."""
-
-
-def _value(content: Any, key: str) -> Any:
-    for name in key.split("."):
-        content = content.get(name, _ABSENT) if isinstance(content, Mapping) else _ABSENT
-    return content
-
-
 Status = Literal["running", "finished", "failed", "interrupted"]
 
 _PACKAGES = (
@@ -101,12 +92,12 @@ NOTED = ("device", "precision", "files")
 
 
 class RunRecord:
-    """Keeps run.json true from the start of a run to its end.
+    """Keeps run.json up to date from the start of a run to its end.
 
     Args:
         run: The run directory.
         seed: The run's seed.
-        resume: Whether the run goes on; what a folder says of another start is left out else.
+        resume: Whether the run goes on; otherwise the record of an earlier run is ignored.
     """
 
     def __init__(self, run: Path, seed: int, *, resume: bool) -> None:
@@ -209,25 +200,15 @@ def _version(name: str) -> str | None:
 def _commit() -> str | None:
     """Commit of the source tree, with a mark if it was changed; None outside a checkout."""
     root = Path(__file__).resolve().parent.parent.parent
+    # Installed into an environment, the package may lie in a repository of the user's own.
+    if not (root / ".git").exists():
+        return None
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    options: Any = {"cwd": root, "capture_output": True, "text": True, "timeout": 5, "check": True}
     try:
-        # Installed into an environment, the package may lie in a repository of the user's own.
-        if Path(_git(root, "rev-parse", "--show-toplevel")).resolve() != root:
-            return None
-        return _git(root, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+        return subprocess.run(command, **options).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None
-
-
-def _git(folder: Path, *words: str) -> str:
-    """What git says, in a folder.
-
-    Raises:
-        OSError, subprocess.SubprocessError: If it fails.
-    """
-    run = subprocess.run(
-        ["git", *words], cwd=folder, capture_output=True, text=True, timeout=5, check=True
-    )
-    return run.stdout.strip()
 
 
 def read_config(run: Path) -> dict[str, Any]:
@@ -250,7 +231,7 @@ def read_config(run: Path) -> dict[str, Any]:
 
 
 def require_same_run(run: Path, config: Mapping[str, Any], max_steps: int) -> None:
-    """Refuse to go on as another run than that of the checkpoint, or with nothing to train.
+    """Refuse to resume with settings other than the checkpoint's, or with no steps left.
 
     Args:
         run: The run directory.
@@ -279,7 +260,7 @@ def require_same_run(run: Path, config: Mapping[str, Any], max_steps: int) -> No
 
 @contextmanager
 def keeping_settings(run: Path, config: Mapping[str, Any], overrides: list[str]) -> Iterator[None]:
-    """Write down the settings; those of before come back if they turn out to be impossible."""
+    """Write the settings; the earlier ones are restored if the new ones turn out to be invalid."""
     paths = (run / "config.yaml", run / "overrides.txt")
     before = {path: path.read_bytes() for path in paths if path.is_file()}
     write_text(paths[0], yaml.safe_dump(dict(config), sort_keys=False))
@@ -317,7 +298,7 @@ def logged(path: Path) -> Iterator[None]:
 
 
 class _LogFile(logging.FileHandler):
-    """A log that a full disk cuts short, without a word for each line on the terminal."""
+    """A log that ends silently when the disk is full."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
         return

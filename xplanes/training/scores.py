@@ -1,13 +1,15 @@
-"""Scores of views: rendered, compared with the true images, and averaged."""
+"""Scores of views: rendered, compared with the true images, and averaged; when Lightning asks."""
 
 import math
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from lightning import Trainer
-from torch import Tensor, distributed
+from lightning import LightningModule, Trainer
+from lightning.pytorch.trainer.states import TrainerFn
+from torch import Tensor, distributed, nn
 
 from xplanes.fields.base import Representation
 from xplanes.metrics import psnr, ssim
@@ -15,12 +17,13 @@ from xplanes.rendering.base import Renderer, leave_empty
 from xplanes.scenes.datamodule import whole_view
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
+from xplanes.training.meters import Tally
 
 VISIBLE = 0.05
 """Opacity above which a background pixel shows a floater."""
 
 SOLID = 128
-"""Share of a pixel, of 255, from which it shows the thing."""
+"""Share of a pixel, of 255, from which it counts as showing the foreground object."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,7 @@ class ViewScore:
         time: Its time, from 0 to 1.
         psnr: In dB.
         ssim: Structural similarity.
-        psnr_thing: In dB, over the pixels that show the thing; NaN where they are not known.
+        psnr_thing: In dB, over the pixels that show the foreground object; NaN where not known.
         floaters: Share of background pixels (alpha 0 in the true image) that are not transparent;
             NaN where the image has none.
     """
@@ -50,23 +53,6 @@ class ViewScore:
         found = {"psnr": self.psnr, "ssim": self.ssim}
         maybe = {"psnr_thing": self.psnr_thing, "floaters": self.floaters}
         return found | {name: value for name, value in maybe.items() if not math.isnan(value)}
-
-
-@dataclass(frozen=True)
-class ViewImages:
-    """What was compared.
-
-    Attributes:
-        truth: True colours. [H, W, 3]
-        colour: Rendered colours. [H, W, 3]
-        depth: Rendered depth in the field's frame. [H, W]
-        opacity: Rendered opacity. [H, W]
-    """
-
-    truth: Tensor
-    colour: Tensor
-    depth: Tensor
-    opacity: Tensor
 
 
 def render_item(
@@ -131,13 +117,11 @@ def score_view(
     views: Views,
     index: int,
     background: Tensor,
-) -> tuple[ViewScore, ViewImages]:
-    """Render one view and compare it with the true image in front of ``background``."""
+) -> tuple[ViewScore, dict[str, Tensor]]:
+    """As `render_view`, with the view's score, and its true colours as ``truth`` [H, W, 3]."""
     item = whole_view(views, index, background)
     image = render_item(field, renderer, frame, item)
-    colour, depth, opacity = (image[name].float() for name in ("colour", "depth", "opacity"))
-    images = ViewImages(item["target"], colour.clamp(0, 1), depth, opacity)
-    return score_image(image, item), images
+    return score_image(image, item), image | {"truth": item["target"]}
 
 
 def gathered(scores: Sequence[ViewScore], trainer: Trainer) -> list[ViewScore]:
@@ -155,12 +139,12 @@ def gathered(scores: Sequence[ViewScore], trainer: Trainer) -> list[ViewScore]:
 
 
 def psnr_thing(colour: Tensor, truth: Tensor, thing: Tensor | None) -> float:
-    """PSNR in dB of the pixels most of which show the thing; NaN where there are none.
+    """PSNR in dB of the pixels that show the foreground object; NaN where there are none.
 
     Args:
         colour: Rendered colours. [H, W, 3]
         truth: True colours. [H, W, 3]
-        thing: Share of each pixel that shows the thing; None where it is not known. uint8 [H, W]
+        thing: Share of each pixel that shows the object; None where not known. uint8 [H, W]
     """
     if thing is None or not (shown := thing.cpu() >= SOLID).any():
         return math.nan
@@ -195,5 +179,80 @@ def blank_psnr(views: Views, background: Tensor) -> float:
 
 
 def mean(values: Sequence[float]) -> float:
-    """Plain mean; NaN for none."""
+    """Mean; NaN for no values."""
     return math.fsum(values) / len(values) if values else math.nan
+
+
+class ViewScoring(LightningModule):
+    """Scores whole views, as `SceneDataModule` serves them, in validation and test.
+
+    Attributes:
+        field: What is rendered.
+        tally: Takes the means over views.
+        scores: Those of the views of the last validation or test, of all processes.
+    """
+
+    field: Representation
+    tally: Tally
+    scores: list[ViewScore]
+    _tag = ""
+
+    @property
+    @abstractmethod
+    def frame(self) -> Frame | None:
+        """The field's frame; None before it is built."""
+
+    @property
+    @abstractmethod
+    def renderer(self) -> Renderer:
+        """Renders images of the field."""
+
+    @property
+    @abstractmethod
+    def shared_parts(self) -> list[nn.Module]:
+        """Modules whose buffers differ between the processes of a run while they train."""
+
+    def predict_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
+        """One view: ``colour`` [H, W, 3], ``opacity`` and ``depth`` [H, W]."""
+        frame = self.frame
+        assert frame is not None
+        return render_item(self.field, self.renderer, frame, batch)
+
+    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
+        """The rendered view; its scores wait for those of the others."""
+        image = self.predict_step(batch, batch_idx)
+        self.scores.append(score_image(image, batch))
+        self._tag = batch["tag"]
+        return image
+
+    test_step = validation_step
+
+    def on_validation_epoch_start(self) -> None:
+        self.agree()
+        self.scores = []
+
+    on_test_epoch_start = on_validation_epoch_start
+
+    def on_validation_epoch_end(self) -> None:
+        self.scores = gathered(self.scores, self.trainer)
+        tag = self.trainer.strategy.broadcast(self._tag)  # A process may have had no view.
+        means = {f"{tag}/{name}": value for name, value in mean_scores(self.scores).items()}
+        self.tally.last |= means
+        if self.trainer.state.fn == TrainerFn.FITTING:
+            # Lightning's own count is one less, and not that of a run that goes on.
+            means["step"] = float(self.trainer.global_step)
+        # All processes have the means of all views; Lightning warns where it need not.
+        self.log_dict(means, batch_size=1, sync_dist=self.trainer.world_size > 1)
+
+    on_test_epoch_end = on_validation_epoch_end
+
+    def agree(self) -> None:
+        """Copy the first process's sampler to all, each of which saw its own rays alone.
+
+        What is scored, or goes into a checkpoint, is one field.
+        """
+        if self._trainer is None or self._trainer.world_size == 1:
+            return
+        for part in self.shared_parts:
+            for buffer in part.buffers():
+                distributed.broadcast(buffer, src=0)

@@ -11,9 +11,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from xplanes.baselines.gaussians.ply import write_gaussians
+from xplanes.baselines.networks import layers, octaves
+from xplanes.baselines.products import PlaneProducts
 from xplanes.fields.base import Masked, Representation, Writer
-from xplanes.fields.networks import layers, octaves
-from xplanes.fields.products import PlaneProducts
 from xplanes.streams import Stream, TrainingState
 
 BASE = 0.28209479177387814
@@ -141,6 +141,14 @@ class Gaussians(Representation):
     @property
     def exports(self) -> Mapping[str, Writer]:
         return {"gaussians": lambda path, time, frame: write_gaussians(path, self.at(time), frame)}
+
+    @torch.no_grad()
+    def cloud(self, time: float) -> tuple[Tensor, Tensor]:
+        """Means and colours of the Gaussians at least half as opaque as the most opaque one."""
+        posed = self.at(time)
+        order = posed.opacities.argsort(descending=True)
+        order = order[: int((posed.opacities >= posed.opacities.max() / 2).sum())]
+        return posed.means[order], (0.5 + BASE * posed.harmonics[order, 0]).clamp(0, 1)
 
     def masked(self, keep: Callable[[Tensor], Tensor]) -> "MaskedGaussians":
         return MaskedGaussians(self, keep)

@@ -13,8 +13,8 @@ from xplanes.baselines.gaussians.model import (
     GaussiansSettings,
     camera_extent,
 )
+from xplanes.baselines.products import PlaneProducts
 from xplanes.errors import ConfigError
-from xplanes.fields.products import PlaneProducts
 from xplanes.fields.regularisers import add_time_smoothness_gradient, time_smoothness
 from xplanes.models.base import InitialValues
 from xplanes.rendering.sampler import Group, Site

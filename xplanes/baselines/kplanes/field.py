@@ -5,13 +5,30 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from xplanes.fields.background import RADIUS, contract_cube
+from xplanes.baselines.networks import PaddedMLP, spherical_harmonics, truncated_exponential
+from xplanes.baselines.products import PlaneProducts
+from xplanes.fields.background import RADIUS
 from xplanes.fields.base import ViewDependentField
-from xplanes.fields.networks import PaddedMLP, spherical_harmonics, truncated_exponential
-from xplanes.fields.products import PlaneProducts
 
 GEOMETRY = 15
 """Features that the density network hands to the colour network."""
+
+
+def contract_cube(points: Tensor) -> Tensor:
+    """Draw all of space into the cube [-2, 2]^3; the cube [-1, 1]^3 stays as it is.
+
+    As `xplanes.fields.background.contract`, with the largest coordinate in place of the length.
+
+    Args:
+        points: Positions in the field's frame, finite. [..., 3]
+
+    Returns:
+        [..., 3]
+
+    Source: K-Planes, released code; Mip-NeRF 360, Eq. 10.
+    """
+    largest = points.abs().amax(dim=-1, keepdim=True).clamp_min(1)
+    return (RADIUS - 1 / largest) * (points / largest)
 
 
 class HybridDecoder(nn.Module):

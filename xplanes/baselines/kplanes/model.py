@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from xplanes.baselines.kplanes.field import ExplicitDecoder, HybridDecoder, KPlanes
+from xplanes.baselines.products import PlaneProducts, PlaneTerms, Variation
 from xplanes.errors import ConfigError
-from xplanes.fields.products import PlaneProducts
-from xplanes.fields.regularisers import PlaneTerms, Variation
 from xplanes.models.base import InitialValues, Model, ModelSettings, warm_cosine
 from xplanes.rendering.sampler import (
     Group,

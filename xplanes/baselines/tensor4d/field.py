@@ -8,9 +8,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm
 
+from xplanes.baselines.networks import octaves
 from xplanes.baselines.tensor4d.hierarchy import Compression, HierarchicalPlanes
 from xplanes.fields.base import Masked, SurfaceField, ViewDependentField
-from xplanes.fields.networks import octaves
 
 HIDDEN = 3
 """Hidden layers of all networks."""

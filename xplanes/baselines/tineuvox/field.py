@@ -8,9 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from xplanes.baselines.networks import layers, octaves
 from xplanes.fields.background import Background
 from xplanes.fields.base import ViewDependentField
-from xplanes.fields.networks import layers, octaves
 
 STRIDES = (1, 2, 4)
 """The grid is read at every cell, every second and every fourth."""

@@ -1,8 +1,9 @@
-"""Products of feature planes at several scales: what K-Planes reads from."""
+"""Products of feature planes at several scales, what K-Planes reads from, and their smoothness."""
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -10,6 +11,12 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from xplanes.backend import compiled, cpu_loops, gpu_kernels, gpu_module, proven, waves
+from xplanes.fields.regularisers import (
+    add_time_smoothness_gradient,
+    add_total_variation_gradient,
+    time_smoothness,
+    total_variation,
+)
 
 AXES = "xyzt"
 
@@ -144,7 +151,7 @@ class _Product(torch.autograd.Function):
     def forward(ctx: Any, places: Tensor, axes: Tensor, *planes: Tensor) -> Tensor:
         product = places.new_empty(len(places), planes[0].shape[1])
         arrays = tuple(_array(plane) for plane in planes)
-        cpu = compiled("xplanes.fields.lookup_numba")
+        cpu = compiled("xplanes.baselines.products_numba")
         cpu.multiply(arrays, places.numpy(), axes.numpy(), product.numpy())
         ctx.save_for_backward(places, axes, *planes)
         return product
@@ -157,7 +164,7 @@ class _Product(torch.autograd.Function):
         places, axes, *planes = ctx.saved_tensors
         found = [torch.zeros_like(plane, memory_format=torch.channels_last) for plane in planes]
         spread = places.new_empty(BLOCK, len(planes), planes[0].shape[1])
-        compiled("xplanes.fields.lookup_numba").multiply_backward(
+        compiled("xplanes.baselines.products_numba").multiply_backward(
             tuple(_array(plane) for plane in planes),
             places.numpy(),
             axes.numpy(),
@@ -177,7 +184,7 @@ class _Kernels(torch.autograd.Function):
         places = places.to(torch.promote_types(first.dtype, torch.float32)).contiguous()
         product = first.new_empty(len(places), first.shape[1])
         if len(places):
-            gpu = gpu_module("xplanes.fields.products_triton")
+            gpu = gpu_module("xplanes.baselines.products_triton")
             gpu.multiply(tuple(_rows(plane) for plane in planes), places, axes, product)
         ctx.save_for_backward(places, *planes)
         ctx.axes = axes
@@ -195,7 +202,7 @@ class _Kernels(torch.autograd.Function):
             for plane in planes
         ]
         if len(places):
-            gpu_module("xplanes.fields.products_triton").multiply_backward(
+            gpu_module("xplanes.baselines.products_triton").multiply_backward(
                 tuple(_rows(plane) for plane in planes),
                 places,
                 ctx.axes,
@@ -234,3 +241,72 @@ def _rows(plane: Tensor) -> Tensor:
 def _array(plane: Tensor) -> Any:
     """A plane with its channels last, for loops. [1, C, rows, columns] -> [rows, columns, C]"""
     return _rows(plane).numpy()
+
+
+Variation = Literal["coded", "corrected"]
+
+ROWS, COLUMNS = 2, 3
+"""Axes of a plane [1, C, rows, columns]; time is along the rows."""
+
+
+@dataclass(frozen=True)
+class PlaneTerms:
+    """Weights of the terms.
+
+    Attributes:
+        total_variation: Of squared differences between neighbouring texels.
+        variation: ``coded`` sums twice the mean squares along rows and columns over all planes,
+            along time too, and counts space planes twice. ``corrected`` is the mean over planes of
+            half that sum for space planes, and of differences along space alone for the others.
+        time_smoothness: Of squared second differences along time, summed over planes.
+        time_identity: Of the time planes' mean distance from 1, summed over planes.
+
+    Source: K-Planes, released code.
+    """
+
+    total_variation: float
+    variation: Variation
+    time_smoothness: float
+    time_identity: float
+
+    def values(self, products: PlaneProducts) -> dict[str, Tensor]:
+        """The three terms by name, without their weights. [] each"""
+        planes = products.planes()
+        zero = planes[0][1].new_zeros(())
+        names = ("total_variation", "time_smoothness", "time_identity")
+        found: dict[str, Tensor] = dict.fromkeys(names, zero)
+        for name, plane in planes:
+            dims, factor = self._variation(name, len(planes))
+            term = factor * total_variation(plane, dims)
+            found["total_variation"] = found["total_variation"] + term
+            if "t" in name:
+                found["time_smoothness"] = found["time_smoothness"] + time_smoothness(plane[0])
+                found["time_identity"] = found["time_identity"] + (1 - plane).abs().mean()
+        return found
+
+    @torch.no_grad()
+    def add_gradients(self, products: PlaneProducts) -> None:
+        """Add the weighted terms' gradients to those of the planes."""
+        if not (self.total_variation or self.time_smoothness or self.time_identity):
+            return
+        planes = products.planes()
+        for name, plane in planes:
+            if plane.grad is None:
+                plane.grad = torch.zeros_like(plane)
+            if weight := self.total_variation:
+                dims, factor = self._variation(name, len(planes))
+                add_total_variation_gradient(plane.grad, plane, dims, weight * factor)
+            if "t" not in name:
+                continue
+            if weight := self.time_smoothness:
+                add_time_smoothness_gradient(plane.grad[0], plane[0], weight)
+            if weight := self.time_identity:
+                plane.grad.add_((plane - 1).sign(), alpha=weight / plane.numel())
+
+    def _variation(self, name: str, count: int) -> tuple[tuple[int, ...], float]:
+        """Axes along which a plane's differences count, and their factor."""
+        if self.variation == "coded":
+            return (ROWS, COLUMNS), 2.0 if "t" in name else 4.0
+        if "t" in name:
+            return (COLUMNS,), 1 / count
+        return (ROWS, COLUMNS), 0.5 / count

@@ -1,4 +1,4 @@
-"""Small networks of the baselines, and the activation of their density."""
+"""Small networks, encodings of their inputs, and an activation of density."""
 
 import math
 from collections.abc import Sequence
@@ -9,24 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-ROWS = 256
-"""On the CPU the rows of products are padded to a multiple of this; to a larger one for many rows.
-
-There each number of rows has a kernel that is compiled at its first use and kept, and every batch
-has another number of samples.
-"""
-
-
-def half_rows(values: Tensor) -> Tensor:
-    """The values in bfloat16, on the CPU with rows of zeros below. [N, C] -> [at least N, C]
-
-    Those are fewer than `ROWS` or than a sixteenth of the values.
-    """
-    values = values.to(torch.bfloat16)
-    if values.device.type != "cpu":
-        return values
-    step = max(ROWS, 2 ** (len(values).bit_length() - 1) // 16)
-    return F.pad(values, (0, 0, 0, -len(values) % step))
+from xplanes.fields.decoder import half_rows
 
 
 def octaves(values: Tensor, count: int) -> Tensor:

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from xplanes.fields import products
-from xplanes.fields.products import DYNAMIC, STATIC, plane_product_gpu, plane_product_reference
+from xplanes.baselines import products
+from xplanes.baselines.products import DYNAMIC, STATIC, plane_product_gpu, plane_product_reference
 
 pytest.importorskip("triton", reason="triton is not installed")
 
@@ -60,12 +60,6 @@ def test_in_float64_nothing_but_rounding_is_left():
             torch.testing.assert_close(
                 a, b, atol=1e-12, rtol=1e-12, msg=lambda m, c=sizes: f"{c}: {m}"
             )
-
-
-def test_no_point():
-    ours, theirs = both(STATIC, torch.float32, channels=4, count=0)
-    assert ours[0].shape == theirs[0].shape == (0, 4)
-    assert all((gradient == 0).all() for gradient in ours[1:])
 
 
 def test_points_that_fill_up_a_block_spread_no_nan():

@@ -1,0 +1,236 @@
+"""Runs on a hub: the real client uploads to a server of our own and reads them back."""
+
+import base64
+import functools
+import hashlib
+import http.server
+import json
+import re
+import shutil
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+
+from xplanes.cli import main
+from xplanes.errors import ConfigError
+from xplanes.evaluation.hub import fetch, model_card, push
+from xplanes.evaluation.runs import load_run
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+NOWHERE = "http://127.0.0.1:9"
+
+
+class Hub(http.server.BaseHTTPRequestHandler):
+    """A hub with one repository, which begins to exist when it is made."""
+
+    files: dict[str, bytes]
+    requests: list[tuple[str, str, str | None]]
+    name: str | None
+
+    def _answer(self, body: bytes, status: int = 200, **headers: str) -> None:
+        self.send_response(status)
+        for name, value in {"Content-Length": str(len(body)), **headers}.items():
+            self.send_header(name.replace("_", "-"), value)
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(body)
+
+    def _json(self, content: Any, status: int = 200, **headers: str) -> None:
+        self._answer(
+            json.dumps(content).encode(), status, Content_Type="application/json", **headers
+        )
+
+    def _missing(self) -> None:
+        self._json({"error": "not found"}, 404, X_Error_Code="RepoNotFound")
+
+    def do_POST(self) -> None:
+        hub, body = type(self), self.rfile.read(int(self.headers["Content-Length"]))
+        hub.requests.append(("POST", self.path, self.headers.get("Authorization")))
+        path = self.path.partition("?")[0]
+        if self.headers.get("Authorization") != "Bearer hf_of_a_test":
+            self._json({"error": "unauthorized"}, 401)
+        elif path == "/api/repos/create":
+            asked = json.loads(body)
+            hub.name = f"{asked.get('organization', 'somebody')}/{asked['name']}"
+            self._json({"url": f"http://{self.headers['Host']}/{hub.name}"})
+        elif path == "/api/validate-yaml":
+            self._json({"errors": [], "warnings": []})
+        elif path.endswith("/preupload/main"):
+            files = [
+                {"path": each["path"], "uploadMode": "regular", "shouldIgnore": False}
+                for each in json.loads(body)["files"]
+            ]
+            self._json({"files": files})
+        elif path.endswith("/commit/main"):
+            for line in map(json.loads, body.splitlines()):
+                if line["key"] == "file":
+                    hub.files[line["value"]["path"]] = base64.b64decode(line["value"]["content"])
+            address = f"http://{self.headers['Host']}/{hub.name}/commit/{COMMIT}"
+            self._json({"commitUrl": address, "commitOid": COMMIT, "success": True})
+        else:
+            self._missing()
+
+    def do_GET(self) -> None:
+        hub = type(self)
+        hub.requests.append((self.command, self.path, self.headers.get("Authorization")))
+        path = self.path.partition("?")[0]
+        if hub.name is None or f"/{hub.name}" not in path:
+            self._missing()
+        elif path.startswith(f"/api/models/{hub.name}/tree/"):
+            tree = [
+                {"type": "file", "path": name, "size": len(content), "oid": oid(content)}
+                for name, content in hub.files.items()
+            ]
+            self._json(tree)
+        elif path.startswith(f"/api/models/{hub.name}"):
+            siblings = [{"rfilename": name} for name in hub.files]
+            self._json({"id": hub.name, "sha": COMMIT, "siblings": siblings})
+        elif (found := re.fullmatch(rf"/{hub.name}/resolve/{COMMIT}/(.+)", path)) is not None:
+            content = hub.files[found[1]]
+            self._answer(content, ETag=f'"{oid(content)}"', X_Repo_Commit=COMMIT)
+        else:
+            self._missing()
+
+    def do_HEAD(self) -> None:
+        self.do_GET()
+
+    def log_message(self, *_: Any) -> None:
+        pass
+
+
+def oid(content: bytes) -> str:
+    """The name that git gives to a file's content."""
+    return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
+
+
+@pytest.fixture
+def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, type[Hub]]]:
+    """Address of a hub on this machine, and what it holds."""
+    for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY", "all_proxy"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HF_TOKEN", "hf_of_a_test")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+    handler = type("Handler", (Hub,), {"requests": [], "files": {}, "name": None})
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_address[1]}", handler
+    server.shutdown()
+    server.server_close()
+
+
+def test_a_run_comes_back_from_the_hub_as_it_was_pushed(hub, trained_run: Path, tmp_path: Path):
+    address, held = hub
+    said: list[str] = []
+    url = push(trained_run, "somebody/excavator", say=said.append, endpoint=address)
+    assert url == f"{address}/somebody/excavator"
+    assert re.match(r"uploading   \d+ files, [\d.]+ MB, to somebody/excavator", said[0])
+    assert {"README.md", "config.yaml", "metrics.json", "checkpoints/last.ckpt"} <= set(held.files)
+    assert not [name for name in held.files if name.endswith((".log", ".lock"))]
+
+    options = {"say": said.append, "outputs": tmp_path / "outputs", "endpoint": address}
+    run = fetch("hf://somebody/excavator", **options)
+    assert run == tmp_path / "outputs" / "hub" / "somebody" / "excavator"
+    for name, content in held.files.items():
+        assert (run / name).read_bytes() == content
+    mine, theirs = load_run(trained_run), load_run(run)
+    assert theirs.step == mine.step
+    for name, value in mine.module.state_dict().items():
+        assert torch.equal(value, theirs.module.state_dict()[name]), name
+
+    # What has not changed is not sent twice.
+    held.requests.clear()
+    assert fetch("hf://somebody/excavator", **options) == run
+    assert not [
+        path for command, path, _ in held.requests if command == "GET" and "resolve" in path
+    ]
+
+    # Without a network, the copy serves.
+    assert fetch("hf://somebody/excavator", **{**options, "endpoint": NOWHERE}) == run
+    assert said[-1].startswith("offline     ")
+
+
+def test_what_names_the_machine_stays_there(hub, trained_run: Path):
+    address, held = hub
+    push(trained_run, "somebody/excavator", say=print, endpoint=address)
+    mine = json.loads((trained_run / "run.json").read_text())
+    theirs = json.loads(held.files["run.json"])
+    assert set(mine) - set(theirs) == {"directory", "process"}
+    assert theirs["versions"] == mine["versions"]
+
+
+def card_of(run: Path) -> tuple[dict[str, Any], str]:
+    _, head, text = model_card(run, "somebody/excavator").split("---\n", 2)
+    return yaml.safe_load(head), text
+
+
+def test_the_model_card_has_scores_command_and_licence(trained_run: Path, tmp_path: Path):
+    head, text = card_of(trained_run)
+    metrics = json.loads((trained_run / "metrics.json").read_text())
+    assert head["library_name"] == "xplanes"
+    assert "license" not in head
+    (found,) = head["model-index"]
+    scores = {m["type"]: m["value"] for m in found["results"][0]["metrics"]}
+    assert scores["psnr"] == round(metrics["test"]["psnr"], 4)
+    assert f"| psnr | {metrics['test']['psnr']:.4g} |" in text
+    assert "xplanes train seed=0" in text
+    assert "hf://somebody/excavator" in text
+    assert "random initialisation" in text
+
+    run = tmp_path / "run"
+    shutil.copytree(trained_run, run)
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config["lrm"] = {
+        "name": "base",
+        "repository": "somebody/lrm",
+        "licence": "CC-BY-NC-4.0",
+    }
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    head, text = card_of(run)
+    assert (head["license"], head["base_model"]) == ("cc-by-nc-4.0", "somebody/lrm")
+    assert "licence CC-BY-NC-4.0" in text
+    config["lrm"] = {"name": "tiny", "bundled": "tiny"}
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    assert "bundled with X-Planes (MIT licence)" in card_of(run)[1]
+
+
+def test_commands_read_a_run_of_the_hub(
+    hub, trained_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+):
+    address, _ = hub
+    monkeypatch.chdir(tmp_path)
+    for name, verb in (("push", push), ("fetch", fetch)):
+        at_hub = functools.partial(verb, endpoint=address)
+        monkeypatch.setattr(f"xplanes.evaluation.hub.{name}", at_hub)
+    assert main(["push", str(trained_run), "somebody/excavator"]) == 0
+    assert f"wrote {address}/somebody/excavator" in capsys.readouterr().out
+    arguments = ["--frames", "1", "--size", "16", "--time", "0", "--path", "fixed"]
+    assert main(["render", "hf://somebody/excavator", *arguments, "--out", "a.png"]) == 0
+    assert (tmp_path / "a.png").is_file()
+    assert "fetching    hf://somebody/excavator" in capsys.readouterr().out
+
+
+def test_what_cannot_be_is_refused_in_words(
+    hub, trained_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    address, _ = hub
+    options: dict[str, Any] = {"say": print, "outputs": tmp_path}
+    with pytest.raises(ConfigError, match="excavator: a repository on the hub is written USER/"):
+        fetch("hf://excavator", **options)
+    with pytest.raises(ConfigError, match=r"hf://no/body cannot be read.*hf auth login"):
+        fetch("hf://no/body", **options, endpoint=address)
+    with pytest.raises(ConfigError, match=r"hf://no/body cannot be read: .*:9 cannot be reached"):
+        fetch("hf://no/body", **options, endpoint=NOWHERE)
+    with pytest.raises(ConfigError, match="leave out @v1"):
+        push(trained_run, "somebody/excavator@v1", say=print)
+    (tmp_path / "run").mkdir()
+    with pytest.raises(ConfigError, match=r"has no checkpoints/last\.ckpt"):
+        push(tmp_path / "run", "somebody/excavator", say=print)
+    monkeypatch.setenv("HF_TOKEN", "hf_wrong")
+    with pytest.raises(ConfigError, match=r"cannot be written.*HF_TOKEN"):
+        push(trained_run, "somebody/excavator", say=print, endpoint=address)

@@ -1,0 +1,70 @@
+"""The notebook and its twin run from the first cell to the last."""
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tests.training.runs import SMALL
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+pytest.importorskip("trimesh")
+pytest.importorskip("skimage")
+
+SHORT = [text for text in SMALL if text != "lrm=none" and not text.startswith("model.")]
+
+
+@pytest.fixture
+def settings(tmp_path: Path, scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few steps on small images, in a folder of their own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FIRST_MINUTE_SETTINGS", shlex.join([*SHORT, f"data.root={scenes}"]))
+    monkeypatch.setenv("PYTHONPATH", str(EXAMPLES.parent))
+
+
+def check_outputs(folder: Path) -> None:
+    written = folder / "outputs" / "first_minute"
+    for run, lrm in (("lrm", "tiny"), ("random", "none")):
+        config = yaml.safe_load((written / run / "config.yaml").read_text())
+        assert config["lrm"]["name"] == lrm
+        assert json.loads((written / run / "metrics.json").read_text())["step"] == 40
+    assert (written / "picture.png").is_file()
+    assert len(json.loads((written / "web" / "export.json").read_text())["times"]) == 8
+
+
+def test_the_script_runs(settings: None, tmp_path: Path) -> None:
+    command = [sys.executable, str(EXAMPLES / "first_minute.py")]
+    done = subprocess.run(command, env=os.environ, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert f"open {Path('outputs', 'first_minute', 'web', 'index.html')}" in done.stdout
+    check_outputs(tmp_path)
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(settings: None, tmp_path: Path) -> None:
+    """Its cells are those of the script, which tests/test_docs.py checks."""
+    nbformat: Any = pytest.importorskip("nbformat")
+    nbclient: Any = pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    notebook = nbformat.read(EXAMPLES / "first_minute.ipynb", as_version=4)
+    nbformat.validate(notebook)
+    client = nbclient.NotebookClient(
+        notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}
+    )
+    client.execute()
+    check_outputs(tmp_path)
+    pictures = [
+        output["data"]
+        for cell in notebook.cells
+        if cell.cell_type == "code"
+        for output in cell.outputs
+        if output.output_type == "display_data"
+    ]
+    assert ["image/png" in data for data in pictures] == [True, True]

@@ -1,0 +1,168 @@
+"""One HTML file that plays a run's shapes over time: `xplanes export --what web`."""
+
+import base64
+import html
+import json
+import re
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+from tqdm import tqdm
+
+from xplanes.errors import ConfigError
+from xplanes.files import write_text
+
+PARTS = Path(__file__).parent / "web"
+"""The page, three.js, and where that comes from."""
+
+LIMIT = 20_000_000
+"""Bytes that a page stays below; mail and most hosts take as much."""
+
+COARSEST = 1 / 100
+"""Share of the wanted triangles or points below which there are too many timesteps."""
+
+SPARE = 100_000
+"""Bytes for everything but the shapes and the scripts."""
+
+STEPS = 2**16 - 1
+"""Coordinates along each side of a shape's bounding box."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A coloured surface, or points on one, at one time.
+
+    Attributes:
+        places: Vertices or points in the world. [N, 3]
+        colours: In sRGB, from 0 to 1. [N, 3]
+        faces: Triangles, counter-clockwise from outside; None for points. [F, 3]
+    """
+
+    places: Tensor
+    colours: Tensor
+    faces: np.ndarray | None = None
+
+
+def write_page(
+    path: Path,
+    shape_at: Callable[[float, float], Shape],
+    times: Sequence[float],
+    *,
+    title: str,
+    background: Tensor,
+    eye: Tensor,
+) -> dict[str, Any]:
+    """Write a page that needs no other file and no network.
+
+    Args:
+        path: The HTML file.
+        shape_at: The shape at a time from 0 to 1, with a share from 0 to 1 of its triangles or
+            points; the share is lowered until the page has less than 20 MB.
+        times: From 0 to 1.
+        title: Shown by the browser.
+        background: Colour in sRGB, from 0 to 1. [3]
+        eye: Where the camera stands at first, in the world, whose z axis points up. [3]
+
+    Returns:
+        What was written: vertices, triangles, bytes, and the share.
+
+    Raises:
+        ConfigError: If there are too many timesteps for the limit.
+    """
+    three = json.loads((PARTS / "three.json").read_text(encoding="utf-8"))
+    script = (PARTS / three["file"]).read_text(encoding="utf-8")
+    page = (PARTS / "page.html").read_text(encoding="utf-8")
+    shapes, share = _fitting(LIMIT - len(page) - len(script) - SPARE, shape_at, times)
+    low = np.min([shape.pop("least") for shape in shapes], axis=0)
+    high = np.max([shape.pop("most") for shape in shapes], axis=0)
+    radius = float(np.linalg.norm(high - low)) / 2
+    vertices, triangles = (sum(shape[name] for shape in shapes) for name in ("vertices", "faces"))
+    content = {
+        "times": list(times),
+        "background": background.tolist(),
+        "centre": ((low + high) / 2).tolist(),
+        "radius": radius,
+        "towards": (eye.numpy() - (low + high) / 2).tolist(),
+        # So large that points on a ball would cover it.
+        "point": 0 if triangles else 4 * radius * (len(shapes) / vertices) ** 0.5,
+        "shapes": shapes,
+    }
+    licence = (PARTS / three["licence_file"]).read_text(encoding="utf-8")
+    filled = {
+        "title": html.escape(title),
+        "notice": f"three.js {three['version']}, {three['homepage']}\n\n{licence}",
+        "three": script,
+        "run": json.dumps(content).replace("<", "\\u003c"),  # No text may end the script.
+    }
+    text = re.sub(r"\{\{(\w+)\}\}", lambda found: filled[found[1]], page)
+    write_text(path, text)
+    return {
+        "vertices": vertices,
+        "triangles": triangles,
+        "bytes": len(text.encode()),
+        "share": share,
+        "three": three["version"],
+    }
+
+
+def _fitting(
+    room: int, shape_at: Callable[[float, float], Shape], times: Sequence[float]
+) -> tuple[list[dict[str, Any]], float]:
+    """Shapes that take no more than so many bytes together, and the share that they need."""
+    share = 1.0
+    while share > COARSEST:
+        shapes: list[dict[str, Any]] = []
+        for time in tqdm(times, "times", leave=False, delay=2, disable=None):
+            shapes.append(_packed_shape(shape_at(time, share)))
+            expected = sum(len(shape["data"]) for shape in shapes) * len(times) / len(shapes)
+            if expected > room:
+                share *= 0.95 * room / expected
+                break
+        else:
+            return shapes, share
+    raise ConfigError(
+        f"--times {len(times)}: so many timesteps do not fit into a page of {LIMIT // 10**6} MB; "
+        "set fewer"
+    )
+
+
+def _packed_shape(shape: Shape) -> dict[str, Any]:
+    places, colours = shape.places.numpy(), (255 * shape.colours).round().byte().numpy()
+    low, size = places.min(axis=0), np.ptp(places, axis=0)
+    cells = np.round((places - low) / np.where(size > 0, size, 1) * STEPS).astype("<u2")
+    if shape.faces is None:  # Neighbours one after the other take a third less.
+        order = np.lexsort((cells[:, 2], *(cells[:, :2] >> 11).T))
+        cells, colours = cells[order], colours[order]
+    content = packed(cells) + packed(colours)
+    if shape.faces is not None:
+        content += packed(shape.faces.astype("<u4"))
+    least, most = np.quantile(places, [0.01, 0.99], axis=0)  # Floaters shall not set the camera.
+    return {
+        "vertices": len(places),
+        "faces": 0 if shape.faces is None else len(shape.faces),
+        "low": low.tolist(),
+        "size": size.tolist(),
+        "least": least,
+        "most": most,
+        "data": base64.b64encode(zlib.compress(content, 9)).decode(),
+    }
+
+
+def packed(values: np.ndarray) -> bytes:
+    """Unsigned integers as bytes that compress well; the page has the inverse.
+
+    Args:
+        values: Little-endian. [N, C]
+
+    Returns:
+        Differences from row to row, modulo the type's range, column by column; of a column first
+        all lowest bytes, the highest last.
+    """
+    steps = np.diff(values, axis=0, prepend=np.zeros_like(values[:1])).T
+    split = np.ascontiguousarray(steps).view(np.uint8).reshape(*steps.shape, -1)
+    return split.transpose(0, 2, 1).tobytes()

@@ -1,0 +1,240 @@
+"""Runs on the Hugging Face hub: `xplanes push`, and `hf://USER/REPOSITORY` in place of a run."""
+
+import json
+import re
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from xplanes import __version__
+from xplanes.errors import ConfigError
+from xplanes.evaluation.runs import OUTPUTS, is_run
+from xplanes.files import read_json
+from xplanes.lrm.weights import answers
+from xplanes.training.record import read_config
+
+SCHEME = "hf://"
+"""What the address of a run on the hub begins with."""
+
+PATTERNS = (
+    *("README.md", "config.yaml", "overrides.txt", "run.json", "metrics.json", "curve.csv"),
+    *("checkpoints/*.ckpt", "media/*"),
+)
+"""Files of a run that the hub holds; logs stay, for they name folders and machines."""
+
+PRIVATE = ("directory", "process")
+"""Keys of run.json that tell of the machine and are left out."""
+
+_ADDRESS = re.compile(r"(?P<repository>[\w.-]+/[\w.-]+)(?:@(?P<revision>[\w./-]+))?")
+
+
+def push(
+    run: Path,
+    repository: str,
+    *,
+    private: bool = False,
+    say: Callable[[str], None],
+    endpoint: str | None = None,
+) -> str:
+    """Upload a run with a model card.
+
+    Args:
+        run: The run directory.
+        repository: USER/REPOSITORY; made if it does not exist.
+        private: Whether a new repository is private.
+        say: Receives progress messages.
+        endpoint: Address of the hub; the default when None.
+
+    Returns:
+        The repository's address.
+
+    Raises:
+        ConfigError: If the run has no checkpoint or no metrics, or the hub refuses.
+    """
+    from huggingface_hub import CommitOperationAdd, HfApi, constants
+
+    repository, revision = _parsed(repository)
+    if revision is not None:
+        raise ConfigError(
+            f"{repository}@{revision}: runs are pushed to main; leave out @{revision}"
+        )
+    for needed in ("checkpoints/last.ckpt", "metrics.json", "run.json"):
+        if not (run / needed).is_file():
+            raise ConfigError(f"{run} has no {needed}: push a run that has finished")
+    contents: dict[str, Path | bytes] = {
+        path.relative_to(run).as_posix(): path
+        for pattern in PATTERNS
+        for path in sorted(run.glob(pattern.replace("media/*", "media/**/*")))
+        if path.is_file()
+    }
+    record = read_json(run / "run.json")
+    record = {name: value for name, value in record.items() if name not in PRIVATE}
+    contents["run.json"] = json.dumps(record, indent=2).encode()
+    contents["README.md"] = model_card(run, repository).encode()
+    operations = [
+        CommitOperationAdd(path_in_repo=name, path_or_fileobj=content)
+        for name, content in contents.items()
+    ]
+    size = sum(operation.upload_info.size for operation in operations)
+    say(f"uploading   {len(operations)} files, {size / 1e6:.1f} MB, to {repository}")
+    api = HfApi(endpoint=endpoint)
+    if constants.HF_HUB_OFFLINE or not answers(api.endpoint):
+        raise ConfigError(f"{api.endpoint} cannot be reached, or HF_HUB_OFFLINE is set: try later")
+    try:
+        api.create_repo(repository, private=private, exist_ok=True)
+        message = f"A run of xplanes {__version__}"
+        api.create_commit(repository, operations, commit_message=message)
+    except Exception as problem:  # The hub's errors have no common class.
+        raise ConfigError(
+            f"{repository} cannot be written ({_reason(problem)}): log in with `hf auth login`, or "
+            "set HF_TOKEN to a token that may write"
+        ) from problem
+    return f"{api.endpoint}/{repository}"
+
+
+def fetch(
+    address: str,
+    *,
+    say: Callable[[str], None],
+    outputs: Path = OUTPUTS,
+    endpoint: str | None = None,
+) -> Path:
+    """Download a run, or what has changed of it since the last time.
+
+    Args:
+        address: hf://USER/REPOSITORY, optionally with @REVISION.
+        say: Receives a message before a download.
+        outputs: Where runs are kept; the run lies in hub/USER/REPOSITORY below.
+        endpoint: Address of the hub; the default when None.
+
+    Returns:
+        The run directory.
+
+    Raises:
+        ConfigError: If the hub cannot be reached or has no such run.
+    """
+    from huggingface_hub import constants, snapshot_download
+
+    repository, revision = _parsed(address.removeprefix(SCHEME))
+    suffix = "" if revision is None else f"@{revision.replace('/', '-')}"
+    run = outputs / "hub" / f"{repository}{suffix}"
+    server = endpoint or constants.ENDPOINT
+    if constants.HF_HUB_OFFLINE or not answers(server):
+        if not is_run(run):
+            raise ConfigError(
+                f"{address} cannot be read: {server} cannot be reached, or HF_HUB_OFFLINE is set, "
+                f"and {run} holds no copy of an earlier time"
+            )
+        say(f"offline     {run} is used as it was fetched before")
+        return run
+    say(f"fetching    {address} to {run}")
+    try:
+        snapshot_download(
+            repository,
+            revision=revision,
+            local_dir=run,
+            allow_patterns=list(PATTERNS),
+            endpoint=endpoint,
+        )
+    except Exception as problem:  # The hub's errors have no common class.
+        raise ConfigError(
+            f"{address} cannot be read ({_reason(problem)}): check its name; a private repository "
+            "needs `hf auth login` or HF_TOKEN"
+        ) from problem
+    return run
+
+
+def _parsed(text: str) -> tuple[str, str | None]:
+    found = _ADDRESS.fullmatch(text)
+    if found is None:
+        raise ConfigError(f"{text}: a repository on the hub is written USER/REPOSITORY")
+    return found["repository"], found["revision"]
+
+
+def _reason(problem: Exception) -> str:
+    return f"{type(problem).__name__}: {' '.join(str(problem).split())[:300]}"
+
+
+def model_card(run: Path, repository: str) -> str:
+    """The README of a run on the hub: metrics, command, and the licence of the LRM's weights.
+
+    Args:
+        run: The run directory.
+        repository: USER/REPOSITORY.
+    """
+    from huggingface_hub import EvalResult, ModelCardData
+
+    config, metrics = read_config(run), read_json(run / "metrics.json")
+    data, model, lrm = config["data"], config["model"], config["lrm"]
+    scene = f"{data['name']}/{data['scene']}"
+    scores = {name: value for name, value in metrics["test"].items() if value is not None}
+    results = [
+        EvalResult(
+            task_type="novel-view-synthesis",
+            dataset_type=data["name"],
+            dataset_name=scene,
+            dataset_split=metrics["split"],
+            metric_type=name,
+            metric_value=round(value, 4),
+        )
+        for name, value in scores.items()
+    ]
+    licence, origin = lrm.get("licence"), lrm.get("repository")
+    card = ModelCardData(
+        library_name="xplanes",
+        tags=["xplanes", "dynamic-nerf", "novel-view-synthesis"],
+        license=licence.lower() if licence else None,
+        base_model=origin,
+        model_name=repository.rpartition("/")[2],
+        eval_results=results,
+    )
+    table = "".join(f"| {name} | {value:.4g} |\n" for name, value in scores.items())
+    picture = "![Orbit](media/orbit.webp)\n\n" if (run / "media" / "orbit.webp").is_file() else ""
+    overrides = shlex.join((run / "overrides.txt").read_text(encoding="utf-8").splitlines())
+    return f"""---
+{card.to_yaml()}
+---
+
+# {repository.rpartition("/")[2]}
+
+A dynamic radiance field of the scene {scene}, model {model["name"]}, trained with X-Planes
+{__version__}.
+
+{picture}| metric ({metrics["split"]} split) | value |
+|---|---|
+{table}
+{_weights(lrm)}
+
+Trained for {metrics["step"]:,} steps with
+
+    xplanes train {overrides}
+
+To use it:
+
+    pip install "xplanes[export]"
+    xplanes render {SCHEME}{repository}
+    xplanes export {SCHEME}{repository} --what web
+
+These commands read the scene, which is not part of this repository: it must lie where `data.root`
+in `config.yaml` says (the demo scene is rendered where it is missing). In Python,
+`RadianceModule.load_from_checkpoint("checkpoints/last.ckpt")` needs no scene.
+"""
+
+
+def _weights(lrm: dict[str, Any]) -> str:
+    """What a card says of the weights that training began with."""
+    name = lrm["name"]
+    if name == "none":
+        return "Training began with random initialisation: no weights of others are part of it."
+    if (licence := lrm.get("licence")) is not None:
+        return (
+            f"Training began with the LRM `{name}` ({lrm['repository']}), whose weights have the "
+            f"licence {licence}. The field contains the LRM's decoder."
+        )
+    if lrm.get("bundled"):
+        return (
+            f"Training began with the LRM `{name}`, bundled with X-Planes (MIT licence). The field "
+            "contains the LRM's decoder."
+        )
+    return f"Training began with `lrm={name}`, whose files have the licence of their author."

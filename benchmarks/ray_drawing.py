@@ -2,8 +2,8 @@
 
     python benchmarks/ray_drawing.py [--gigabytes 2] [--step-ms 25] [--cache FOLDER]
 
-Writes results/ray_drawing.md and ray_drawing.csv beside this file. Frames of noise are written as a
-file of tiles and removed again. Between draws the script waits for the rest of a step, in which the
+Writes results/ray_drawing.md and ray_drawing.csv beside this file. Frames of noise are written to a
+file and removed again. Between draws the script waits for the rest of a step, in which the
 system reads what was announced; "cold" drops the file from the system's cache at the beginning.
 """
 
@@ -90,6 +90,7 @@ def main() -> None:
     pause, frame = args.step_ms / 1000, cube_frame(4.0, torch.zeros(3))
     count = max(8, round(args.gigabytes * 2**30 / (3 * SIZE[0] * SIZE[1])))
     rows = [["none (process only)", "", "", "", f"{private_bytes() / 2**20:.0f}"]]
+    limit = store.IN_MEMORY
     with tempfile.TemporaryDirectory(dir=args.cache) as place:
         source = Path(place) / "source"
         source.write_bytes(b"")
@@ -99,9 +100,12 @@ def main() -> None:
             for first in range(0, count, per_job)
         ]
         began = time.perf_counter()
-        images = store.decoded([source], "benchmark", [SIZE] * count, 3, jobs, Path(place))
+        store.IN_MEMORY = 0
+        images = store.images(
+            [SIZE] * count, jobs, [source], "benchmark", lambda: False, Path(place)
+        )
         writing = time.perf_counter() - began
-        file = next(Path(place).glob("*.tiles"))
+        file = next(Path(place).glob("*.pixels"))
 
         def drop() -> None:
             with file.open("rb") as handle:
@@ -121,17 +125,18 @@ def main() -> None:
         rows.append(measure("on disk, cold", batches, pause, drop))
         rows.append(measure("on disk, in the system's cache", batches, pause, warm))
         silent = RayBatches(views, frame, settings, seed=0)
-        silent._prefetch = lambda step: None  # type: ignore[method-assign]
+        silent._prefetch = lambda step, rays: None  # type: ignore[method-assign]
         rows.append(measure("on disk, cold, without prefetching", silent, pause, drop))
         size = file.stat().st_size
         del batches, silent, prefetched, views, images
+    store.IN_MEMORY = limit
     held = store.in_memory([SIZE] * 32, [lambda: frames(0, 32)])
     small = RayBatches(views_of(held), frame, settings, seed=0)
     rows.append(measure("32 images in memory", small, pause, lambda: None))
     write_rows(RESULTS / "ray_drawing.csv", COLUMNS, rows)
     page = f"""# Drawing rays from images on disk
 
-{count} images of {SIZE[1]} x {SIZE[0]} pixels without alpha, {size / 2**30:.1f} GB in one tiled
+{count} images of {SIZE[1]} x {SIZE[0]} pixels without alpha, {size / 2**30:.1f} GB in one
 file, written in {writing:.0f} s; {settings.per_batch} rays per batch; a training step is assumed to
 take {args.step_ms:g} ms; {STEPS} steps, warm-up included; {machine()}, load average
 {os.getloadavg()[0]:.1f}. `{command()}`

@@ -4,8 +4,8 @@ import math
 
 import torch
 
-from xplanes.scenes.cameras import focal_length, look_at
-from xplanes.scenes.views import Scene, Views, camera_rays
+from xplanes.scenes.cameras import PosedCamera, focal_length, look_at
+from xplanes.scenes.views import Scene, Views
 
 STATIC = torch.zeros(3)
 
@@ -27,7 +27,7 @@ def ball_views(
     focal = focal_length(angle, size)
     images = torch.zeros(count, size * size, 4, dtype=torch.uint8)
     for image, pose, time in zip(images, poses, times.tolist(), strict=True):
-        origins, directions = camera_rays(pose, focal, size, size)
+        origins, directions = PosedCamera(pose, focal, size, size).rays()
         offset = (STATIC if centre is None else centre(time)) - origins
         along = (offset * directions).sum(dim=-1)
         image[offset.square().sum(dim=-1) - along.square() < radius**2] = torch.tensor(

@@ -31,7 +31,7 @@ COMPILING = 15
 
 @dataclass
 class WarmUp:
-    """The time that loops took to load and compile, which belongs to no stage.
+    """The time that loops took to load and compile, which counts towards no stage.
 
     Attributes:
         seconds: Since the process began.
@@ -59,7 +59,7 @@ warm_up = WarmUp()
 
 @functools.cache
 def _found(package: str, consequence: str) -> bool:
-    """Whether a package can be imported; says once what follows where it cannot."""
+    """Whether a package can be imported; logs the consequence once if not."""
     if importlib.util.find_spec(package) is None:
         logger.warning("%s is not installed: %s", package, consequence)
         return False
@@ -67,7 +67,7 @@ def _found(package: str, consequence: str) -> bool:
         with warm_up.timed():
             importlib.import_module(package)
     except Exception as error:
-        # A package that is there may still refuse, another one being too new or too old for it.
+        # An installed package may still fail, if another is too new or too old for it.
         reason = str(error).strip().split("\n")[0]
         logger.warning("%s cannot be imported (%s): %s", package, reason, consequence)
         return False
@@ -75,7 +75,7 @@ def _found(package: str, consequence: str) -> bool:
 
 
 def numba_found() -> bool:
-    """Whether the compiled CPU loops can be used; says so once where they cannot."""
+    """Whether the compiled CPU loops can be used; logs once if not."""
     return _found(
         "numba",
         "the CPU takes the plain torch path, several times slower. "
@@ -94,7 +94,7 @@ def cpu_loops(tensor: Tensor) -> bool:
 
 
 def triton_found() -> bool:
-    """Whether triton is installed; says so once where it is not."""
+    """Whether triton is installed; logs once if not."""
     _settle_triton()
     return _found(
         "triton",
@@ -105,7 +105,7 @@ def triton_found() -> bool:
 
 @functools.cache
 def _settle_triton() -> None:
-    """Give triton a folder of this process for what it compiles, where it could write to none."""
+    """Give triton a temporary folder for compiled kernels if it cannot write to its own."""
     home = os.environ.get("TRITON_HOME") or "~"
     folder = os.environ.get("TRITON_CACHE_DIR") or f"{home}/.triton/cache"
     try:
@@ -124,8 +124,7 @@ def _settle_triton() -> None:
 def gpu_kernels(tensor: Tensor) -> bool:
     """Whether Triton kernels apply to ``tensor``: on CUDA, where results are not bit-identical.
 
-    Which of several threads adds first to a gradient is chance, so the kernels stay out of runs
-    that must be deterministic.
+    The order in which threads add to a gradient varies, so deterministic runs do not use them.
     """
     return (
         tensor.device.type == "cuda"
@@ -136,13 +135,13 @@ def gpu_kernels(tensor: Tensor) -> bool:
 
 
 def waves(device: torch.device, *shape: int) -> Tensor:
-    """Numbers from -1 to 1 for a trial, which must leave all random generators alone."""
+    """Numbers from -1 to 1 for a trial that leaves all random generators alone."""
     count = torch.arange(torch.Size(shape).numel(), device=device, dtype=torch.float32)
     return count.mul(0.7).sin().view(shape)
 
 
 _refused: set[str] = set()
-"""Work whose Triton kernels did not stand their trial."""
+"""Work whose Triton kernels failed their trial."""
 
 
 def proven(
@@ -153,9 +152,9 @@ def proven(
     plain: Callable[..., Any],
     dtype: torch.dtype,
 ) -> bool:
-    """Whether kernels compile, run and come to the numbers of their readable twin.
+    """Whether kernels compile, run and agree with their readable twin; logs if not.
 
-    Says so where they do not. Callers keep the answer: the trial compiles and waits for the device.
+    Callers keep the answer: the trial compiles and waits for the device.
 
     Args:
         what: Name of the work, for the message.
@@ -166,7 +165,7 @@ def proven(
         dtype: Type of the planes; the twin computes in float32 at least.
 
     Raises:
-        DeviceError: If the device answers nothing any more.
+        DeviceError: If the device no longer responds.
     """
     exact = torch.promote_types(dtype, torch.float32)
     tolerance = 1e-4 if dtype == exact else 0.05
@@ -178,7 +177,7 @@ def proven(
                     ours.to(exact), theirs, atol=tolerance, rtol=tolerance, check_dtype=False
                 )
     except Exception as error:
-        # Whatever keeps a compiler from working is no reason to fail: there is another way.
+        # No failure of a compiler ends the run: torch does the same.
         reason = str(error).strip().split("\n")[0] or "no reason given"
         _require_alive(device, what, f"{type(error).__name__}: {reason}")
         logger.warning(
@@ -194,7 +193,7 @@ def proven(
 
 
 def _require_alive(device: torch.device, what: str, reason: str) -> None:
-    """Refuse to go on with a GPU whose context a kernel has destroyed: no call works any more."""
+    """Refuse to continue on a GPU whose context a kernel has destroyed."""
     try:
         synchronize(device)
     except Exception as error:
@@ -257,7 +256,7 @@ def gpu_module(module: str) -> Any:
 
 
 def synchronize(device: torch.device) -> None:
-    """Wait until a device has done all that it was asked to do; the CPU always has."""
+    """Wait until a device has finished its work; the CPU always has."""
     if device.type != "cpu":
         torch.get_device_module(device).synchronize(device)
 
@@ -266,8 +265,8 @@ def synchronize(device: torch.device) -> None:
 def _settle_threads() -> None:
     """Start the loops' threads, as many as torch has, and leave torch's number as it is.
 
-    Where both use OpenMP, starting them gives torch the number of all cores: what was asked for is
-    lost, and sums come out otherwise before and after the first loop.
+    If both use OpenMP, starting them sets torch's number to that of all cores, against the user's
+    choice, and sums would differ before and after the first loop.
     """
     count = torch.get_num_threads()
     importlib.import_module("numba")
@@ -294,7 +293,7 @@ def threads(count: int) -> Iterator[None]:
 
 
 def name(device: torch.device) -> str:
-    """Name of the inner loops on a device; once they have run, with what failed its trial."""
+    """Name of the inner loops on a device, with the kernels that failed their trial so far."""
     probe = torch.empty(0, device=device)
     if gpu_kernels(probe):
         failed = f" (torch for {', '.join(sorted(_refused))})" if _refused else ""

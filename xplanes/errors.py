@@ -1,6 +1,11 @@
 """Errors whose messages name the problem, the value and the remedy."""
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 class XPlanesError(Exception):
@@ -12,7 +17,7 @@ class ConfigError(XPlanesError, ValueError):
 
 
 class DeviceError(XPlanesError, RuntimeError):
-    """A device that does not work any more; the message names what it was doing and the way out."""
+    """A device stopped working; the message names what it was doing and the way out."""
 
 
 class LRMError(XPlanesError, ValueError):
@@ -36,7 +41,7 @@ SHOWN = 5
 
 
 def refuse_all(problems: Sequence[str]) -> None:
-    """Refuse a capture with all that is wrong with it at once; nothing if nothing is.
+    """Refuse a capture with all of its problems at once, if there are any.
 
     Raises:
         SceneError: With the first of many problems, and their number.
@@ -45,8 +50,30 @@ def refuse_all(problems: Sequence[str]) -> None:
         raise SceneError(first_of(problems))
 
 
+def all_of(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    """What a function makes of each item.
+
+    Raises:
+        SceneError: If it refuses some; with the problems of all, see `refuse_all`.
+    """
+    results: list[Result] = []
+    problems: list[str] = []
+    for item in items:
+        try:
+            results.append(function(item))
+        except SceneError as problem:
+            problems.append(str(problem))
+    refuse_all(problems)
+    return results
+
+
 def first_of(problems: Sequence[str]) -> str:
     """The first of many problems, a line each, and how many more there are."""
     more = len(problems) - SHOWN
     rest = [f"... and {more} more problems like these."] * (more > 0)
     return "\n".join([*problems[:SHOWN], *rest])
+
+
+def warn(text: str) -> None:
+    """Warn of what a capture lacks, or may mean."""
+    warnings.warn(text, stacklevel=3)

@@ -21,7 +21,7 @@ OWNERS = {
     "logger": "logger=none, or another of its group,",
     "default_root_dir": "hydra.run.dir",
 }
-"""Arguments of the Trainer that are not set as such, and what is set instead."""
+"""Arguments of the Trainer that are not set directly, and what to set instead."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Experiment:
         """Where the field is trained.
 
         Raises:
-            ConfigError: If the machine has not what is asked for.
+            ConfigError: If the machine lacks the device.
         """
         try:
             return find_device(str(self.trainer.get("accelerator", "auto")))

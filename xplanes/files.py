@@ -28,12 +28,11 @@ class StorageError(XPlanesError, OSError):
 
 
 def storage_error(problem: OSError, path: Path | None = None) -> StorageError | None:
-    """The same problem in words, if it is one of the disk.
+    """The error to report for a problem of the disk; None for any other problem.
 
     Args:
         problem: What went wrong.
-        path: What was to be written; None where it may have been to be read, and is as the
-            problem says.
+        path: The file to be written; None takes the problem's own, which may have been read.
     """
     way_out = _WAYS_OUT.get(problem.errno or 0)
     if way_out is None or (path is None and problem.errno not in _ONLY_WRITING):
@@ -79,7 +78,7 @@ def existing(path: Path) -> Path:
 
 
 def is_there(path: Path) -> bool:
-    """Whether a path exists; what lies in a folder that cannot be entered is as good as missing."""
+    """Whether a path exists; files in a folder that cannot be entered count as missing."""
     try:
         return path.exists()
     except PermissionError:
@@ -87,7 +86,7 @@ def is_there(path: Path) -> bool:
 
 
 def stand_in(path: Path) -> str | None:
-    """What lies in the place of a file that was not fetched, and the way out; None if nothing does.
+    """What a placeholder of a file that was not fetched is, and the way out; None for others.
 
     Args:
         path: A file that cannot be read as what it should be.
@@ -111,7 +110,7 @@ def stand_in(path: Path) -> str | None:
 
 
 def require_writable(folder: Path) -> None:
-    """Try whether a folder, which need not exist yet, can take a small file.
+    """Refuse a folder, which need not exist yet, that cannot take a small file.
 
     Raises:
         StorageError: If it cannot.
@@ -161,7 +160,7 @@ def clear_unfinished(folder: Path, older_than: float = 0.0) -> None:
 
     Args:
         folder: Where to look, in all folders below it too.
-        older_than: Age in seconds below which a file may still be somebody's.
+        older_than: Age in seconds below which a file may still be in use.
     """
     for path in folder.rglob(f".*{MARK}*"):
         try:

@@ -1,4 +1,4 @@
-"""Keeping processes out of one another's way; the system frees a lock however a process ends."""
+"""Locks between processes; the system frees a lock however its process ends."""
 
 import logging
 from collections.abc import Iterator
@@ -30,18 +30,13 @@ def in_turn(path: Path | None) -> Iterator[bool]:
         yield False
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(path)
-    try:
-        lock.acquire(timeout=0)
-        waited = False
-    except Timeout:
-        logger.warning("%s: another process is making it; waiting", path.with_suffix(""))
-        lock.acquire()
-        waited = True
-    try:
-        yield waited
-    finally:
-        lock.release()
+    with if_free(path) as free:
+        if free:
+            yield False
+            return
+    logger.warning("%s: another process is making it; waiting", path.with_suffix(""))
+    with FileLock(path):
+        yield True
 
 
 @contextmanager
@@ -55,13 +50,10 @@ def if_free(path: Path) -> Iterator[bool]:
         Whether this process holds it.
     """
     lock = FileLock(path)
-    try:
+    with suppress(Timeout):
         lock.acquire(timeout=0)
-    except Timeout:
-        yield False
-        return
     try:
-        yield True
+        yield lock.is_locked
     finally:
         lock.release()
 

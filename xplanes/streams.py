@@ -1,4 +1,4 @@
-"""Random numbers without memory: each use has a stream of its own, numbered here."""
+"""Stateless random numbers: each use has a stream of its own, numbered here."""
 
 import math
 from collections.abc import Iterator
@@ -40,7 +40,7 @@ class Stream(IntEnum):
     NOISE = 1_000_271
     """Noise of time planes that are initialised from an LRM."""
     BACKGROUND = 1_000_289
-    """Initial values of what lies behind the field's cube."""
+    """Initial values of the field behind the cube."""
     VIEWS = 1_000_303
     """Order of the training views, where a batch is a whole view."""
     SPLITTING = 1_000_333
@@ -48,7 +48,7 @@ class Stream(IntEnum):
     TIME_NOISE = 1_000_357
     """Noise on the times at which Gaussians are deformed."""
     SIGHT = 1_000_381
-    """Rays along which points of a field are looked for."""
+    """Rays along which points of a field are searched."""
     SPARSITY = 1_000_403
     """Points at which the sparsity prior is taken; processes add their rank."""
 
@@ -82,7 +82,7 @@ def counted_uniform(
         step: The training step.
         stream: Tells independent uses apart: a `Stream`, or the rank of a process.
         shape: Shape of the result.
-        device: Where they are made, without a word from the host.
+        device: Where they are made, without waiting for the host.
 
     Returns:
         Multiples of 2^-53 below 1. float64 [...]
@@ -98,12 +98,12 @@ def counted_uniform(
 
 
 def _signed(number: int) -> int:
-    """64 bits as the number that int64 takes them for; its products drop what goes beyond."""
+    """64 bits read as int64, whose products wrap around."""
     return number - 2**64 if number >= 2**63 else number
 
 
 def _shifted(bits: Tensor, by: int) -> Tensor:
-    """Shifted to the right with zeros behind; int64 alone would repeat the sign."""
+    """A logical shift to the right; that of int64 would repeat the sign."""
     return (bits >> by) & (2 ** (64 - by) - 1)
 
 

@@ -15,7 +15,8 @@ from xplanes.evaluation.camera_path import read_camera_path
 from xplanes.evaluation.render import VideoOptions, render_video
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.rendering.pictures import to_bytes
-from xplanes.scenes.views import Views, camera_rays
+from xplanes.scenes.cameras import PosedCamera
+from xplanes.scenes.views import Views
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +67,7 @@ def test_a_frame_is_the_render_from_its_camera_at_its_time(
     folder = render_video(trained, VideoOptions(path=str(path)), f"{tmp_path}/frames/")
     for index, (fov, time) in enumerate(((40, 0.75), (55, 0.25))):
         focal = 6 / math.tan(math.radians(fov / 2))
-        rays = camera_rays(views.camera_to_world[index], focal, 12, 20)
+        rays = PosedCamera(views.camera_to_world[index], focal, 12, 20).rays()
         image = trained.module.renderer.image(
             trained.module.field, *trained.frame.rays(*rays), time, trained.scene.background
         )

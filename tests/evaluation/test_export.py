@@ -38,9 +38,9 @@ from xplanes.rendering.behind import look
 from xplanes.rendering.grid_renderer import GridRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.pictures import to_bytes
-from xplanes.scenes.cameras import orbit
+from xplanes.scenes.cameras import PosedCamera, orbit
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.views import Views, camera_rays
+from xplanes.scenes.views import Views
 from xplanes.training.scores import render_view
 
 trimesh: Any = pytest.importorskip("trimesh")
@@ -104,7 +104,7 @@ def quiet(text: str) -> None:
 
 def silhouettes(trained: TrainedRun, mesh: Any, time: float, pose: Tensor) -> tuple[Tensor, Tensor]:
     """What a mesh in the world covers, and where the field stops half the light. bool [P], [P]"""
-    origins, directions = camera_rays(pose, 1.2 * SIZE, SIZE, SIZE)
+    origins, directions = PosedCamera(pose, 1.2 * SIZE, SIZE, SIZE).rays()
     rays = trained.frame.rays(origins, directions)
     image = trained.module.renderer.image(trained.module.field, *rays, time, torch.ones(3))
     corners = torch.tensor(np.asarray(mesh.triangles)).float()

@@ -18,7 +18,7 @@ from xplanes.lrm.openlrm import turn_third_plane
 from xplanes.lrm.triposr import CHORD
 from xplanes.rendering.grid_renderer import DIAGONAL, GridRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.scenes.cameras import focal_length, look_at, pixel_rays
+from xplanes.scenes.cameras import cast_rays, focal_length, look_at
 
 VIEWS = {"openlrm": OPENLRM_VIEW, "triposr": TRIPOSR_VIEW}
 DNERF_FOCAL = focal_length(0.6911112, 400)
@@ -141,7 +141,9 @@ def source_rays(view, seed=5, depth=4.03):
     target = pose[:3, 3] - depth * pose[:3, 2]
     alignment = align(pose, focal=focal, height=SIZE, width=SIZE, target=target, view=view)
     rows, columns = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
-    rays = pixel_rays(pose, rows.flatten(), columns.flatten(), focal=focal, height=SIZE, width=SIZE)
+    rays = cast_rays(
+        pose, rows.flatten(), columns.flatten(), focal=focal, centre=(0.5 * SIZE, 0.5 * SIZE)
+    )
     return alignment, rays
 
 
@@ -187,13 +189,12 @@ def test_triposr_image_through_our_field(monkeypatch):
     alignment, rays = source_rays(model.view)
     pose = model.view.camera_to_world().float()
     rows, columns = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
-    origins, directions = pixel_rays(
+    origins, directions = cast_rays(
         pose,
         rows.flatten(),
         columns.flatten(),
         focal=model.view.focal * SIZE,
-        height=SIZE,
-        width=SIZE,
+        centre=(0.5 * SIZE, 0.5 * SIZE),
     )
     query = triposr_query(model, triplane)
     found = field_image(model, triplane, alignment, rays, samples=8000)

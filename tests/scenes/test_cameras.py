@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.oracles import project
-from xplanes.scenes.cameras import cast_rays, focal_length, look_at, orbit, pixel_rays
+from xplanes.scenes.cameras import PosedCamera, cast_rays, focal_length, look_at, orbit
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.views import camera_rays
 
 EYE = torch.eye(4)
 
@@ -25,7 +24,7 @@ def test_focal_length_of_a_right_angle_is_half_the_width():
 def test_pixel_centres_by_hand():
     # Two rows of four pixels, focal length 1: centres at +0.5 from the corner.
     rows, columns = torch.tensor([0.0, 0, 1, 1]), torch.tensor([0.0, 3, 0, 3])
-    origins, directions = pixel_rays(EYE, rows, columns, focal=1.0, height=2, width=4)
+    origins, directions = cast_rays(EYE, rows, columns, focal=1.0, centre=(2.0, 1.0))
     expected = torch.tensor([[-1.5, 0.5, -1], [1.5, 0.5, -1], [-1.5, -0.5, -1], [1.5, -0.5, -1]])
     expected = expected / expected.norm(dim=-1, keepdim=True)
     torch.testing.assert_close(directions, expected)
@@ -33,7 +32,7 @@ def test_pixel_centres_by_hand():
 
 
 def test_image_rays_run_row_by_row():
-    origins, directions = camera_rays(EYE, 2.0, 3, 4)
+    origins, directions = PosedCamera(EYE, 2.0, 3, 4).rays()
     assert origins.shape == directions.shape == (12, 3)
     grid = directions.view(3, 4, 3)
     assert (grid[:, 1:, 0] > grid[:, :-1, 0]).all()  # right along a row
@@ -51,7 +50,7 @@ def test_image_rays_run_row_by_row():
 def test_points_on_a_ray_project_into_its_pixel(place, row, column, distance):
     pose = look_at(torch.tensor([place], dtype=torch.float64))[0]
     pixel = torch.tensor([row]).double(), torch.tensor([column]).double()
-    origins, directions = pixel_rays(pose, *pixel, focal=11.0, height=9, width=13)
+    origins, directions = cast_rays(pose, *pixel, focal=11.0, centre=(6.5, 4.5))
     point = (origins + distance * directions)[0].numpy()
     assert project(point, pose.numpy(), 11.0, 9, 13) == (row, column, True)
 
@@ -59,10 +58,10 @@ def test_points_on_a_ray_project_into_its_pixel(place, row, column, distance):
 def test_each_ray_may_have_its_own_camera():
     poses = look_at(torch.randn(6, 3, generator=torch.Generator().manual_seed(0)))
     rows, columns = torch.arange(6.0), torch.arange(6.0).flip(0)
-    together = pixel_rays(poses, rows, columns, focal=5.0, height=6, width=6)
+    together = cast_rays(poses, rows, columns, focal=5.0, centre=(3.0, 3.0))
     for index in range(6):
         one = slice(index, index + 1)
-        alone = pixel_rays(poses[index], rows[one], columns[one], focal=5.0, height=6, width=6)
+        alone = cast_rays(poses[index], rows[one], columns[one], focal=5.0, centre=(3.0, 3.0))
         for a, b in zip(together, alone, strict=True):
             torch.testing.assert_close(a[one], b)
 

@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from tests.balls import ball_views, inside_ball, surrounding
+from tests.captures import settings
 from tests.refusals import assert_refused
 from xplanes.baselines.tineuvox.model import frusta_box
 from xplanes.errors import SceneError
@@ -20,7 +21,7 @@ from xplanes.rendering.filling import fill
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.batches import RayBatches, RaySettings
 from xplanes.scenes.cameras import focal_length
-from xplanes.scenes.dnerf import read_scene
+from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.scenes.frame import cube_frame, scene_frame
 from xplanes.scenes.silhouettes import foreground, may_hold
 from xplanes.scenes.source import frames_are_equal
@@ -379,7 +380,8 @@ def write(folder, sizes, *, split="train", shared=None, frames=None):
 
 
 def read(folder, resolution=None):
-    return read_scene(folder, resolution=resolution, splits=("train",)).splits["train"]
+    made = settings(BlenderSettings, "blender", folder, resolution=resolution)
+    return made.load(["train"]).splits["train"]
 
 
 def test_a_scene_that_tells_every_frames_camera_equals_one_that_tells_an_angle(tmp_path):

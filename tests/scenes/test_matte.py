@@ -16,7 +16,7 @@ from xplanes.scenes.datamodule import UNIFORM
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.matte import FAINT, NOISE, SMALLER, VISIBLE, silhouette_of
 from xplanes.scenes.silhouettes import may_hold
-from xplanes.scenes.store import CELL, StoredImages, TileFile
+from xplanes.scenes.store import PixelFile, StoredImages
 
 SIZE, COUNT = 200, 16
 
@@ -186,8 +186,8 @@ def painted(views, paint):
     return replace(views, images=paint(views.images.clone()))
 
 
-def tiled(views):
-    file = TileFile.of(views.image(index) for index in range(len(views)))
+def in_file(views):
+    file = PixelFile.of(views.image(index) for index in range(len(views)))
     return replace(views, images=StoredImages.all_of(file))
 
 
@@ -217,21 +217,14 @@ def test_soft_mattes_leave_cube_grid_and_pools_as_they_are(matte):
 
 
 @pytest.mark.parametrize("matte", list(MATTES))
-def test_mattes_in_tiles_are_read_as_those_in_memory(matte):
+def test_mattes_in_a_file_are_read_as_those_in_memory(matte):
     views = painted(clean(), MATTES[matte])
-    stored = tiled(views)
+    stored = in_file(views)
     for index in range(COUNT):
-        mask, side = views.silhouette(index)
-        cells, cell = stored.silhouette(index)
-        assert (side, cell) == (1, CELL)
-        blocks = F.max_pool2d(mask.float()[None], CELL, ceil_mode=True)[0] > 0
-        assert torch.equal(cells, blocks)
-    pixel = 4.0 / float(views.intrinsics.focal[0, 0])
-    assert 0 <= half_side(stored) - half_side(views) < 1.1 * 2**0.5 * CELL * pixel
-    clean_tiles = tiled(clean())
-    assert half_side(stored) == pytest.approx(half_side(clean_tiles), rel=0.03)
-    assert occupied_share(stored) == pytest.approx(occupied_share(clean_tiles), abs=0.02)
-    assert near_share(stored) == pytest.approx(near_share(clean_tiles), abs=0.02)
+        assert torch.equal(stored.silhouette(index), views.silhouette(index))
+    assert half_side(stored) == half_side(views)
+    assert occupied_share(stored) == occupied_share(views)
+    assert near_share(stored) == pytest.approx(near_share(in_file(clean())), abs=0.02)
 
 
 def test_pixels_that_no_silhouette_holds_keep_colour_and_time():
@@ -279,7 +272,7 @@ def test_a_wire_stays_in_the_cube_and_in_the_grid(thickness):
         wire_views(0.5 * thickness * pixel), lambda images: noisy(0.01)(speckled(images))
     )
     points = torch.linspace(-WIRE, WIRE, 300)[:, None] * torch.tensor([0.0, 0.0, 1.0])
-    for seen in (views, tiled(views)):
+    for seen in (views, in_file(views)):
         frame = scene_frame(seen)
         assert frame.points(points).abs().max() <= 1
         assert may_hold(seen, points, radius=0.5 * pixel).all()
@@ -292,4 +285,4 @@ def test_images_are_opaque_where_the_silhouette_is_all_of_them():
     for part, expected in ((slice(0, 0), True), (slice(0, 9), False)):
         images[1, part, :, 3] = VISIBLE - 1
         found = replace(views, images=images)
-        assert found.is_opaque == tiled(found).is_opaque == expected
+        assert found.is_opaque == in_file(found).is_opaque == expected

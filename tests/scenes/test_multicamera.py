@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from tests.balls import ball_views, surrounding, swinging
-from tests.captures import write_colmap
+from tests.captures import settings, write_colmap
 from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
@@ -22,7 +22,7 @@ from xplanes.evaluation.inspect import choose
 from xplanes.optional import MissingExtraError
 from xplanes.scenes import store
 from xplanes.scenes import videos as recordings
-from xplanes.scenes.multicamera import read_cameras, read_multicamera
+from xplanes.scenes.multicamera import MultiCameraSettings, read_cameras
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Views
 
@@ -115,8 +115,8 @@ def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def read(folder: Path, splits=("train", "test"), **options):
-    options = {"resolution": None, "test_cameras": ["cam00"]} | options
-    return read_multicamera(folder, splits=splits, **options)
+    options = {"test_cameras": ["cam00"]} | options
+    return settings(MultiCameraSettings, "multicamera", folder, **options).load(splits)
 
 
 def require_rays_of(found: Views, indices: list[int]) -> None:
@@ -290,15 +290,15 @@ def test_large_captures_are_kept_on_disk(videos: Path, tmp_path: Path, monkeypat
     expected = read(videos)
     before = sorted(videos.iterdir())
     monkeypatch.setattr(store, "IN_MEMORY", 0)
-    scene = read(videos, cache=tmp_path / "cache")
+    scene = read(videos, cache=str(tmp_path / "cache"))
     assert f"{CAMERAS * FRAMES} images" in capsys.readouterr().out
     for split in ("train", "test"):
         assert scene.splits[split].is_stored
         assert torch.equal(scene.splits[split].in_memory(), expected.splits[split].in_memory())
     assert torch.equal(scene.video.in_memory(), expected.video.in_memory())
-    assert scene.splits["train"].images.files[0].channels == 3
+    assert scene.splits["train"].images.places[0][0].channels == 3
     # Another split, or fewer views, need nothing new.
-    read(videos, splits=("test",), cache=tmp_path / "cache", views=3)
+    read(videos, splits=("test",), cache=str(tmp_path / "cache"), views=3)
     assert not capsys.readouterr().out
     assert sorted(videos.iterdir()) == before
 

@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 
 from tests.balls import ball_views, surrounding
+from tests.captures import settings
 from tests.lens_oracle import direction
 from tests.refusals import assert_refused
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
@@ -20,7 +21,7 @@ from xplanes.scenes import store
 from xplanes.scenes.batches import RayBatches, ViewBatches, ViewSettings
 from xplanes.scenes.datamodule import UNIFORM, SceneDataModule, whole_view
 from xplanes.scenes.frame import scene_frame
-from xplanes.scenes.nerfstudio import read_capture
+from xplanes.scenes.nerfstudio import NerfstudioSettings
 from xplanes.scenes.views import joined
 from xplanes.streams import step_generator
 from xplanes.training.scores import score_image
@@ -28,6 +29,10 @@ from xplanes.training.scores import score_image
 SIZE, ANGLE = 24, 0.7
 FOCAL = 0.5 * SIZE / math.tan(0.5 * ANGLE)
 PINHOLE = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 12.0, "cy": 12.0, "w": SIZE, "h": SIZE}
+
+
+def read_capture(folder, splits, **changes):
+    return settings(NerfstudioSettings, "nerfstudio", folder, **changes).load(splits)
 
 
 class Capture:
@@ -55,7 +60,7 @@ class Capture:
 
     def read(self, splits=("train",), resolution=None, **options):
         (self.path / "transforms.json").write_text(json.dumps(self.content))
-        return read_capture(self.path, resolution=resolution, splits=splits, **options)
+        return read_capture(self.path, splits, resolution=resolution, **options)
 
     def refused(self, words, case=None, error=SceneError, **options):
         return assert_refused(error, words, partial(self.read, **options), case)
@@ -308,11 +313,11 @@ def test_masks_that_look_like_silhouettes_bound_the_scene(capture, caplog):
 def test_rays_of_stored_images_leave_ignored_pixels_out(capture, monkeypatch, tmp_path):
     masked(capture, band())
     monkeypatch.setattr(store, "IN_MEMORY", 0)
-    views = capture.read(eval_every=100, cache=tmp_path / "tiles").splits["train"]
+    views = capture.read(eval_every=100, cache=str(tmp_path / "cache")).splits["train"]
     assert views.is_stored
     batches = RayBatches(views, scene_frame(views), UNIFORM, seed=0)
     for step in range(5):
-        _, _, row, _, _ = batches._from_tiles(
+        _, _, row, _, _ = batches._from_files(
             views.images, torch.rand(200, 3, dtype=torch.float64), step_generator(0, step)
         )
         assert int(row.max()) < SIZE - SIZE // 4
@@ -422,15 +427,15 @@ def test_a_mark_at_the_start_and_a_missing_last_row_are_read(tmp_path):
     for frame in content["frames"]:
         frame["transform_matrix"] = frame["transform_matrix"][:3]
     path.write_text(json.dumps(content), encoding="utf-8-sig")
-    found = read_capture(tmp_path, resolution=None, splits=["train"], eval_every=10)
+    found = read_capture(tmp_path, ["train"], eval_every=10)
     assert torch.equal(found.splits["train"].camera_to_world, expected)
     path.write_text('{"frames": [] // none yet\n}')
     with pytest.raises(SceneError, match="JSON has no comments: take those that begin with //"):
-        read_capture(tmp_path, resolution=None, splits=["train"])
+        read_capture(tmp_path, ["train"])
     content["distortion_params"] = [0.1, 0.0, 0.0, 0.0]
     path.write_text(json.dumps(content))
     with pytest.raises(SceneError, match="a list of the 6 numbers k1, k2, k3, k4, p1, p2"):
-        read_capture(tmp_path, resolution=None, splits=["train"])
+        read_capture(tmp_path, ["train"])
 
 
 def test_keys_of_other_programs_change_nothing(capture):
@@ -465,7 +470,7 @@ def test_what_is_no_capture(tmp_path):
         ("none", "none does not exist. Captures in .*: other"),
         ("other/images", r"holds no transforms\.json"),
     ):
-        read = partial(read_capture, tmp_path / name, resolution=None, splits=("train",))
+        read = partial(read_capture, tmp_path / name, ["train"])
         assert_refused(SceneError, words, read, name)
 
 
@@ -577,7 +582,7 @@ def test_a_file_in_another_encoding_is_read(capture, encoding):
         frame["file_path"] = frame["file_path"].replace("images", "bildér")
     path = capture.path / "transforms.json"
     path.write_text(json.dumps(capture.content, ensure_ascii=False), encoding=encoding)
-    read = partial(read_capture, capture.path, resolution=None, splits=["train"])
+    read = partial(read_capture, capture.path, ["train"])
     assert len(read().splits["train"]) == 9
     for text, words in (
         (json.dumps(capture.content, ensure_ascii=False).encode("cp1252"), "Save it as UTF-8"),

@@ -4,12 +4,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
 from xplanes.scenes import pools
-from xplanes.scenes.pools import PixelPools, pixels_of
+from xplanes.scenes.pools import PixelPools
 
 
 def masks(shape, seed=0):
@@ -68,12 +67,6 @@ def test_shares_of_kinds_are_those_asked_for():
     assert torch.equal(far, ~near.flatten()[pixels])
     assert far.float().mean() == pytest.approx(0.1, abs=0.01)
     assert (near & plain).flatten()[pixels].float().mean() == pytest.approx(0.5, abs=0.01)
-
-
-def test_pixels_of_a_tile_are_its_chosen_ones():
-    chosen = torch.tensor([[False, True, True], [True, False, False]])
-    found = pixels_of(chosen, torch.tensor([0.0, 0.34, 0.99, 1.0], dtype=torch.float64))
-    assert np.array_equal(found, [1, 2, 3, 3])
 
 
 GROWTH = """

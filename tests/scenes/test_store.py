@@ -1,4 +1,4 @@
-"""Images in a file of tiles: the same pixels as in memory, drawn evenly, whatever happens."""
+"""Images in a file of pixels: the same as in memory, drawn evenly, whatever happens."""
 
 import copy
 import errno
@@ -24,8 +24,9 @@ from xplanes.scenes.frame import cube_frame, scene_frame
 from xplanes.scenes.images import final_sizes, native_sizes
 from xplanes.scenes.images import read_images as read_sized
 from xplanes.scenes.lenses import Lenses, LensModel
+from xplanes.scenes.matte import silhouette_of
 from xplanes.scenes.silhouettes import foreground, may_hold, plain
-from xplanes.scenes.store import TILE, StoredImages, TileFile
+from xplanes.scenes.store import RUN, PixelFile, StoredImages
 from xplanes.scenes.views import Views, joined
 from xplanes.streams import step_generator
 
@@ -65,8 +66,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def stored(views: Views) -> Views:
-    """The same views in tiles."""
-    file = TileFile.of(views.image(index) for index in range(len(views)))
+    """The same views in a file."""
+    file = PixelFile.of(views.image(index) for index in range(len(views)))
     return replace(views, images=StoredImages.all_of(file))
 
 
@@ -84,10 +85,12 @@ def test_a_file_holds_the_pixels_of_memory(tmp_path: Path, monkeypatch, alpha: b
     assert images.shape == expected.shape
     for index, (height, width) in enumerate(SIZES):
         assert torch.equal(images.image(index), expected[index, :height, :width]), index
-    (file,) = images.files
+    ((file, _), *_) = images.places
     assert file.channels == (4 if alpha else 3)
-    tiles = 3 * 2 + 1 + 1 * 3 + 1
-    assert images.nbytes == tiles * TILE**2 * file.channels
+    assert images.nbytes == sum(height * width for height, width in SIZES) * file.channels
+    for index in range(4 if alpha else 0):
+        seen = silhouette_of(expected[index, : SIZES[index][0], : SIZES[index][1], 3])
+        assert torch.equal(images.silhouette(index), seen), index
     backwards = images.subset(torch.tensor([2, 0]))
     assert torch.equal(backwards.image(0), images.image(2))
     assert backwards.shape == (2, 130, 129, 4)
@@ -106,37 +109,19 @@ def test_reduced_images_are_the_same_too(tmp_path: Path, small) -> None:
     assert torch.equal(images.image(1), expected[1])
 
 
-def test_a_file_says_what_the_alpha_of_cells_and_tiles_shows() -> None:
-    image = torch.zeros(70, 130, 4, dtype=torch.uint8)
-    image[:, 64:, 3] = 255
-    image[0, 64, 3] = 0
-    image[9:11, 17:19, 3] = 255
-    image[40, 20, 3] = 255  # A speck.
-    image[20, 40, 3] = 2
-    images = StoredImages.all_of(TileFile.of([torch.zeros_like(image), image]))
-    lit = torch.zeros(9, 17, dtype=torch.bool)
-    lit[:, 8:] = lit[1, 2] = True
-    assert torch.equal(images.lit(1), lit)
-    # The padding of the tiles at the edges is neither lit nor transparent.
-    assert images.solid(1).tolist() == [[False, False, True], [False, True, True]]
-    assert not images.lit(0).any()
-    assert not images.solid(0).any()
-
-
-def test_pixels_are_drawn_from_their_cells_alone() -> None:
-    """Silhouettes in tiles are as fine as cells: what is drawn as near is near."""
+def test_pixels_near_silhouettes_are_told_by_eights() -> None:
     views = ball_views(2, 0.15, size=400)
     settings = replace(RAYS, skip_background=True, background_share=0.0)
     batches = RayBatches(stored(views), FRAME, settings, seed=0)
     exact = RayBatches(views, FRAME, settings, seed=0)
-    # The margin of 8 pixels is rounded up to a cell, and so are the silhouettes.
+    # Silhouettes are widened by whole squares of 8 pixels.
     assert exact.near_pixels < batches.near_pixels < 1.6 * exact.near_pixels
     shown = float((views.images[..., 3] > 0).sum()) / batches.near_pixels
     lit = sum(float((batches.draw(step)["alpha"] > 0).float().mean()) for step in range(20)) / 20
     assert lit == pytest.approx(shown, rel=0.1)
 
 
-def test_views_in_tiles_tell_the_same_as_views_in_memory() -> None:
+def test_views_in_a_file_tell_the_same_as_views_in_memory() -> None:
     views = ball_views(6, 0.6, size=150)
     tiled = stored(views)
     assert tiled.is_stored
@@ -158,17 +143,15 @@ def test_views_in_tiles_tell_the_same_as_views_in_memory() -> None:
     assert tiled.identity != both.identity
 
 
-def test_tiles_never_rule_out_what_pixels_leave_open() -> None:
+def test_views_in_a_file_leave_room_for_the_same() -> None:
     views = ball_views(4, 0.3, size=300)
-    tiled = stored(views)
     points = torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) * 3 - 1.5
-    exact, coarse = (may_hold(those, points, radius=0.02) for those in (views, tiled))
-    assert not (exact & ~coarse).any()
-    assert (~coarse).float().mean() > 0.1
-    near, far = scene_frame(views).scale, scene_frame(tiled).scale
-    assert far <= near * (1 + 1e-6)
+    memory, file = (may_hold(those, points, radius=0.02) for those in (views, stored(views)))
+    assert torch.equal(memory, file)
+    assert (~memory).float().mean() > 0.1
     opaque = replace(views, images=torch.full_like(views.images, 255))
-    assert scene_frame(stored(opaque)).scale == pytest.approx(scene_frame(opaque).scale, rel=1e-6)
+    for those in (views, opaque):
+        assert scene_frame(stored(those)).scale == scene_frame(those).scale
 
 
 def numbered(sizes) -> Views:
@@ -184,7 +167,7 @@ def numbered(sizes) -> Views:
     size = torch.tensor(sizes)
     focal, centre = torch.full((len(sizes), 2), 90.0), 0.5 * size.flip(1).double()
     intrinsics = views.intrinsics.__class__(focal, centre, size)
-    return replace(views, images=StoredImages.all_of(TileFile.of(images)), intrinsics=intrinsics)
+    return replace(views, images=StoredImages.all_of(PixelFile.of(images)), intrinsics=intrinsics)
 
 
 def test_every_pixel_is_drawn_as_often_as_any_other() -> None:
@@ -210,15 +193,16 @@ def test_every_pixel_is_drawn_as_often_as_any_other() -> None:
     assert drawn.sum() == counts.sum() == 120 * 3000
     assert drawn.min() > 0
     expected = 120 * 3000 / views.pixels
-    # Pixels of one tile are drawn together, which does not change how often, but spreads counts
-    # of whole tiles.
+    # Pixels of one run are drawn together, which does not change how often, but spreads the counts
+    # of whole runs.
     assert abs(float(drawn.mean()) - expected) < 1e-3
-    tile = counts[0, :64, :64].sum() / 4096, counts[1, :33].sum() / 2112, counts[2].sum() / 320
-    for mean in tile:
+    first = counts[0, :70, :130].flatten()
+    runs = first[:RUN].mean(), first[RUN : 2 * RUN].mean(), counts[1, :33, :64].mean()
+    for mean in runs:
         assert float(mean) == pytest.approx(expected, rel=0.15)
-    within = counts[0, :64, :64].flatten()
+    within = first[:RUN]
     chi_squared = float(((within - within.mean()) ** 2 / within.mean()).sum())
-    assert abs(chi_squared - 4095) < 5 * (2 * 4095) ** 0.5
+    assert abs(chi_squared - (RUN - 1)) < 5 * (2 * RUN) ** 0.5
 
 
 def test_no_pixel_is_drawn_that_a_fisheye_lens_leaves_dark() -> None:
@@ -231,13 +215,13 @@ def test_no_pixel_is_drawn_that_a_fisheye_lens_leaves_dark() -> None:
     images = [views.image(index).clone() for index in range(2)]
     for image in images:
         image[~shown] = 0
-    tiles = StoredImages.all_of(TileFile.of(images))
-    views = replace(views, images=tiles, intrinsics=intrinsics)
+    file = StoredImages.all_of(PixelFile.of(images))
+    views = replace(views, images=file, intrinsics=intrinsics)
     assert views.is_opaque
     batches = RayBatches(views, FRAME, replace(RAYS, per_batch=4000), seed=0)
     assert batches.near_pixels + batches.far_pixels == 2 * int(shown.sum())
     drawn = torch.zeros(150, 150)
-    for step in range(60):
+    for step in range(100):
         batch = batches.draw(step)
         assert (batch["alpha"] == 1).all()
         row, column = (batch["target"][:, 1:] * 255).round().long().T
@@ -250,7 +234,7 @@ def test_no_pixel_is_drawn_that_a_fisheye_lens_leaves_dark() -> None:
     assert drawn[shown].min() > 0
 
 
-def test_tiles_far_from_silhouettes_get_the_asked_share() -> None:
+def test_runs_far_from_silhouettes_get_the_asked_share() -> None:
     views = stored(ball_views(3, 0.15, size=400))
     for share in (0.0, 0.2):
         settings = replace(
@@ -273,7 +257,7 @@ def test_tiles_far_from_silhouettes_get_the_asked_share() -> None:
         assert lit == pytest.approx((1 - share) * shown / (1 - natural), rel=0.25)
 
 
-def test_a_batch_of_tiles_depends_on_seed_step_and_rank_alone(tmp_path: Path, small) -> None:
+def test_a_batch_from_a_file_depends_on_seed_step_and_rank_alone(tmp_path: Path, small) -> None:
     paths = pictures(tmp_path / "scene", [(200, 200)] * 4, alpha=False)
     images, *_ = read_images(paths, None, tmp_path / "cache")
     views = replace(ball_views(4, 0.5, size=200), images=images)
@@ -288,25 +272,25 @@ def test_a_batch_of_tiles_depends_on_seed_step_and_rank_alone(tmp_path: Path, sm
     for seed, rank in ((4, 0), (3, 1)):
         other = RayBatches(views, FRAME, settings, seed=seed, rank=rank).draw(0)
         assert not torch.equal(other["directions"], used.draw(0)["directions"])
-    # Few rays come from as many tiles as they can.
+    # Few rays come from as many runs as they can.
     few = RayBatches(views, FRAME, replace(RAYS, per_batch=7), seed=0).draw(0)
     assert len(few["times"]) == 7
 
 
-def test_tiles_of_coming_steps_are_announced_once(monkeypatch) -> None:
+def test_runs_of_coming_steps_are_announced_once(monkeypatch) -> None:
     views = numbered([(200, 200)] * 3)
     told: list[tuple[int, int]] = []
     read: list[tuple[int, int]] = []
-    tiles = StoredImages.pixels
+    of_runs = StoredImages.pixels
     monkeypatch.setattr(
         StoredImages,
         "prefetch",
-        lambda self, view, tile: told.extend(zip(view.tolist(), tile.tolist(), strict=True)),
+        lambda self, view, run: told.extend(zip(view.tolist(), run.tolist(), strict=True)),
     )
 
-    def pixels(self, view, tile, inside):
-        read.extend(zip(view.tolist(), tile.tolist(), strict=True))
-        return tiles(self, view, tile, inside)
+    def pixels(self, view, run, inside):
+        read.extend(zip(view.tolist(), run.tolist(), strict=True))
+        return of_runs(self, view, run, inside)
 
     monkeypatch.setattr(StoredImages, "pixels", pixels)
     batches = RayBatches(views, FRAME, RAYS, seed=0)
@@ -358,9 +342,8 @@ def test_drawing_takes_no_memory_of_the_images(tmp_path: Path, small, capsys) ->
     source.write_bytes(b"")
     whole = 3 * count * size[0] * size[1]  # 63 MB
     before = private_bytes()
-    images = store.decoded(
-        [source], "test", [size] * count, 3, [job(i) for i in range(count)], tmp_path / "cache"
-    )
+    jobs = [job(i) for i in range(count)]
+    images = store.images([size] * count, jobs, [source], "test", lambda: False, tmp_path / "cache")
     poses = ball_views(count, 0.5, size=4)
     batches = RayBatches(
         Views(images, poses.camera_to_world, poses.times, 1000.0, poses.files), FRAME, RAYS, seed=0
@@ -391,14 +374,14 @@ def test_the_cache_is_used_again_until_a_source_changes(tmp_path: Path, small, c
     # One second later with the same content is another file, too.
     os.utime(paths[2], ns=(0, 10**9))
     assert read_images(paths, None, cache)[0].identity != changed.identity
-    assert sorted(path.suffix for path in cache.iterdir()).count(".tiles") == 3
+    assert sorted(path.suffix for path in cache.iterdir()).count(".pixels") == 3
     assert not [path for path in (tmp_path / "scene").iterdir() if path.suffix != ".png"]
 
 
 def test_a_file_that_was_cut_off_is_made_anew(tmp_path: Path, small) -> None:
     paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=True)
     images = read_images(paths, None, tmp_path / "cache")[0]
-    (path,) = (tmp_path / "cache").glob("*.tiles")
+    (path,) = (tmp_path / "cache").glob("*.pixels")
     expected = images.image(2)
     os.truncate(path, 1000)
     with pytest.raises(StorageError, match=r"ends too early.*Delete it"):
@@ -415,7 +398,7 @@ def test_a_damaged_image_leaves_nothing_behind(tmp_path: Path, small) -> None:
         read_images(paths, None, tmp_path / "cache")
     assert not [p for p in (tmp_path / "cache").iterdir() if p.suffix != ".lock"]
     paths[1].write_bytes(content)
-    assert len(read_images(paths, None, tmp_path / "cache")[0]) == 3
+    assert read_images(paths, None, tmp_path / "cache")[0].shape[0] == 3
 
 
 def test_a_disk_without_space_is_refused_first(tmp_path: Path, small, monkeypatch) -> None:
@@ -424,7 +407,7 @@ def test_a_disk_without_space_is_refused_first(tmp_path: Path, small, monkeypatc
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
     with pytest.raises(StorageError, match=r"0\.3 GB free.*data\.cache"):
         read_images(paths, None, tmp_path / "cache")
-    assert not list((tmp_path / "cache").glob("*.tiles"))
+    assert not list((tmp_path / "cache").glob("*.pixels"))
 
 
 def test_the_cache_is_the_users_if_none_is_named(tmp_path: Path, small, monkeypatch) -> None:
@@ -432,7 +415,7 @@ def test_the_cache_is_the_users_if_none_is_named(tmp_path: Path, small, monkeypa
     monkeypatch.setattr("sys.platform", "linux")
     paths = pictures(tmp_path / "scene", [(65, 65)], alpha=False)
     read_images(paths, None)
-    assert len(list((tmp_path / "home" / "xplanes" / "images").glob("*.tiles"))) == 1
+    assert len(list((tmp_path / "home" / "xplanes" / "images").glob("*.pixels"))) == 1
 
 
 def test_what_no_run_has_used_for_a_month_is_removed(
@@ -444,24 +427,27 @@ def test_what_no_run_has_used_for_a_month_is_removed(
     paths = pictures(tmp_path / "scene", [(65, 65)] * 6, alpha=False)
     read_images(paths[:1], None)
     assert "after 30 days without use" in capsys.readouterr().out
-    (old,) = cache.glob("*.tiles")
+    (old,) = cache.glob("*.pixels")
 
     def aged(path: Path, days: float) -> Path:
         if not path.exists():
-            path.write_bytes(b"tiles")
+            path.write_bytes(b"pixels")
         past = time.time() - days * DAY
         os.utime(path, (past, past))
         return path
 
-    locked = aged(cache / f"{'1' * 32}.tiles", 31)
+    locked = aged(cache / f"{'1' * 32}.pixels", 31)
     kept = [
         locked,
-        aged(cache / f"{'2' * 32}.tiles", 29),
-        aged(cache / "mine.tiles", 99),
+        aged(cache / f"{'2' * 32}.pixels", 29),
+        aged(cache / "mine.pixels", 99),
         aged(cache / f"{'3' * 32}.npy", 99),
-        aged(cache / f".{'4' * 32}.tiles{MARK}x", 0.5),
+        aged(cache / f".{'4' * 32}.pixels{MARK}x", 0.5),
     ]
-    gone = [aged(cache / f".{'5' * 32}.tiles{MARK}x", 2), aged(cache / f"{'6' * 32}.tiles", 31)]
+    gone = [
+        aged(cache / f"{'7' * 32}.tiles", 31),  # Of an earlier version.
+        *[aged(cache / f".{'5' * 32}.pixels{MARK}x", 2), aged(cache / f"{'6' * 32}.pixels", 31)],
+    ]
     # Use makes a file young again.
     aged(old, 31)
     images = read_images(paths[:1], None)[0]
@@ -484,13 +470,13 @@ def test_a_cache_that_is_named_is_the_users_to_clean(tmp_path: Path, small, caps
     cache = tmp_path / "cache"
     read_images(paths[:1], None, cache)
     assert "without use" not in capsys.readouterr().out
-    (old,) = cache.glob("*.tiles")
+    (old,) = cache.glob("*.pixels")
     os.utime(old, (0, 0))
     read_images(paths[1:], None, cache)
     assert old.exists()
 
 
-def test_an_interrupted_decoder_stops_soon(tmp_path: Path) -> None:
+def test_an_interrupted_decoder_stops_soon(tmp_path: Path, small) -> None:
     source = tmp_path / "source"
     source.write_bytes(b"")
     begun = threading.Event()
@@ -508,11 +494,13 @@ def test_an_interrupted_decoder_stops_soon(tmp_path: Path) -> None:
 
     began = time.monotonic()
     with pytest.raises(SceneError, match="camera 7"):
-        store.decoded([source], "", [(4, 4)] * 101, 3, [slow, broken], tmp_path / "cache")
+        store.images(
+            [(4, 4)] * 101, [slow, broken], [source], "", lambda: False, tmp_path / "cache"
+        )
     assert time.monotonic() - began < 1.5
 
 
-def test_tiles_on_a_read_only_disk_are_read(tmp_path: Path, small, monkeypatch) -> None:
+def test_files_on_a_read_only_disk_are_read(tmp_path: Path, small, monkeypatch) -> None:
     paths = pictures(tmp_path / "scene", [(65, 65)] * 2, alpha=False)
     first = read_images(paths, None, cache=tmp_path / "cache")[0]
 

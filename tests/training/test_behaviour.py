@@ -156,13 +156,13 @@ def test_a_run_on_images_from_disk_resumes_in_a_later_epoch(
     every = ("model.rays.per_batch=1024", "callbacks.checkpoints.every=6")
     config = small_config(scenes, f"data.cache={cache}", *every)
     run(config, whole, [], resume=False)
-    tiles = sorted(cache.glob("*.tiles"))
-    assert [path.stat().st_size for path in tiles]
+    files = sorted(cache.glob("*.pixels"))
+    assert [path.stat().st_size for path in files]
     stopped_at((20, 31), config, folder, monkeypatch)
-    for path in tiles:
+    for path in files:
         path.unlink()
     run(config, folder, [], resume=True)
-    assert sorted(cache.glob("*.tiles")) == tiles
+    assert sorted(cache.glob("*.pixels")) == files
     same(folder, whole)
 
 

@@ -12,9 +12,10 @@ from xplanes.rendering.base import RayRenderer, Renderer
 from xplanes.rendering.box import snapshot
 from xplanes.rendering.grid_renderer import GridRenderer
 from xplanes.rendering.pictures import depth_picture
+from xplanes.scenes.cameras import PosedCamera
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.silhouettes import may_hold
-from xplanes.scenes.views import PosedCamera, Views, spread
+from xplanes.scenes.views import Views, spread
 from xplanes.training.scores import VISIBLE
 
 MODES = ("colour", "depth", "opacity", "floaters")

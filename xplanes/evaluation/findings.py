@@ -15,7 +15,7 @@ from xplanes.scenes.cameras import project
 from xplanes.scenes.entries import some
 from xplanes.scenes.frame import Frame, axes_meet, backwards, optical_centre
 from xplanes.scenes.matte import silhouette_of
-from xplanes.scenes.store import count_in_squares
+from xplanes.scenes.silhouettes import count_in_squares
 from xplanes.scenes.views import Scene, Views, spread
 
 GAP_SPACINGS, GAP_SPAN = 12.0, 0.05

@@ -256,7 +256,7 @@ def distortion(views: Views) -> float:
             continue
         done.add(key)
         height, width = views.size(index)
-        lens = intrinsics.lenses.subset(slice(index, index + 1))
+        lens = intrinsics.lenses[index : index + 1]
         rows = torch.tensor([-0.5, -0.5, height - 0.5, height - 0.5], dtype=torch.float64)
         columns = torch.tensor([-0.5, width - 0.5, -0.5, width - 0.5], dtype=torch.float64)
         x, y = image_plane(

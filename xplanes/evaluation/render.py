@@ -21,9 +21,9 @@ from xplanes.files import replacing, require_writable
 from xplanes.optional import require
 from xplanes.rendering.base import Renderer, leave_empty
 from xplanes.rendering.pictures import colour_map, to_bytes
-from xplanes.scenes.cameras import orbit
+from xplanes.scenes.cameras import PosedCamera, orbit
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.views import PosedCamera, Scene, Views
+from xplanes.scenes.views import Scene, Views
 from xplanes.training.module import RadianceModule
 
 ELEVATION = 20.0

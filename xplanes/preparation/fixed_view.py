@@ -20,9 +20,9 @@ from xplanes.lrm.canonical import CanonicalView
 from xplanes.models.initialisation import Method, Place, PreparationSettings
 from xplanes.preparation.cache import StageCache
 from xplanes.rendering.base import RayRenderer
-from xplanes.scenes.cameras import camera_around
+from xplanes.scenes.cameras import PosedCamera, camera_around
 from xplanes.scenes.frame import Frame, frame_content
-from xplanes.scenes.views import Intrinsics, Views, camera_rays
+from xplanes.scenes.views import Intrinsics, Views
 from xplanes.training.fit import fit_quietly
 from xplanes.training.module import RadianceModule
 
@@ -147,7 +147,7 @@ def check_camera(video: Views) -> None:
             f"{way_out}"
         )
     if intrinsics.lenses is not None:
-        straight = camera_rays(video.camera_to_world[0], focal_x, height, width)[1]
+        straight = PosedCamera(video.camera_to_world[0], focal_x, height, width).rays()[1]
         bent = (video.image_rays(0)[1] - straight).norm(dim=-1).max()
         if float(bent) * focal_x > OFF_CENTRE * width:
             raise SceneError(
@@ -336,7 +336,7 @@ def _render(
     device = renderer.device
     if isinstance(module.field, XPlanes):
         module.field.background = None  # The video shows only what is in the cube.
-    origins, directions = camera_rays(pose, focal, side, side)
+    origins, directions = PosedCamera(pose, focal, side, side).rays()
     origins, directions = frame.rays(origins - back * directions, directions)
     rays = origins.to(device), directions.to(device)
     frames = []

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from xplanes.rendering.box import snapshot
 from xplanes.rendering.marching import Samples
+from xplanes.scenes.cameras import PosedCamera
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.views import PosedCamera
 
 
 @dataclass(frozen=True)

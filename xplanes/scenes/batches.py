@@ -1,4 +1,4 @@
-"""Ray batches drawn without memory: the step alone decides what is in them."""
+"""Stateless ray batches: the step alone determines their content."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
@@ -10,9 +10,9 @@ from torch import Tensor
 from xplanes.backend import memory_left
 from xplanes.errors import ConfigError
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.pools import PixelPools, TilePool, in_cells, pixels_of, tile_pools
+from xplanes.scenes.pools import PixelPools, RunPools
 from xplanes.scenes.silhouettes import changing, foreground, plain
-from xplanes.scenes.store import CELL, TILE, StoredImages, unpacked
+from xplanes.scenes.store import RUN, StoredImages
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Settings, Share
 from xplanes.streams import Stream, counted_uniform, step_generator
@@ -24,28 +24,28 @@ NEAR_SILHOUETTE = 0.02
 """Share of the image's side around silhouettes that counts as near."""
 
 PLAIN_SHARE = 0.2
-"""Share of rays at opaque pixels of one colour with all around them."""
+"""Share of rays at opaque pixels whose surroundings have the same colour."""
 
 STILL_SHARE = 0.5
 """Share of rays at pixels of fixed cameras where nothing changes."""
 
-PER_TILE = 32
-"""Rays from one tile, of images in a file of tiles."""
+PER_RUN = 32
+"""Rays from one run of pixels, of images in files."""
 
-LEAST_TILES = 32
-"""Tiles of a batch at least, if it has as many rays."""
+LEAST_RUNS = 32
+"""Runs of a batch at least, if it has as many rays."""
 
 LARGEST_SHARE = 0.25
 """Share of a GPU's free memory that images may take."""
 
 AHEAD = 8
-"""Batches whose tiles the system is told to read in advance."""
+"""Batches whose pixels the system is asked to read ahead."""
 
 CPU_RAYS, CPU_SAMPLES = 1365, 8192
-"""Largest batch on the CPU where the settings leave it open; schedules in steps are made for it."""
+"""Largest batch on the CPU under per_batch=auto, for which schedules in steps are made."""
 
 GPU_RAYS, GPU_SAMPLES = 2**15, 2**19
-"""The same on a GPU, which a small batch leaves idle."""
+"""The same on a GPU, which small batches leave idle."""
 
 
 class Batches(ABC):
@@ -54,7 +54,7 @@ class Batches(ABC):
     Attributes:
         views: Training views.
         rays: Rays of a batch.
-        skipped: Share of all pixels that uniform drawing would have shown and this one leaves out.
+        skipped: Share of rays that uniform sampling would have drawn and this one does not.
     """
 
     views: Views
@@ -73,21 +73,21 @@ class Batches(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class BatchSettings(Settings, ABC):
-    """What a training step gets to see."""
+    """What a training step is given."""
 
     def on(self, device: torch.device) -> "BatchSettings":
-        """The same with sizes that suit a device, where these are open."""
+        """The same settings with each auto replaced by what suits a device."""
         return self
 
     @property
     @abstractmethod
     def most(self) -> int:
-        """Rays of a batch at most; 0 where that is those of a view."""
+        """Maximum rays per batch; 0 if a batch is a whole view."""
 
     @property
     @abstractmethod
     def most_samples(self) -> int | None:
-        """Samples of a batch at most, on average; None where rays have none."""
+        """Maximum samples per batch, on average; None without samples along rays."""
 
     @abstractmethod
     def batches(self, views: Views, frame: Frame, *, seed: int, rank: int) -> Batches:
@@ -224,9 +224,9 @@ class RayBatches(Batches):
     `PLAIN_SHARE`. Opaque images of fixed cameras have no silhouettes, but pixels that change: the
     others are drawn at `STILL_SHARE`, at their own times.
 
-    Of images in a file of tiles each batch takes `PER_TILE` pixels of each of some tiles, so that
-    it reads few places of the disk; every pixel is still as likely as any other. Near and far are
-    told apart by cells of `CELL` pixels there.
+    Of images in files each batch takes `PER_RUN` pixels of each of some runs of consecutive pixels,
+    so that it reads few places of the disk; every pixel is still as likely as any other. Near and
+    far are told apart more coarsely there (`RunPools`).
 
     Args:
         views: Training views.
@@ -245,11 +245,8 @@ class RayBatches(Batches):
         widths = views.intrinsics.size[:, 1].tolist()
         margins = [max(1, round(NEAR_SILHOUETTE * width)) for width in widths]
         changes = None
-        self.pools: PixelPools | None = None
-        self.tiles: tuple[TilePool, TilePool] | None = None
         if isinstance(views.images, StoredImages):
-            near, far = self.tiles = tile_pools(views, views.images, margins)
-            self.far_pixels, plain_pixels, others = len(far), 0, len(near)
+            self.pools = RunPools(views, views.images, margins)
         else:
             if settings.skip_background and views.is_opaque:
                 changes = changing(views, margins)  # Large captures are drawn from evenly.
@@ -259,7 +256,7 @@ class RayBatches(Batches):
                 plain(views, margins) if skips_plain else None,
                 views.valid() if views.is_cut else None,
             )
-            self.far_pixels, plain_pixels, others = self.pools.sizes
+        self.far_pixels, plain_pixels, others = self.pools.sizes
         self._prefetched = -1
         self.near_pixels = plain_pixels + others
         pixels = self.near_pixels + self.far_pixels
@@ -271,8 +268,7 @@ class RayBatches(Batches):
         jitter = skip and natural > 0 and not views.is_static and changes is None
         self.background_jitter = settings.background_jitter if jitter else 0.0
         self.skipped = natural + plain_natural - self.far_share - self.plain_share
-        if self.pools is not None:
-            self.pools.share(self.far_share, self.plain_share)
+        self.pools.share(self.far_share, self.plain_share)
 
     def draw(self, step: int, rays: int | None = None) -> Batch:
         """The batch of a step.
@@ -291,7 +287,7 @@ class RayBatches(Batches):
         uniform = torch.rand(rays, 3, generator=generator, dtype=torch.float64)
         if isinstance(self.views.images, StoredImages):
             self._prefetch(step, rays)
-            drawn = self._from_tiles(self.views.images, uniform, generator)
+            drawn = self._from_files(self.views.images, uniform, generator)
         else:
             drawn = self._from_memory(self.views.images, uniform)
         shape = (rays, 3)
@@ -324,77 +320,41 @@ class RayBatches(Batches):
             "jitter": jitter,
         }
 
-    def _choose(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
-        """Which choices are far from silhouettes, and the place of each. [K, 3] -> [K], [K, 2]"""
-        assert self.tiles is not None
-        far, (near_tiles, far_tiles) = uniform[:, 0] < self.far_share, self.tiles
-        if not (len(near_tiles) and len(far_tiles)):
-            return far, (near_tiles if len(near_tiles) else far_tiles).pick(uniform[:, 1])
-        near_place, far_place = near_tiles.pick(uniform[:, 1]), far_tiles.pick(uniform[:, 1])
-        return far, torch.where(far[:, None], far_place, near_place)
-
     def _from_memory(self, images: Tensor, uniform: Tensor) -> tuple[Tensor, ...]:
         """Far, view, row, column and colour of rays through scattered pixels. [R], [R, 4]"""
-        assert self.pools is not None
+        assert isinstance(self.pools, PixelPools)
         far, pixel = self.pools.pick(uniform[:, 0], uniform[:, 1])
         height, width = self.views.height, self.views.width
         view, row, column = pixel // (height * width), pixel // width % height, pixel % width
         return far, view, row, column, images.view(-1, 4)[pixel]
 
-    def _from_tiles(
+    def _from_files(
         self, images: StoredImages, uniform: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, ...]:
-        """Far, view, row, column and colour of rays, some through each of few tiles."""
-        number = len(uniform)
-        per_tile = _per_tile(number)
-        far, place = self._choose(uniform[::per_tile])
-        view, tile = place[:, :2].unbind(dim=1)
-        cells = unpacked(place[:, 2:].byte().numpy())
-        size = self.views.intrinsics.size[view]
-        columns = (size[:, 1] + TILE - 1) // TILE
-        top, left = tile // columns * TILE, tile % columns * TILE
-        inside = torch.rand(len(tile), per_tile, generator=generator, dtype=torch.float64)
-        if self.views.intrinsics.sights is None and self.views.ignored is None:
-            row, column = in_cells(cells, size[:, 0] - top, size[:, 1] - left, inside)
-        else:
-            row, column = self._with_rays(view, top, left, cells, inside)
-        colour = images.pixels(view, tile, row * TILE + column)
-        rays = slice(0, number)  # The last tile may have to give fewer.
-        far, view = (of_tile.repeat_interleave(per_tile)[rays] for of_tile in (far, view))
-        row, column = (top[:, None] + row).flatten()[rays], (left[:, None] + column).flatten()[rays]
-        return far, view, row, column, colour.flatten(0, 1)[rays]
-
-    def _with_rays(
-        self, view: Tensor, top: Tensor, left: Tensor, cells: Tensor, inside: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """As `in_cells`, among the pixels that are trained on."""
-        found = []
-        side = TILE // CELL
-        tiles = cells.view(-1, side, side).repeat_interleave(CELL, 1).repeat_interleave(CELL, 2)
-        for index, row, column, tile, uniform in zip(
-            view.tolist(), top.tolist(), left.tolist(), tiles, inside, strict=True
-        ):
-            height, width = self.views.size(index)
-            chosen = torch.zeros(TILE, TILE, dtype=torch.bool)
-            chosen[: height - row, : width - column] = True
-            shown = self.views.shown(index)
-            if shown is not None:
-                shown = shown[row : row + TILE, column : column + TILE]
-                chosen[: shown.shape[0], : shown.shape[1]] = shown
-            found.append(pixels_of(chosen & tile, uniform))
-        pixel = torch.stack(found)
-        return pixel // TILE, pixel % TILE
+        """Far, view, row, column and colour of rays, some through each of few runs of pixels."""
+        assert isinstance(self.pools, RunPools)
+        number, per_run = len(uniform), _per_run(len(uniform))
+        far, view, run = self.pools.pick(*uniform[::per_run, :2].T)
+        inside = torch.rand(len(run), per_run, generator=generator, dtype=torch.float64)
+        inside = self.pools.inside(far, view, run, inside)
+        colour = images.pixels(view, run, inside).flatten(0, 1)
+        pixel = (RUN * run[:, None] + inside).flatten()
+        far, view = (each.repeat_interleave(per_run) for each in (far, view))
+        width = self.views.intrinsics.size[view, 1]
+        drawn = far, view, pixel // width, pixel % width, colour
+        return tuple(each[:number] for each in drawn)  # The last run may have to give fewer.
 
     def _prefetch(self, step: int, rays: int) -> None:
-        """Let the system read the tiles of the next batches, as far as it was not told yet."""
+        """Ask the system to read the runs of the next batches ahead, each once."""
         assert isinstance(self.views.images, StoredImages)
+        assert isinstance(self.pools, RunPools)
         if not step <= self._prefetched <= step + AHEAD:
             self._prefetched = step
         for later in range(self._prefetched + 1, step + AHEAD + 1):
             generator = step_generator(self.seed, later, self.rank)
             uniform = torch.rand(rays, 3, generator=generator, dtype=torch.float64)
-            _, place = self._choose(uniform[:: _per_tile(rays)])
-            self.views.images.prefetch(*place[:, :2].unbind(dim=1))
+            _, view, run = self.pools.pick(*uniform[:: _per_run(rays), :2].T)
+            self.views.images.prefetch(view, run)
         self._prefetched = step + AHEAD
 
     def _times(self, view: Tensor, empty: Tensor, move: Tensor | None) -> Tensor:
@@ -423,7 +383,7 @@ class DeviceBatches(RayBatches):
         self.device = device
         self.views = batches.views.to(device)
         self.frame = batches.frame.to(device)
-        assert batches.pools is not None
+        assert isinstance(batches.pools, PixelPools)
         self.pools = batches.pools.to(device)
 
     @staticmethod
@@ -449,6 +409,6 @@ class DeviceBatches(RayBatches):
         return self._served(drawn, background, move, uniform[:, 2].float())
 
 
-def _per_tile(rays: int) -> int:
-    """Rays of a batch from one tile."""
-    return max(1, min(PER_TILE, rays // LEAST_TILES))
+def _per_run(rays: int) -> int:
+    """Rays of a batch from one run of pixels."""
+    return max(1, min(PER_RUN, rays // LEAST_RUNS))

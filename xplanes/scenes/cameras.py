@@ -4,6 +4,7 @@ Camera axes are OpenGL's: x right, y up, looking along -z. Pixel centres lie at 
 """
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,24 +17,46 @@ def focal_length(angle_x: float, width: int) -> float:
     return 0.5 * width / math.tan(0.5 * angle_x)
 
 
-def pixel_rays(
-    camera_to_world: Tensor, rows: Tensor, columns: Tensor, *, focal: float, height: int, width: int
-) -> tuple[Tensor, Tensor]:
-    """Cast one ray through each named pixel of a camera with square pixels and a centred image.
+@dataclass(frozen=True)
+class PosedCamera:
+    """A camera somewhere in the world, and the size of its image.
 
-    Args:
-        camera_to_world: Pose of the camera of each ray. [R, 4, 4] or [4, 4]
-        rows: Pixel rows, from 0 at the top; fractions are allowed. [R]
-        columns: Pixel columns, from 0 at the left. [R]
-        focal: Focal length in pixels.
-        height: Image height in pixels.
-        width: Image width in pixels.
-
-    Returns:
-        Origins and unit directions in the world. [R, 3], [R, 3]
+    Attributes:
+        camera_to_world: Its pose. [4, 4]
+        focal: Focal length in pixels, or those along x and y. [2]
+        height: Rows.
+        width: Columns.
+        centre: Principal point, x from the left and y from the top; the middle when None. [2]
+        lens: Its lens; a pinhole when None.
     """
-    middle = (0.5 * width, 0.5 * height)
-    return cast_rays(camera_to_world, rows, columns, focal=(focal, focal), centre=middle)
+
+    camera_to_world: Tensor
+    focal: float | Tensor
+    height: int
+    width: int
+    centre: Tensor | None = None
+    lens: Lenses | None = None
+
+    def rays(self) -> tuple[Tensor, Tensor]:
+        """Rays through every pixel, row by row.
+
+        Returns:
+            Origins and unit directions in the world. [H W, 3], [H W, 3]
+        """
+        lines = [torch.arange(count, dtype=torch.float32) for count in (self.height, self.width)]
+        rows, columns = torch.meshgrid(*lines, indexing="ij")
+        return cast_rays(
+            self.camera_to_world,
+            rows.flatten(),
+            columns.flatten(),
+            focal=self.focal,
+            centre=(0.5 * self.width, 0.5 * self.height) if self.centre is None else self.centre,
+            lenses=self.lens,
+        )
+
+    def to(self, device: torch.device) -> "PosedCamera":
+        """The same: cameras stay on the CPU when Lightning moves a batch."""
+        return self
 
 
 def cast_rays(
@@ -41,7 +64,7 @@ def cast_rays(
     rows: Tensor,
     columns: Tensor,
     *,
-    focal: Tensor | tuple[float, float],
+    focal: Tensor | float,
     centre: Tensor | tuple[float, float],
     lenses: Lenses | None = None,
 ) -> tuple[Tensor, Tensor]:
@@ -53,7 +76,7 @@ def cast_rays(
         camera_to_world: Pose of the camera of each ray. [R, 4, 4] or [4, 4]
         rows: Pixel rows, from 0 at the top; fractions are allowed. [R]
         columns: Pixel columns, from 0 at the left. [R]
-        focal: Focal lengths along x and y in pixels. [R, 2] or [2]
+        focal: Focal lengths along x and y in pixels, or one for both. [R, 2] or [2]
         centre: Principal point, x from the left and y from the top, in pixels. [R, 2] or [2]
         lenses: One for each ray, or one for all; pinholes when None.
 
@@ -91,7 +114,7 @@ def image_plane(
     rows: Tensor,
     columns: Tensor,
     *,
-    focal: Tensor | tuple[float, float],
+    focal: Tensor | float,
     centre: Tensor | tuple[float, float],
     lenses: Lenses,
 ) -> tuple[Tensor, Tensor]:
@@ -114,7 +137,7 @@ def project(
     centre: Tensor,
     lenses: Lenses | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Find the pixels at which a camera sees points; the inverse of `cast_rays`.
+    """The pixels at which a camera sees points; the inverse of `cast_rays`.
 
     Args:
         camera_to_world: Pose of the camera. [4, 4]
@@ -125,8 +148,8 @@ def project(
 
     Returns:
         Distances in pixels from the image's left and top edges, at +0.5 in the middle of a row or
-        column, [N] each, and whether the camera can see each point, however large its image may be,
-        bool [N]. The distances of other points mean nothing.
+        column, [N] each, and whether the camera can see each point, inside its image or beyond,
+        bool [N]. The distances of other points are meaningless.
     """
     local = camera_axes(camera_to_world, points)
     (focal_x, focal_y), (centre_x, centre_y) = focal.unbind(-1), centre.unbind(-1)
@@ -177,8 +200,10 @@ def camera_axes(camera_to_world: Tensor, points: Tensor) -> Tensor:
     return (points - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
 
 
-def _pair(value: Tensor | tuple[float, float]) -> tuple[Tensor | float, ...]:
-    return value.unbind(-1) if isinstance(value, Tensor) else value
+def _pair(value: Tensor | tuple[float, float] | float) -> tuple[Tensor | float, ...]:
+    if isinstance(value, Tensor):
+        return value.unbind(-1)
+    return value if isinstance(value, tuple) else (value, value)
 
 
 def _like(reference: Tensor, value: Tensor | float) -> Tensor | float:

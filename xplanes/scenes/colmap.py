@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import ClassVar
 
-import torch
+import numpy as np
 
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.files import natural
@@ -22,28 +22,17 @@ from xplanes.scenes.entries import (
     is_number,
     mask_files,
     oriented,
-    refuse_repeats,
-    require_precision,
     short,
     some,
     unit_times,
 )
 from xplanes.scenes.formats import is_image
-from xplanes.scenes.listing import (
-    Listing,
-    held_out,
-    picked,
-    read_splits,
-    require_shapes,
-    thinned,
-    time_words,
-)
-from xplanes.scenes.masks import MaskUse
+from xplanes.scenes.listing import Listing, held_out, time_source
 from xplanes.scenes.multicamera import recordings_of_cameras
 from xplanes.scenes.name_times import OTHER_TIMES, times_in_names
-from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.source import CaptureSettings
 from xplanes.scenes.views import Scene
-from xplanes.settings import Count, Location
+from xplanes.settings import Location
 
 logger = logging.getLogger(__name__)
 
@@ -52,7 +41,7 @@ USUAL = "images"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ColmapSettings(SceneSettings):
+class ColmapSettings(CaptureSettings):
     """A capture registered with COLMAP."""
 
     files: ClassVar = "sparse/0 with cameras.bin and images.bin (or .txt), and images"
@@ -62,9 +51,6 @@ class ColmapSettings(SceneSettings):
     # Folder of masks: NAME.png for each image NAME, black outside the foreground; null for none.
     # Masks that hid moving objects from COLMAP would hide them here, too.
     masks: Location | None
-    # What masks leave out. alpha: is empty; ignore: is neither trained on nor scored; auto: alpha
-    # where they look like silhouettes, else ignore; lrm: is cut from the LRM's input alone.
-    mask_use: MaskUse
     # Times of the images: a CSV file with the columns file and time; rank: the order within each
     # camera's folder; null: the numbers in the file names.
     times: Location | None
@@ -73,8 +59,6 @@ class ColmapSettings(SceneSettings):
     # names and is not a camera's, as in 034_cam1.
     time_pattern: str | None
     test_cameras: list[str]  # Subfolders of the image folder that form the test split.
-    # Hold out every n-th image as val, in order of time and file name; never the first or last.
-    eval_every: Count
     orient: bool  # Rotate the world so that the cameras' mean up vector becomes its z axis.
 
     @classmethod
@@ -112,28 +96,25 @@ class ColmapSettings(SceneSettings):
     def load(self, splits: Sequence[str]) -> Scene:
         source = _model_folder(self.folder, self.model)
         if "test" in splits and not self.test_cameras:
-            # Known before the model and all images are looked at.
+            # This needs no reading of the model and the images.
             raise MissingSplitError(
                 f"{source} has no test split. Name the folders of some cameras in "
                 "data.test_cameras, or choose another data.eval_split."
             )
         model = read_model(source)
-        listing, points = self._listing(model)
-        chosen = picked(
-            self._parts(listing),
+        listing, folders, points = self._listing(model)
+        return self.capture(
+            listing,
+            self._places(listing, folders),
             splits,
             model.source,
             "Name the folders of some cameras in data.test_cameras, lower data.eval_every="
             f"{self.eval_every}, or choose another data.eval_split.",
+            points,
         )
-        chosen = thinned(chosen, self.views, self.eval_views, self.folder)
-        read, cut, notes = read_splits(
-            chosen, self.resolution, self.image_cache, self.mask_use, listing
-        )
-        return Scene(self.folder.resolve().name, read, points=points, cut=cut, notes=notes)
 
-    def _listing(self, model: SparseModel) -> tuple[Listing, torch.Tensor | None]:
-        """All images of the capture, and the model's points."""
+    def _listing(self, model: SparseModel) -> tuple[Listing, list[str], np.ndarray | None]:
+        """All images of the capture, the folder of each, and the model's points."""
         images = _image_folder(self.folder, self.images, model)
         root = images.resolve()
         labels = [f"{model.source}: {name}" for name in model.names]
@@ -148,29 +129,25 @@ class ColmapSettings(SceneSettings):
         }
         used = {path.relative_to(root).as_posix() for path in paths}
         _warn_of_unregistered(sorted(present - used), len(present), images)
-        times, words = self._times(model.names, labels, present)
+        times, source = self._times(model.names, labels, present)
         poses, points = model.camera_to_world, model.points
         if self.orient:
             poses, points = oriented(poses, points, paths)
-        require_precision(model.source, poses[:, :3, 3])
-        refuse_repeats(labels, paths, poses, times)
-        folders = [_camera(name) for name in model.names]
-        listing = Listing(
-            paths=tuple(paths),
+        listing = Listing.checked(
+            model.source,
+            labels,
+            paths,
+            poses,
+            times,
             files=tuple(
                 (images.relative_to(self.folder) / path.relative_to(root)).as_posix()
                 for path in paths
             ),
-            camera_to_world=torch.from_numpy(poses).float(),
-            times=torch.tensor(times or [0.0] * len(paths), dtype=torch.float32),
             calibrations=model.calibrations,
-            timed=bool(times),
             masks=() if self.masks is None else self._masks(model.names, self.masks),
-            cameras=tuple(folders) if any(folders) else (),
-            time_words=words,
+            time_source=source,
         )
-        require_shapes(listing)
-        return listing, None if points is None else torch.from_numpy(points).float()
+        return listing, [_camera(name) for name in model.names], points
 
     def _masks(self, names: Sequence[str], masks: str) -> tuple[Path | None, ...]:
         kinds = [
@@ -202,19 +179,16 @@ class ColmapSettings(SceneSettings):
             "The times of %d images, from 0 to 1, are %s, from %s to %s",
             *(len(names), origin, min(found), max(found)),
         )
-        return unit_times(found), time_words(origin, names, found)
+        return unit_times(found), time_source(origin, names, found)
 
-    def _parts(self, listing: Listing) -> dict[str, Listing]:
-        """The capture by splits."""
+    def _places(self, listing: Listing, folders: Sequence[str]) -> dict[str, list[int]]:
+        """The images of each split."""
         tested: set[int] = set()
         for camera in self.test_cameras:
-            chosen = {
-                place
-                for place, name in enumerate(listing.cameras)
-                if f"{name}/".startswith(f"{camera.strip('/')}/")
-            }
+            inside = f"{camera.strip('/')}/"
+            chosen = {at for at, name in enumerate(folders) if f"{name}/".startswith(inside)}
             if not chosen:
-                names = sorted(set(listing.cameras))
+                names = sorted({*folders} - {""})
                 raise SceneError(
                     f"data.test_cameras={camera}: {self.folder / self.images} has "
                     + (
@@ -224,9 +198,10 @@ class ColmapSettings(SceneSettings):
                     )
                 )
             tested |= chosen
-        rest = listing.subset([place for place in range(len(listing)) if place not in tested])
-        parts = {name: rest.subset(part) for name, part in held_out(rest, self.eval_every).items()}
-        return parts | {"test": listing.subset(sorted(tested))}
+        rest = [place for place in range(len(listing)) if place not in tested]
+        parts = held_out(listing.subset(rest), self.eval_every)
+        places = {split: [rest[at] for at in part] for split, part in parts.items()}
+        return places | {"test": sorted(tested)}
 
 
 def _model_folder(folder: Path, name: str | None) -> Path:

@@ -5,14 +5,14 @@ memory or returns wrong cameras, and its errors do not name the file.
 """
 
 import math
-import mmap
 import os
 import struct
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
+from typing import BinaryIO, TypeVar
 
 import numpy as np
 
@@ -39,7 +39,7 @@ LENSES: dict[str, tuple[int, LensModel, str]] = {
 """COLMAP's camera models: their numbers in binary files, and their parameters in order."""
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "sparse_/0", "sparse_", "colmap/sparse")
-"""Where sparse models are looked for. That in colmap/ is what transforms.json was made of."""
+"""Usual folders of sparse models. The one in colmap/ is the source of a transforms.json."""
 
 DEEPEST = 3
 """Levels of folders in which models are searched for, as in dense/0/sparse."""
@@ -56,10 +56,13 @@ POINT_IN_IMAGE, TRACK_ENTRY = 24, 8
 
 Parsed = TypeVar("Parsed")
 
+Lens = tuple[str, int, int, Sequence[float]]
+"""A camera's model, width, height and parameters."""
+
 
 @dataclass(frozen=True)
 class SparseModel:
-    """What COLMAP found out about the images that it registered, in the order of their names.
+    """A sparse model: the images that COLMAP registered, in the order of their names.
 
     Attributes:
         source: The file that lists the images.
@@ -111,17 +114,20 @@ def read_model(folder: Path) -> SparseModel:
         folder: Folder of cameras, images and points3D, each .bin or .txt.
 
     Raises:
-        SceneError: If a file is missing, damaged, or tells of a lens that is not read.
+        SceneError: If a file is missing, damaged, or has a lens that is not read.
     """
     cameras_path, images_path = _part(folder, "cameras"), _part(folder, "images")
-    cameras = (_binary_cameras if cameras_path.suffix == ".bin" else _text_cameras)(cameras_path)
-    images = (_binary_images if images_path.suffix == ".bin" else _text_images)(images_path)
+    cameras: dict[int, Calibration] = {}
+    for label, number, lens in _cameras(cameras_path):
+        if number in cameras:
+            raise SceneError(f"{label} is listed twice. Remove one of the two.")
+        cameras[number] = _calibration(label, *lens)
+    images = sorted(_images(images_path), key=lambda image: image[0])
     if not images:
         raise SceneError(
             f"{images_path} lists no images: COLMAP has registered none. Run its mapper again, or "
             "choose another model."
         )
-    images.sort(key=lambda image: image[0])
     for (name, *_), (after, *_) in pairwise(images):
         if name == after:
             raise SceneError(f"{images_path} lists {name} twice. Remove one of the two.")
@@ -132,26 +138,25 @@ def read_model(folder: Path) -> SparseModel:
                 f"does not list. Both files must be of one model: copy or export them again."
             )
     names, poses, numbers = zip(*images, strict=True)
-    points_path = next(
-        (path for end in ("bin", "txt") if (path := folder / f"points3D.{end}").is_file()), None
-    )
-    points = None
-    if points_path is not None:
-        binary = points_path.suffix == ".bin"
-        points = (_binary_points if binary else _text_points)(points_path)
+    points_path = _found(folder, "points3D")
     return SparseModel(
         images_path,
         names,
         np.stack(poses),
         tuple(cameras[camera] for camera in numbers),
-        points,
+        None if points_path is None else _positions(points_path),
     )
 
 
+def _found(folder: Path, name: str) -> Path | None:
+    """A part of a model; the binary file where there are both kinds."""
+    paths = (folder / f"{name}.{end}" for end in ("bin", "txt"))
+    return next((path for path in paths if path.is_file()), None)
+
+
 def _part(folder: Path, name: str) -> Path:
-    for end in ("bin", "txt"):
-        if (path := folder / f"{name}.{end}").is_file():
-            return path
+    if (path := _found(folder, name)) is not None:
+        return path
     raise SceneError(
         f"{folder} holds neither {name}.bin nor {name}.txt. Export the model again, or copy all of "
         "it there."
@@ -161,43 +166,46 @@ def _part(folder: Path, name: str) -> Path:
 class _Binary:
     """A binary file, read from its front."""
 
-    def __init__(self, path: Path, data: bytes | mmap.mmap) -> None:
-        self.path, self.data, self.at = path, data, 0
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        self.path, self.file = path, file
+        self.length = os.fstat(file.fileno()).st_size
 
     def take(self, kind: struct.Struct, what: str) -> tuple:
         """The next values, which are those of ``what``."""
-        start = self.at
-        self.skip(kind.size, what)
-        return kind.unpack_from(self.data, start)
+        content = self.file.read(kind.size)
+        if len(content) < kind.size:
+            raise self._truncated(what)
+        return kind.unpack(content)
 
     def text(self, what: str) -> str:
         """The next text, up to a byte of 0."""
-        end = self.data.find(b"\0", self.at)
-        if end < 0:
-            raise self._truncated(what)
-        start, self.at = self.at, end + 1
-        return os.fsdecode(self.data[start:end])
+        letters = bytearray()
+        while (letter := self.file.read(1)) != b"\0":
+            if not letter:
+                raise self._truncated(what)
+            letters += letter
+        return os.fsdecode(bytes(letters))
 
     def skip(self, count: int, what: str) -> None:
         """Pass over bytes of ``what``."""
-        if count > len(self.data) - self.at:
+        if count > self.length - self.file.tell():
             raise self._truncated(what)
-        self.at += count
+        self.file.seek(count, os.SEEK_CUR)
 
     def entries(self, kind: str) -> Iterator[str]:
-        """Labels of as many entries as the file says that it holds; all of it must be read then."""
+        """Labels of the entries; the file must end after the last one."""
         (count,) = self.take(COUNT, f"the number of {kind}s")
         for index in range(count):
             yield f"{kind} {index + 1} of {count}"
-        if self.at < len(self.data):
+        if rest := self.length - self.file.tell():
             raise SceneError(
-                f"{self.path} is damaged: {len(self.data) - self.at} bytes follow the {count} "
-                f"{kind}s that it says it holds. {_AGAIN}"
+                f"{self.path} is damaged: {rest} bytes follow the {count} {kind}s that it says it "
+                f"holds. {_AGAIN}"
             )
 
     def _truncated(self, what: str) -> SceneError:
         return SceneError(
-            f"{self.path} is truncated or damaged: its {len(self.data)} bytes end within {what}. "
+            f"{self.path} is truncated or damaged: its {self.length} bytes end within {what}. "
             f"{_AGAIN}"
         )
 
@@ -205,60 +213,14 @@ class _Binary:
 _AGAIN = "Copy it again, or export the model again with colmap model_converter."
 
 
-def _read_binary(path: Path, parse: Callable[[_Binary], Parsed]) -> Parsed:
+@contextmanager
+def _binary(path: Path) -> Iterator[_Binary]:
     require_fetched(path)
     try:
         with path.open("rb") as file:
-            if not os.fstat(file.fileno()).st_size:
-                return parse(_Binary(path, b""))
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                return parse(_Binary(path, data))
+            yield _Binary(path, file)
     except OSError as problem:
         raise SceneError(f"{path} cannot be read ({problem}).") from problem
-
-
-def _binary_cameras(path: Path) -> dict[int, Calibration]:
-    lenses = {number: (name, kind) for name, (number, _, kind) in LENSES.items()}
-
-    def parse(file: _Binary) -> dict[int, Calibration]:
-        cameras: dict[int, Calibration] = {}
-        for what in file.entries("camera"):
-            camera, number, width, height = file.take(CAMERA, what)
-            label = f"{path}: camera {camera}"
-            if number not in lenses:
-                raise _other_lens(label, f"number {number}")
-            name, kind = lenses[number]
-            values = file.take(struct.Struct(f"<{len(kind.split())}d"), what)
-            _add_camera(cameras, label, camera, _calibration(label, name, width, height, values))
-        return cameras
-
-    return _read_binary(path, parse)
-
-
-def _binary_images(path: Path) -> list[tuple[str, np.ndarray, int]]:
-    def parse(file: _Binary) -> list[tuple[str, np.ndarray, int]]:
-        images = []
-        for what in file.entries("image"):
-            _, *motion, camera = file.take(IMAGE, what)
-            name = file.text(what)
-            (count,) = file.take(COUNT, what)
-            file.skip(POINT_IN_IMAGE * count, f"{what} ({name})")
-            images.append((name, _pose(f"{path}: {name}", motion), camera))
-        return images
-
-    return _read_binary(path, parse)
-
-
-def _binary_points(path: Path) -> np.ndarray:
-    def parse(file: _Binary) -> np.ndarray:
-        points = []
-        for what in file.entries("point"):
-            _, x, y, z, *_, seen_by = file.take(POINT, what)
-            file.skip(TRACK_ENTRY * seen_by, what)
-            points.append((x, y, z))
-        return _positions(path, points)
-
-    return _read_binary(path, parse)
 
 
 def _text_lines(path: Path) -> Iterator[tuple[str, str]]:
@@ -276,7 +238,7 @@ def _text_lines(path: Path) -> Iterator[tuple[str, str]]:
 def _parsed(
     label: str, line: str, kind: str, parse: Callable[[list[str]], Parsed], most: int = -1
 ) -> Parsed:
-    """What ``parse`` makes of a line's words, of which the last holds all after ``most``."""
+    """What ``parse`` makes of a line's words; the last word holds all after ``most``."""
     try:
         return parse(line.split(maxsplit=most))
     except (ValueError, IndexError, OverflowError) as problem:
@@ -286,30 +248,43 @@ def _parsed(
         ) from problem
 
 
-def _text_cameras(path: Path) -> dict[int, Calibration]:
-    def parse(words: list[str]) -> tuple[int, str, int, int, list[float]]:
+def _cameras(path: Path) -> Iterator[tuple[str, int, Lens]]:
+    """Label, number and lens of each camera of a file."""
+    if path.suffix == ".bin":
+        models = {number: (name, len(kind.split())) for name, (number, _, kind) in LENSES.items()}
+        with _binary(path) as file:
+            for what in file.entries("camera"):
+                camera, number, width, height = file.take(CAMERA, what)
+                model, count = models.get(number, (f"number {number}", 0))
+                values = file.take(struct.Struct(f"<{count}d"), what)
+                yield f"{path}: camera {camera}", camera, (model, width, height, values)
+        return
+
+    def parse(words: list[str]) -> tuple[int, Lens]:
         camera, model, width, height, *values = words
-        return int(camera), model, int(width), int(height), [float(value) for value in values]
+        return int(camera), (model, int(width), int(height), [*map(float, values)])
 
-    cameras: dict[int, Calibration] = {}
     for label, line in _text_lines(path):
-        if not line:
-            continue
-        camera, model, width, height, values = _parsed(
-            label, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", parse
-        )
-        label = f"{label} (camera {camera})"
-        if model not in LENSES:
-            raise _other_lens(label, model)
-        _add_camera(cameras, label, camera, _calibration(label, model, width, height, values))
-    return cameras
+        if line:
+            camera, lens = _parsed(label, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", parse)
+            yield f"{label} (camera {camera})", camera, lens
 
 
-def _text_images(path: Path) -> list[tuple[str, np.ndarray, int]]:
+def _images(path: Path) -> Iterator[tuple[str, np.ndarray, int]]:
+    """Name, pose and camera of each image of a file."""
+    if path.suffix == ".bin":
+        with _binary(path) as file:
+            for what in file.entries("image"):
+                _, *motion, camera = file.take(IMAGE, what)
+                name = file.text(what)
+                (count,) = file.take(COUNT, what)
+                file.skip(POINT_IN_IMAGE * count, f"{what} ({name})")
+                yield name, _pose(f"{path}: {name}", motion), camera
+        return
+
     def parse(words: list[str]) -> tuple[list[float], int, str]:
         return [float(word) for word in words[1:8]], int(words[8]), words[9]
 
-    images = []
     lines = _text_lines(path)
     for label, line in lines:
         if not line:
@@ -326,23 +301,28 @@ def _text_images(path: Path) -> list[tuple[str, np.ndarray, int]]:
                 f"empty, but {'the file ends' if points is None else f'is {short(points)}'}. The "
                 "file is truncated or damaged: export the model again."
             )
-        images.append((name, _pose(f"{label} ({name})", motion), camera))
-    return images
+        yield name, _pose(f"{label} ({name})", motion), camera
 
 
-def _text_points(path: Path) -> np.ndarray:
-    def parse(words: list[str]) -> tuple[float, float, float]:
-        return float(words[1]), float(words[2]), float(words[3])
+def _positions(path: Path) -> np.ndarray:
+    """The points of a file. float64 [N, 3]"""
+    points = []
+    if path.suffix == ".bin":
+        with _binary(path) as file:
+            for what in file.entries("point"):
+                _, *position, _, _, _, _, seen_by = file.take(POINT, what)
+                file.skip(TRACK_ENTRY * seen_by, what)
+                points.append(position)
+    else:
 
-    points = [
-        _parsed(label, line, "POINT3D_ID X Y Z ...", parse, most=4)
-        for label, line in _text_lines(path)
-        if line
-    ]
-    return _positions(path, points)
+        def parse(words: list[str]) -> tuple[float, ...]:
+            return float(words[1]), float(words[2]), float(words[3])
 
-
-def _positions(path: Path, points: list[tuple[float, float, float]]) -> np.ndarray:
+        points = [
+            _parsed(label, line, "POINT3D_ID X Y Z ...", parse, most=4)
+            for label, line in _text_lines(path)
+            if line
+        ]
     positions = np.array(points, dtype=np.float64).reshape(-1, 3)
     bad = ~np.isfinite(positions).all(axis=1)
     if bad.any():
@@ -353,18 +333,16 @@ def _positions(path: Path, points: list[tuple[float, float, float]]) -> np.ndarr
     return positions
 
 
-def _add_camera(
-    cameras: dict[int, Calibration], label: str, number: int, calibration: Calibration
-) -> None:
-    if number in cameras:
-        raise SceneError(f"{label} is listed twice. Remove one of the two.")
-    cameras[number] = calibration
-
-
 def _calibration(
     label: str, model: str, width: int, height: int, values: Sequence[float]
 ) -> Calibration:
-    """The lens that COLMAP's parameters stand for."""
+    """The lens with COLMAP's parameters."""
+    if model not in LENSES:
+        raise SceneError(
+            f"{label} has the camera model {model}, which is not read. These are: "
+            f"{', '.join(LENSES)}. Undistort the images with colmap image_undistorter, or "
+            "calibrate with one of these."
+        )
     _, lens, kind = LENSES[model]
     names = kind.split()
     if len(values) != len(names):
@@ -399,14 +377,6 @@ def _calibration(
         h=height,
         model=lens,
         distortion=distortion if any(distortion) else (),
-    )
-
-
-def _other_lens(label: str, model: str) -> SceneError:
-    return SceneError(
-        f"{label} has the camera model {model}, which is not read. These are: "
-        f"{', '.join(LENSES)}. Undistort the images with colmap image_undistorter, or calibrate "
-        "with one of these."
     )
 
 

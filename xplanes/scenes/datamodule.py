@@ -18,9 +18,9 @@ from xplanes.errors import ConfigError, MissingSplitError
 from xplanes.files import read_json
 from xplanes.scenes.batches import Batch, Batches, DeviceBatches, RayBatches, RaySettings
 from xplanes.scenes.frame import scene_frame
-from xplanes.scenes.listing import even_ranks, held_out_places
+from xplanes.scenes.listing import held_out_places
 from xplanes.scenes.source import HELD_OUT, SceneSettings, may_hold_out
-from xplanes.scenes.views import Scene, Views
+from xplanes.scenes.views import Scene, Views, spread
 
 UNIFORM = RaySettings(
     per_batch=1024,
@@ -30,7 +30,7 @@ UNIFORM = RaySettings(
     background_share=1.0,
     background_jitter=0.0,
 )
-"""Rays for a LightningModule that says nothing about them."""
+"""Rays for a LightningModule that does not specify any."""
 
 
 class SceneDataModule(LightningDataModule):
@@ -79,7 +79,7 @@ class SceneDataModule(LightningDataModule):
 
     @property
     def rays(self) -> int | None:
-        """Rays of the next batch, where the LightningModule says so (``rays``)."""
+        """Rays of the next batch, if the LightningModule sets them (``rays``)."""
         module = None if self.trainer is None else self.trainer.lightning_module
         return getattr(module, "rays", None)
 
@@ -156,7 +156,7 @@ class SceneDataModule(LightningDataModule):
     def setup(self, stage: str) -> None:
         """Read the splits that a stage needs: ``fit``, ``validate``, ``test`` or ``predict``."""
         if stage == "fit" and self.trainer is not None:
-            # Where this data trained another module before, the next starts again.
+            # If this data has trained another module before, the next one starts over.
             self.first = getattr(self.trainer.lightning_module, "batches", self.first)
         scores = self.trainer is None or self.trainer.limit_val_batches
         if stage in ("fit", "validate") and scores:
@@ -178,7 +178,7 @@ class SceneDataModule(LightningDataModule):
     def validation_split(self) -> str | None:
         """The split that is scored during training; None where there are no views for it.
 
-        Never ``test``, unless the settings say so.
+        Never ``test``, unless the settings choose it.
         """
         return self.settings.eval_split or ("val" if "val" in self.scene.splits else None)
 
@@ -204,7 +204,7 @@ class SceneDataModule(LightningDataModule):
         times, order = train.times.sort(stable=True)
         places = held_out_places(times.tolist(), HELD_OUT)
         if (most := self.settings.eval_views) is not None:
-            places = [places[rank] for rank in even_ranks(min(most, len(places)), len(places))]
+            places = [places[rank] for rank in spread(most, len(places))]
         chosen[order[places]] = True
         parts = {
             "train": train.subset((~chosen).nonzero()[:, 0]),
@@ -226,7 +226,7 @@ class SceneDataModule(LightningDataModule):
         return batches
 
     def batches_for(self, module: Any, rank: int) -> Batches:
-        """The batches of a process for a LightningModule, or for none that says anything."""
+        """The batches of a process for a LightningModule, which may specify them."""
         if rank not in self._batches:
             views = self.scene.splits["train"]
             frame = getattr(module, "frame", None)
@@ -244,7 +244,7 @@ class SceneDataModule(LightningDataModule):
     def val_dataloader(self) -> DataLoader:
         split, tag = self.validation_split, "val"
         if split is None:
-            # What is scored on the way must not choose a checkpoint: nothing looks for this name.
+            # These scores must not choose a checkpoint, so they get a name that nothing monitors.
             split, tag = self.test_split, "test"
         return self._views(split, tag, spread_order(len(self.read_split(split))))
 

@@ -1,18 +1,15 @@
 """Scenes on disk in the format of D-NeRF and Blender: transforms_train.json and its images."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from xplanes.errors import MissingSplitError, SceneError
-from xplanes.scenes.listing import Listing, read_splits, read_views, thinned
+from xplanes.errors import MissingSplitError, SceneError, warn
+from xplanes.scenes.listing import Listing, read_views
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.transforms import read_transforms
 from xplanes.scenes.views import Scene
-
-__all__ = ["SceneError", "read_scene"]
 
 GET_DATA = (
     "Set data.root and data.scene to a folder that holds transforms_train.json, get the D-NeRF "
@@ -31,35 +28,15 @@ class BlenderSettings(SceneSettings):
         return (folder / "transforms_train.json").is_file()
 
     def load(self, splits: Sequence[str]) -> Scene:
-        return read_scene(
-            self.folder,
-            resolution=self.resolution,
-            splits=splits,
-            views=self.views,
-            eval_views=self.eval_views,
-            cache=self.image_cache,
-        )
+        return read_scene(self, splits)
 
 
-def read_scene(
-    folder: Path,
-    *,
-    resolution: int | None,
-    splits: Sequence[str],
-    views: int | None = None,
-    eval_views: int | None = None,
-    cache: Path | None = None,
-) -> Scene:
+def read_scene(settings: SceneSettings, splits: Sequence[str]) -> Scene:
     """Read a scene and check all of it, so that nothing fails after training has begun.
 
     Args:
-        folder: Folder of transforms_train.json and the images.
-        resolution: Width of the images in pixels; None keeps the native sizes.
+        settings: Its folder, with transforms_train.json and the images, and what to read of it.
         splits: Names of the splits to read, such as train, val, test.
-        views: Number of views to keep of the train split, spread evenly over time;
-            None keeps all.
-        eval_views: The same for every other split, at most.
-        cache: Folder of images that are too large for memory; that of the user when None.
 
     Returns:
         The scene, with ``video`` where transforms_video.json exists.
@@ -67,38 +44,35 @@ def read_scene(
     Raises:
         SceneError: Anything is missing, damaged or inconsistent; the message says what to do.
     """
-    folder = Path(folder)
+    folder = settings.folder
     _check_folder(folder)
     paths = {split: _transforms_path(folder, split) for split in dict.fromkeys(splits)}
-    listed = {split: _listed(split, path) for split, path in paths.items()}
-    listed = thinned(listed, views, eval_views, folder)
+    listed = settings.thinned({split: _listed(split, path) for split, path in paths.items()})
     video = _list_video(folder)
-    others = listed if video is None else {**listed, "video": video}
-    _require_times(folder, listed.get("train"), others)
+    _require_times(folder, listed, video)
     told = any(part.mask_meaning for part in listed.values())
-    read, _, notes = read_splits(listed, resolution, cache, "auto" if told else "alpha")
-    return Scene(
-        folder.resolve().name,
-        read,
-        video=None if video is None else read_views(video, resolution, cache),
-        notes=notes,
-    )
+    frames = None
+    if video is not None:
+        frames = read_views(video, settings.resolution, settings.image_cache)
+    return settings.scene_of(listed, "auto" if told else "alpha", video=frames)
 
 
 def _listed(split: str, path: Path) -> Listing:
-    """The frames of a split; a warning tells why those of a split that is only scored are none."""
+    """The frames of a split; warns why a split that is only scored has none."""
     try:
         return read_transforms(path)
     except MissingSplitError as problem:
         if split != "train":
-            warnings.warn(f"The {split} split is left out. {problem}", stacklevel=4)
+            warn(f"The {split} split is left out. {problem}")
         raise
 
 
-def _require_times(folder: Path, train: Listing | None, others: Mapping[str, Listing]) -> None:
-    """Refuse frames of a moving scene that do not tell their times."""
+def _require_times(folder: Path, parts: Mapping[str, Listing], video: Listing | None) -> None:
+    """Refuse frames of a dynamic scene without times."""
+    train = parts.get("train")
     if train is None or len(train.times.unique()) == 1:
         return
+    others = parts if video is None else {**parts, "video": video}
     for split, listing in others.items():
         if not listing.timed:
             raise SceneError(

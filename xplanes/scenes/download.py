@@ -23,7 +23,7 @@ PROGRESS_SECONDS = 5.0
 
 
 class FetchError(Exception):
-    """A file could not be fetched; the message says why."""
+    """A file could not be fetched, for the reason in the message."""
 
 
 class _BrokenTransferError(Exception):
@@ -35,7 +35,7 @@ def fetch(
 ) -> None:
     """Download ``url`` to ``path``; what has arrived survives in ``path``.part until then.
 
-    A second call goes on where the first was cut off, provided that the server still has the
+    A second call continues where the first was interrupted, provided that the server still has the
     same file (compared by ETag or modification time) and can send parts of it.
 
     Args:
@@ -175,7 +175,7 @@ def _saved_validator(url: str, part: Path) -> str | None:
 
 
 def _save_validator(url: str, part: Path, response: HTTPResponse) -> None:
-    # First the old beginning goes, so that it never stands beside the new version's name.
+    # The old beginning goes first, so that it never lies beside the new version's name.
     _discard(part)
     note = {"url": url, "validator": _validator(response)}
     _note_path(part).write_text(json.dumps(note), encoding="utf-8")
@@ -364,6 +364,6 @@ def _check_scene(folder: Path, announce: Callable[[str], None]) -> None:
             raise _BadArchiveError(
                 f"{name} has {len(files)} training views instead of {TRAIN_VIEWS[name]}"
             )
-        # Only the training views are known for certain, so a difference here is just said.
+        # Only the number of training views is certain, so a difference here is no error.
         if split == "test" and len(files) != TEST_VIEWS:
             announce(f"Note: {name} has {len(files)} test views; {TEST_VIEWS} are usual")

@@ -7,7 +7,6 @@ import math
 import os
 import re
 import unicodedata
-import warnings
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -16,7 +15,7 @@ from typing import Any, TypeGuard
 import numpy as np
 import torch
 
-from xplanes.errors import BrokenFrameError, MissingSplitError, SceneError, first_of
+from xplanes.errors import BrokenFrameError, MissingSplitError, SceneError, first_of, warn
 from xplanes.files import stand_in
 from xplanes.scenes.cameras import upright
 from xplanes.scenes.formats import ENDINGS, is_image, orientation
@@ -37,7 +36,7 @@ ROUNDING = 1e-4
 
 
 def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> Path:
-    """The file that ``name`` stands for inside ``folder``.
+    """The file that ``name`` refers to inside ``folder``.
 
     Suffixes may be left out or be those of another format, and names differ in case or in how
     accents are written, as long as one file alone fits. Of a path that leads nowhere, such as one
@@ -97,10 +96,7 @@ def found_images(
     if len(missing) == len(found):
         raise MissingSplitError(first_of(missing))
     if missing:
-        warnings.warn(
-            f"{len(missing)} of {len(found)} images are left out:\n{first_of(missing)}",
-            stacklevel=4,
-        )
+        warn(f"{len(missing)} of {len(found)} images are left out:\n{first_of(missing)}")
     return found
 
 
@@ -136,7 +132,7 @@ def _like(folder: Path) -> Path | None:
 
 
 def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) -> Iterator[Path]:
-    """What a name may stand for, as it is and with the suffix of an image, inside ``folder``.
+    """Paths that a name may refer to inside ``folder``, as it is and with suffixes of images.
 
     Links are followed, wherever they lead; ``..`` does not leave the folder.
 
@@ -176,7 +172,7 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
 def mask_files(
     folder: Path, names: Sequence[Sequence[str]], key: str = "data.masks"
 ) -> tuple[Path | None, ...]:
-    """The mask of each image; None for images without, of which a warning tells.
+    """The mask of each image; None, with a warning, for images without.
 
     Args:
         folder: Folder of masks.
@@ -196,10 +192,9 @@ def mask_files(
             f"mask of any image, such as {bare[0]}. Put the masks there, or set {key}=null."
         )
     if bare:
-        warnings.warn(
+        warn(
             f"{folder} has no mask of {len(bare)} of {len(masks)} images, which are shown whole: "
-            f"{some(bare)}.",
-            stacklevel=4,
+            f"{some(bare)}."
         )
     return masks
 
@@ -240,7 +235,7 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
 
 
 def decoded(content: bytes) -> str:
-    """Text in UTF-8, or in UTF-16 or UTF-32 where a byte order mark says so.
+    """Text in UTF-8, or in UTF-16 or UTF-32 if a byte order mark indicates it.
 
     Some editors begin files with a mark; PowerShell writes UTF-16.
     """
@@ -256,7 +251,7 @@ def decoded(content: bytes) -> str:
 
 
 def require_fetched(path: Path) -> None:
-    """Refuse what stands for a file that was not fetched, such as a pointer of Git LFS.
+    """Refuse a placeholder of a file that was not fetched, such as a pointer of Git LFS.
 
     Raises:
         SceneError: Saying what it is and how to fetch the file.
@@ -313,7 +308,7 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
 
 
 UP = {3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
-"""What is up in the stored pixels, to the right and upward, by EXIF's orientation; (0, 1) else."""
+"""The up vector in the stored pixels (right, up) by EXIF orientation; (0, 1) for others."""
 
 
 def oriented(
@@ -321,8 +316,8 @@ def oriented(
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """A capture whose world is turned so that the cameras' mean up vector is its z axis.
 
-    Up is where EXIF says that it is in an image; pixels and cameras stay as they are. The world
-    stays as it is, and a warning says so, where the cameras agree on no up vector.
+    Up in an image follows its EXIF orientation; pixels and cameras stay as they are. If the cameras
+    have no common up vector, the world stays as it is, with a warning.
 
     Args:
         poses: Cameras. float64 [V, 4, 4]
@@ -339,10 +334,9 @@ def oriented(
     right, upward = np.array([UP.get(tag, (0, 1)) for tag in tags], np.float64).T[..., None]
     rotation = upright(torch.from_numpy(poses[:, :3, 0] * right + poses[:, :3, 1] * upward))
     if rotation is None:
-        warnings.warn(
+        warn(
             "The up vectors of the cameras cancel out, so the world keeps the axes that the files "
-            "give it. data.orient=false says that it should.",
-            stacklevel=4,
+            "give it. data.orient=false says that it should."
         )
         return poses, points
     turned, turn = poses.copy(), rotation.numpy()

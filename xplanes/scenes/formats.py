@@ -1,4 +1,4 @@
-"""Image files: formats that are read, and what to say of those that are not."""
+"""Image files: the formats that are read, and error messages for the others."""
 
 import re
 import struct
@@ -23,7 +23,7 @@ RAW = ".dng .nef .cr2 .cr3 .arw .raf .orf .rw2 .pef .srw".split()
 """Endings of cameras' raw files, in which Pillow would find a thumbnail."""
 
 OTHERS = [*RAW, *".heic .heif .jxl .exr .hdr .psd".split()]
-"""Endings of image files that are not read, but named for what they are."""
+"""Endings of image files that are recognised but not read."""
 
 KINDS = {
     r".{4}ftyp(hei|hev|mif1|msf1)": "HEIC",
@@ -49,14 +49,14 @@ UNTURN = {
     7: "-transverse",
     8: "-rotate 90",
 }
-"""How ImageMagick turns back what was turned as an EXIF orientation says."""
+"""How ImageMagick undoes an EXIF orientation."""
 
 TURNED_BACK = {
     **{2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180},
     **{4: Image.Transpose.FLIP_TOP_BOTTOM, 5: Image.Transpose.TRANSPOSE},
     **{6: Image.Transpose.ROTATE_90, 7: Image.Transpose.TRANSVERSE, 8: Image.Transpose.ROTATE_270},
 }
-"""How Pillow turns back what was turned as an EXIF orientation says."""
+"""How Pillow undoes an EXIF orientation."""
 
 UNREADABLE = (
     OSError,
@@ -84,13 +84,10 @@ def read_header(path: Path) -> tuple[tuple[int, int], bool]:
 
 
 def orientation(path: Path) -> int:
-    """How EXIF says that an image is to be turned when it is shown, from 1 (not at all) to 8.
-
-    Pixels are read as they are stored, whatever it says.
-    """
+    """EXIF orientation of an image, from 1 (upright) to 8; pixels are read as they are stored."""
     try:
         with _opened(path) as picture:
-            # Of a PNG without it, Pillow would decode all pixels to look for it.
+            # Without one, Pillow would decode a whole PNG to search for it.
             if picture.format != "TIFF" and not {"exif", "Raw profile type exif"} & {*picture.info}:
                 return 1
             found = picture.getexif().get(ORIENTATION, 1)
@@ -141,7 +138,7 @@ def open_image(path: Path) -> Image.Image:
     picture = _opened(path)
     if not isinstance(picture, TiffImageFile):
         return picture
-    # Of TIFF files alone, Pillow turns the pixels as EXIF says.
+    # Pillow applies the EXIF orientation of TIFF files alone.
     if (turn := TURNED_BACK.get(picture.tag_v2.get(ORIENTATION, 1))) is None:
         return picture
     with picture:
@@ -151,11 +148,11 @@ def open_image(path: Path) -> Image.Image:
 
 
 def unreadable(path: Path, problem: BaseException) -> SceneError:
-    """What to say of a file that cannot be decoded.
+    """The error for a file that cannot be decoded.
 
     Args:
         path: The file.
-        problem: What its decoder says.
+        problem: The decoder's error.
     """
     if (other := stand_in(path)) is not None:
         return SceneError(f"{path} {other}.")

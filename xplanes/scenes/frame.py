@@ -12,7 +12,7 @@ from xplanes.scenes.cameras import cast_rays, project, turned
 from xplanes.scenes.views import Views
 
 MARGIN = 1.03
-"""Room around the farthest thing that any view shows."""
+"""Margin around the farthest content that any view shows."""
 
 MIDDLE = 0.6
 """Share of an image's width and height that counts as its middle."""
@@ -21,13 +21,13 @@ OUTLIERS = 0.02
 """Share of points that a cube may leave out on either side of an axis."""
 
 ROOM = 1.15
-"""Room around points, which lie on surfaces and are few on what moves."""
+"""Margin around points, which lie on surfaces and are sparse on moving content."""
 
 LEAST_POINTS, MOST_POINTS, MOST_CAMERAS = 32, 20_000, 64
-"""Points in the middle that a cube needs; points and cameras that are looked at."""
+"""Points in the middle that a cube needs; points and cameras that are sampled."""
 
 CONVERGENCE = 0.02
-"""Least eigenvalue at which optical axes, which are not parallel then, meet in a point."""
+"""Least eigenvalue at which optical axes are not nearly parallel, so that they meet."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Frame:
         scale: Field units per world unit.
         rotation: Turns world axes into the field's. [3, 3]
         centre: World point that becomes the origin. [3]
-        source: What the cube was found by, in words; empty where it is not known.
+        source: What the cube was estimated from; empty if unknown.
     """
 
     scale: float
@@ -116,26 +116,27 @@ def cube_frame(half_side: float, centre: Tensor, source: str = "") -> Frame:
 
 
 def backwards(views: Views) -> Tensor:
-    """Unit vectors against which the middle of each image looks. [V, 3]
+    """Unit vectors opposite to the viewing direction of each image's middle. [V, 3]
 
-    They are the cameras' z axes where principal points are centred.
+    They are the cameras' z axes if principal points are centred.
     """
-    focal, centre, size = views.intrinsics.focal, views.intrinsics.centre, views.intrinsics.size
-    if (lenses := views.intrinsics.lenses) is not None:
-        rows, columns = (0.5 * size.double() - 0.5).unbind(dim=1)
-        poses = views.camera_to_world.double()
-        looks = cast_rays(poses, rows, columns, focal=focal, centre=centre, lenses=lenses)[1]
-        return -looks.float()
-    right, down = ((0.5 * size.flip(1) - centre) / focal).unbind(dim=1)
-    local = torch.stack([-right, down, torch.ones_like(right)], dim=1)
-    local = local / local.norm(dim=1, keepdim=True)
-    return (views.camera_to_world[:, :3, :3].double() @ local[..., None])[..., 0].float()
+    intrinsics = views.intrinsics
+    rows, columns = (0.5 * intrinsics.size.double() - 0.5).unbind(dim=1)
+    _, directions = cast_rays(
+        views.camera_to_world.double(),
+        rows,
+        columns,
+        focal=intrinsics.focal,
+        centre=intrinsics.centre,
+        lenses=intrinsics.lenses,
+    )
+    return -directions.float()
 
 
 def optical_centre(views: Views) -> Tensor:
     """The point nearest to all rays through images' middles, in the least-squares sense. [3]
 
-    Cameras that all look the same way leave the depth open: it is then that of the world's origin.
+    Parallel cameras leave the depth undetermined: it is then that of the world's origin.
     """
     origin, projector = views.camera_to_world[:, :3, 3].double(), _projectors(views)
     target = (projector @ origin[..., None])[..., 0].mean(dim=0)
@@ -150,7 +151,7 @@ def axes_meet(views: Views) -> bool:
 
 
 def _projectors(views: Views) -> Tensor:
-    """What takes from vectors their part along each optical axis. float64 [V, 3, 3]"""
+    """Projections onto the planes perpendicular to the optical axes. float64 [V, 3, 3]"""
     axis = backwards(views).double()
     return torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]
 
@@ -158,7 +159,7 @@ def _projectors(views: Views) -> Tensor:
 def scene_frame(
     views: Views, half_side: float | None = None, points: Tensor | None = None
 ) -> Frame:
-    """Frame a scene: the smallest cube that its cameras and silhouettes leave room for.
+    """The frame of a scene: the smallest cube that its cameras and silhouettes allow.
 
     The cameras' common view gives a first cube around the point that they look at. No ray through
     the foreground passes the centre farther away than the scene reaches, and over views from many
@@ -168,7 +169,7 @@ def scene_frame(
 
     Args:
         views: Training views.
-        half_side: Half the side of the cube in world units, if known; None finds it.
+        half_side: Half the side of the cube in world units; None estimates it.
         points: World points on surfaces, if known. [N, 3]
 
     Raises:
@@ -250,7 +251,7 @@ def _middle_box(views: Views, points: Tensor, centre: Tensor) -> Tensor | None:
 
 
 def _spread(views: Views) -> float:
-    """Share of a distance from the centre that some view shows, whichever way it points.
+    """Share of a distance from the centre that some view shows, in the worst direction.
 
     Views from all sides show nearly all of it; views from one side see what lies along their axes
     foreshortened, those of one axis not at all.

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from xplanes.errors import SceneError, refuse_all
+from xplanes.errors import SceneError, all_of
 from xplanes.scenes import store
 from xplanes.scenes.formats import (
     SIXTEEN_BIT_MODES,
@@ -18,9 +18,7 @@ from xplanes.scenes.formats import (
     unreadable,
 )
 from xplanes.scenes.masks import MaskKind, read_mask
-
-Size = tuple[int, int]
-"""Height and width."""
+from xplanes.scenes.store import Size
 
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "P", "PA", "1")
 
@@ -44,8 +42,15 @@ def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
     Raises:
         SceneError: A file cannot be decoded, sizes differ, or the resolution cannot be met.
     """
-    common_size(paths)
-    sizes = final_sizes(paths, native_sizes(paths), resolution)
+    native = native_sizes(paths)
+    for path, (height, width) in zip(paths, native, strict=True):
+        if (height, width) != native[0]:
+            raise SceneError(
+                f"{path} has {width}x{height} pixels, but {paths[0]} has "
+                f"{native[0][1]}x{native[0][0]}. All images must have one size: export or resize "
+                "them alike."
+            )
+    sizes = final_sizes(paths, native, resolution)
     return store.in_memory(sizes, _jobs(paths, sizes))
 
 
@@ -55,15 +60,7 @@ def native_sizes(paths: Sequence[Path]) -> list[Size]:
     Raises:
         SceneError: If files are no images; it names all of them.
     """
-    sizes: list[Size] = []
-    problems: list[str] = []
-    for path in paths:
-        try:
-            sizes.append(read_header(path)[0])
-        except SceneError as problem:
-            problems.append(str(problem))
-    refuse_all(problems)
-    return sizes
+    return all_of(lambda path: read_header(path)[0], paths)
 
 
 def final_sizes(
@@ -81,8 +78,13 @@ def final_sizes(
     """
     if resolution is None:
         return list(native)
-    for path, (height, width) in zip(paths, native, strict=True):
-        check_resolution(path, width, height, resolution)
+    for path, (_, width) in zip(paths, native, strict=True):
+        if resolution > width:
+            raise SceneError(
+                f"data.resolution={resolution} is more than the {width} pixels that {path} is "
+                f"wide. Enlarged images hold no more detail: give at most {width}, or null for the "
+                "native size."
+            )
     return [(max(1, round(height * resolution / width)), resolution) for height, width in native]
 
 
@@ -116,43 +118,19 @@ def read_images(
         StorageError: The cache cannot be written.
     """
     jobs = _jobs(paths, sizes, masks, has_ray, kind)
-    try:
-        return _decoded(paths, sizes, masks, has_ray, cache, kind, jobs)
-    except SceneError:
-        refuse_all(_problems(jobs))  # Not the first one alone.
-        raise
-
-
-def _problems(jobs: Sequence[store.Job]) -> list[str]:
-    """Why images cannot be decoded, of all that cannot."""
-    found = []
-    for job in jobs:
-        try:
-            for _ in job():
-                pass
-        except SceneError as problem:
-            found.append(str(problem))
-    return found
-
-
-def _decoded(
-    paths: Sequence[Path],
-    sizes: Sequence[Size],
-    masks: Sequence[Path | None],
-    has_ray: Sequence[Tensor | None],
-    cache: Path | None,
-    kind: MaskKind,
-    jobs: Sequence[store.Job],
-) -> Tensor | store.StoredImages:
-    """The images in memory, or in a file of the cache; arguments as those of `read_images`."""
-    if not store.is_needed(sizes):
-        return store.in_memory(sizes, jobs)
-    cut = any(masks) or any(shown is not None for shown in has_ray)
-    channels = 4 if cut or any(read_header(path)[1] for path in paths) else 3
     sources = [*paths, *(mask for mask in masks if mask is not None)]
     meaning = [MASKS, kind.labels, kind.inverted]
     recipe = ["images", meaning, [mask is not None for mask in masks], digests(has_ray)]
-    return store.decoded(sources, recipe, sizes, channels, jobs, cache)
+    cleared = any(masks) or any(shown is not None for shown in has_ray)
+
+    def has_alpha() -> bool:
+        return cleared or any(read_header(path)[1] for path in paths)
+
+    try:
+        return store.images(sizes, jobs, sources, recipe, has_alpha, cache)
+    except SceneError:
+        all_of(lambda job: sum(1 for _ in job()), jobs)  # Name all that cannot be decoded.
+        raise
 
 
 def _jobs(
@@ -183,7 +161,7 @@ def cleared(pixels: np.ndarray, shown: Tensor | None) -> np.ndarray:
 
 
 def digests(masks: Sequence[Tensor | None]) -> list[str]:
-    """Hashes of masks, most of which are one and the same tensor."""
+    """Hashes of masks, most of which are the same tensor."""
     known: dict[int, str] = {id(None): ""}
     for mask in masks:
         if mask is not None and id(mask) not in known:
@@ -200,35 +178,6 @@ def read_image(
         channels *= read_mask(mask, kind, path)
     height, width = size
     return shrink(channels, width, height)
-
-
-def common_size(paths: Sequence[Path]) -> tuple[int, int]:
-    """Width and height that all files share, read from their headers alone."""
-    sizes = [read_header(path)[0] for path in paths]
-    first_height, first_width = sizes[0]
-    for path, (height, width) in zip(paths, sizes, strict=True):
-        if (height, width) != sizes[0]:
-            raise SceneError(
-                f"{path} has {width}x{height} pixels, but {paths[0]} has "
-                f"{first_width}x{first_height}. All images must have one size: "
-                f"export or resize them alike."
-            )
-    return first_width, first_height
-
-
-def check_resolution(path: Path, width: int, height: int, resolution: int) -> None:
-    """Refuse a resolution that images of ``width`` x ``height`` pixels cannot be reduced to."""
-    if resolution < 1:
-        raise SceneError(
-            f"data.resolution={resolution} is not a size. Give 1 to {width} pixels, or null "
-            f"to keep the {width}x{height} pixels of {path}."
-        )
-    if resolution > width:
-        raise SceneError(
-            f"data.resolution={resolution} is more than the {width} pixels that {path} is wide. "
-            f"Enlarged images hold no more detail: give at most {width}, or null for the native "
-            f"size."
-        )
 
 
 def load_premultiplied(path: Path) -> np.ndarray:

@@ -6,7 +6,7 @@ tan(theta) from the plane's middle, a fisheye lens to theta. Then it distorts th
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 
 import torch
@@ -21,7 +21,7 @@ class LensModel(IntEnum):
     FISHEYE = 1
     """Equidistant: OPENCV_FISHEYE, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, THIN_PRISM_FISHEYE."""
     FOV = 2
-    """One angle, omega, that stands in the place of k1."""
+    """One angle, omega, stored in place of k1."""
 
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
@@ -35,7 +35,7 @@ STEEPEST = 1e3
 """Tangent of the largest angle from the optical axis at which perspective lenses are used."""
 
 WIDEST = math.radians(120)
-"""Largest field of view of the pinhole that stands for a lens where only a pinhole will do."""
+"""Largest field of view of the pinhole that replaces a lens where pinholes are required."""
 
 NODES = 4096
 """Radii at which lenses are searched for folds."""
@@ -53,13 +53,13 @@ class Lenses:
         coefficients: Distortion, in the order of `COEFFICIENTS`. float64 [V, 12]
         skew: Pixels to the right for each focal length down. float64 [V]
         limit: Distance from the middle, before distortion, up to which each lens maps different
-            directions to different points; found where it is None. float64 [V]
+            directions to different points; computed where it is None. float64 [V]
     """
 
     model: Tensor
     coefficients: Tensor
     skew: Tensor
-    limit: Tensor | None = None
+    limit: Tensor = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         count = len(self.model)
@@ -91,26 +91,14 @@ class Lenses:
         straight = self.model != LensModel.FISHEYE
         return bool(straight.all()) and not self.coefficients.any() and not self.skew.any()
 
-    def subset(self, indices: Tensor | slice) -> "Lenses":
+    def __getitem__(self, indices: Tensor | slice) -> "Lenses":
         """Those of the images at ``indices``, in that order. [K]"""
-        assert self.limit is not None
-        return Lenses(
-            self.model[indices],
-            self.coefficients[indices],
-            self.skew[indices],
-            self.limit[indices],
-        )
+        return Lenses(*(getattr(self, each.name)[indices] for each in fields(self)))
 
     def joined(self, other: "Lenses") -> "Lenses":
         """These, then those of ``other``."""
-        assert self.limit is not None
-        assert other.limit is not None
-        return Lenses(
-            torch.cat([self.model, other.model]),
-            torch.cat([self.coefficients, other.coefficients]),
-            torch.cat([self.skew, other.skew]),
-            torch.cat([self.limit, other.limit]),
-        )
+        names = [each.name for each in fields(self)]
+        return Lenses(*(torch.cat([getattr(self, n), getattr(other, n)]) for n in names))
 
     def directions(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Directions that the lenses map to points of the image plane.
@@ -127,7 +115,7 @@ class Lenses:
         parts = []
         for start in range(0, max(1, len(x)), CHUNK):
             part = slice(start, start + CHUNK)
-            few = self if len(self) == 1 else self.subset(part)
+            few = self if len(self) == 1 else self[part]
             parts.append(few._directions(x[part], y[part]))
         local, found = zip(*parts, strict=True)
         return torch.cat(local), torch.cat(found)
@@ -171,7 +159,6 @@ class Lenses:
                 scale = torch.where(on_axis, scale, angle / aside[points])
                 front |= ~on_axis
             flat_x, flat_y = right[points] * scale, down[points] * scale
-            assert lenses.limit is not None
             front &= torch.hypot(flat_x, flat_y) <= lenses.limit
             if model == LensModel.FOV:
                 x[points], y[points] = _apply_fov(flat_x, flat_y, lenses)
@@ -216,7 +203,7 @@ class Lenses:
             return [(models[0], slice(None), self)]
         assert len(self) == count
         chosen = [(self.model == model).nonzero()[:, 0] for model in models]
-        return [(m, rays, self.subset(rays)) for m, rays in zip(models, chosen, strict=True)]
+        return [(m, rays, self[rays]) for m, rays in zip(models, chosen, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -260,11 +247,8 @@ def sight(lens: Lenses, focal: Tensor, centre: Tensor, height: int, width: int) 
     if not found.all():
         rows, columns = torch.meshgrid(along, across, indexing="ij")
         has_ray = look(columns.flatten(), rows.flatten())[1].view(height, width)
-    middle, edge_x = torch.tensor([width / 2] * 5), torch.tensor([0.0, width])
-    middle[:2] = edge_x
-    lines = torch.tensor([height / 2] * 5)
-    lines[2:4] = torch.tensor([0.0, height])
-    edges = look(middle, lines)[0]
+    x, y = 0.5 * width, 0.5 * height
+    edges = look(torch.tensor([0, width, x, x, x]), torch.tensor([y, y, 0, height, y]))[0]
     apart = torch.linalg.cross(edges[:4], edges[4:].expand(4, 3)).norm(dim=-1)
     angles = torch.atan2(apart, edges[:4] @ edges[4])
     half_x, half_y = (
@@ -284,7 +268,6 @@ def _stretch(lens: Lenses, border: Tensor) -> float:
         return 2 * math.tan(omega / 2) / omega if omega else 1.0
     angle = torch.atan2(border[:, :2].norm(dim=-1), -border[:, 2])
     largest = float((angle if lens.model[0] == LensModel.FISHEYE else angle.tan()).max())
-    assert lens.limit is not None
     # The border's pixels reach half a pixel farther than their centres.
     radius = torch.linspace(0, min(1.05 * largest, float(lens.limit)), NODES, dtype=torch.float64)
     terms = _terms(lens)
@@ -350,7 +333,6 @@ def _determinant(slopes: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
 def _undo(x: Tensor, y: Tensor, lenses: Lenses) -> tuple[Tensor, Tensor, Tensor]:
     """Points that are distorted to x and y, and whether there are any. [R] each"""
     terms, limit = _terms(lenses), lenses.limit
-    assert limit is not None
     target = torch.hypot(x, y)
     most = limit * _radial(limit, terms)[0]
     found = target <= most
@@ -405,7 +387,6 @@ def _undo_radial(target: Tensor, terms: list[Tensor], limit: Tensor) -> Tensor:
 def _undo_fov(x: Tensor, y: Tensor, lenses: Lenses) -> tuple[Tensor, Tensor, Tensor]:
     """The same for lenses of the model FOV."""
     omega, limit = lenses.coefficients[:, 0], lenses.limit
-    assert limit is not None
     distorted = torch.hypot(x, y)
     slope = 2 * (omega / 2).tan()
     most = torch.where(omega > 0, (slope * limit).atan() / omega, limit)

@@ -1,22 +1,22 @@
-"""What every reader makes of its files: a list of posed, timed images; how these become views."""
+"""What every reader makes of its files: a list of posed, timed images. How these become views."""
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from xplanes.errors import MissingSplitError, SceneError, refuse_all
-from xplanes.scenes.entries import some
+from xplanes.errors import MissingSplitError, SceneError, refuse_all, warn
+from xplanes.scenes.entries import refuse_repeats, require_precision, some
 from xplanes.scenes.formats import UNTURN, mask_misfit, orientation
 from xplanes.scenes.images import PLAIN, Size, final_sizes, native_sizes, read_images
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.masks import MaskKind, MaskUse, chosen_use, ignored_pixels, survey
-from xplanes.scenes.views import Intrinsics, Views
+from xplanes.scenes.views import Intrinsics, Views, spread
 
 SHORTEST, LONGEST = 1e-3, 1e5
 """Smallest and largest focal length, in sizes of the image."""
@@ -27,21 +27,23 @@ FARTHEST_ASIDE, STRONGEST = 1e3, 1e6
 MOST_FOLDED = 0.5
 """Share of an image's pixels that a perspective lens may map no direction to."""
 
+Part = TypeVar("Part", "Listing", Views)
+
 SHAPE_TOLERANCE = 0.02
 """By how much the aspect ratio of an image may differ from that of its camera."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a file tells about the camera of one image.
+    """The camera of one image as a file gives it.
 
     Attributes:
-        per_width: Focal length in image widths; None where ``fl_x`` tells it.
+        per_width: Focal length in image widths; None if ``fl_x`` is given.
         fl_x: Focal length along x in pixels of an image of ``w`` x ``h``.
         fl_y: The same along y; None for square pixels.
         cx: Principal point, from the left; None for the middle.
         cy: Principal point, from the top; None for the middle.
-        w: Width of the image that these numbers speak of; None for that of the image file.
+        w: Width of the image that these numbers refer to; None for that of the image file.
         h: Its height.
         model: Kind of lens.
         distortion: Its coefficients, in the order of `COEFFICIENTS`; none for a lens without.
@@ -69,7 +71,7 @@ class Calibration:
             size: Those after it was resized.
         """
         (rows, columns), (height, width) = native, size
-        # Of an image of another size only one side may be told.
+        # Of an image of another size, only one side may be given.
         wide = self.w or (columns if self.h is None else columns * self.h / rows)
         high = self.h or (rows if self.w is None else rows * self.w / columns)
         per_width = self.per_width if self.fl_x is None else self.fl_x / wide
@@ -85,7 +87,7 @@ class Calibration:
 
     @property
     def words(self) -> str:
-        """The lens in words."""
+        """The lens, for messages."""
         named = [
             f"{'omega' if self.model == LensModel.FOV else name}={value:g}"
             for name, value in zip(COEFFICIENTS, self.distortion, strict=False)
@@ -104,14 +106,12 @@ class Listing:
         camera_to_world: Rigid camera poses with OpenGL's axes. [V, 4, 4]
         times: Time of each image, from 0 to 1; all 0 for a static scene. [V]
         calibrations: Focal length, principal point and lens of each image. [V]
-        timed: Whether the source tells the times.
+        timed: Whether the source has times.
         masks: A mask file for each image, white where it shows the scene and black elsewhere, or
             None for an image without; empty where there are none. [V]
-        cameras: Name of the physical camera that took each image; empty where that is not
-            known. [V]
-        mask_meaning: What the source says that masks are: alpha, or white where pixels are to be
-            ignored; empty where it says nothing.
-        time_words: Where times come from, in words; empty where there are none.
+        mask_meaning: What the source defines masks as: "alpha", or "ignored" (white where pixels
+            are to be ignored); empty if it does not.
+        time_source: Where times come from, with examples; empty where there are none.
     """
 
     paths: tuple[Path, ...]
@@ -121,68 +121,68 @@ class Listing:
     calibrations: tuple[Calibration, ...]
     timed: bool
     masks: tuple[Path | None, ...] = ()
-    cameras: tuple[str, ...] = ()
-    mask_meaning: Literal["", "alpha", "ignored"] = ""
-    time_words: str = ""
+    mask_meaning: str = ""
+    time_source: str = ""
 
     def __len__(self) -> int:
         return len(self.files)
 
+    @classmethod
+    def checked(
+        cls,
+        source: Path,
+        labels: Sequence[str],
+        paths: Sequence[Path],
+        poses: np.ndarray,
+        times: Sequence[float],
+        **more: Any,
+    ) -> "Listing":
+        """A list of images that passes the checks of all formats.
+
+        Args:
+            source: Where the cameras were read, for messages.
+            labels: The file and frame of each image, for messages. [V]
+            paths: Image files. [V]
+            poses: Camera-to-world matrices with OpenGL's axes. float64 [V, 4, 4]
+            times: From 0 to 1; empty for a static scene. [V]
+            **more: Further attributes.
+
+        Raises:
+            SceneError: If cameras lie too far away, an image is listed twice, or files have sizes
+                that do not belong together.
+        """
+        require_precision(source, poses[:, :3, 3])
+        refuse_repeats(labels, paths, poses, times)
+        listing = cls(
+            paths=tuple(paths),
+            camera_to_world=torch.from_numpy(poses).float(),
+            times=torch.tensor(times or [0.0] * len(paths), dtype=torch.float32),
+            timed=bool(times),
+            **more,
+        )
+        _require_shapes(listing)
+        return listing
+
     def subset(self, indices: Sequence[int]) -> "Listing":
         """The images at ``indices``, in that order. [K]"""
         chosen = list(indices)
-        return Listing(
-            tuple(self.paths[i] for i in chosen),
-            tuple(self.files[i] for i in chosen),
-            self.camera_to_world[chosen],
-            self.times[chosen],
-            tuple(self.calibrations[i] for i in chosen),
-            self.timed,
-            tuple(self.masks[i] for i in chosen) if self.masks else (),
-            tuple(self.cameras[i] for i in chosen) if self.cameras else (),
-            self.mask_meaning,
-            self.time_words,
-        )
-
-    def spread(self, count: int | None, key: str, split: str) -> "Listing":
-        """``count`` images at even ranks in time, the first and the last among them.
-
-        Args:
-            count: How many to keep; None keeps all.
-            key: The setting that says so, for messages.
-            split: What they are taken from, for messages.
-
-        Raises:
-            SceneError: If there are fewer.
-        """
-        if count is None:
-            return self
-        total = len(self)
-        if not 1 <= count <= total:
-            raise SceneError(
-                f"{key}={count}, but {split} has {total} views. Give a number from 1 to "
-                f"{total}, or null for all."
-            )
-        by_time = self.times.argsort(stable=True).tolist()
-        return self.subset(sorted(by_time[rank] for rank in even_ranks(count, total)))
+        each = {name: getattr(self, name) for name in ("paths", "files", "calibrations", "masks")}
+        kept = {name: tuple(part[i] for i in chosen) for name, part in each.items() if part}
+        poses, times = self.camera_to_world[chosen], self.times[chosen]
+        return replace(self, camera_to_world=poses, times=times, **kept)
 
 
-def time_words(origin: str, files: Sequence[str], times: Sequence[Any]) -> str:
+def time_source(origin: str, files: Sequence[str], times: Sequence[Any]) -> str:
     """Where times come from, with examples.
 
     Args:
-        origin: What tells them.
+        origin: Their source.
         files: Names of the images. [V]
-        times: Their times as they are told. [V]
+        times: Their times as given. [V]
     """
-    shown = dict.fromkeys(even_ranks(min(len(files), 3), len(files)))
+    shown = dict.fromkeys(spread(min(len(files), 3), len(files)))
     examples = ", ".join(f"{files[rank]} -> {times[rank]}" for rank in shown)
     return f"{origin}, from {min(times)} to {max(times)}: {examples}"
-
-
-def even_ranks(count: int, total: int) -> list[int]:
-    """``count`` of ``total`` ranks, evenly spread, the first and the last among them."""
-    return [round(i * (total - 1) / max(count - 1, 1)) for i in range(count)]
 
 
 def held_out_places(times: Sequence[float], every: int) -> list[int]:
@@ -194,7 +194,7 @@ def held_out_places(times: Sequence[float], every: int) -> list[int]:
 
     Args:
         times: Times of the views, in order.
-        every: Views of which one is held out.
+        every: One in so many views is held out.
     """
     # Multiples of the golden ratio spread evenly, too.
     step = 0.5 * (math.sqrt(5) - 1) if 1 < len(set(times)) < len(times) else 0.0
@@ -218,53 +218,28 @@ def held_out(listing: Listing, every: int) -> dict[str, list[int]]:
     }
 
 
-def picked(
-    parts: Mapping[str, Listing], splits: Sequence[str], source: Path, way_out: str
-) -> dict[str, Listing]:
-    """The splits asked for.
+def thinned(part: Part, count: int | None, key: str, where: str) -> Part:
+    """``count`` views at even ranks in time, the first and the last among them.
 
     Args:
-        parts: Images by split name.
-        splits: Names of splits.
-        source: What the splits were made from, for messages.
-        way_out: What makes another split, for messages.
+        part: Views, or a list of images.
+        count: How many to keep; None keeps all.
+        key: The setting that asks for it, for messages.
+        where: What they are taken from, for messages.
 
     Raises:
-        MissingSplitError: If one has no images.
+        SceneError: If there are fewer.
     """
-    for split in splits:
-        if not parts.get(split):
-            names = ", ".join(name for name, part in parts.items() if part)
-            raise MissingSplitError(
-                f"{source} has no {split} split. Splits of this capture: {names or 'none'}. "
-                f"{way_out}"
-            )
-    return {split: parts[split] for split in splits}
-
-
-def thinned(
-    listings: dict[str, Listing], views: int | None, eval_views: int | None, source: Path
-) -> dict[str, Listing]:
-    """Splits with as many images as data.views and data.eval_views ask for.
-
-    Args:
-        listings: Images by split name.
-        views: Images to keep of the train split; None keeps all.
-        eval_views: The same for every other split, at most.
-        source: Folder of the scene, for messages.
-
-    Raises:
-        SceneError: If the train split has fewer.
-    """
-    found = {}
-    for split, listing in listings.items():
-        where = f"the {split} split of {source}"
-        if split == "train":
-            found[split] = listing.spread(views, "data.views", where)
-        else:
-            most = eval_views if eval_views is None else min(eval_views, len(listing))
-            found[split] = listing.spread(most, "data.eval_views", where)
-    return found
+    if count is None:
+        return part
+    total = len(part)
+    if count > total:
+        raise SceneError(
+            f"{key}={count}, but {where} has {total} views. Give a number from 1 to {total}, or "
+            "null for all."
+        )
+    by_time = part.times.argsort(stable=True).tolist()
+    return part.subset(sorted(by_time[rank] for rank in spread(count, total)))
 
 
 def read_views(
@@ -284,8 +259,8 @@ def read_views(
         resolution: Width in pixels; None keeps the sizes of the files.
         cache: Folder of images that are too large for memory; that of the user when None.
         ignore: Whether pixels that masks leave out are ignored; they get alpha 0 otherwise. Images
-            of which nothing remains are left out, with a warning.
-        kind: What masks mean; None finds out.
+            without any other pixels are left out, with a warning.
+        kind: What masks mean; None determines it.
 
     Raises:
         MissingSplitError: If masks leave out all pixels of all images.
@@ -324,7 +299,7 @@ def read_views(
 
 
 def _without_ignored(listing: Listing, rest: Sequence[int]) -> Listing:
-    """The images at ``rest``; a warning names the others, of which masks leave out all pixels."""
+    """The images at ``rest``; a warning names the others, whose pixels are all masked out."""
     gone = [file for index, file in enumerate(listing.files) if index not in {*rest}]
     text = (
         f"masks leave out all pixels of {len(gone)} of {len(listing)} images: {some(gone)} in "
@@ -334,10 +309,7 @@ def _without_ignored(listing: Listing, rest: Sequence[int]) -> Listing:
         raise MissingSplitError(
             f"{text}. Check the masks, or set data.mask_use=alpha if such images show empty space."
         )
-    warnings.warn(
-        f"{text}. These are left out; set data.mask_use=alpha if they show empty space.",
-        stacklevel=5,
-    )
+    warn(f"{text}. These are left out; set data.mask_use=alpha if they show empty space.")
     return listing.subset(rest)
 
 
@@ -366,7 +338,7 @@ def read_splits(
     """
     listings = [whole] if whole is not None else list(parts.values())
     masks = [mask for listing in listings for mask in listing.masks]
-    notes = {"times": words} if (words := listings[0].time_words) else {}
+    notes = {"times": source} if (source := listings[0].time_source) else {}
     if not any(masks):
         if mask_use == "lrm":
             raise SceneError(
@@ -389,16 +361,8 @@ def read_splits(
     return read, cut, notes
 
 
-def require_shapes(listing: Listing) -> None:
-    """Refuse images that cannot be those that their cameras were calibrated for, and other masks.
-
-    Args:
-        listing: The images.
-
-    Raises:
-        SceneError: If an aspect ratio is another, or a mask has another size than its image. It
-            names all such files.
-    """
+def _require_shapes(listing: Listing) -> None:
+    """Refuse images of other aspect ratios than their cameras', and masks of other sizes."""
     sizes = native_sizes(listing.paths)
     shapes = map(misshapen, listing.paths, sizes, listing.calibrations)
     problems = [problem for problem in shapes if problem is not None]
@@ -421,7 +385,7 @@ def misshapen(path: Path, size: Size, camera: Calibration) -> str | None:
     Args:
         path: The file.
         size: Its height and width.
-        camera: Its calibration; it may tell width and height, of another aspect ratio.
+        camera: Its calibration, which may have a width and height of another aspect ratio.
     """
     if camera.w is None or camera.h is None:
         return None
@@ -441,8 +405,8 @@ def misshapen(path: Path, size: Size, camera: Calibration) -> str | None:
             f"copies of the images (magick mogrify -auto-orient *{path.suffix})."
         )
     return (
-        f"{text} Perhaps the image was cut or turned: take the one that the camera was calibrated "
-        "with."
+        f"{text} Perhaps the image was cropped or turned: use the one that the camera was "
+        "calibrated with."
     )
 
 
@@ -456,7 +420,7 @@ def final_intrinsics(
 
     Args:
         labels: The images, for messages. [V]
-        calibrations: What is told about their cameras. [V]
+        calibrations: Their cameras as given. [V]
         native: Heights and widths of the files. [V]
         sizes: Those after the images were resized. [V]
 
@@ -487,7 +451,7 @@ def _require_real(
     centre: tuple[float, float],
     skew: float,
 ) -> None:
-    """Refuse cameras so extreme that their rays cannot be told apart, or overflow."""
+    """Refuse cameras so extreme that their rays coincide or overflow."""
     for axis, along, middle, pixels in zip("xy", focal, centre, reversed(size), strict=True):
         for name, value, low, high in (
             ("focal length", along / pixels, SHORTEST, LONGEST),
@@ -513,13 +477,13 @@ def _require_real(
 def require_rays(
     labels: Sequence[str], lenses: Sequence[Calibration], has_ray: Sequence[Tensor | None]
 ) -> None:
-    """Refuse images most of which show nothing, as where their lens folds back inside them.
+    """Refuse images whose lens maps no direction to most of their pixels.
 
-    A warning tells of pixels that perspective lenses map no direction to: they are left out.
+    Such pixels of perspective lenses are left out with a warning where they are fewer.
 
     Args:
         labels: The images, for messages. [V]
-        lenses: What is told about their cameras. [V]
+        lenses: Their cameras as given. [V]
         has_ray: Pixels that the lens maps a direction to, None for all. bool [h, w] each, [V]
 
     Raises:
@@ -545,17 +509,13 @@ def require_rays(
     refuse_all(problems)
     if folded:
         others = len(folded) - 1
-        warnings.warn(
-            max(folded)[1] + (f"; so are fewer of {others} other images." if others else "."),
-            stacklevel=4,
-        )
+        warn(max(folded)[1] + (f"; so are fewer of {others} other images." if others else "."))
 
 
 def _warn_of_empty(views: Views, listing: Listing) -> None:
-    empty = [file for index, file in enumerate(views.files) if not views.silhouette(index)[0].any()]
+    empty = [file for index, file in enumerate(views.files) if not views.silhouette(index).any()]
     if empty:
-        warnings.warn(
+        warn(
             f"{len(empty)} of {len(views)} images show nothing (alpha is next to 0 everywhere): "
-            f"{some(empty)} in {listing.paths[0].parent}.",
-            stacklevel=4,
+            f"{some(empty)} in {listing.paths[0].parent}."
         )

@@ -1,7 +1,6 @@
-"""Mask files: what their values and black parts stand for, decided over a whole capture."""
+"""Mask files: what their values and black parts mean, decided for a whole capture."""
 
 import logging
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from xplanes.errors import SceneError
+from xplanes.errors import SceneError, warn
 from xplanes.scenes.formats import (
     SIXTEEN_BIT_MODES,
     UNREADABLE,
@@ -25,34 +24,35 @@ from xplanes.scenes.formats import (
 logger = logging.getLogger(__name__)
 
 MaskUse = Literal["auto", "alpha", "ignore", "lrm"]
-"""What the black parts of masks are: empty space, pixels to ignore, or of no concern but to LRMs.
+"""What the black parts of masks mean.
 
-auto: empty space where masks look like silhouettes, else pixels to ignore.
+alpha: empty space; ignore: pixels to ignore; lrm: removed from the LRM's input alone; auto: empty
+space where masks look like silhouettes, else pixels to ignore.
 """
 
 SURVEYED = 32
-"""Masks of a capture that are looked at to find out what its masks mean."""
+"""Masks of a capture that are sampled to determine what its masks mean."""
 
 LOOK = 512
-"""Rows and columns of each of them that are looked at."""
+"""Rows and columns of each of them that are sampled."""
 
 COLOURED = 16
-"""Difference of channels above which a mask is coloured; what JPEG makes of grey stays below."""
+"""Difference of channels above which a mask is coloured; grey JPEGs stay below."""
 
 MOST_LABELS = 64
-"""Distinct numbers that a capture's masks may have if they are labels of things."""
+"""Most distinct values in a capture's masks if these are labels of objects."""
 
 WHITE = 0.94
-"""Share of the largest value that labels do not exceed."""
+"""Share of the largest possible value that labels do not exceed."""
 
 LOSSY = ("JPEG", "MPO", "WEBP", "AVIF", "JPEG2000")
-"""Formats whose values are near those that were meant."""
+"""Formats whose values are only near the original ones."""
 
 RUNS = 0.6
-"""Share of a mask's pixels whose neighbour has the same value, if these are labels of things."""
+"""Least share of a mask's pixels with a neighbour of the same value, if these are labels."""
 
 NOISE = 8 / 255
-"""Difference from black and from white below which lossy formats may have made it."""
+"""Largest difference from black and from white that lossy formats make."""
 
 SILHOUETTE_EDGE, UNCLEAR = 0.5, (0.4, 0.7)
 """Least share of the images' edges that silhouettes leave out, and shares that may mean either."""
@@ -69,12 +69,12 @@ class MaskKind:
     """What the masks of a capture mean.
 
     Attributes:
-        labels: Whether their values are numbers of things, all of which but 0 belong to the mask.
+        labels: Whether their values are labels of objects, all of which but 0 belong to the mask.
         edge: Share of the pixels at the images' edges that they leave out.
         share: Share of all pixels that they leave out.
         inverted: Whether they leave out what is white.
         middle: Share of the pixels in the images' middle that they leave out.
-        shared: Whether several images have one file: things have other silhouettes in each.
+        shared: Whether several images share a file, which cannot be a silhouette then.
         equal: Whether masks of several images are equal, although their files are not.
     """
 
@@ -102,7 +102,7 @@ class MaskKind:
 
 
 def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
-    """Look at some masks of a capture to find out what all of them mean.
+    """Determine from some masks of a capture what all of them mean.
 
     Args:
         masks: A file for each image, or None. [V]
@@ -133,7 +133,7 @@ def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
         contents.add(hash(out.tobytes()))
         shares.append(float(out.mean()))
         if out.all() and (edges or place < len(stored) - 1):
-            continue  # Black all over, it says nothing of a shape.
+            continue  # All black: it has no shape.
         rim = np.concatenate([out[0], out[-1], out[1:-1, 0], out[1:-1, -1]])
         edges.append(float(rim.mean()))
         rows, columns = (slice(round(0.45 * n), round(0.55 * n) + 1) for n in out.shape)
@@ -144,7 +144,7 @@ def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
 
 
 def _has_regions(grey: np.ndarray) -> bool:
-    """Whether pixels above 0 mostly have a neighbour of their own value: noise has not. [H, W]"""
+    """Whether most pixels above 0 have a neighbour of the same value, unlike noise. [H, W]"""
     above = grey > 0
     across = (grey[:, 1:] == grey[:, :-1])[above[:, 1:]]
     down = (grey[1:] == grey[:-1])[above[1:]]
@@ -152,13 +152,13 @@ def _has_regions(grey: np.ndarray) -> bool:
 
 
 def chosen_use(use: MaskUse, kind: MaskKind, where: str, told: str = "") -> tuple[MaskUse, str]:
-    """The use of a capture's masks, and that in words; a warning where they may be either.
+    """The use of a capture's masks, and a sentence about it; warns if it may be another.
 
     Args:
         use: The setting ``data.mask_use``.
         kind: What `survey` found.
         where: Where the masks are, for messages.
-        told: What their source says that they are, "alpha" or "ignored"; empty for nothing.
+        told: What their source defines them as, "alpha" or "ignored"; empty if it does not.
     """
     if use == "lrm":
         return use, "for LRMs alone (data.mask_use=lrm)"
@@ -174,10 +174,9 @@ def chosen_use(use: MaskUse, kind: MaskKind, where: str, told: str = "") -> tupl
     text = f"masks leave out {kind.share:.1%} of the pixels. They are taken for {meaning[found]}"
     if use == "auto" and not told and kind.is_unclear:
         hint = " Silhouettes are white where the scene is." if found == "ignore" else ""
-        warnings.warn(
+        warn(
             f"{where}: {text}. Both readings are possible: set data.mask_use={found} to "
-            f"confirm it, or data.mask_use={other} if they are {meaning[other]}.{hint}",
-            stacklevel=4,
+            f"confirm it, or data.mask_use={other} if they are {meaning[other]}.{hint}"
         )
     else:
         logger.info("%s: %s (data.mask_use=%s)", where, text, found)

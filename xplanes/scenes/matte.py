@@ -5,10 +5,10 @@ from torch import Tensor
 
 VISIBLE = 20
 """Alpha, of 255, from which a pixel shows something: far above the noise of mattes, far below half,
-so that hair, glass and the edges of thin things stay."""
+so that hair, glass and thin edges stay."""
 
 FAINT = 6
-"""The same in an image that shows next to nothing opaque, whose content may be faint."""
+"""The same in an image with hardly any opaque pixels, whose content may be faint."""
 
 OPAQUE, OPAQUE_SHARE = 64, 1e-3
 """Alpha of opaque content; share of the pixels that has it at least, unless the image is faint."""

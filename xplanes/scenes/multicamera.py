@@ -8,8 +8,7 @@ name.
 
 import logging
 import re
-import warnings
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -19,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xplanes.errors import ConfigError, MissingSplitError, SceneError, refuse_all
+from xplanes.errors import ConfigError, MissingSplitError, SceneError, refuse_all, warn
 from xplanes.files import natural
 from xplanes.scenes import store, videos
 from xplanes.scenes.colmap_model import MODELS, find_model, read_model
@@ -44,11 +43,9 @@ from xplanes.scenes.images import (
 )
 from xplanes.scenes.listing import (
     Calibration,
-    Listing,
     final_intrinsics,
     misshapen,
     require_rays,
-    thinned,
 )
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.transforms import read_calibration, read_frames
@@ -69,7 +66,7 @@ SAME_RATE = 1e-3
 """Share by which frame rates of synchronised cameras differ at most."""
 
 LATE = 1.5
-"""Times between frames that are so much longer than most are not of a constant rate."""
+"""How many times the median a gap between frames is if the rate varies."""
 
 SAME_POSE = 1e-4
 """Largest difference between poses of a fixed camera."""
@@ -114,17 +111,33 @@ class MultiCameraSettings(SceneSettings):
                 "data.train_on_video=true: the video's camera is one of the training cameras "
                 "already; set it to false"
             )
-        return read_multicamera(
-            self.folder,
-            resolution=self.resolution,
-            splits=splits,
-            frames=self.frames,
-            test_cameras=self.test_cameras,
-            video_camera=self.video_camera,
-            views=self.views,
-            eval_views=self.eval_views,
-            cache=self.image_cache,
-        )
+        folder = self.folder
+        if not folder.is_dir():
+            raise SceneError(
+                f"The scene folder {folder.absolute()} does not exist. Set data.root and "
+                f"data.scene to a folder with {POSES}, {TRANSFORMS} or {MODELS[0]} and the "
+                "cameras' videos."
+            )
+        cameras = read_cameras(folder)
+        parts = _split_cameras(folder, cameras, self.test_cameras)
+        for split in splits:
+            if split not in parts:
+                raise MissingSplitError(
+                    f"{folder} has no split {split}: its splits are {', '.join(parts)}. Name "
+                    "cameras to score with data.test_cameras=[NAME], or leave data.eval_split out."
+                )
+        watched = _video_camera(cameras, parts, self.video_camera)
+        recordings = [_recording(camera) for camera in cameras]
+        numbers = _frame_numbers(folder, recordings, self.frames)
+        stamped = _are_stamped(recordings)
+        whole = _read_views(recordings, numbers, stamped, self.resolution, self.image_cache)
+
+        def views_of(chosen: Sequence[int]) -> Views:
+            count = len(numbers)
+            return whole.subset([camera * count + i for camera in chosen for i in range(count)])
+
+        chosen = self.thinned({split: views_of(parts[split]) for split in dict.fromkeys(splits)})
+        return Scene(folder.resolve().name, chosen, video=views_of([watched]))
 
 
 @dataclass(frozen=True)
@@ -136,7 +149,7 @@ class Camera:
         source: The video or the folder.
         pose: Camera-to-world matrix with OpenGL's axes. float64 [4, 4]
         calibration: Its focal length, principal point and lens.
-        label: Where the calibration tells of it, for messages.
+        label: The file and entry that calibrate it, for messages.
     """
 
     name: str
@@ -154,7 +167,7 @@ class Recording:
         camera: The camera.
         size: Height and width of the frames.
         count: Number of frames.
-        rate: Frames per second; None for images and where the video does not tell.
+        rate: Frames per second; None for images and if the video has none.
         images: The image files in the order of time; empty for a video. [count]
         times: Seconds at which a video shows its frames; empty where that is not known. [count]
     """
@@ -170,82 +183,6 @@ class Recording:
     def step(self) -> float:
         """Median seconds between frames; 0 where that is not known."""
         return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
-
-    @property
-    def varies(self) -> bool:
-        """Whether a video leaves frames out, or has a variable rate."""
-        return self.step > 0 and float(np.diff(self.times).max()) > LATE * self.step
-
-
-def read_multicamera(
-    folder: Path,
-    *,
-    resolution: int | None,
-    splits: Sequence[str],
-    frames: Sequence[int] | None = None,
-    test_cameras: Sequence[str] | None = (),
-    video_camera: str | None = None,
-    views: int | None = None,
-    eval_views: int | None = None,
-    cache: Path | None = None,
-) -> Scene:
-    """Read the videos of fixed cameras and their calibration, and check all of it.
-
-    Args:
-        folder: Folder of the calibration and the videos or images.
-        resolution: Width of the images in pixels; None keeps the native sizes.
-        splits: Names of the splits to read: train, test.
-        frames: First frame, last frame and stride; None for all that every camera has. They get
-            times from 0 to 1.
-        test_cameras: Names of the cameras that make up the test split; all others are trained on.
-            None takes cam00, as is usual for Neural 3D Video, or else the most central camera; none
-            of fewer than three.
-        video_camera: Camera whose frames are ``Scene.video``; the most central training camera when
-            None.
-        views: Number of views to keep of the train split, spread evenly over time; None keeps all.
-        eval_views: The same for the test split, at most.
-        cache: Folder of images that are too large for memory; that of the user when None.
-
-    Raises:
-        MissingSplitError: If there is no split of a name.
-        SceneError: Anything else is missing, damaged or inconsistent.
-    """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise SceneError(
-            f"The scene folder {folder.absolute()} does not exist. Set data.root and data.scene to "
-            f"a folder with {POSES}, {TRANSFORMS} or {MODELS[0]} and the cameras' videos."
-        )
-    cameras = read_cameras(folder)
-    parts = _split_cameras(folder, cameras, test_cameras)
-    for split in splits:
-        if split not in parts:
-            raise MissingSplitError(
-                f"{folder} has no split {split}: its splits are {', '.join(parts)}. Name cameras "
-                "to score with data.test_cameras=[NAME], or leave data.eval_split out."
-            )
-    watched = _video_camera(cameras, parts, video_camera)
-    recordings = [_recording(camera) for camera in cameras]
-    if not _are_stamped(recordings):
-        _require_one_rate(recordings)
-    _warn_of_starts(recordings)
-    _require_same_frames(recordings)
-    numbers = _frame_numbers(folder, recordings, frames)
-    whole = _read_views(recordings, numbers, resolution, cache)
-    count = len(numbers)
-    places = {file: place for place, file in enumerate(whole.files)}
-    listing = _listing(recordings, whole, count)
-    wanted = {split: _of_cameras(parts[split], count) for split in dict.fromkeys(splits)}
-    chosen = {split: listing.subset(part) for split, part in wanted.items()}
-    chosen = thinned(chosen, views, eval_views, folder)
-    return Scene(
-        folder.resolve().name,
-        {
-            split: whole.subset(torch.tensor([places[file] for file in part.files]))
-            for split, part in chosen.items()
-        },
-        video=whole.subset(torch.tensor(_of_cameras([watched], count))),
-    )
 
 
 def read_cameras(folder: Path) -> list[Camera]:
@@ -267,10 +204,8 @@ def read_cameras(folder: Path) -> list[Camera]:
             f"camera) nor {MODELS[0]} (COLMAP's model of an image of each), but {found}. Add the "
             "calibration of the cameras."
         )
-    twice = [
-        name for name, count in Counter(camera.name for camera in cameras).items() if count > 1
-    ]
-    if twice:
+    names = [camera.name for camera in cameras]
+    if twice := [name for name in names if names.count(name) > 1]:
         raise SceneError(
             f"{folder}: several cameras are called {twice[0]}. Name their videos or folders apart."
         )
@@ -432,9 +367,7 @@ def _split_cameras(
     """Numbers of the cameras of each split."""
     names = [camera.name for camera in cameras]
     if test_cameras is None:
-        places = np.stack([camera.pose[:3, 3] for camera in cameras])
-        central = int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmin())
-        chosen = "cam00" if "cam00" in names else names[central]
+        chosen = "cam00" if "cam00" in names else names[int(_distances(cameras).argmin())]
         test_cameras = [chosen] if len(names) > 2 else []
         logger.info(
             "%s: held out %s of the cameras %s (data.test_cameras)",
@@ -456,12 +389,17 @@ def _split_cameras(
     return {"train": train} | ({"test": test} if test else {})
 
 
+def _distances(cameras: Sequence[Camera]) -> np.ndarray:
+    """How far each camera is from the middle of all. [V]"""
+    places = np.stack([camera.pose[:3, 3] for camera in cameras])
+    return np.linalg.norm(places - places.mean(axis=0), axis=1)
+
+
 def _video_camera(cameras: Sequence[Camera], parts: dict[str, list[int]], name: str | None) -> int:
     """Number of the camera whose video the LRM sees."""
     train = parts["train"]
     if name is None:
-        centres = np.stack([camera.pose[:3, 3] for camera in cameras])
-        away = np.linalg.norm(centres - centres.mean(axis=0), axis=1)
+        away = _distances(cameras)
         return min(train, key=lambda index: away[index])
     found = [index for index, camera in enumerate(cameras) if camera.name == name]
     if not found:
@@ -511,42 +449,47 @@ def _images_in(folder: Path) -> list[Path]:
 
 
 def _are_stamped(recordings: Sequence[Recording]) -> bool:
-    """Whether times are those of the files, as where frames of videos are unevenly spaced."""
-    uneven = [recording.camera.source.name for recording in recordings if recording.varies]
-    return bool(uneven) and all(recording.times for recording in recordings)
+    """Whether times are those of the files, as where the frames of a video are unevenly spaced.
 
+    Elsewhere frames of one number are of one time. A warning tells of videos that begin at
+    different times then.
 
-def _warn_of_starts(recordings: Sequence[Recording]) -> None:
-    """Warn of videos that begin at different times."""
-    begun = [(r.times[0], r.camera.source, r.step) for r in recordings if r.times]
-    if not begun or _are_stamped(recordings):
-        return
-    (early, first, step), (late, last, _) = min(begun), max(begun)
-    if late - early > 0.5 * step > 0:
-        warnings.warn(
-            f"{last} begins {late - early:.3g} s after {first}: frames of one number are taken to "
-            "be of one time. If they are not, cut the videos to one beginning.",
-            stacklevel=4,
-        )
-
-
-def _require_one_rate(recordings: Sequence[Recording]) -> None:
-    """Refuse videos of different rates, whose frame numbers stand for different times."""
-    timed = [(recording.camera, recording.rate) for recording in recordings if recording.rate]
-    for camera, rate in timed:
-        if abs(rate / timed[0][1] - 1) > SAME_RATE:
+    Raises:
+        SceneError: If videos have different rates.
+    """
+    uneven = any(
+        recording.step and np.diff(recording.times).max() > LATE * recording.step
+        for recording in recordings
+    )
+    if uneven and all(recording.times for recording in recordings):
+        return True
+    timed = [
+        (recording.camera.source, recording.rate) for recording in recordings if recording.rate
+    ]
+    for source, rate in timed:
+        first, usual = timed[0]
+        if abs(rate / usual - 1) > SAME_RATE:
             raise SceneError(
-                f"{camera.source} has {rate:g} frames per second, but {timed[0][0].source} "
-                f"{timed[0][1]:g}: frames of one number are not of one time. Encode all videos at "
-                f"one rate: ffmpeg -i {camera.source.name} -r {timed[0][1]:g} NEW.mp4"
+                f"{source} has {rate:g} frames per second, but {first} {usual:g}: frames of one "
+                f"number are not of one time. Encode all videos at one rate: ffmpeg -i "
+                f"{source.name} -r {usual:g} NEW.mp4"
             )
+    begun = [(r.times[0], r.camera.source, r.step) for r in recordings if r.times]
+    if begun:
+        (early, first, step), (late, last, _) = min(begun), max(begun)
+        if late - early > 0.5 * step > 0:
+            warn(
+                f"{last} begins {late - early:.3g} s after {first}: frames of one number are taken "
+                "to be of one time. If they are not, cut the videos to one beginning."
+            )
+    return False
 
 
 def _require_same_frames(recordings: Sequence[Recording]) -> None:
-    """Refuse folders of numbered images of which a camera lacks some in the middle.
+    """Refuse folders of numbered images where a camera lacks some in the middle.
 
-    Frames that follow the missing one would be those of earlier times in other cameras. Where
-    cameras begin to count is up to them, and some may have stopped early.
+    Its later frames would be paired with earlier ones of other cameras. Numbering may start
+    anywhere, and some cameras may have stopped early.
     """
     first: tuple[Recording, list[int]] | None = None
     for recording in recordings:
@@ -570,6 +513,7 @@ def _frame_numbers(
     folder: Path, recordings: Sequence[Recording], frames: Sequence[int] | None
 ) -> range:
     """Numbers of the frames to read, which every camera has."""
+    _require_same_frames(recordings)
     shortest = min(recordings, key=lambda recording: recording.count)
     longest = max(recordings, key=lambda recording: recording.count)
     if frames is not None:
@@ -585,23 +529,18 @@ def _frame_numbers(
     if shortest.count < longest.count:
         logger.warning(
             "%s: camera %s has %d frames, but %s %d: the first %d frames of every camera are used",
-            folder,
-            shortest.camera.name,
-            shortest.count,
-            longest.camera.name,
-            longest.count,
+            *(folder, shortest.camera.name, shortest.count, longest.camera.name, longest.count),
             shortest.count,
         )
     return range(shortest.count)
 
 
-def _of_cameras(cameras: Sequence[int], count: int) -> list[int]:
-    """Numbers of the views of some cameras, of ``count`` frames each."""
-    return [camera * count + frame for camera in cameras for frame in range(count)]
-
-
 def _read_views(
-    recordings: Sequence[Recording], numbers: range, resolution: int | None, cache: Path | None
+    recordings: Sequence[Recording],
+    numbers: range,
+    stamped: bool,
+    resolution: int | None,
+    cache: Path | None,
 ) -> Views:
     """All frames of all cameras, camera by camera."""
     count = len(numbers)
@@ -609,8 +548,7 @@ def _read_views(
     sources = [recording.camera.source for recording in recordings]
     sizes = final_sizes(sources, native, resolution)
     calibrations = [recording.camera.calibration for recording in recordings]
-    shapes = map(misshapen, sources, native, calibrations)
-    refuse_all([problem for problem in shapes if problem is not None])
+    refuse_all(list(filter(None, map(misshapen, sources, native, calibrations))))
     labels = [recording.camera.label for recording in recordings]
     intrinsics = final_intrinsics(labels, calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(recordings))]
@@ -619,28 +557,25 @@ def _read_views(
         _job(recording, numbers, sizes[index], has_ray[index], index * count)
         for index, recording in enumerate(recordings)
     ]
-    all_sizes = [size for size in sizes for _ in numbers]
-    if store.is_needed(all_sizes):
-        images = [
-            recording.images[number]
-            for recording in recordings
-            if recording.images
-            for number in numbers
-        ]
-        files = [source for source in sources if source.is_file()] + images
-        cut = any(shown is not None for shown in has_ray)
-        channels = 4 if cut or any(read_header(path)[1] for path in images) else 3
-        names = [[recording.camera.name, bool(recording.images)] for recording in recordings]
-        span = [numbers.start, numbers.stop, numbers.step]
-        recipe = ["multicamera", names, span, digests(has_ray)]
-        pixels = store.decoded(files, recipe, all_sizes, channels, jobs, cache)
-    else:
-        pixels = store.in_memory(all_sizes, jobs)
+    images = [r.images[number] for r in recordings if r.images for number in numbers]
+    names = [[recording.camera.name, bool(recording.images)] for recording in recordings]
+    span = [numbers.start, numbers.stop, numbers.step]
+    pixels = store.images(
+        [size for size in sizes for _ in numbers],
+        jobs,
+        [source for source in sources if source.is_file()] + images,
+        ["multicamera", names, span, digests(has_ray)],
+        lambda: (
+            any(shown is not None for shown in has_ray)
+            or any(read_header(path)[1] for path in images)
+        ),
+        cache,
+    )
     poses = torch.from_numpy(np.stack([recording.camera.pose for recording in recordings])).float()
     camera = torch.arange(len(recordings)).repeat_interleave(count)
     times = torch.linspace(0, 1, count) if count > 1 else torch.zeros(1)
     times = times.repeat(len(recordings))
-    if _are_stamped(recordings):
+    if stamped:
         seconds = [recording.times[number] for recording in recordings for number in numbers]
         times = torch.tensor(unit_times(seconds))
         logger.info("Frames of some videos are unevenly spaced: times are those of the files")
@@ -660,15 +595,14 @@ def _read_views(
 def _job(
     recording: Recording, numbers: range, size: Size, shown: Tensor | None, place: int
 ) -> store.Job:
-    """What decodes the frames of a camera, the first of which is image number ``place``."""
+    """Decodes the frames of a camera, which are the images from number ``place`` on."""
 
     def decode() -> Iterator[tuple[int, np.ndarray]]:
         if recording.images:
             pictures = (read_image(recording.images[number], size) for number in numbers)
         else:
-            pictures = (
-                _reduced(frame, size) for frame in videos.frames(recording.camera.source, numbers)
-            )
+            video = videos.frames(recording.camera.source, numbers)
+            pictures = (_reduced(frame, size) for frame in video)
         for offset, pixels in enumerate(pictures):
             yield place + offset, cleared(pixels, shown)
 
@@ -682,16 +616,3 @@ def _reduced(frame: np.ndarray, size: Size) -> np.ndarray:
     channels = np.full((4, *frame.shape[:2]), 255, np.float32)
     channels[:3] = frame.transpose(2, 0, 1)
     return shrink(channels, size[1], size[0])
-
-
-def _listing(recordings: Sequence[Recording], views: Views, count: int) -> Listing:
-    """The views as a list from which some can be chosen."""
-    return Listing(
-        paths=tuple(r.camera.source for r in recordings for _ in range(count)),
-        files=views.files,
-        camera_to_world=views.camera_to_world,
-        times=views.times,
-        calibrations=tuple(r.camera.calibration for r in recordings for _ in range(count)),
-        timed=True,
-        cameras=tuple(r.camera.name for r in recordings for _ in range(count)),
-    )

@@ -1,13 +1,13 @@
 """Times of images from the numbers in their names."""
 
 import re
-import warnings
 from collections import defaultdict
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import PurePosixPath
 
+from xplanes.errors import warn
 from xplanes.files import natural
 from xplanes.scenes.entries import some
 
@@ -17,13 +17,13 @@ OTHER_TIMES = (
 )
 
 FEW = 0.5
-"""Share of the images of a folder below which different times are suspiciously few."""
+"""Share of a folder's images below which the number of distinct times is suspicious."""
 
 CAMERA = re.compile(
     r"(?i)(?<![a-z])(cam|camera|view|lens|sensor|rig)s?[_\- ]*\d+(?![a-z\d])"
     r"|(?<![^_\-. ])[cv]\d+(?=$|[_\-. ])"
 )
-"""A number that is a camera's, as in 034_cam1."""
+"""The number of a camera, as in 034_cam1."""
 
 CLOCK = re.compile(r"(?<![A-Za-z\d])\d+\.\d+$|(?<!\d)(\d{10})[_-](\d{9}|\d{6})$")
 """Seconds and their fraction at the end of a name, as in 1305031102.175304."""
@@ -38,7 +38,7 @@ Number = int | float
 
 
 def times_in_names(names: Sequence[str]) -> list[Number]:
-    """Times of images, in any unit, from their names; none, with a warning, where these tell none.
+    """Times of images, in any unit, from their names; none, with a warning, if these have none.
 
     They are dates and times of day, seconds with a fraction, or else the number that differs most
     among the names and is no camera's. A warning shows names and times where their orders disagree,
@@ -61,7 +61,7 @@ def times_in_names(names: Sequence[str]) -> list[Number]:
         if len(set(found)) > 1 or (found and len(names) == 1):
             break
     if why := _no_series(names, stems, found):
-        warnings.warn(f"{why}: all images are taken for one timestep. {OTHER_TIMES}", stacklevel=6)
+        warn(f"{why}: all images are taken for one timestep. {OTHER_TIMES}")
         return []
     return _checked(names, found)
 
@@ -128,7 +128,7 @@ def _few(names: Sequence[str], times: Sequence[Number]) -> bool:
 
 
 def _checked(names: Sequence[str], times: list[Number]) -> list[Number]:
-    """The times, with a warning where they hardly are those of the images."""
+    """The times, with a warning if they are unlikely."""
     why, shown = "", list(range(min(3, len(names))))
     for places in _folders(names):
         back = [pair for pair in pairwise(places) if times[pair[1]] < times[pair[0]]]
@@ -139,7 +139,5 @@ def _checked(names: Sequence[str], times: list[Number]) -> list[Number]:
         why = f"are only {len(set(times))}, for {len(names)} images"
     if why:
         pairs = ", ".join(f"{names[place]} -> {times[place]}" for place in shown)
-        warnings.warn(
-            f"The times from the numbers in the names {why} ({pairs}). {OTHER_TIMES}", stacklevel=6
-        )
+        warn(f"The times from the numbers in the names {why} ({pairs}). {OTHER_TIMES}")
     return times

@@ -2,16 +2,14 @@
 
 import logging
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import torch
 
-from xplanes.errors import SceneError
+from xplanes.errors import SceneError, warn
 from xplanes.scenes.entries import (
     SUFFIXES,
     checked_pose,
@@ -21,28 +19,16 @@ from xplanes.scenes.entries import (
     mask_files,
     oriented,
     read_object,
-    refuse_repeats,
     require_fetched,
-    require_precision,
     short,
     some,
     unit_times,
 )
 from xplanes.scenes.images import native_sizes
-from xplanes.scenes.listing import (
-    Calibration,
-    Listing,
-    held_out,
-    picked,
-    read_splits,
-    require_shapes,
-    thinned,
-    time_words,
-)
-from xplanes.scenes.masks import MaskUse
-from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.listing import Calibration, Listing, held_out, time_source
+from xplanes.scenes.source import CaptureSettings
 from xplanes.scenes.views import Scene
-from xplanes.settings import Count, Location
+from xplanes.settings import Location
 
 logger = logging.getLogger(__name__)
 
@@ -53,7 +39,7 @@ DOWNLOAD = "Download or unpack the capture again."
 
 
 @dataclass(frozen=True, kw_only=True)
-class NerfiesSettings(SceneSettings):
+class NerfiesSettings(CaptureSettings):
     """A capture in the format of Nerfies, HyperNeRF or DyCheck."""
 
     files: ClassVar = "dataset.json, camera/ and rgb/"
@@ -64,11 +50,6 @@ class NerfiesSettings(SceneSettings):
     # Folder of masks, with the subfolders and file names of rgb, black outside the foreground; null
     # for none. DyCheck's co-visibility masks are unsuitable: they do not mark the foreground.
     masks: Location | None
-    # What masks leave out. alpha: is empty; ignore: is neither trained on nor scored; auto: alpha
-    # where they look like silhouettes, else ignore; lrm: is cut from the LRM's input alone.
-    mask_use: MaskUse
-    # Without listed val images: hold out every n-th image as val, in order of time and name.
-    eval_every: Count
     orient: bool  # Rotate the world so that the cameras' mean up vector becomes its z axis.
 
     @classmethod
@@ -91,19 +72,10 @@ class NerfiesSettings(SceneSettings):
             found = {split: [places[name] for name in part] for split, part in chosen.items()}
         else:
             found = held_out(listing, self.eval_every)
-        parts = picked(
-            {split: listing.subset(part) for split, part in found.items()},
-            splits,
-            source,
-            "Leave data.eval_split out, or set it to val.",
-        )
-        parts = thinned(parts, self.views, self.eval_views, folder)
-        read, cut, notes = read_splits(
-            parts, self.resolution, self.image_cache, self.mask_use, listing
-        )
-        return Scene(folder.resolve().name, read, points=points, cut=cut, notes=notes)
+        way_out = "Leave data.eval_split out, or set it to val."
+        return self.capture(listing, found, splits, source, way_out, points)
 
-    def _listing(self, names: Sequence[str], pictures: str) -> tuple[Listing, torch.Tensor | None]:
+    def _listing(self, names: Sequence[str], pictures: str) -> tuple[Listing, np.ndarray | None]:
         """The images of these names in a folder of rgb, and the points of the capture."""
         folder = self.folder
         root = folder.resolve()
@@ -125,32 +97,29 @@ class NerfiesSettings(SceneSettings):
         ]
         if self.orient:
             poses, points = oriented(poses, points, paths)
-        times, takers, words = self._metadata(names)
-        require_precision(folder, poses[:, :3, 3])
-        refuse_repeats(labels, paths, poses, times)
+        times, source = self._times(names)
         masks = ()
         if self.masks is not None:
             kinds = [(f"{pictures}/{name}.png", f"{name}.png") for name in names]
             masks = mask_files(folder / self.masks, kinds)
-        listing = Listing(
-            paths=tuple(paths),
+        listing = Listing.checked(
+            folder,
+            labels,
+            paths,
+            poses,
+            times,
             files=tuple(path.relative_to(root).as_posix() for path in paths),
-            camera_to_world=torch.from_numpy(poses).float(),
-            times=torch.tensor(times or [0.0] * len(paths), dtype=torch.float32),
             calibrations=tuple(calibration for _, calibration in cameras),
-            timed=bool(times),
             masks=masks,
-            cameras=takers,
-            time_words=words,
+            time_source=source,
         )
-        require_shapes(listing)
-        return listing, None if points is None else torch.from_numpy(points).float()
+        return listing, points
 
-    def _metadata(self, names: Sequence[str]) -> tuple[list[float], tuple[str, ...], str]:
-        """Times from 0 to 1, names of cameras, and where times come from; no times if static."""
+    def _times(self, names: Sequence[str]) -> tuple[list[float], str]:
+        """Times from 0 to 1, and where they come from; none where the scene is static."""
         path = self.folder / "metadata.json"
-        if self.static and not path.is_file():
-            return [], (), ""
+        if self.static:
+            return [], ""
         content = read_object(path, "the timestep of each image")
         entries = []
         for name in names:
@@ -161,10 +130,6 @@ class NerfiesSettings(SceneSettings):
                     '"camera_id": 0}, or take the name out of dataset.json.'
                 )
             entries.append(entry)
-        taken = [str(entry["camera_id"]) for entry in entries if "camera_id" in entry]
-        cameras = tuple(taken) if len(taken) == len(names) else ()
-        if self.static:
-            return [], cameras, ""
         key = next((key for key in TIMES if all(key in entry for entry in entries)), None)
         if key is None:
             bare = next(
@@ -185,7 +150,7 @@ class NerfiesSettings(SceneSettings):
             "%s: %s from %s to %s is mapped to times from 0 to 1",
             *(path, key, min(times), max(times)),
         )
-        return unit_times(times), cameras, time_words(key, names, times)
+        return unit_times(times), time_source(key, names, times)
 
 
 def _no_capture(folder: Path) -> SceneError:
@@ -332,9 +297,8 @@ def _camera(path: Path) -> tuple[np.ndarray, Calibration]:
 def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) -> str:
     """The folder in rgb of the smallest images that are at least as wide as asked for.
 
-    The largest images, where none are, or none were asked for. Where images of that scale are
-    missing, another that lacks fewer takes its place, the next larger first; a warning says so, and
-    names the images that it lacks.
+    Without such images, or a width, the largest ones. If images of that scale are missing, the
+    scale that lacks the fewest takes its place with a warning, the next larger first.
     """
     widths: dict[str, int] = {}
     lost: dict[str, list[str]] = {}
@@ -362,16 +326,15 @@ def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) 
     chosen = min(widths, key=rank)
     if lost[wanted]:
         rest = f", without {some(lost[chosen])}" if lost[chosen] else ""
-        warnings.warn(
+        warn(
             f"{len(lost[wanted])} of {len(names)} images are not in {folder / 'rgb' / wanted}: "
-            f"{some(lost[wanted])}. Those of rgb/{chosen} are read{rest}.",
-            stacklevel=4,
+            f"{some(lost[wanted])}. Those of rgb/{chosen} are read{rest}."
         )
     return chosen
 
 
 def _missing(folder: Path, names: Sequence[str], ends: Sequence[str]) -> list[str]:
-    """Names of which a folder has no file."""
+    """Names without a file in a folder."""
     return [name for name in names if not any((folder / f"{name}{end}").is_file() for end in ends)]
 
 

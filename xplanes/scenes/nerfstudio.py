@@ -5,14 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from xplanes.errors import BrokenFrameError, MissingSplitError, SceneError
+from xplanes.errors import BrokenFrameError, SceneError
 from xplanes.scenes.entries import image_path, short
-from xplanes.scenes.listing import Listing, held_out, read_splits, thinned
-from xplanes.scenes.masks import MaskUse
-from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.listing import Listing, held_out
+from xplanes.scenes.source import CaptureSettings
 from xplanes.scenes.transforms import listing_of, read_frames
 from xplanes.scenes.views import Scene
-from xplanes.settings import Count
 
 SPLITS = ("train", "val", "test")
 
@@ -21,89 +19,41 @@ OTHER_AXES = ("from_mitsuba", "from_na")
 
 
 @dataclass(frozen=True, kw_only=True)
-class NerfstudioSettings(SceneSettings):
+class NerfstudioSettings(CaptureSettings):
     """A capture in the format of nerfstudio or instant-ngp."""
 
     files: ClassVar = "transforms.json"
-
-    # Hold out every n-th frame as val, in order of time and file name; never the first or last.
-    # Splits listed in the capture (train_filenames, ...) take precedence.
-    eval_every: Count
-    # What masks leave out. alpha: is empty; ignore: is neither trained on nor scored; auto: alpha
-    # where they look like silhouettes, else ignore; lrm: is cut from the LRM's input alone.
-    mask_use: MaskUse
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         return (folder / "transforms.json").is_file()
 
     def load(self, splits: Sequence[str]) -> Scene:
-        return read_capture(
-            self.folder,
-            resolution=self.resolution,
-            splits=splits,
-            eval_every=self.eval_every,
-            mask_use=self.mask_use,
-            views=self.views,
-            eval_views=self.eval_views,
-            cache=self.image_cache,
-        )
+        """Read a capture and check all of it.
 
-
-def read_capture(
-    folder: Path,
-    *,
-    resolution: int | None,
-    splits: Sequence[str],
-    eval_every: int = 8,
-    mask_use: MaskUse = "auto",
-    views: int | None = None,
-    eval_views: int | None = None,
-    cache: Path | None = None,
-) -> Scene:
-    """Read a capture and check all of it.
-
-    Poses are taken as they stand: ``applied_transform``, ``applied_scale``, ``scale``, ``offset``
-    and ``aabb_scale`` tell where the world lies in other programs, but the field's frame is found
-    from the cameras. Times in any unit are mapped to [0, 1] over all frames, of whichever split.
-
-    Args:
-        folder: Folder of transforms.json.
-        resolution: Width of the images in pixels; None keeps the native sizes.
-        splits: Names of the splits to read: train, val, test.
-        eval_every: Where the file lists no splits, one frame in ``eval_every`` goes to val.
-        mask_use: What the black parts of masks are.
-        views: Number of views to keep of the train split, spread evenly over time;
-            None keeps all.
-        eval_views: The same for every other split, at most.
-        cache: Folder of images that are too large for memory; that of the user when None.
-
-    Raises:
-        MissingSplitError: If there is no split of a name.
-        SceneError: Anything else is missing, damaged or inconsistent.
-    """
-    folder = Path(folder)
-    path = folder / "transforms.json"
-    if not path.is_file():
-        raise _no_capture(folder)
-    content = read_frames(path)
-    for key in OTHER_AXES:
-        if content.get(key):
-            raise SceneError(
-                f"{path}: {key}={short(content[key])} stands for poses with other axes than "
-                "OpenGL's (x right, y up, z backward). Convert transform_matrix, and take the key "
-                "out."
-            )
-    listing = listing_of(path, content, any_unit=True)
-    parts = _listed_splits(path, content, listing) or held_out(listing, eval_every)
-    chosen = {}
-    for split in dict.fromkeys(splits):
-        if not parts.get(split):
-            raise _no_split(path, split, parts, eval_every)
-        chosen[split] = listing.subset(parts[split])
-    chosen = thinned(chosen, views, eval_views, folder)
-    read, cut, notes = read_splits(chosen, resolution, cache, mask_use, listing)
-    return Scene(folder.resolve().name, read, cut=cut, notes=notes)
+        Poses are taken as they stand: ``applied_transform``, ``applied_scale``, ``scale``,
+        ``offset`` and ``aabb_scale`` say where the world lies in other programs, but the field's
+        frame is estimated from the cameras. Times in any unit are mapped to [0, 1] over all frames,
+        of whichever split.
+        """
+        path = self.folder / "transforms.json"
+        if not path.is_file():
+            raise _no_capture(self.folder)
+        content = read_frames(path)
+        for key in OTHER_AXES:
+            if content.get(key):
+                raise SceneError(
+                    f"{path}: {key}={short(content[key])} stands for poses with other axes than "
+                    "OpenGL's (x right, y up, z backward). Convert transform_matrix, and take the "
+                    "key out."
+                )
+        listing = listing_of(path, content, any_unit=True)
+        places = _listed_splits(path, content, listing) or held_out(listing, self.eval_every)
+        if "train" in splits and not places.get("train"):
+            raise SceneError(f'{path} has no frames to train on: fill "train_filenames".')
+        missing = next((split for split in splits if not places.get(split)), "")
+        way_out = _way_out(missing, places, self.eval_every)
+        return self.capture(listing, places, splits, path, way_out)
 
 
 def _listed_splits(
@@ -127,7 +77,7 @@ def _listed_splits(
                 image = image_path(str(path), path.parent.resolve(), name, key)
             except BrokenFrameError:
                 if name in {frame["file_path"] for frame in content["frames"]}:
-                    continue  # A warning told of it.
+                    continue  # There was a warning of it.
                 raise
             if image not in places:
                 raise SceneError(
@@ -145,25 +95,16 @@ def _listed_splits(
     return {split: sorted(set(chosen)) for split, chosen in found.items()}
 
 
-def _no_split(
-    path: Path, split: str, parts: Mapping[str, list[int]], eval_every: int
-) -> SceneError:
-    names = ", ".join(name for name in parts if parts[name])
-    if split == "train":
-        return SceneError(f'{path} has no frames to train on: fill "train_filenames".')
-    way_out = (
-        "Leave data.eval_split out, set it to val, or list "
-        if split == "test" and parts.get("val")
-        else f"Set data.eval_every below {eval_every}, or list "
-        if "val" in parts and len(parts["train"]) > 2 and eval_every > 1
-        else "The first and the last frame are never held out. List "
-        if "val" in parts
-        else "List "
-    )
-    return MissingSplitError(
-        f"{path} has no {split} split. Splits of this capture: {names}. {way_out}"
-        f'"{split}_filenames" in the file.'
-    )
+def _way_out(split: str, places: Mapping[str, list[int]], eval_every: int) -> str:
+    """What makes a split that is missing."""
+    way_out = "List"
+    if split == "test" and places.get("val"):
+        way_out = "Leave data.eval_split out, set it to val, or list"
+    elif "val" in places and len(places["train"]) > 2 and eval_every > 1:
+        way_out = f"Set data.eval_every below {eval_every}, or list"
+    elif "val" in places:
+        way_out = "The first and the last frame are never held out. List"
+    return f'{way_out} "{split}_filenames" in the file.'
 
 
 def _no_capture(folder: Path) -> SceneError:

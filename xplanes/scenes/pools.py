@@ -2,12 +2,15 @@
 
 import copy
 import itertools
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from xplanes.scenes.store import CELL, TILE, StoredImages, by_tile, count_in_squares, packed
+from xplanes.scenes.silhouettes import count_in_squares
+from xplanes.scenes.store import RUN, StoredImages
 from xplanes.scenes.views import Views
 
 FAR, OTHER, PLAIN, NOTHING = range(4)
@@ -17,21 +20,24 @@ ORDER = (FAR, PLAIN, OTHER)
 """Kinds as they are listed."""
 
 BLOCK = 2**16
-"""Pixels that the same 16 bits tell apart."""
+"""Pixels that 16 bits can number."""
 
 PART = 2**22
-"""Pixels whose numbers are put together at a time."""
+"""Pixels whose whole numbers are computed at a time."""
+
+CELLS = 8
+"""Pixels of a run, and rows and columns of an image, that are near together."""
 
 
 class PixelPools:
-    """Pixels of three kinds, each of which has a share of its own: far, plain and all others.
+    """Pixels of three kinds, each with a share of its own: far, plain and all others.
 
     Pixels are listed kind by kind, by the lower 16 bits of their numbers: whole numbers would take
     as much memory as the images.
 
     Args:
         near: Pixels near silhouettes; all others are far. Overwritten. bool [V, H, W]
-        plain: Which pixels have one colour with all around them; None for none. bool [V, H, W]
+        plain: Pixels whose surroundings have the same colour; None for none. bool [V, H, W]
         valid: Which pixels show something; None for all. bool [V, H, W]
 
     Attributes:
@@ -67,7 +73,7 @@ class PixelPools:
                 next(places).copy_((part == kind).nonzero()[:, 0])
 
     def share(self, far: float, plain: float) -> None:
-        """Settle the shares of far and of plain pixels."""
+        """Set the shares of far and of plain pixels."""
         self.bounds = torch.tensor([far, plain], dtype=torch.float64).cumsum(dim=0)
 
     def to(self, device: torch.device) -> "PixelPools":
@@ -102,103 +108,95 @@ class PixelPools:
         return BLOCK * block + (self.listed[place].long() & (BLOCK - 1))
 
 
-def pixels_of(chosen: Tensor, uniform: Tensor) -> Tensor:
-    """Some of the chosen pixels of a tile, by numbers from 0 to 1. bool [H, W], [K] -> int64 [K]"""
-    pixels = chosen.flatten().nonzero()[:, 0]
-    return pixels[(uniform * len(pixels)).long().clamp_(max=len(pixels) - 1)]
+class RunPools:
+    """Pixels of images in files, near silhouettes and far from them, drawn run by run.
 
-
-class TilePool:
-    """Tiles to draw from, each as often as it has pixels.
+    A run is drawn as often as it has pixels of a kind. `CELLS` consecutive pixels are all near if
+    one of them is, and silhouettes are widened by whole squares of `CELLS` pixels a side.
 
     Args:
-        places: The view of each tile, and the tile's number in it. int32 [K, 2]
-        cells: Which of its cells belong to the pool, as bits. uint8 [K, B]
-        pixels: The pixels of these cells, without padding. int64 [K]
+        views: Views whose images are ``images``.
+        images: Images in files of pixels.
+        margins: Pixels around the silhouette of each image that are near, too. [V]
+
+    Attributes:
+        sizes: Numbers of far, plain and near pixels; none are plain.
     """
 
-    def __init__(self, places: Tensor, cells: Tensor, pixels: Tensor) -> None:
-        self.places, self.cells, self.ends = places, cells, pixels.cumsum(dim=0)
+    def __init__(self, views: Views, images: StoredImages, margins: Sequence[int]) -> None:
+        self.views = views
+        self.pixels = images.sizes.prod(dim=1)
+        self.first = F.pad((-(-self.pixels // RUN)).cumsum(dim=0), (1, 0))
+        """Number of each view's first run, and that of all runs. int64 [V + 1]"""
+        total = int(self.first[-1])
+        counts = torch.zeros(2, total, dtype=torch.int64)
+        self.near = torch.full((total, RUN // CELLS // 8), 255, dtype=torch.uint8)
+        """A bit for each `CELLS` pixels of a run. uint8 [runs, B]"""
+        self.all_near = True
+        for index, margin in enumerate(margins):
+            runs = slice(int(self.first[index]), int(self.first[index + 1]))
+            near, shown = _widened(images.silhouette(index), margin), views.shown(index)
+            if shown is None and near.all():
+                counts[1, runs] = self._lengths(index, torch.arange(runs.stop - runs.start))
+                continue
+            self.all_near = False
+            cells = _in_runs(near).view(-1, RUN // CELLS, CELLS).any(dim=2)
+            valid = _in_runs(torch.ones_like(near) if shown is None else shown)
+            self.near[runs] = torch.from_numpy(np.packbits(cells.numpy(), axis=1))
+            near = cells.repeat_interleave(CELLS, dim=1)
+            counts[0, runs], counts[1, runs] = ((valid & (near == kind)).sum(1) for kind in (0, 1))
+        self.ends = counts.flatten().cumsum(dim=0)
+        """Pixels up to the end of each run, far ones, then near ones. int64 [2 runs]"""
+        far, near = counts.sum(dim=1).tolist()
+        self.sizes = far, 0, near
+        self.far_share = 0.0
 
-    def __len__(self) -> int:
-        return int(self.ends[-1]) if len(self.ends) else 0
+    def _lengths(self, view: Tensor | int, run: Tensor) -> Tensor:
+        """Pixels of runs: the last one of an image may have fewer. [K]"""
+        return (self.pixels[view] - RUN * run).clamp(max=RUN)
 
-    def pick(self, uniform: Tensor) -> Tensor:
-        """Views, tiles and their cells at places given by numbers from 0 to 1. [K] -> [K, 2 + B]"""
-        place = (uniform * len(self)).long().clamp_(max=len(self) - 1)
-        found = torch.searchsorted(self.ends, place, right=True)
-        return torch.cat([self.places[found].long(), self.cells[found].long()], dim=1)
+    def share(self, far: float, plain: float) -> None:
+        """Set the share of far pixels; none are plain."""
+        self.far_share = far
 
+    def pick(self, kind: Tensor, where: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Runs by numbers from 0 to 1: which are far, their views and their numbers there. [K]"""
+        far, total, (size, _, rest) = kind < self.far_share, int(self.first[-1]), self.sizes
+        place = torch.where(far, where * size, size + where * rest).long()
+        place = place.clamp_(max=size + rest - 1)
+        run = torch.searchsorted(self.ends, place, right=True) % total
+        view = torch.searchsorted(self.first, run, right=True) - 1
+        return far, view, run - self.first[view]
 
-def tile_pools(views: Views, images: StoredImages, margins: list[int]) -> tuple[TilePool, TilePool]:
-    """The cells of tiles within some pixels of the silhouettes, and all others."""
-    numbers = torch.tensor(
-        [-(-height // TILE) * -(-width // TILE) for height, width in _sizes(images)]
-    )
-    ends = numbers.cumsum(dim=0)
-    total = int(numbers.sum())
-    # Filled image by image: small tensors that stay, among large ones that go, would scatter both.
-    places = torch.empty(total, 2, dtype=torch.int32)
-    bits = torch.empty(2, total, (TILE // CELL) ** 2 // 8, dtype=torch.uint8)
-    counts = torch.empty(2, total, dtype=torch.int64)
-    for index, (size, margin) in enumerate(zip(_sizes(images), margins, strict=True)):
-        part = slice(int(ends[index] - numbers[index]), int(ends[index]))
-        places[part, 0] = index
-        places[part, 1] = torch.arange(int(numbers[index]), dtype=torch.int32)
-        lit = near = images.lit(index)
-        if not lit.all():
-            reach = -(-margin // CELL)
-            around = F.max_pool2d(lit.float()[None], 2 * reach + 1, stride=1, padding=reach)
-            near = around[0] > 0
-        shown = views.shown(index)
-        if shown is None:
-            height, width = (_lengths(side) for side in size)
-            count = height[:, None] * width
-        else:
-            count = count_in_squares(shown, CELL)
-        for pool, chosen in enumerate((near, ~near)):
-            bits[pool, part] = torch.from_numpy(packed(by_tile(chosen)))
-            counts[pool, part] = by_tile(count * chosen).sum(dim=1)
-    near_pool, far_pool = (
-        TilePool(places[count > 0], bit[count > 0], count[count > 0])
-        for bit, count in zip(bits, counts, strict=True)
-    )
-    return near_pool, far_pool
-
-
-def in_cells(
-    cells: Tensor, height: Tensor, width: Tensor, uniform: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Pixels of tiles, each in any of some cells as likely as any other.
-
-    Args:
-        cells: The cells of each tile to draw from. bool [K, (TILE / CELL)**2]
-        height: Rows from each tile's first to the end of its image. int64 [K]
-        width: Columns, likewise. int64 [K]
-        uniform: Numbers from 0 to 1. [K, P]
-
-    Returns:
-        Rows and columns in the tiles. int64 [K, P] each
-    """
-    side = TILE // CELL
-    first = CELL * torch.arange(side)
-    rows, columns = ((size[:, None] - first).clamp(0, CELL) for size in (height, width))
-    pixels = (rows[:, :, None] * columns[:, None, :]).flatten(1) * cells
-    ends = pixels.cumsum(dim=1)
-    total = ends[:, -1:]
-    place = torch.minimum((uniform * total).long(), total - 1)
-    cell = torch.searchsorted(ends, place, right=True)
-    place -= (ends - pixels).gather(1, cell)
-    across = columns.gather(1, cell % side)
-    row = cell // side * CELL + place // across
-    return row, cell % side * CELL + place % across
+    def inside(self, far: Tensor, view: Tensor, run: Tensor, uniform: Tensor) -> Tensor:
+        """Pixels of runs, as `pick` gives these, by numbers from 0 to 1. [K, P] -> int64 [K, P]"""
+        length = self._lengths(view, run)
+        if self.all_near:
+            return torch.minimum((uniform * length[:, None]).long(), length[:, None] - 1)
+        bits = self.near[self.first[view] + run].numpy()
+        near = torch.from_numpy(np.unpackbits(bits, axis=1)).bool().repeat_interleave(CELLS, dim=1)
+        chosen = (near != far[:, None]) & (torch.arange(RUN) < length[:, None])
+        for row, (index, start) in enumerate(zip(view.tolist(), (RUN * run).tolist(), strict=True)):
+            if (shown := self.views.shown(index)) is not None:
+                part = shown.flatten()[start : start + RUN]
+                chosen[row, : len(part)] &= part
+        ends = chosen.cumsum(dim=1)
+        place = torch.minimum((uniform * ends[:, -1:]).long(), ends[:, -1:] - 1)
+        return torch.searchsorted(ends, place, right=True)
 
 
-def _sizes(images: StoredImages) -> list[tuple[int, int]]:
-    """Height and width of each image."""
-    return [(height, width) for height, width in images.sizes.tolist()]
+def _widened(mask: Tensor, margin: int) -> Tensor:
+    """The squares within some pixels of those that hold pixels of a mask. bool [h, w]"""
+    if mask.all():
+        return mask
+    height, width = mask.shape
+    reach = -(-margin // CELLS)
+    held = (count_in_squares(mask, CELLS) > 0).float()[None]
+    near = F.max_pool2d(held, 2 * reach + 1, stride=1, padding=reach)[0] > 0
+    near = near.repeat_interleave(CELLS, 0).repeat_interleave(CELLS, 1)
+    return near[:height, :width]
 
 
-def _lengths(side: int) -> Tensor:
-    """Rows, or columns, of the cells along a side of an image."""
-    return (side - torch.arange(0, side, CELL)).clamp(max=CELL)
+def _in_runs(mask: Tensor) -> Tensor:
+    """The pixels of an image run by run, False behind the last one. bool [h, w] -> [runs, RUN]"""
+    return F.pad(mask.flatten(), (0, -mask.numel() % RUN)).view(-1, RUN)

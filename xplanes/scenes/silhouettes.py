@@ -8,17 +8,22 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from xplanes.scenes.cameras import ball_extent, project
-from xplanes.scenes.matte import silhouette_of
 from xplanes.scenes.views import Views
 
 WINDOW = 0.06
-"""Share of the time span over which content counts as static when silhouettes are joined."""
+"""Share of the time span over which content counts as static when silhouettes are intersected."""
 
 SAME_COLOUR = 4
 """Steps of 255 by which pixels of one colour differ at most."""
 
+LEAST_FRAMES = 3
+"""Images that a camera must have taken for their median to show what is static."""
+
+CHANGE = 20
+"""Least difference from the median, of 255 in any channel, of a pixel that has changed."""
+
 MOST_VIEWS = 5
-"""Views of such a span at most: more rule out little empty space, but ever more of what moves."""
+"""Most views in such a span: more would cut into moving content and empty little else."""
 
 
 def foreground(views: Views, margin: int | Sequence[int]) -> Tensor:
@@ -31,17 +36,17 @@ def foreground(views: Views, margin: int | Sequence[int]) -> Tensor:
     near = torch.zeros(views.images.shape[:3], dtype=torch.bool)
     margins = [margin] * len(views) if isinstance(margin, int) else margin
     for index, reach in enumerate(margins):
-        shown = silhouette_of(views.image(index)[..., 3])
+        shown = views.silhouette(index)
         near[index, : shown.shape[0], : shown.shape[1]] = widened(shown, reach)
     return near
 
 
 def plain(views: Views, margins: Sequence[int]) -> Tensor:
-    """Opaque pixels around which all have one colour: walls and floors without texture.
+    """Opaque pixels in surroundings of one colour: walls and floors without texture.
 
     Args:
         views: Images in memory.
-        margins: Pixels around that have the same colour at least, for each image. [V]
+        margins: Size of these surroundings in pixels, for each image. [V]
 
     Returns:
         bool [V, H, W]
@@ -58,6 +63,21 @@ def plain(views: Views, margins: Sequence[int]) -> Tensor:
         even = even.repeat_interleave(reach, 0).repeat_interleave(reach, 1)
         found[index, :height, :width] = even
     return found
+
+
+def count_in_squares(mask: Tensor, side: int) -> Tensor:
+    """How many pixels a mask holds in each square of an image.
+
+    Args:
+        mask: Pixels. bool [h, w]
+        side: Rows and columns of a square.
+
+    Returns:
+        Their numbers. int64 [h / side, w / side], rounded up
+    """
+    height, width = mask.shape
+    padded = F.pad(mask, (0, -width % side, 0, -height % side))
+    return padded.view(-(-height // side), side, -(-width // side), side).sum(dim=(1, 3))
 
 
 def widened(mask: Tensor, reach: int) -> Tensor:
@@ -84,7 +104,7 @@ def may_hold(views: Views, points: Tensor, *, radius: float) -> Tensor:
     inside = torch.ones(len(views), len(points), dtype=torch.bool)
     intrinsics = views.intrinsics
     for index, pose in enumerate(views.camera_to_world):
-        (height, width), (mask, cell) = views.size(index), views.silhouette(index)
+        height, width = views.size(index)
         focal, lens = intrinsics.focal[index], intrinsics.lens(index)
         centre = intrinsics.centre[index]
         column, row, seen = project(pose, points, focal=focal, centre=centre, lenses=lens)
@@ -95,9 +115,14 @@ def may_hold(views: Views, points: Tensor, *, radius: float) -> Tensor:
         seen &= margin < math.inf
         if not seen.any():
             continue
-        margin = (margin[seen] / cell).ceil()
-        steps = _steps_to_foreground(mask, int(margin.max()))
-        inside[index, seen] = steps[row[seen].long() // cell, column[seen].long() // cell] <= margin
+        # The silhouette's pixels in the square around each point, from sums over rectangles.
+        sums = F.pad(views.silhouette(index).cumsum(0, dtype=torch.int32).cumsum(1), (1, 0, 1, 0))
+        reach = margin[seen].ceil().clamp(max=max(height, width)).long()
+        row, column = row[seen].long(), column[seen].long()
+        top, left = (row - reach).clamp(min=0), (column - reach).clamp(min=0)
+        end, right = (row + reach + 1).clamp(max=height), (column + reach + 1).clamp(max=width)
+        held = sums[end, right] - sums[top, right] - sums[end, left] + sums[top, left]
+        inside[index, seen] = held > 0
     return inside
 
 
@@ -126,31 +151,6 @@ def join_in_time(inside: Tensor, times: Tensor) -> Tensor:
     result = torch.empty_like(held)
     result[order] = held
     return result
-
-
-def _steps_to_foreground(mask: Tensor, most: int) -> Tensor:
-    """Pixels to the nearest foreground along rows, columns or diagonals. [H, W] -> int16 [H, W]
-
-    Farther than ``most`` shows as ``most + 1``.
-    """
-    most = min(most, max(mask.shape))
-    steps = (~mask).to(torch.int16)
-    for _ in range(most):
-        wide = mask.clone()
-        wide[1:] |= mask[:-1]
-        wide[:-1] |= mask[1:]
-        mask = wide.clone()
-        mask[:, 1:] |= wide[:, :-1]
-        mask[:, :-1] |= wide[:, 1:]
-        steps += ~mask
-    return steps
-
-
-LEAST_FRAMES = 3
-"""Images that a camera must have taken for their median to show what is static."""
-
-CHANGE = 20
-"""Difference from the median, of 255 in any channel, from which a pixel has changed."""
 
 
 def changing(views: Views, margins: Sequence[int]) -> Tensor | None:

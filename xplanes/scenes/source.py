@@ -1,16 +1,18 @@
-"""Base class of data formats: common settings and handling of static scenes."""
+"""Base classes of data formats: common settings, splits, and static scenes."""
 
-import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
+import numpy as np
 import torch
 
-from xplanes.errors import MissingSplitError, SceneError
+from xplanes.errors import MissingSplitError, SceneError, warn
+from xplanes.scenes.listing import Listing, Part, read_splits, thinned
+from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.views import Scene, Views, joined
 from xplanes.settings import Count, Location, Positive, Settings
 
@@ -75,7 +77,7 @@ class SceneSettings(Settings, ABC):
     cache: Location | None  # Folder for images too large for memory; null: the user's cache.
 
     files: ClassVar[str] = ""
-    """What a folder of this format holds, in words; empty for formats without such folders."""
+    """What a folder of this format holds, for messages; empty for formats without folders."""
 
     @property
     def folder(self) -> Path:
@@ -113,6 +115,46 @@ class SceneSettings(Settings, ABC):
             MissingSplitError: If a split does not exist.
             SceneError: If anything else is missing, damaged or inconsistent.
         """
+
+    def thinned(self, parts: Mapping[str, Part]) -> dict[str, Part]:
+        """Splits with as many views as `views` and `eval_views` ask for.
+
+        Args:
+            parts: Views, or lists of images, by split name.
+
+        Raises:
+            SceneError: If the train split has fewer.
+        """
+        found = {}
+        for split, part in parts.items():
+            count, key = self.views, "data.views"
+            if split != "train":
+                count, key = self.eval_views, "data.eval_views"
+                count = None if count is None else min(count, len(part))
+            found[split] = thinned(part, count, key, f"the {split} split of {self.folder}")
+        return found
+
+    def scene_of(
+        self,
+        parts: Mapping[str, Listing],
+        mask_use: MaskUse,
+        whole: Listing | None = None,
+        **more: Any,
+    ) -> Scene:
+        """The scene of listed images, which are decoded here.
+
+        Args:
+            parts: The images of each split.
+            mask_use: What the black parts of masks are.
+            whole: All images of the capture, see `read_splits`.
+            **more: Further attributes of the scene.
+
+        Raises:
+            SceneError: If an image or a mask cannot be used.
+        """
+        read = read_splits(parts, self.resolution, self.image_cache, mask_use, whole)
+        splits, cut, notes = read
+        return Scene(self.folder.resolve().name, splits, cut=cut, notes=notes, **more)
 
     def read(self, splits: Sequence[str] | None = None) -> Scene:
         """Read the scene as these settings specify.
@@ -154,9 +196,54 @@ class SceneSettings(Settings, ABC):
             train = scene.splits["train"]
             if may_hold_out(train):
                 return scene
-            warnings.warn(
+            warn(
                 f"{self.folder}: {len(train)} images are too few to hold some out: the images that "
-                "are trained on are scored, which says little of other views.",
-                stacklevel=4,
+                "are trained on are scored, which says little of other views."
             )
             return replace(scene, splits={**scene.splits, "val": train})
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureSettings(SceneSettings, ABC):
+    """Base class of formats that hold images out and have masks."""
+
+    # Where the capture lists no splits: hold out every n-th image as val, in order of time and file
+    # name; never the first or last.
+    eval_every: Count
+    # What masks leave out. alpha: is empty; ignore: is neither trained on nor scored; auto: alpha
+    # where they look like silhouettes, else ignore; lrm: is removed from the LRM's input alone.
+    mask_use: MaskUse
+
+    def capture(
+        self,
+        listing: Listing,
+        places: Mapping[str, Sequence[int]],
+        splits: Sequence[str],
+        source: Path,
+        way_out: str,
+        points: np.ndarray | None = None,
+    ) -> Scene:
+        """The splits asked for of a whole capture.
+
+        Args:
+            listing: All images.
+            places: Those of each split, by their places in the list.
+            splits: Names of splits.
+            source: What the splits were made from, for messages.
+            way_out: What makes another split, for messages.
+            points: World points on surfaces. [N, 3]
+
+        Raises:
+            MissingSplitError: If a split has no images.
+            SceneError: If an image or a mask cannot be used.
+        """
+        for split in splits:
+            if not places.get(split):
+                names = ", ".join(name for name, part in places.items() if part)
+                raise MissingSplitError(
+                    f"{source} has no {split} split. Splits of this capture: {names or 'none'}. "
+                    f"{way_out}"
+                )
+        parts = self.thinned({split: listing.subset(places[split]) for split in splits})
+        found = None if points is None else torch.from_numpy(points).float()
+        return self.scene_of(parts, self.mask_use, listing, points=found)

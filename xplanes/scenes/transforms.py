@@ -2,14 +2,12 @@
 
 import logging
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from xplanes.errors import (
     BrokenFrameError,
@@ -17,6 +15,7 @@ from xplanes.errors import (
     SceneError,
     first_of,
     refuse_all,
+    warn,
 )
 from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.entries import (
@@ -25,14 +24,12 @@ from xplanes.scenes.entries import (
     is_number,
     is_positive,
     read_object,
-    refuse_repeats,
-    require_precision,
     short,
     unit_times,
 )
 from xplanes.scenes.formats import read_header
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
-from xplanes.scenes.listing import Calibration, Listing, require_shapes, time_words
+from xplanes.scenes.listing import Calibration, Listing, time_source
 
 logger = logging.getLogger(__name__)
 
@@ -45,7 +42,7 @@ OTHER_MODELS = ("FISHEYE", "EQUIRECTANGULAR", "ORTHO", "OMNI", "VR180", "DIVISIO
 """Parts of the names of lens models that are not read, but for those above."""
 
 OTHER_LENSES = ("equirectangular", "latlong", "orthographic", "ftheta_p0")
-"""Keys with which instant-ngp tells of further lenses."""
+"""Keys of further lenses in files of instant-ngp."""
 
 DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Order of the list of coefficients that nerfstudio writes and reads."""
@@ -71,6 +68,12 @@ IGNORED = (
     *("crop_width", "crop_height", "blur_score", "intrinsic_matrix", "n_images", "fps"),
 )
 """Keys of other programs that change nothing here."""
+
+BESIDE = {
+    "ignored": ["dynamic_mask_{stem}.png"],
+    "alpha": ["{stem}.alpha{suffix}", "{stem}{suffix}.alpha{suffix}"],
+}
+"""Names of mask files beside an image, by what they mean."""
 
 SYNONYMS = {"sx1": "s1", "sy1": "s3"}
 """What COLMAP calls the prism coefficients of a fisheye lens."""
@@ -98,118 +101,102 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
         SceneError: Anything is missing, out of range, repeated, or outside the scene's folder.
     """
     folder = path.parent.resolve()
-    named, paths, masks, matrices, meaning = _usable(path, content, folder)
-    poses, labels = np.stack(matrices), [label for label, _ in named]
-    times, words = _times(path, named, any_unit)
-    require_precision(path, poses[:, :3, 3])
-    refuse_repeats(labels, paths, poses, times)
-    listing = Listing(
-        paths=tuple(paths),
+    frames = _usable(path, content, folder)
+    paths = [frame.image for frame in frames]
+    masks, meaning = [frame.mask for frame in frames], ""
+    if not any(masks):
+        masks, meaning = _masks_beside(paths)
+    times, source = _times(path, frames, any_unit)
+    listing = Listing.checked(
+        path,
+        [frame.label for frame in frames],
+        paths,
+        np.stack([frame.pose for frame in frames]),
+        times,
         files=tuple(image.relative_to(folder).as_posix() for image in paths),
-        camera_to_world=torch.from_numpy(poses).float(),
-        times=torch.tensor(times or [0.0] * len(named), dtype=torch.float32),
-        calibrations=_calibrations(path, content, named, paths),
-        timed=bool(times),
+        calibrations=_calibrations(path, content, frames),
         masks=tuple(masks) if any(masks) else (),
         mask_meaning=meaning,
-        time_words=words,
+        time_source=source,
     )
-    require_shapes(listing)
     _warn_of_unknown(path, content)
     return listing
 
 
-def _usable(
-    path: Path, content: Mapping[str, Any], folder: Path
-) -> tuple[
-    list[tuple[str, dict[str, Any]]],
-    list[Path],
-    list[Path | None],
-    list[np.ndarray],
-    Literal["", "alpha", "ignored"],
-]:
-    """Frames that can be used, with their labels, images, masks and poses; what masks are.
+class _Frame(NamedTuple):
+    """A frame that can be used: its label for messages, its entry, and what this refers to."""
 
-    A warning tells of those without an image or with a pose that is not finite.
+    label: str
+    entry: dict[str, Any]
+    image: Path
+    mask: Path | None
+    pose: np.ndarray
+
+
+def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame]:
+    """Frames that can be used; a warning lists those without an image or with an infinite pose.
 
     Raises:
         MissingSplitError: If no frame can be used.
         SceneError: If others are wrong; it names all of them.
     """
-    named: list[tuple[str, dict[str, Any]]] = []
-    paths: list[Path] = []
-    masks: list[Path | None] = []
-    poses: list[np.ndarray] = []
+    found: list[_Frame] = []
     left_out, wrong = [], []
-    frames = content["frames"]
-    for index, frame in enumerate(frames):
-        label = f"{path}: frame {index} ({frame['file_path']})"
+    for index, entry in enumerate(content["frames"]):
+        label = f"{path}: frame {index} ({entry['file_path']})"
         try:
-            image = image_path(label, folder, frame["file_path"])
-            pose = checked_pose(label, frame["transform_matrix"])
-            mask = frame.get("mask_path") or content.get("mask_path") or None
+            image = image_path(label, folder, entry["file_path"])
+            pose = checked_pose(label, entry["transform_matrix"])
+            mask = entry.get("mask_path") or content.get("mask_path") or None
             mask = None if mask is None else image_path(label, folder, mask, "mask_path")
         except BrokenFrameError as problem:
             left_out.append(str(problem))
         except SceneError as problem:
             wrong.append(str(problem))
         else:
-            named.append((label, frame))
-            paths.append(image)
-            masks.append(mask)
-            poses.append(pose)
+            found.append(_Frame(label, entry, image, mask, pose))
     refuse_all(wrong)
-    if not named:
+    if not found:
         raise MissingSplitError(first_of(left_out))
     if left_out:
-        warnings.warn(
-            f"{len(left_out)} of {len(frames)} frames are left out:\n{first_of(left_out)}",
-            stacklevel=5,
-        )
-    meaning: Literal["", "alpha", "ignored"] = ""
-    if not any(masks):
-        masks, meaning = _masks_beside(paths)
-    return named, paths, masks, poses, meaning
+        count = len(content["frames"])
+        warn(f"{len(left_out)} of {count} frames are left out:\n{first_of(left_out)}")
+    return found
 
 
-def _masks_beside(paths: Sequence[Path]) -> tuple[list[Path | None], Literal["alpha", "ignored"]]:
-    """Masks beside images, by the names that instant-ngp gives them, and what they are."""
-    found: list[Path | None] = [None] * len(paths)
-    for index, path in enumerate(paths):
-        mask = path.with_name(f"dynamic_mask_{path.stem}.png")
-        found[index] = mask if mask.is_file() else None
-    if any(found):
-        return found, "ignored"
-    for index, path in enumerate(paths):
-        names = (f"{path.stem}.alpha{path.suffix}", f"{path.name}.alpha{path.suffix}")
-        found[index] = next((m for name in names if (m := path.with_name(name)).is_file()), None)
-    return found, "alpha"
+def _masks_beside(paths: Sequence[Path]) -> tuple[list[Path | None], str]:
+    """Masks beside images, by the names that instant-ngp gives them, and what they mean."""
+    for meaning, patterns in BESIDE.items():
+        names = [[p.format(stem=path.stem, suffix=path.suffix) for p in patterns] for path in paths]
+        found = [
+            next((mask for name in each if (mask := path.with_name(name)).is_file()), None)
+            for path, each in zip(paths, names, strict=True)
+        ]
+        if any(found):
+            return found, meaning
+    return [], ""
 
 
 def _calibrations(
-    path: Path,
-    content: Mapping[str, Any],
-    named: Sequence[tuple[str, dict[str, Any]]],
-    images: Sequence[Path],
+    path: Path, content: Mapping[str, Any], frames: Sequence[_Frame]
 ) -> tuple[Calibration, ...]:
-    """The cameras of all frames; a warning tells of pixels that are not square. [V]"""
-    told = [read_calibration(str(path), content, *each) for each in named]
+    """The cameras of all frames, with a warning of pixels that are not square. [V]"""
+    stated = [read_calibration(str(path), content, frame.label, frame.entry) for frame in frames]
     found = tuple(
-        _with_height(camera, {**content, **frame}, image)
-        for camera, (_, frame), image in zip(told, named, images, strict=True)
+        _with_height(camera, {**content, **frame.entry}, frame.image)
+        for camera, frame in zip(stated, frames, strict=True)
     )
-    if stretched := sum(new != old for new, old in zip(found, told, strict=True)):
-        warnings.warn(
+    if stretched := sum(new != old for new, old in zip(found, stated, strict=True)):
+        warn(
             f"{path}: camera_angle_y of {stretched} of {len(found)} frames gives pixels that are "
             "not square, and is followed. If they are square, take it out: Blender's own angle_y "
-            "belongs to the sensor, not to the image.",
-            stacklevel=5,
+            "belongs to the sensor, not to the image."
         )
     return found
 
 
 def _with_height(camera: Calibration, keys: Mapping[str, Any], image: Path) -> Calibration:
-    """A camera whose pixels are not square where its two fields of view say so."""
+    """A camera, with pixels that are not square if its two fields of view imply that."""
     angle = keys.get("camera_angle_y")
     if camera.fl_y is not None or not is_positive(angle) or angle >= math.pi:
         return camera
@@ -230,15 +217,14 @@ def _warn_of_unknown(path: Path, content: Mapping[str, Any]) -> None:
     entries = (content, *content["frames"])
     given = {key for each in entries for key, value in each.items() if _says_something(value)}
     if unknown := sorted(given - {*KNOWN, *IGNORED}):
-        warnings.warn(
+        warn(
             f"{path}: keys that are not read are {', '.join(map(short, unknown))}. Where one of "
-            "them changes what the images or cameras mean, convert these and take the key out.",
-            stacklevel=5,
+            "them changes what the images or cameras mean, convert these and take the key out."
         )
 
 
 def _says_something(value: Any) -> bool:
-    """Whether a value is more than null, false, zeros or nothing at all."""
+    """Whether a value is more than null, false, zeros or empty."""
     return any(map(_says_something, value)) if isinstance(value, list) else bool(value)
 
 
@@ -250,10 +236,9 @@ def _in_radians(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
         if is_positive(angle):
             found.setdefault(name, math.radians(angle))
         elif is_number(keys.get(name)) and math.pi < keys[name] < 180:
-            warnings.warn(
+            warn(
                 f"{path}: {name}={keys[name]:g} is read in degrees, as it is above pi: radians are "
-                "expected.",
-                stacklevel=5,
+                "expected."
             )
             found[name] = math.radians(keys[name])
     return found
@@ -283,36 +268,34 @@ def read_frames(path: Path) -> dict[str, Any]:
     return _in_radians(path, content) | {"frames": [_in_radians(path, each) for each in frames]}
 
 
-def _times(
-    path: Path, named: list[tuple[str, dict[str, Any]]], any_unit: bool
-) -> tuple[list[float], str]:
+def _times(path: Path, frames: Sequence[_Frame], any_unit: bool) -> tuple[list[float], str]:
     """Times of all frames, and where they come from; empty where no frame has one."""
-    stamped = any_unit and not any("time" in frame for _, frame in named)
+    stamped = any_unit and not any("time" in frame.entry for frame in frames)
     key = "timestamp" if stamped else "time"
-    timed = [label for label, frame in named if key in frame]
-    if not timed:
+    bare = [frame.label for frame in frames if key not in frame.entry]
+    if len(bare) == len(frames):
         return [], ""
     kind = "in any unit" if any_unit else "in [0, 1]"
-    if len(timed) < len(named):
-        bare = next(label for label, frame in named if key not in frame)
+    if bare:
         raise SceneError(
-            f'{bare} has no "{key}", but {len(timed)} of {len(named)} frames of {path.name} do. '
-            f"Give every frame a time {kind}, or none for a static scene."
+            f'{bare[0]} has no "{key}", but {len(frames) - len(bare)} of {len(frames)} frames of '
+            f"{path.name} do. Give every frame a time {kind}, or none for a static scene."
         )
-    for label, frame in named:
-        time = frame[key]
+    for frame in frames:
+        time = frame.entry[key]
         if not is_number(time) or not (any_unit or 0 <= time <= 1):
             raise SceneError(
-                f"{label}: {key} is {short(time)}; it must be a number {kind}"
+                f"{frame.label}: {key} is {short(time)}; it must be a number {kind}"
                 f"{'' if any_unit else '. Divide frame numbers by the last one'}."
             )
-    times = [frame[key] for _, frame in named]
-    words = time_words(f'"{key}" of {path.name}', [frame["file_path"] for _, frame in named], times)
+    times = [frame.entry[key] for frame in frames]
+    names = [frame.entry["file_path"] for frame in frames]
+    source = time_source(f'"{key}" of {path.name}', names, times)
     first, last = min(times), max(times)
     if not any_unit or (not stamped and first >= 0 and last <= 1):
-        return [float(time) for time in times], words
+        return [float(time) for time in times], source
     logger.info("%s: %s from %s to %s is mapped to times from 0 to 1", path, key, first, last)
-    return unit_times(times), words
+    return unit_times(times), source
 
 
 def read_calibration(
@@ -359,9 +342,9 @@ def read_calibration(
 
 
 def _pixels(name: str, keys: Mapping[str, Any]) -> dict[str, float]:
-    """The keys in pixels that are given; null, and 0 where it can be no size, stand for none."""
+    """The keys in pixels that are given; null is none, and so is 0 for sizes."""
     if all(keys.get(key) is None for key in PIXELS[:4]):
-        # A size alone says nothing: whatever it is, it is not looked at.
+        # A size alone means nothing, so it is not checked.
         return {key: keys[key] for key in ("w", "h") if is_positive(keys.get(key))}
     found = {}
     for key in PIXELS:
@@ -436,7 +419,7 @@ def _listed_distortion(source: str, keys: Mapping[str, Any]) -> Mapping[str, Any
 
 
 def _model(source: str, name: str) -> LensModel:
-    """The kind of lens that a name stands for; unknown names are those of perspective cameras."""
+    """The kind of lens that a name means; unknown names are perspective cameras."""
     if name in FISHEYES:
         return LensModel.FISHEYE
     if any(word in name for word in OTHER_MODELS):

@@ -1,6 +1,5 @@
 """Frames of video files, decoded with PyAV (extra `video`)."""
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -9,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from xplanes.errors import SceneError
+from xplanes.errors import SceneError, warn
 from xplanes.files import stand_in
 from xplanes.optional import require
 from xplanes.scenes.images import Size
@@ -24,14 +23,14 @@ HDR = {16: "PQ", 18: "HLG"}
 
 @dataclass(frozen=True)
 class Video:
-    """What a video file says about itself.
+    """The header of a video file.
 
     Attributes:
         path: The file.
         size: Height and width of its frames.
         count: Number of the frames that it shows.
-        rate: Frames per second; None where the file does not tell.
-        times: When they are shown, in seconds; empty where the file does not tell.
+        rate: Frames per second; None if unknown.
+        times: When they are shown, in seconds; empty if unknown.
     """
 
     path: Path
@@ -62,10 +61,9 @@ def read_header(path: Path) -> Video:
             whole = len(known) == len(stamps) and stream.time_base is not None
             times = tuple(float(stamp * stream.time_base) for stamp in known) if whole else ()
             if (curve := stream.codec_context.color_trc) in HDR:
-                warnings.warn(
+                warn(
                     f"{path} is an HDR video ({HDR[curve]}): its colours look pale where they are "
-                    "taken for ordinary ones. Convert it to SDR (tone mapping) before.",
-                    stacklevel=4,
+                    "taken for ordinary ones. Convert it to SDR (tone mapping) before."
                 )
             size = (stream.codec_context.height, stream.codec_context.width)
             return Video(path, size, len(stamps), stream.average_rate, times)

@@ -1,7 +1,7 @@
-"""Images of a scene with poses and times, in memory or in a file of tiles."""
+"""Images of a scene with poses and times, in memory or in a file of pixels."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -10,19 +10,19 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from xplanes.scenes.cameras import cast_rays
+from xplanes.scenes.cameras import PosedCamera, cast_rays
 from xplanes.scenes.lenses import Lenses, Sight, sight
 from xplanes.scenes.matte import silhouette_of
-from xplanes.scenes.store import CELL, TILE, StoredImages, TileFile, count_in_squares
+from xplanes.scenes.store import PixelFile, StoredImages
 
 PALE_STEPS, PALE_EDGE = 16, 0.9
-"""Pixels so far from the background look like it; share of an image's edge that ends in it then."""
+"""Steps of 255 by which background pixels differ at most; their least share of an image's edge."""
 
 RIM = 0.02
 """Width of an image's edge, as a share of its smaller side."""
 
 MOST_EDGES = 32
-"""Views whose edges are looked at, spread evenly."""
+"""Views whose edges are sampled, spread evenly."""
 
 SAME_CAMERA = 1e-4
 """Share by which intrinsics of one camera differ at most."""
@@ -30,7 +30,7 @@ SAME_CAMERA = 1e-4
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """What the cameras of some images see, in pixels; pixel centres lie at +0.5.
+    """Intrinsics of the cameras of some images, in pixels; pixel centres lie at +0.5.
 
     Attributes:
         focal: Focal lengths along x and y. float64 [V, 2]
@@ -76,7 +76,7 @@ class Intrinsics:
 
     def subset(self, indices: Tensor) -> "Intrinsics":
         """Those of the images at ``indices``, in that order. [K]"""
-        lenses = None if self.lenses is None else self.lenses.subset(indices)
+        lenses = None if self.lenses is None else self.lenses[indices]
         return Intrinsics(self.focal[indices], self.centre[indices], self.size[indices], lenses)
 
     def joined(self, other: "Intrinsics") -> "Intrinsics":
@@ -85,30 +85,31 @@ class Intrinsics:
             torch.cat([self.focal, other.focal]),
             torch.cat([self.centre, other.centre]),
             torch.cat([self.size, other.size]),
-            _joined_lenses(self, other),
+            self._all_lenses().joined(other._all_lenses()),
         )
+
+    def _all_lenses(self) -> Lenses:
+        return self.lenses or Lenses.pinholes(len(self))
 
     @property
     def is_shared(self) -> bool:
         """Whether all images have the same, as those of one camera."""
         room = SAME_CAMERA * self.size.max()
-        return (
-            bool((self.size == self.size[0]).all())
-            and bool(((self.focal / self.focal[0] - 1).abs() <= SAME_CAMERA).all())
-            and bool(((self.centre - self.centre[0]).abs() <= room).all())
-            and (self.lenses is None or self._lenses_are_equal(self.lenses, float(room)))
-        )
-
-    def _lenses_are_equal(self, lenses: Lenses, room: float) -> bool:
-        return (
-            bool((lenses.model == lenses.model[0]).all())
-            and bool(((lenses.coefficients - lenses.coefficients[0]).abs() <= SAME_CAMERA).all())
-            and bool(((lenses.skew - lenses.skew[0]).abs() <= room).all())
+        pairs = [
+            (self.focal / self.focal[0] - 1, SAME_CAMERA),
+            (self.centre - self.centre[0], room),
+        ]
+        if (lenses := self.lenses) is not None:
+            pairs.append((lenses.model - lenses.model[0], 0))
+            pairs.append((lenses.coefficients - lenses.coefficients[0], SAME_CAMERA))
+            pairs.append((lenses.skew - lenses.skew[0], float(room)))
+        return bool((self.size == self.size[0]).all()) and all(
+            bool((apart.abs() <= most).all()) for apart, most in pairs
         )
 
     def lens(self, index: int) -> Lenses | None:
         """The lens of image ``index`` alone; None for a pinhole."""
-        return None if self.lenses is None else self.lenses.subset(slice(index, index + 1))
+        return None if self.lenses is None else self.lenses[index : index + 1]
 
     @cached_property
     def sights(self) -> list[Sight] | None:
@@ -127,7 +128,7 @@ class Intrinsics:
         for index, key in enumerate(map(tuple, numbers.tolist())):
             if key not in known:
                 height, width = self.size[index].tolist()
-                lens = lenses.subset(slice(index, index + 1))
+                lens = lenses[index : index + 1]
                 known[key] = sight(lens, self.focal[index], self.centre[index], height, width)
             found.append(known[key])
         return found
@@ -157,13 +158,6 @@ class Intrinsics:
         return float((self.pinhole.mean(dim=1) * size / longer).median())
 
 
-def _joined_lenses(first: Intrinsics, second: Intrinsics) -> Lenses | None:
-    if first.lenses is None and second.lenses is None:
-        return None
-    lenses = [each.lenses or Lenses.pinholes(len(each)) for each in (first, second)]
-    return lenses[0].joined(lenses[1])
-
-
 @dataclass(frozen=True)
 class Views:
     """The images of one split with their cameras and times.
@@ -172,7 +166,7 @@ class Views:
     `image`, `composite` and `image_rays` leave the padding out.
 
     Attributes:
-        images: RGB premultiplied by alpha, and alpha, as a tensor or a reader of a file of tiles.
+        images: RGB premultiplied by alpha, and alpha, as a tensor or a reader of a file of pixels.
             uint8 [V, H, W, 4]
         camera_to_world: Rigid camera poses with OpenGL axes. [V, 4, 4]
         times: Time of each image, from 0 to 1. [V]
@@ -250,22 +244,16 @@ class Views:
 
     @cached_property
     def is_opaque(self) -> bool:
-        """Whether the silhouettes are the whole images: alpha says nothing then."""
+        """Whether the silhouettes are the whole images, so that alpha carries no information."""
         for index in range(len(self)):
-            has_ray = self.shown(index)
-            if isinstance(self.images, StoredImages):
-                shown = self.images.solid(index)
-                if has_ray is not None:
-                    has_ray = count_in_squares(has_ray, TILE) == TILE**2
-            else:
-                shown, _ = self.silhouette(index)
-            if not (shown if has_ray is None else shown[has_ray]).all():
+            silhouette, shown = self.silhouette(index), self.shown(index)
+            if not (silhouette if shown is None else silhouette[shown]).all():
                 return False
         return True
 
     @property
     def outline(self) -> str:
-        """The images' size, in words."""
+        """The images' size, for messages."""
         return f"{'up to ' if self.is_padded else ''}{self.width}x{self.height} px"
 
     @property
@@ -275,7 +263,7 @@ class Views:
 
     @property
     def is_stored(self) -> bool:
-        """Whether the images are in a file of tiles, not in memory."""
+        """Whether the images are in a file of pixels, not in memory."""
         return isinstance(self.images, StoredImages)
 
     @property
@@ -285,7 +273,7 @@ class Views:
 
     @property
     def identity(self) -> Any:
-        """What tells these images from others: their bytes, or what they were decoded from."""
+        """What distinguishes these images from others: their bytes, or their sources."""
         return self.images if isinstance(self.images, Tensor) else self.images.identity
 
     def size(self, index: int) -> tuple[int, int]:
@@ -297,8 +285,11 @@ class Views:
         """Image ``index`` without padding; do not modify it. uint8 [h, w, 4]"""
         if isinstance(self.images, StoredImages):
             return self.images.image(index)
+        return self._cropped(self.images, index)
+
+    def _cropped(self, pixels: Tensor, index: int) -> Tensor:
         height, width = self.size(index)
-        return self.images[index, :height, :width]
+        return pixels[index, :height, :width]
 
     def shown(self, index: int) -> Tensor | None:
         """Pixels of image ``index`` that are trained on and scored; None for all. bool [h, w]
@@ -308,8 +299,7 @@ class Views:
         has_ray = self.intrinsics.has_ray(index)
         if self.ignored is None:
             return has_ray
-        height, width = self.size(index)
-        shown = ~self.ignored[index, :height, :width]
+        shown = ~self._cropped(self.ignored, index)
         return shown if has_ray is None else shown & has_ray
 
     def thing_in(self, index: int) -> Tensor | None:
@@ -317,10 +307,7 @@ class Views:
 
         None if unknown.
         """
-        if self.thing is None:
-            return None
-        height, width = self.size(index)
-        return self.thing[index, :height, :width]
+        return None if self.thing is None else self._cropped(self.thing, index)
 
     def in_memory(self) -> Tensor:
         """All images, with padding. uint8 [V, H, W, 4]"""
@@ -328,20 +315,14 @@ class Views:
             return self.images
         whole = torch.zeros(self.images.shape, dtype=torch.uint8)
         for index in range(len(self)):
-            height, width = self.size(index)
-            whole[index, :height, :width] = self.images.image(index)
+            self._cropped(whole, index).copy_(self.images.image(index))
         return whole
 
-    def silhouette(self, index: int) -> tuple[Tensor, int]:
-        """The silhouette of image ``index``, see `silhouette_of`, in square cells.
-
-        Returns:
-            Whether any pixel of a cell belongs to it, and the cells' side in pixels: 1, but `CELL`
-            for images in a file of tiles, of which nothing is read. bool [rows, columns]
-        """
+    def silhouette(self, index: int) -> Tensor:
+        """The silhouette of image ``index``, see `silhouette_of`. bool [h, w]"""
         if isinstance(self.images, StoredImages):
-            return self.images.lit(index), CELL
-        return silhouette_of(self.image(index)[..., 3]), 1
+            return self.images.silhouette(index)
+        return silhouette_of(self.image(index)[..., 3])
 
     def valid(self) -> Tensor:
         """Which pixels show something: no padding, and a ray leads there. bool [V, H, W]"""
@@ -356,26 +337,20 @@ class Views:
 
     def to(self, device: torch.device) -> "Views":
         """Views in memory, without lenses, on another device."""
-        intrinsics = self.intrinsics
         assert isinstance(self.images, Tensor)
-        assert intrinsics.lenses is None
-        focal, centre, size = (
-            number.to(device) for number in (intrinsics.focal, intrinsics.centre, intrinsics.size)
-        )
-        return Views(
-            self.images.to(device),
-            self.camera_to_world.to(device),
-            self.times.to(device),
-            Intrinsics(focal, centre, size),
-            self.files,
-        )
+        assert self.intrinsics.lenses is None
+        names = ("focal", "centre", "size")
+        intrinsics = Intrinsics(*(getattr(self.intrinsics, name).to(device) for name in names))
+        images, poses = self.images.to(device), self.camera_to_world.to(device)
+        return Views(images, poses, self.times.to(device), intrinsics, self.files)
 
-    def subset(self, indices: Tensor) -> "Views":
+    def subset(self, indices: Tensor | Sequence[int]) -> "Views":
         """Select views by index.
 
         Args:
             indices: Indices of views, in the order of the result. int64 [K]
         """
+        indices = torch.as_tensor(indices, dtype=torch.int64)
         intrinsics = self.intrinsics.subset(indices)
         if isinstance(self.images, StoredImages):
             images = self.images.subset(indices)
@@ -428,22 +403,15 @@ class Views:
     def outline_rays(self, index: int) -> tuple[Tensor, Tensor]:
         """Rays through the outline of the silhouette of image ``index``.
 
-        These are its pixels that have a neighbour outside of it, or lie at the image's edge. Of
-        images in a file of tiles, the corners of the cells that hold pixels of the silhouette.
+        These are its pixels that have a neighbour outside of it, or lie at the image's edge.
 
         Returns:
             Origins and unit directions in the world. [N, 3], [N, 3]
         """
-        mask, cell = self.silhouette(index)
-        if cell == 1:
-            around = F.pad(mask, (1, 1, 1, 1))
-            inside = around[:-2, 1:-1] & around[2:, 1:-1] & around[1:-1, :-2] & around[1:-1, 2:]
-            rows, columns = (mask & ~inside).nonzero().T
-        else:
-            first = mask.nonzero() * cell
-            last = torch.minimum(first + cell, self.intrinsics.size[index]) - 1
-            corners = torch.cat([first, last, torch.stack([first[:, 0], last[:, 1]], dim=1)])
-            rows, columns = torch.cat([corners, torch.stack([last[:, 0], first[:, 1]], dim=1)]).T
+        mask = self.silhouette(index)
+        around = F.pad(mask, (1, 1, 1, 1))
+        inside = around[:-2, 1:-1] & around[2:, 1:-1] & around[1:-1, :-2] & around[1:-1, 2:]
+        rows, columns = (mask & ~inside).nonzero().T
         return self.pixel_rays(torch.full_like(rows, index), rows.float(), columns.float())
 
     def pixel_rays(self, views: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
@@ -464,50 +432,45 @@ class Views:
             columns,
             focal=intrinsics.focal[views],
             centre=intrinsics.centre[views],
-            lenses=None if intrinsics.lenses is None else intrinsics.lenses.subset(views),
+            lenses=None if intrinsics.lenses is None else intrinsics.lenses[views],
         )
 
 
 def joined(first: Views, second: Views) -> Views:
     """The views of both."""
+    height, width = max(first.height, second.height), max(first.width, second.width)
+
+    def together(parts: Sequence[Tensor]) -> Tensor:
+        """Images with zeros at the bottom and on the right. [V, h, w, C] each"""
+        whole = parts[0].new_zeros(sum(map(len, parts)), height, width, *parts[0].shape[3:])
+        for part, room in zip(parts, whole.split([*map(len, parts)]), strict=True):
+            room[:, : part.shape[1], : part.shape[2]] = part
+        return whole
+
     if isinstance(first.images, Tensor) and isinstance(second.images, Tensor):
-        height, width = max(first.height, second.height), max(first.width, second.width)
-        parts = [_padded(images, height, width) for images in (first.images, second.images)]
-        images = torch.cat(parts)
+        images = together([first.images, second.images])
     else:
-        images = _tiled(first).joined(_tiled(second))
+        images = _stored(first).joined(_stored(second))
+    ignored = None
+    if first.ignored is not None or second.ignored is not None:
+        none = (torch.zeros(each.images.shape[:3], dtype=torch.bool) for each in (first, second))
+        given = (first.ignored, second.ignored)
+        ignored = together([e if e is not None else n for e, n in zip(given, none, strict=True)])
     return Views(
         images,
         torch.cat([first.camera_to_world, second.camera_to_world]),
         torch.cat([first.times, second.times]),
         first.intrinsics.joined(second.intrinsics),
         first.files + second.files,
-        ignored=None if first.ignored is second.ignored else _joined_ignored(first, second),
+        ignored=ignored,
     )
 
 
-def _joined_ignored(first: Views, second: Views) -> Tensor:
-    """Ignored pixels of the views of both. bool [V, H, W]"""
-    height, width = max(first.height, second.height), max(first.width, second.width)
-    found = torch.zeros(len(first) + len(second), height, width, dtype=torch.bool)
-    for start, views in ((0, first), (len(first), second)):
-        if views.ignored is not None:
-            found[start : start + len(views), : views.height, : views.width] = views.ignored
-    return found
-
-
-def _tiled(views: Views) -> StoredImages:
-    """The images in tiles."""
+def _stored(views: Views) -> StoredImages:
+    """The images as if they were in a file."""
     if isinstance(views.images, StoredImages):
         return views.images
-    file = TileFile.of(views.image(index) for index in range(len(views)))
-    return StoredImages.all_of(file)
-
-
-def _padded(images: Tensor, height: int, width: int) -> Tensor:
-    """Images with zeros at the bottom and on the right. [..., h, w, 4] -> [..., H, W, 4]"""
-    rows, columns = height - images.shape[-3], width - images.shape[-2]
-    return F.pad(images, (0, 0, 0, columns, 0, rows)) if rows or columns else images
+    return StoredImages.all_of(PixelFile.of(views.image(index) for index in range(len(views))))
 
 
 @dataclass(frozen=True)
@@ -524,7 +487,7 @@ class Scene:
             float32 [N, 3]
         cut: Training views masked to the foreground object, for LRMs, while ``splits`` show whole
             images; None if the alpha of ``splits`` holds the masks, or there are no masks.
-        notes: What was found out while it was read, in words, by what that is about.
+        notes: What reading the scene revealed: sentences by subject.
     """
 
     name: str
@@ -551,74 +514,8 @@ class Scene:
         return 2 * sum(plain) <= len(plain)
 
 
-@dataclass(frozen=True)
-class PosedCamera:
-    """A camera somewhere in the world, and the size of its image; arguments of `camera_rays`.
-
-    Attributes:
-        camera_to_world: Its pose. [4, 4]
-        focal: Focal length in pixels, or those along x and y. [2]
-        height: Rows.
-        width: Columns.
-        centre: Principal point, x from the left and y from the top; the middle when None. [2]
-        lens: Its lens; a pinhole when None.
-    """
-
-    camera_to_world: Tensor
-    focal: float | Tensor
-    height: int
-    width: int
-    centre: Tensor | None = None
-    lens: Lenses | None = None
-
-    def rays(self) -> tuple[Tensor, Tensor]:
-        """Rays through every pixel, row by row, in the world. [H W, 3], [H W, 3]"""
-        size = (self.height, self.width)
-        return camera_rays(self.camera_to_world, self.focal, *size, self.centre, self.lens)
-
-    def to(self, device: torch.device) -> "PosedCamera":
-        """The same: cameras stay on the CPU when Lightning moves a batch."""
-        return self
-
-
-def camera_rays(
-    camera_to_world: Tensor,
-    focal: float | Tensor,
-    height: int,
-    width: int,
-    centre: Tensor | None = None,
-    lens: Lenses | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Rays through every pixel of one camera, row by row.
-
-    Args:
-        camera_to_world: Its pose. [4, 4]
-        focal: Focal length in pixels, or those along x and y. [2]
-        height: Rows.
-        width: Columns.
-        centre: Principal point, x from the left and y from the top; the middle when None. [2]
-        lens: Its lens; a pinhole when None.
-
-    Returns:
-        Origins and unit directions in the world. [H W, 3], [H W, 3]
-    """
-    rows, columns = torch.meshgrid(
-        torch.arange(height, dtype=torch.float32),
-        torch.arange(width, dtype=torch.float32),
-        indexing="ij",
-    )
-    return cast_rays(
-        camera_to_world,
-        rows.flatten(),
-        columns.flatten(),
-        focal=focal if isinstance(focal, Tensor) else (focal, focal),
-        centre=(0.5 * width, 0.5 * height) if centre is None else centre,
-        lenses=lens,
-    )
-
-
 def spread(count: int, total: int) -> list[int]:
     """``count`` indices spread evenly over ``total``, both ends included."""
     if count >= total:
         return list(range(total))
-    return torch.linspace(0, total - 1, count).round().long().tolist()
+    return [round(i * (total - 1) / max(count - 1, 1)) for i in range(count)]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from xplanes.scenes.cameras import pixel_rays
+from xplanes.scenes.cameras import cast_rays
 from xplanes.synthetic.demo.render import render_image
 from xplanes.synthetic.demo.scenes import DEMO_SCENES, build_demo_scene
 from xplanes.synthetic.pretraining.objects import (
@@ -111,13 +111,12 @@ def test_images_agree_with_the_demo_renderer():
     assert np.abs(colour - on_white).mean() < 4e-3
     line = torch.arange(48, dtype=torch.float64) - 0.25
     rows, columns = torch.meshgrid(line, line, indexing="ij")
-    origins, directions = pixel_rays(
+    origins, directions = cast_rays(
         torch.from_numpy(pose),
         rows.flatten(),
         columns.flatten(),
         focal=48 * FOCAL,
-        height=48,
-        width=48,
+        centre=(24.0, 24.0),
     )
     distance = cast(solids, origins.numpy().copy(), directions.numpy())[0]
     seen = np.isfinite(distance)

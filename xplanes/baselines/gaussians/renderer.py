@@ -15,8 +15,8 @@ from xplanes.rendering.base import Renderer, Rendering
 from xplanes.rendering.marching import Samples
 from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
 from xplanes.scenes.batches import Batch
+from xplanes.scenes.cameras import PosedCamera
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.views import PosedCamera
 from xplanes.streams import TrainingState
 
 

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from xplanes.scenes.cameras import camera_around, focal_length, look_at, pixel_rays
+from xplanes.scenes.cameras import camera_around, cast_rays, focal_length, look_at
 from xplanes.synthetic.demo.posed import Posed
 
 CAMERA_ANGLE_X = 0.6911112070083618
@@ -64,13 +64,12 @@ def image_samples(
     """
     steps = (torch.arange(resolution * samples) + 0.5) / samples - 0.5
     rows, columns = torch.meshgrid(steps, steps, indexing="ij")
-    origins, directions = pixel_rays(
+    origins, directions = cast_rays(
         camera_to_world.float(),
         rows.flatten(),
         columns.flatten(),
         focal=focal_length(angle_x, resolution),
-        height=resolution,
-        width=resolution,
+        centre=(0.5 * resolution, 0.5 * resolution),
     )
     layers = see(origins, directions)
     return layers.reshape(resolution, samples, resolution, samples, 4).mean(dim=(1, 3))

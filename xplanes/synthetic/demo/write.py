@@ -324,14 +324,7 @@ class ProceduralSettings(SceneSettings, ABC):
     def load(self, splits: Sequence[str]) -> Scene:
         folder = self.folder
         try:
-            scene = read_scene(
-                folder,
-                resolution=self.resolution,
-                splits=splits,
-                views=self.views,
-                eval_views=self.eval_views,
-                cache=self.image_cache,
-            )
+            scene = read_scene(self, splits)
             return _with_masks(scene, folder / MASKS)
         except SceneError as problem:
             raise SceneError(

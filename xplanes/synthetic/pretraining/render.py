@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from xplanes.fields.decoder import Decoder
-from xplanes.scenes.cameras import pixel_rays
+from xplanes.scenes.cameras import cast_rays
 from xplanes.synthetic.pretraining.losses import composite, triplane_logits
 
 CHUNK = 2**14
@@ -35,10 +35,10 @@ def render_view(
     Returns:
         RGB from 0 to 1. [S, S, 3]
     """
-    line = torch.arange(side)
+    line, middle = torch.arange(side), (0.5 * side, 0.5 * side)
     rows, columns = torch.meshgrid(line, line, indexing="ij")
-    origins, directions = pixel_rays(
-        pose, rows.flatten(), columns.flatten(), focal=focal * side, height=side, width=side
+    origins, directions = cast_rays(
+        pose, rows.flatten(), columns.flatten(), focal=focal * side, centre=middle
     )
     inverse = 1 / torch.where(directions.abs() < 1e-9, 1e-9, directions)
     middle, reach = -origins * inverse, half_side * inverse.abs()

@@ -682,7 +682,7 @@ LAYERS = (
     ("preparation",),
     ("evaluation",),
     ("baselines", "synthetic"),
-    ("run", "launch"),
+    ("hints", "run", "launch"),
     ("cli",),
     ("__main__",),
 )
@@ -697,7 +697,7 @@ WINGS = ("baselines", "synthetic")
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 
 EDGES = {
-    "launch": {"config", "errors", "files", "run"},
+    "launch": {"config", "errors", "files", "hints", "process", "run"},
     "train": {"cli"},
 }
 """What the ends of the command line may import, which must be quick to start."""

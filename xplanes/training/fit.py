@@ -5,10 +5,9 @@ import logging
 import sys
 import time
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import lightning
 import torch
@@ -256,55 +255,72 @@ def rehearse(module: RadianceModule, rays: Batch) -> None:
     sampler.update(model.field, state)
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """What a run is going to take, from its first rays.
+class Estimate(NamedTuple):
+    """What parts of a run are going to take, measured before its first step.
 
     Attributes:
         step: Seconds of a step.
-        image_rays: Rays of images that are rendered in a second.
+        first_ray: Seconds of a ray of an image before the first step.
+        later_ray: Seconds of a ray of later images.
     """
 
     step: float
-    image_rays: float
+    first_ray: float
+    later_ray: float
+
+
+SOLID = 30.0
+"""Factor on the density that makes a field nearly as opaque as training makes it."""
 
 
 def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
-    """Time a step and some rays of a scored view; fields become faster as empty space is skipped.
+    """Time a step and some rays of a scored view.
+
+    Training makes a field opaque, so that its rays end sooner: a field that is denser in the same
+    places stands for it.
 
     Args:
         module: The module, its loops compiled.
         data: Its data.
     """
-    assert module.frame is not None
-    device = next(module.field.parameters()).device
+    frame, field, renderer = module.frame, module.field, module.renderer
+    assert frame is not None
+    device = next(field.parameters()).device
     rays = _moved(data.batches_for(module, 0).draw(0, module.rays), device)
-    seconds = []
+    views = data.scene.splits[data.test_split]
+    camera, seen_at = views.camera(0), (float(views.times[0]), data.scene.background.to(device))
+    pixels = camera.height * camera.width
+    chosen = torch.linspace(0, pixels - 1, min(2048, pixels)).long()
+    origins, directions = (part[chosen].to(device) for part in frame.rays(*camera.rays()))
+
+    def step() -> None:
+        module.sampler.render(field, rays, module.state).colour.sum().backward()
+        module.zero_grad(set_to_none=True)
+
+    def image(seen: Any) -> None:
+        if isinstance(renderer, RayRenderer):
+            renderer.image(seen, origins, directions, *seen_at)
+        else:
+            renderer.view(seen, frame, camera, *seen_at)
+
+    solid = field
+    if isinstance(renderer, RayRenderer):
+        pixels = len(chosen)
+        solid = field.masked(lambda points: points.new_full(points.shape[:1], SOLID))
+    # The second time finds memory and kernels that the first has made.
+    first, later = (_seconds(lambda seen=seen: image(seen), device) for seen in (field, solid))
+    return Estimate(_seconds(step, device), first / pixels, later / pixels)
+
+
+def _seconds(work: Callable[[], Any], device: torch.device) -> float:
+    """The lesser time of two that some work takes."""
+    spent = []
     for _ in range(2):
         began = time.perf_counter()
-        rendering = module.sampler.render(module.field, rays, module.state)
-        rendering.colour.sum().backward()
-        module.zero_grad(set_to_none=True)
-        synchronize(device)
-        seconds.append(time.perf_counter() - began)
-    views, renderer = data.scene.splits[data.test_split], module.renderer
-    shown_at, background = float(views.times[0]), data.scene.background.to(device)
-    camera = views.camera(0)
-    if not isinstance(renderer, RayRenderer):
-        began = time.perf_counter()
-        renderer.view(module.field, module.frame, camera, shown_at, background)
-        pixels = camera.height * camera.width
-        return Estimate(min(seconds), pixels / (time.perf_counter() - began))
-    ends = module.frame.rays(*camera.rays())
-    chosen = torch.linspace(0, len(ends[0]) - 1, min(2048, len(ends[0]))).long()
-    origins, directions = (part[chosen].to(device) for part in ends)
-    spent = []
-    for _ in range(1 if device.type == "cpu" else 2):  # On a GPU the first compiles kernels.
-        began = time.perf_counter()
-        renderer.image(module.field, origins, directions, shown_at, background)
+        work()
         synchronize(device)
         spent.append(time.perf_counter() - began)
-    return Estimate(min(seconds), len(chosen) / min(spent))
+    return min(spent)
 
 
 def _moved(batch: Batch, device: torch.device) -> Batch:

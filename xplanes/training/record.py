@@ -107,11 +107,12 @@ class RunRecord:
         run: The run directory.
         seed: The run's seed.
         resume: Whether the run goes on; what a folder says of another start is left out else.
+        began: When it began, as `time.perf_counter` counts; now when None.
     """
 
-    def __init__(self, run: Path, seed: int, *, resume: bool) -> None:
+    def __init__(self, run: Path, seed: int, *, resume: bool, began: float | None = None) -> None:
         self.path = run / "run.json"
-        self._began = time.perf_counter()
+        self._began = time.perf_counter() if began is None else began
         earlier = _earlier(self.path) if resume else {}
         self._before = float(earlier.get("total_seconds", 0.0))
         self.content: dict[str, Any] = {
@@ -149,7 +150,12 @@ class RunRecord:
     @property
     def total_seconds(self) -> float:
         """Wall time of this run so far, earlier parts included."""
-        return self._before + time.perf_counter() - self._began
+        return self._before + self.seconds
+
+    @property
+    def seconds(self) -> float:
+        """Wall time since this part of the run began."""
+        return time.perf_counter() - self._began
 
 
 def run_status(run: Path) -> str | None:

@@ -6,6 +6,7 @@ Must stay quick: it imports neither torch nor lightning before the job begins.
 import re
 import shlex
 import sys
+import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,8 @@ from xplanes import __version__
 from xplanes.config import CONF, near_names, quoted, to_plain, unquoted, with_names
 from xplanes.errors import ConfigError
 from xplanes.files import StorageError, read_json, require_writable
-from xplanes.process import train_command
+from xplanes.hints import require_parsed, require_readable
+from xplanes.process import STARTED, train_command
 
 SEARCHPATH = "hydra.searchpath"
 
@@ -36,6 +38,25 @@ FORMER = {
     "views": "lrm=none,tiny data.views=5,10,20,null",
 }
 """Sweeps that were experiments, and what they are where their names are others now."""
+
+
+def file_name(scene: Any) -> str:
+    """The name of a scene as a part of a run directory's: no folders, and nothing to quote."""
+    return re.sub(r"[^\w.+-]+", "-", Path(str(scene)).name).strip("-") or "scene"
+
+
+def options(group: str) -> str:
+    """The options of a group."""
+    return ", ".join(sorted(path.stem for path in (CONF / group).glob("*.yaml")))
+
+
+def options_in_help(group: str) -> str:
+    """The same as lines of conf/hydra/help/train.yaml."""
+    return textwrap.fill(options(group), 84, subsequent_indent=11 * " ")
+
+
+OmegaConf.register_new_resolver("file_name", file_name, replace=True)
+OmegaConf.register_new_resolver("options", options_in_help, replace=True)
 
 
 def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
@@ -143,7 +164,8 @@ def _job(config: DictConfig) -> float:
         own = [text for text in settings.overrides.hydra if _split(text)[0] == SEARCHPATH]
         task = [text for text in settings.overrides.task if _split(text)[0] != "resume"]
         job = None if sweep else _prepared.pop(settings.run.dir, None)
-        return run(plain, folder, [*own, *task], resume=resume, job=job)
+        began = None if sweep else STARTED
+        return run(plain, folder, [*own, *task], resume=resume, job=job, began=began)
     except KNOWN_ERRORS as error:
         if sweep:
             raise
@@ -191,17 +213,18 @@ def prepare(arguments: list[str]) -> list[str]:
         Arguments for Hydra.
 
     Raises:
-        ConfigError: If the run cannot be resumed.
+        ConfigError: If Hydra cannot read the arguments, or the run cannot be resumed.
         StorageError: If the folder of the run cannot be written.
     """
+    require_readable(arguments)
     several = _is_multirun(arguments)
     _require_present_names(arguments, several=several)
     arguments = [with_names(text, several=several) for text in arguments]
+    require_parsed([text for text in arguments if _split(text)[0]])
     values = {key: value for key, value in map(_split, arguments) if key}
     for key, value in values.items():
         if value in ("null", "None") and (CONF / key).is_dir():
-            names = ", ".join(sorted(path.stem for path in (CONF / key).glob("*.yaml")))
-            raise ConfigError(f"{key}={value}: must be one of {names}")
+            raise ConfigError(f"{key}={value}: must be one of {options(key)}")
     resume = unquoted(values.get("resume", "null"))
     if resume in ("null", "", "None", "auto"):
         # Before Hydra makes the folder, whose errors are tracebacks.
@@ -235,7 +258,11 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
     """The run's own overrides, then the new ones, in the run's own folder."""
     path = run / "overrides.txt"
     if not path.is_file():
-        raise ConfigError(f"resume={run}: not a run directory, no overrides.txt in it")
+        found = sorted(Path("outputs").glob("*/overrides.txt"), key=_mtime, reverse=True)
+        newest = ", ".join(str(each.parent) for each in found[:3]) or "there is none in outputs"
+        raise ConfigError(
+            f"resume={run}: not a run directory, no overrides.txt in it. The newest runs: {newest}"
+        )
     require_writable(run)
     _require_version(run)
     text = path.read_text(encoding="utf-8")

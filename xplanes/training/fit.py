@@ -249,19 +249,28 @@ def rehearse(module: RadianceModule, rays: Batch) -> None:
 
 
 class Estimate(NamedTuple):
-    """How long a run is going to take, measured on its first rays.
+    """What parts of a run are going to take, measured before its first step.
 
     Attributes:
         step: Seconds of a step.
-        image_rays: Rays of images that are rendered in a second.
+        first_ray: Seconds of a ray of an image before the first step.
+        later_ray: Seconds of a ray of later images.
     """
 
     step: float
-    image_rays: float
+    first_ray: float
+    later_ray: float
+
+
+SOLID = 30.0
+"""Factor on the density that makes a field nearly as opaque as training makes it."""
 
 
 def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
-    """Time a step and some rays of a scored view; fields become faster as empty space is skipped.
+    """Time a step and some rays of a scored view.
+
+    Training makes a field opaque, so that its rays end sooner: a field that is denser in the same
+    places stands for it.
 
     Args:
         module: The module, its loops compiled.
@@ -281,22 +290,25 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
         module.sampler.render(field, rays, module.state).colour.sum().backward()
         module.zero_grad(set_to_none=True)
 
-    def image() -> None:
+    def image(seen: Any) -> None:
         if isinstance(renderer, RayRenderer):
-            renderer.image(field, origins, directions, *seen_at)
+            renderer.image(seen, origins, directions, *seen_at)
         else:
-            renderer.view(field, frame, camera, *seen_at)
+            renderer.view(seen, frame, camera, *seen_at)
 
-    count = len(chosen) if isinstance(renderer, RayRenderer) else pixels
-    # On a GPU the first image compiles kernels.
-    whole = _seconds(image, device, times=1 if device.type == "cpu" else 2)
-    return Estimate(_seconds(step, device, times=2), count / whole)
+    solid = field
+    if isinstance(renderer, RayRenderer):
+        pixels = len(chosen)
+        solid = field.masked(lambda points: points.new_full(points.shape[:1], SOLID))
+    # The second time finds memory and kernels that the first has made.
+    first, later = (_seconds(lambda seen=seen: image(seen), device) for seen in (field, solid))
+    return Estimate(_seconds(step, device), first / pixels, later / pixels)
 
 
-def _seconds(work: Callable[[], Any], device: torch.device, times: int) -> float:
-    """The least time that some work takes, done several times."""
+def _seconds(work: Callable[[], Any], device: torch.device) -> float:
+    """The lesser time of two that some work takes."""
     spent = []
-    for _ in range(times):
+    for _ in range(2):
         began = time.perf_counter()
         work()
         synchronize(device)

@@ -128,7 +128,11 @@ class ColmapSettings(CaptureSettings):
             if is_image(path) and path.is_file()
         }
         used = {path.relative_to(root).as_posix() for path in paths}
-        _warn_of_unregistered(sorted(present - used), len(present), images)
+        if rest := sorted(present - used):
+            logger.warning(
+                "%d of %d images in %s are not used, because COLMAP did not register them: %s",
+                *(len(rest), len(present), images, some(rest)),
+            )
         times, source = self._times(model.names, labels, present)
         poses, points = model.camera_to_world, model.points
         if self.orient:
@@ -276,14 +280,6 @@ def _image_folder(folder: Path, name: str, model: SparseModel) -> Path:
         "scene, that COLMAP was run on"
         + (f": {' or '.join(names)}." if names else f", with images such as {model.names[0]}.")
     )
-
-
-def _warn_of_unregistered(names: Sequence[str], count: int, images: Path) -> None:
-    if names:
-        logger.warning(
-            "%d of %d images in %s are not used, because COLMAP did not register them: %s",
-            *(len(names), count, images, some(names)),
-        )
 
 
 def _number(text: str) -> float | None:

@@ -87,7 +87,8 @@ def _advance(url: str, part: Path, announce: Callable[[str], None], space_factor
         raise _BrokenTransferError(f"{url} cannot be reached ({problem})") from problem
     with response:
         if response.status == 206:
-            if not _continues(response, start, validator):
+            begins = response.headers.get("Content-Range", "").startswith(f"bytes {start}-")
+            if not begins or _validator(response) not in (None, validator):
                 _discard(part)
                 raise _BrokenTransferError(f"{url} has changed since the download began")
             announce(f"Continuing {url} after {_size(part)} MB")
@@ -147,12 +148,6 @@ def check_space(folder: Path, needed: int) -> None:
             f"{folder} needs {needed / 1e6:.0f} MB of free space and has {free / 1e6:.0f} MB. "
             f"Make room or choose a folder on another disk."
         )
-
-
-def _continues(response: HTTPResponse, start: int, validator: str | None) -> bool:
-    """Whether a partial answer starts where the file ends and belongs to the same file."""
-    begins = response.headers.get("Content-Range", "").startswith(f"bytes {start}-")
-    return begins and _validator(response) in (None, validator)
 
 
 def _validator(response: HTTPResponse) -> str | None:

@@ -294,7 +294,12 @@ def read_views(
         listing.files,
         ignored=ignored,
     )
-    _warn_of_empty(views, listing)
+    empty = [file for index, file in enumerate(views.files) if not views.silhouette(index).any()]
+    if empty:
+        warn(
+            f"{len(empty)} of {len(views)} images show nothing (alpha is next to 0 everywhere): "
+            f"{some(empty)} in {listing.paths[0].parent}."
+        )
     return views
 
 
@@ -510,12 +515,3 @@ def require_rays(
     if folded:
         others = len(folded) - 1
         warn(max(folded)[1] + (f"; so are fewer of {others} other images." if others else "."))
-
-
-def _warn_of_empty(views: Views, listing: Listing) -> None:
-    empty = [file for index, file in enumerate(views.files) if not views.silhouette(index).any()]
-    if empty:
-        warn(
-            f"{len(empty)} of {len(views)} images show nothing (alpha is next to 0 everywhere): "
-            f"{some(empty)} in {listing.paths[0].parent}."
-        )

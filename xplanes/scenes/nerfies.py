@@ -59,7 +59,11 @@ class NerfiesSettings(CaptureSettings):
     def load(self, splits: Sequence[str]) -> Scene:
         folder = self.folder
         if not (folder / "dataset.json").is_file():
-            raise _no_capture(folder)
+            there = "holds no dataset.json" if folder.is_dir() else "does not exist"
+            raise SceneError(
+                f"The folder {folder.absolute()} {there}. Set data.root and data.scene to a folder "
+                "with dataset.json, metadata.json, scene.json, camera/ and rgb/."
+            )
         chosen, source = _splits(folder, self.protocol)
         names = list(dict.fromkeys(name for part in chosen.values() for name in part))
         pictures = _picture_folder(folder, names, self.resolution)
@@ -80,7 +84,11 @@ class NerfiesSettings(CaptureSettings):
         folder = self.folder
         root = folder.resolve()
         scale, centre = _scene(folder / "scene.json")
-        _require_files(folder / "camera", names, (".json",))
+        if missing := _missing(folder / "camera", names, (".json",)):
+            raise SceneError(
+                f"{len(missing)} of {len(names)} files are not in {folder / 'camera'}: "
+                f"{some(missing)} (.json). {DOWNLOAD}"
+            )
         cameras = [
             _camera(image_path(str(folder / "dataset.json"), root, f"camera/{name}.json", "ids"))
             for name in names
@@ -151,14 +159,6 @@ class NerfiesSettings(CaptureSettings):
             *(path, key, min(times), max(times)),
         )
         return unit_times(times), time_source(key, names, times)
-
-
-def _no_capture(folder: Path) -> SceneError:
-    there = "holds no dataset.json" if folder.is_dir() else "does not exist"
-    return SceneError(
-        f"The folder {folder.absolute()} {there}. Set data.root and data.scene to a folder with "
-        "dataset.json, metadata.json, scene.json, camera/ and rgb/."
-    )
 
 
 def _splits(folder: Path, protocol: str | None) -> tuple[dict[str, list[str]], Path]:
@@ -336,14 +336,6 @@ def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) 
 def _missing(folder: Path, names: Sequence[str], ends: Sequence[str]) -> list[str]:
     """Names without a file in a folder."""
     return [name for name in names if not any((folder / f"{name}{end}").is_file() for end in ends)]
-
-
-def _require_files(folder: Path, names: Sequence[str], ends: Sequence[str]) -> None:
-    if missing := _missing(folder, names, ends):
-        raise SceneError(
-            f"{len(missing)} of {len(names)} files are not in {folder}: {some(missing)} "
-            f"({' or '.join(ends)}). {DOWNLOAD}"
-        )
 
 
 def _points(path: Path) -> np.ndarray | None:

@@ -39,7 +39,7 @@ def config(scenes: Path) -> dict:
 def trainer(folder: Path, **options) -> lightning.Trainer:
     given = {
         "accelerator": "cpu",
-        "max_steps": 25,
+        "max_steps": 45,
         "default_root_dir": folder,
         "logger": CSVLogger(folder, name="", version="csv"),
         "log_every_n_steps": 5,
@@ -78,11 +78,11 @@ def test_fit_logs_every_term_of_the_loss_validates_and_keeps_the_best(fitted: tu
     assert values["train/loss"][-1] == pytest.approx(total, rel=1e-5)
     assert values["train/loss"][0] > values["train/loss"][-1]
     # An epoch is as many rays as the views have pixels.
-    assert len(values["val/psnr"]) == 25 // (10 * 32 * 32 // 1024)
+    assert len(values["val/psnr"]) == 45 // (10 * 32 * 32 // 1024)
     assert values["val/psnr"][-1] > values["val/psnr"][0] + 1
     assert used.callback_metrics["val/psnr"] == pytest.approx(values["val/psnr"][-1])
     assert (folder / "best.ckpt").is_file()
-    assert module.global_step == 25
+    assert module.global_step == 45
     assert any(name.startswith("lr-") or name.startswith("lr/") for name in values)
 
 

@@ -289,9 +289,9 @@ def test_a_folder_in_the_layout_of_d_nerf(tmp_path):
     assert again == data.folder
 
 
-@pytest.mark.parametrize(("experiment", "ending"), [("suite", ""), ("suite_test", "_test")])
-def test_the_experiments_list_every_kind(experiment, ending):
-    text = (CONF / "experiment" / f"{experiment}.yaml").read_text(encoding="utf-8")
+@pytest.mark.parametrize(("sweep", "ending"), [("suite", ""), ("suite_test", "_test")])
+def test_the_sweeps_list_every_kind(sweep, ending):
+    text = (CONF / "sweep" / f"{sweep}.yaml").read_text(encoding="utf-8")
     listed = yaml.safe_load(text)["hydra"]["sweeper"]["params"]["data.scene"].split(",")
     assert listed == [kind + ending for kind in KINDS]
     assert len(listed) == 18

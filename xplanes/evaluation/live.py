@@ -18,10 +18,10 @@ from xplanes.training.module import RadianceModule
 logger = logging.getLogger(__name__)
 
 PATIENCE = 1.0
-"""Seconds that training waits for a picture at most, or as long as its last step took."""
+"""Seconds that training waits for a picture at most; longer if its last step took longer."""
 
 TOLD_SECONDS = 0.5
-"""From one line about training to the next."""
+"""Seconds between two updates of the status line."""
 
 
 class LiveViewer(Callback):

@@ -13,7 +13,7 @@ KEYS = {"model": "model.name", "lrm": "lrm.name", "sampler": "model.sampler.name
 """Settings that runs are told apart by, and their columns in the file."""
 
 MEANT = ("data.scene", "seed")
-"""Settings that the means go over."""
+"""Settings over which means are taken."""
 
 OWN = ["runs", "psnr", "ssim", "minutes"]
 PUBLISHED = ["published", "published ssim", "published minutes", "over", "source"]
@@ -51,7 +51,7 @@ def beside(rows: Sequence[RunRow], tables: Sequence[str] = ()) -> str | None:
         tables: Published tables that are shown whole, whatever the data.
 
     Returns:
-        Words and tables in markdown; None where nothing was published of these models.
+        Text and tables in markdown; None where nothing was published of these models.
     """
     entries = [e for e in read_published() if not tables or e["table"] in tables]
     scored = [entry for entry in entries if entry["psnr"]]

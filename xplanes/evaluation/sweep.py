@@ -49,7 +49,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class RunRow:
-    """One run, or one job of a sweep that left none.
+    """One run, or one job of a sweep that left no run.
 
     Attributes:
         name: Folder of the run relative to the sweep's.

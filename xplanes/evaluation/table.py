@@ -80,7 +80,7 @@ def _write(path: Path, lines: Sequence[Line]) -> None:
 
 
 def _counts(rows: Sequence[RunRow]) -> str:
-    """How many runs ended how, and what their scores are of."""
+    """Number of runs by how they ended, and the split of their scores."""
     kinds = [row.status.split(":")[0].split(",")[0].split(";")[0] for row in rows]
     tally = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
     splits = {row.split for row in rows if row.split}
@@ -117,7 +117,7 @@ def _protocol(rows: Sequence[RunRow]) -> str:
 
 
 class SweepTable(Callback):
-    """Says how each job of a multirun ended, and writes and prints the table at its end.
+    """Reports how each job of a multirun ended, and writes and prints the table at its end.
 
     The table comes at the end of the process, whichever that is: Hydra leaves out
     ``on_multirun_end`` when a job has failed or the sweep is stopped.
@@ -175,7 +175,7 @@ class SweepTable(Callback):
         except ConfigError:
             return  # No job has begun.
         except Exception:
-            # The runs are there and whole; only their table is not.
+            # The runs are complete; only their table is missing.
             traceback.print_exc()
             _say(f"no table: xplanes table {folder}")
         if self._sheet is None:

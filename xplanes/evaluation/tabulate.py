@@ -38,7 +38,7 @@ COLUMNS = {
 """Scores of a table, in their order, each with its heading and format in markdown."""
 
 LONGEST = 120
-"""Letters of a status in markdown; the CSV has all of it."""
+"""Characters of a cell in markdown; the CSV has all of them."""
 
 Line = dict[str, Any]
 """A line of a table by column name: settings as text, scores as numbers."""
@@ -195,7 +195,7 @@ def _shown(line: Line, name: str) -> str:
 
 
 def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """A table whose columns also line up where it is read as text."""
+    """A table in markdown, its columns aligned."""
     cells = [[_cell(text) for text in line] for line in (header, *lines)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     cells.insert(1, ["-" * width for width in widths])

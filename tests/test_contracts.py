@@ -681,7 +681,7 @@ WINGS = ("baselines", "synthetic")
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 
 EDGES = {
-    "launch": {"config", "errors", "files", "process", "run", "sweeps"},
+    "launch": {"config", "errors", "files", "hints", "process", "run", "sweeps"},
     "train": {"cli"},
 }
 """What the ends of the command line may import, which must be quick to start."""

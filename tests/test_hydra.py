@@ -1,6 +1,10 @@
 """The command line is Hydra's own: every option of its manual, and its own errors."""
 
 import json
+import os
+import re
+import shlex
+import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,13 +13,16 @@ import pytest
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from tests import warm
 from tests.training.runs import SMALL, small_config
 from tests.warm import forked
-from xplanes.config import compose_plain
-from xplanes.errors import ConfigError
+from xplanes.cli import main
+from xplanes.config import CONF, compose_plain
+from xplanes.errors import ConfigError, SceneError
 from xplanes.launch import prepare
 from xplanes.run import run
 from xplanes.training.logs import forget_later
+from xplanes.training.module import RadianceModule
 
 
 @pytest.mark.parametrize(
@@ -40,8 +47,83 @@ def test_other_configurations_have_suggestions_of_their_own() -> None:
         compose_plain("pretrain_lrm", ["schedule.max_second=3"])
 
 
+def test_the_help_is_a_page_of_examples_that_compose_and_of_options(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["xplanes", "train", "--help"])
+    main()
+    shown = capsys.readouterr().out
+    assert len(shown.splitlines()) < 30
+    examples = re.findall(r"^  xplanes train(.*?)(?:   .*)?$", shown, re.MULTILINE)
+    assert len(examples) == 6
+    for words in map(shlex.split, examples):
+        chosen = [word.split(",")[0] for word in words if "=" in word and "resume" not in word]
+        assert compose_plain("train", chosen)["model"]["name"], words
+    for group in ("data", "model", "lrm", "recipe", "trainer", "logger"):
+        row = re.search(rf"^{group} +((?:.|\n {{11}})+)$", shown, re.MULTILINE)
+        assert row is not None
+        known = {path.stem for path in (CONF / group).glob("*.yaml")}
+        assert set(re.split(r",\s+", row[1])) == known, group
+    assert re.search(r"https://\S+/configuration/$", shown, re.MULTILINE)
+
+
+ANSWERS = (
+    ("train --model nine_planes", "write model=nine_planes"),
+    ("train --model=nine_planes lrm=none", "write model=nine_planes"),
+    ("train --max-steps 9", "Did you mean trainer.max_steps?"),
+    ("train data.scene excavator", "write data.scene=excavator"),
+    ("train lrm=none data.scene excavator", "write data.scene=excavator"),
+    ("train data.root=my captures lrm=none", 'write "data.root=my captures"'),
+    ("train data.root=my old captures", 'write "data.root=my old captures"'),
+    ("train data.root=$my captures", "write 'data.root=$my captures'"),
+    ("train callbacks.evaluation.at=[0.25, 1]", 'write "callbacks.evaluation.at=[0.25, 1]"'),
+    ("train callbacks.evaluation.at=[0, 0.5, 1]", 'write "callbacks.evaluation.at=[0, 0.5, 1]"'),
+    ("train model.name=a(b", "write \"model.name='a(b'\""),
+    ("train excavator", "write key=value"),
+    ("train lrm=tripo", "Did you mean lrm=large (TripoSR)?"),
+    ("train lrm=TripoSR", "Did you mean lrm=large (TripoSR)?"),
+    ("train lrm=openlrm", "lrm=xlarge (OpenLRM large)?"),
+    ("train trainer.gpus=2", "Did you mean trainer=ddp trainer.devices=2?"),
+    ("train model.lr=0.1", "Did you mean model.plane_lr=0.1?"),
+    ("train -m seed=0,1 --cfg job", "-m with --cfg: Hydra shows one run"),
+    ("train -m seed=0,1 --info", "-m with --info: Hydra shows one run"),
+    ("trian", "did you mean `xplanes train`?"),
+    ("model=x seed=1", "did you mean `xplanes train model=x seed=1`?"),
+    ("dance", "see `xplanes --help`"),
+    ("train resume=WRONG", "The newest runs: outputs/new, outputs/old"),
+)
+"""What is typed after ``xplanes``, and a part of the answer."""
+
+
+@pytest.mark.parametrize(("typed", "answer"), ANSWERS)
+def test_what_is_mistyped_is_answered_with_what_was_meant(
+    typed: str, answer: str, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["xplanes", *typed.split(" ")])
+    for age, name in enumerate(("new", "old")):
+        run = tmp_path / "outputs" / name
+        run.mkdir(parents=True)
+        (run / "overrides.txt").touch()
+        os.utime(run / "overrides.txt", (9 - age, 9 - age))
+    try:
+        code = main()
+    except SystemExit as end:
+        code = end.code
+    error = capsys.readouterr().err + str(code)
+    assert code
+    assert answer in error
+    assert "usage:" not in error
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_no_command_is_answered_with_the_commands(capsys) -> None:
+    assert main([]) == 0
+    assert "usage: xplanes" in capsys.readouterr().out
+
+
 COMMANDS = {
-    ("--help",): "Configuration groups",
+    ("--help",): "Hydra's own options",
+    ("hydra/help=default", "--help"): "Configuration groups",
+    ("--hydra-help",): "--experimental-rerun",
     ("--cfg=job",): "plane_set: six",
     ("--cfg", "job", "--package", "model"): "plane_set: six",
     ("--config-name=pretrain_lrm", "--cfg", "job"): "muon_lr",
@@ -136,16 +218,53 @@ def test_a_run_of_an_earlier_version_is_refused_with_its_version(tmp_path: Path)
 
 
 def test_a_run_that_failed_before_its_first_checkpoint_blocks_nothing(
-    scenes: Path, tmp_path: Path
+    scenes: Path, tmp_path: Path, monkeypatch
 ) -> None:
     config = small_config(scenes, "trainer.max_steps=3")
-    broken = small_config(scenes, "data.scene=excavator", "data.views=999")
-    with pytest.raises(Exception, match=r"data\.views=999"):
-        run(broken, tmp_path / "run", [], resume=False)
+    monkeypatch.setattr(RadianceModule, "training_step", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run(config, tmp_path / "run", [], resume=False)
     assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "failed"
+    monkeypatch.undo()
     run(config, tmp_path / "run", [], resume=False)
     with pytest.raises(ConfigError, match="holds a run already"):
         run(config, tmp_path / "run", [], resume=False)
+
+
+REFUSED = (
+    ("data=dnerf", "data.scene=nothing"),
+    ("data=colmap", "data.scene=nothing"),
+    ("data.views=999",),
+    ("lrm=large", "lrm.weights=nowhere.ckpt"),
+    ("lrm=file", "lrm.triplanes=nowhere.pt"),
+    ("lrm=small",),
+)
+"""Settings that are refused when the data or the weights are looked for."""
+
+
+@pytest.mark.parametrize("changes", REFUSED, ids=str)
+def test_a_refused_run_leaves_no_directory(
+    changes, scenes: Path, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("HF_HOME", str(scenes))
+    place, own = f"hydra.run.dir={tmp_path}/outputs/run", [f"data.root={scenes}", *SMALL]
+    own = [text for text in own if not {text.split("=")[0]} & {c.split("=")[0] for c in changes}]
+    if changes[0].startswith("data="):
+        own = [text for text in own if not text.startswith("data.") or "root" in text]
+    done = warm.train(*own, *changes, place, cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: "), done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_stood_in_the_folder_of_a_refused_run_stays(scenes: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("keep")
+    broken = small_config(scenes, "data.scene=excavator", "data.views=999")
+    with pytest.raises(SceneError, match=r"data\.views=999"):
+        run(broken, tmp_path, [], resume=False)
+    assert (tmp_path / "mine.txt").read_text() == "keep"
 
 
 def test_tensorboard_drops_what_a_run_that_was_cut_off_has_left(tmp_path) -> None:
@@ -197,7 +316,9 @@ def test_a_run_says_at_its_ends_what_it_takes_and_what_comes_next(
     run(small_config(scenes, *changes, "data.eval_split=val"), tmp_path, [], resume=False)
     printed = capsys.readouterr().out
     line = next(line for line in printed.splitlines() if line.startswith("estimate"))
-    assert "at most" in line
+    assert re.fullmatch(
+        r"estimate +\d+ s in all: \d+ s so far, \d+ s of training, \d+ s of scores and images", line
+    )
     assert "GB" not in line  # Fragments of the heap, which nothing foretells, are half of it.
     assert printed.index("estimate") < printed.index("step 6/6")
     last = printed.split("step 6/6")[1]

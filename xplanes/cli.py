@@ -4,7 +4,9 @@ Heavy modules are imported by the commands that need them, so that the help is f
 """
 
 import argparse
+import difflib
 import os
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -43,7 +45,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Hydra parses the command line of training itself.
         train(words[1:], words[:1] if sys.argv[1:] == words else ())
         return 0
-    options = build_parser(further_commands()).parse_args(words)
+    parser = build_parser(further_commands())
+    if not words:
+        parser.print_help()
+        return 0
+    if problem := _unknown_command(parser, words):
+        print(f"error: {problem}", file=sys.stderr)
+        return 2
+    options = parser.parse_args(words)
     try:
         options.command(options)
         sys.stdout.flush()
@@ -58,6 +67,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+def _unknown_command(parser: argparse.ArgumentParser, words: Sequence[str]) -> str:
+    """What a first word that is no command may have meant; empty for commands and options."""
+    (known,) = (each.choices for each in parser._actions if each.dest == "COMMAND")
+    assert known is not None
+    if words[0] in known or words[0].startswith("-"):
+        return ""
+    near = ["train", *words] if "=" in words[0] else difflib.get_close_matches(words[0], known, n=1)
+    hint = f"did you mean `xplanes {shlex.join(near)}`?" if near else "see `xplanes --help`"
+    return f"{words[0]}: no such command; {hint}"
 
 
 def further_commands() -> list[AddCommands]:
@@ -78,7 +98,9 @@ def build_parser(further: Sequence[AddCommands] = ()) -> argparse.ArgumentParser
         description="Dynamic radiance fields initialised from Large Reconstruction Models.",
     )
     parser.add_argument("--version", action="version", version=f"xplanes {__version__}")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    commands = parser.add_subparsers(
+        title="commands", metavar="COMMAND", dest="COMMAND", required=True
+    )
     commands.add_parser("train", help="train a field: key=value ..., and the options of Hydra")
     resume = commands.add_parser("resume", help="continue a run: RUN key=value ...")
     resume.add_argument("run", metavar="RUN", help="the run directory")

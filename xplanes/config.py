@@ -22,6 +22,17 @@ NAMES = (
 )
 """Settings whose values are names or paths, whatever they look like."""
 
+ELSEWHERE = {
+    "gpus": "trainer=ddp trainer.devices={}",
+    "lr": "model.plane_lr={}",
+    "batch_size": "model.rays.per_batch={}",
+    "epochs": "+trainer.max_epochs={}",
+    "iterations": "trainer.max_steps={}",
+    "device": "trainer.accelerator={}",
+    "output_dir": "hydra.run.dir={}",
+}
+"""Settings by the names that they have in other programs, with a place for their value."""
+
 _PLAIN = re.compile(r"(?!\.\d)[A-Za-z_./][A-Za-z0-9_./-]*")
 """Text that Hydra reads as it is; other letters it takes in quotes alone."""
 
@@ -178,7 +189,7 @@ def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "
         chosen = [
             str(each.input_line) for each in parsed if each.key_or_group == "hydra.searchpath"
         ]
-        keys = []
+        keys = {}
         with _initialized(conf):
             loader = GlobalHydra.instance().config_loader()
             search = list(chosen)
@@ -187,14 +198,17 @@ def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "
                 options = loader.get_group_options(group, config_name=name, overrides=search)
                 if not options:
                     known = each.is_add() or each.is_force_add() or group.startswith("hydra.")
-                    keys += [] if known else [group]
+                    keys |= {} if known else {group: each.get_value_element_as_str()}
                     continue
                 swept = each.is_sweep_override()
                 values = list(each.sweep_string_iterator()) if swept else [each.value()]
                 for option in values:
                     if isinstance(option, str) and option not in options:
-                        near = difflib.get_close_matches(option, options, n=1, cutoff=0.5)
-                        return f"Did you mean {group}={near[0]}?" if near else ""
+                        near = difflib.get_close_matches(option, options, n=1, cutoff=0.6)
+                        meant = [f"{group}={each}" for each in near] or _described(
+                            conf, group, option
+                        )
+                        return f"Did you mean {' or '.join(meant)}?" if meant else ""
                 line = str(each.input_line)
                 chosen.append(f"{line.partition('=')[0]}={values[0]}" if swept else line)
             config = OmegaConf.to_container(compose(name, chosen, return_hydra_config=True))
@@ -210,6 +224,8 @@ def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "
     if options := _options_with(key, groups, conf):
         return f"{key} belongs to {' and '.join(options)}, not to what is chosen"
     prefix, _, last = key.rpartition(".")
+    if last in ELSEWHERE:
+        return f"Did you mean {ELSEWHERE[last].format(keys[key])}?"
     beside = [each for each in known if each.rpartition(".")[0] == prefix]
     alike = [each for each in known if each.rpartition(".")[2] == last]
     near = (
@@ -218,6 +234,16 @@ def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "
         or difflib.get_close_matches(key, sorted(known), n=3, cutoff=0.6)
     )
     return f"Did you mean {' or '.join(near)}?" if near else ""
+
+
+def _described(conf: Path, group: str, word: str) -> list[str]:
+    """Options whose files begin with a comment that begins with a word, and its first words."""
+    found = []
+    for path in sorted((conf / group).glob("*.yaml")):
+        words = re.match("# ([^.,:]+)", path.read_text(encoding="utf-8"))
+        if words and words[1].lower().startswith(word.lower()):
+            found.append(f"{group}={path.stem} ({words[1]})")
+    return found
 
 
 def _names(node: Any, prefix: str = "") -> Iterator[str]:

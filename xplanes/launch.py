@@ -21,7 +21,8 @@ from xplanes import __version__
 from xplanes.config import CONF, near_names, quoted, to_plain, unquoted, with_names
 from xplanes.errors import ConfigError
 from xplanes.files import StorageError, read_json, require_writable
-from xplanes.process import train_command
+from xplanes.hints import require_parsed, require_readable
+from xplanes.process import STARTED, train_command
 
 SEARCHPATH = "hydra.searchpath"
 
@@ -143,7 +144,8 @@ def _job(config: DictConfig) -> float:
         own = [text for text in settings.overrides.hydra if _split(text)[0] == SEARCHPATH]
         task = [text for text in settings.overrides.task if _split(text)[0] != "resume"]
         job = None if sweep else _prepared.pop(settings.run.dir, None)
-        return run(plain, folder, [*own, *task], resume=resume, job=job)
+        began = None if sweep else STARTED
+        return run(plain, folder, [*own, *task], resume=resume, job=job, began=began)
     except KNOWN_ERRORS as error:
         if sweep:
             raise
@@ -191,12 +193,14 @@ def prepare(arguments: list[str]) -> list[str]:
         Arguments for Hydra.
 
     Raises:
-        ConfigError: If the run cannot be resumed.
+        ConfigError: If Hydra cannot read the arguments, or the run cannot be resumed.
         StorageError: If the folder of the run cannot be written.
     """
+    require_readable(arguments)
     several = _is_multirun(arguments)
     _require_present_names(arguments, several=several)
     arguments = [with_names(text, several=several) for text in arguments]
+    require_parsed([text for text in arguments if _split(text)[0]])
     values = {key: value for key, value in map(_split, arguments) if key}
     for key, value in values.items():
         if value in ("null", "None") and (CONF / key).is_dir():
@@ -235,7 +239,11 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
     """The run's own overrides, then the new ones, in the run's own folder."""
     path = run / "overrides.txt"
     if not path.is_file():
-        raise ConfigError(f"resume={run}: not a run directory, no overrides.txt in it")
+        found = sorted(Path("outputs").glob("*/overrides.txt"), key=_mtime, reverse=True)
+        newest = ", ".join(str(each.parent) for each in found[:3]) or "there is none in outputs"
+        raise ConfigError(
+            f"resume={run}: not a run directory, no overrides.txt in it. The newest runs: {newest}"
+        )
     require_writable(run)
     _require_version(run)
     text = path.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""This process: OpenMP's threads, what oneDNN keeps, the user's home, and the command line.
+"""This process: its start, OpenMP's threads, what oneDNN keeps, the user's home, its command line.
 
 Must stay quick: its caller has yet to import torch, whose libraries read the environment once.
 """
@@ -6,8 +6,12 @@ Must stay quick: its caller has yet to import torch, whose libraries read the en
 import os
 import shlex
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
+
+STARTED = time.perf_counter()
+"""When this process began, as `time.perf_counter` counts."""
 
 WAIT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "10000"}
 """Threads spin briefly, then sleep: spinning for long wastes the cores of a shared machine."""

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shutil
 import time
 import traceback
 from collections.abc import Sequence
@@ -48,6 +49,10 @@ KNOWN_ERRORS = (XPlanesError, MisconfigurationException)
 """Errors that are reported by their message; the traceback is written to train.log only."""
 
 
+REFUSALS = (ConfigError, SceneError, LRMError, MissingExtraError)
+"""Errors of a run that cannot begin with its settings, its data or its weights."""
+
+
 @dataclass(frozen=True)
 class Job:
     """A run that can begin: its settings are parsed, its Trainer is built, nothing is written.
@@ -56,11 +61,13 @@ class Job:
         experiment: The settings.
         trainer: With callbacks and loggers.
         folder: The run directory, which need not exist yet.
+        new: Whether it did not exist.
     """
 
     experiment: Experiment
     trainer: Trainer
     folder: Path
+    new: bool
 
 
 def prepare(config: dict[str, Any], folder: Path) -> Job:
@@ -74,7 +81,7 @@ def prepare(config: dict[str, Any], folder: Path) -> Job:
         ConfigError: If settings are missing, out of range, or contradict one another.
     """
     experiment = Experiment.read(config)
-    return Job(experiment, experiment.build_trainer(folder), folder)
+    return Job(experiment, experiment.build_trainer(folder), folder, not folder.exists())
 
 
 def run(
@@ -84,8 +91,9 @@ def run(
     *,
     resume: bool,
     job: Job | None = None,
+    began: float | None = None,
 ) -> float:
-    """Train and score one field.
+    """Train and score one field; a run that is refused leaves no directory behind.
 
     Args:
         config: The resolved configuration, builtins only.
@@ -93,6 +101,7 @@ def run(
         overrides: What the command line changed.
         resume: Whether to continue the run in ``folder``.
         job: What `prepare` has made of the configuration; made here when None.
+        began: When the run began, as `time.perf_counter` counts; now when None.
 
     Returns:
         PSNR of the scored split in dB; NaN in helper processes of a distributed run.
@@ -111,25 +120,33 @@ def run(
     if int(os.environ.get("LOCAL_RANK", "0")):
         train(job, resume=resume)
         return float("nan")
+    claimed = False
     try:
         with alone_in(folder):
             claim(folder, resume=resume)
+            claimed = True
             if resume and has_checkpoint(folder):
                 require_same_run(folder, config, job.experiment.trainer.get("max_steps", -1))
             clear_unfinished(folder)
             with keeping_settings(folder, config, overrides):
-                return _recorded(job, overrides, resume=resume)
+                return _recorded(job, overrides, resume=resume, began=began)
+    except REFUSALS:
+        if claimed and job.new and not has_checkpoint(folder):
+            shutil.rmtree(folder, ignore_errors=True)
+            with suppress(OSError):  # It holds other runs.
+                folder.parent.rmdir()
+        raise
     except OSError as problem:
         if (words := storage_error(problem)) is None:
             raise
         raise words from problem
 
 
-def _recorded(job: Job, overrides: list[str], *, resume: bool) -> float:
+def _recorded(job: Job, overrides: list[str], *, resume: bool, began: float | None) -> float:
     """Train with run.json and train.log kept, and give PSNR."""
     folder = job.folder
     with logged(folder / "train.log"):
-        record = RunRecord(folder, job.experiment.method.seed, resume=resume)
+        record = RunRecord(folder, job.experiment.method.seed, resume=resume, began=began)
         try:
             metrics = train(job, resume=resume, record=record, overrides=overrides)
             record.end("finished")
@@ -142,7 +159,7 @@ def _recorded(job: Job, overrides: list[str], *, resume: bool) -> float:
             # On a full disk the record stays "running", as after a power cut; resume= takes both.
             with suppress(StorageError):
                 record.end("failed", f"{type(error).__name__}: {error}")
-            if not isinstance(error, ConfigError | SceneError | LRMError | MissingExtraError):
+            if not isinstance(error, REFUSALS):
                 say(f"\nstopped. Once that is fixed: {resume_command(folder)}")
             raise
     return metrics["test"]["psnr"]
@@ -199,7 +216,7 @@ def train(
         )
         warm_up_loops(module, data, device)
         expected = estimate(module, data)
-        text = header(experiment, folder, data, module, overrides, expected)
+        text = header(experiment, folder, data, module, overrides, expected, record.seconds)
         logger.info("\n%s", text)
         say(text + "\n")
         write_pictures(trainer, found.pictures, log=not resume)

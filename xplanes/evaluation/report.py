@@ -40,6 +40,7 @@ def header(
     module: RadianceModule,
     overrides: Sequence[str],
     expected: Estimate,
+    spent: float,
 ) -> str:
     """The lines printed before training: what is about to happen, on what, from what."""
     assert module.frame is not None
@@ -77,29 +78,43 @@ def header(
         "from": module.initialisation.words,
         "samples": module.sampler.outline,
         "budget": budget,
-        "estimate": _estimated(experiment, data, expected),
+        "estimate": estimated(experiment, data, expected, spent),
         "changed": " ".join(overrides) or "(nothing)",
     }
     return "\n".join(f"{name:<9}{text}" for name, text in lines.items())
 
 
-def _estimated(experiment: Experiment, data: SceneDataModule, expected: Estimate) -> str:
-    """How long the run is going to take, as text."""
+def estimated(
+    experiment: Experiment, data: SceneDataModule, expected: Estimate, spent: float
+) -> str:
+    """How long the run is going to take, as text.
+
+    Args:
+        experiment: The settings.
+        data: The data.
+        expected: What a step and a ray take.
+        spent: Seconds since the run began.
+    """
     trainer = experiment.trainer
     steps = float(trainer.get("max_steps", -1)) if trainer.get("max_steps", -1) > 0 else math.inf
     train = min(steps * expected.step, trainer.get("max_seconds") or math.inf)
+    pruned = expected.pruned_at * expected.step / train
     final = data.scene.splits[data.test_split]
     views = data.scene.splits[data.validation_split or data.test_split]
-    times = len(experiment.callbacks.get("evaluation", {}).get("at", []))
-    count = scored_views(experiment.trainer.get("limit_val_batches", 1.0), len(views))
-    pixels = views.height * views.width * times * count
+    shares = {*experiment.callbacks.get("evaluation", {}).get("at", []), 1.0}
+    early = sum(share == 0 or share < pruned for share in shares)
+    count = scored_views(trainer.get("limit_val_batches", 1.0), len(views))
+    pixels = views.height * views.width * count
+    later = pixels * (len(shares) - early)
     if final is not views or count < len(views):
-        pixels += final.height * final.width * len(final)
+        later += final.height * final.width * len(final)
     if experiment.media:
-        pixels += FRAMES * VIDEO_SIZE**2
-    images = pixels / expected.image_rays
-    whole = f"{train + images:.0f} s" if train < math.inf else "no end of training"
-    return f"at most {whole}, {images:.0f} s of it for scores and images"
+        later += FRAMES * VIDEO_SIZE**2
+    images = early * pixels * expected.first_ray + later * expected.later_ray
+    parts = f"{spent:.0f} s so far, {{}} of training, {images:.0f} s of scores and images"
+    if train == math.inf:
+        return parts.format("no end")
+    return f"{spent + train + images:.0f} s in all: {parts.format(f'{train:.0f} s')}"
 
 
 def scored_views(limit: float, views: int) -> int:

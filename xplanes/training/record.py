@@ -98,11 +98,12 @@ class RunRecord:
         run: The run directory.
         seed: The run's seed.
         resume: Whether the run goes on; otherwise the record of an earlier run is ignored.
+        began: When it began, as `time.perf_counter` counts; now when None.
     """
 
-    def __init__(self, run: Path, seed: int, *, resume: bool) -> None:
+    def __init__(self, run: Path, seed: int, *, resume: bool, began: float | None = None) -> None:
         self.path = run / "run.json"
-        self._began = time.perf_counter()
+        self._began = time.perf_counter() if began is None else began
         earlier = _earlier(self.path) if resume else {}
         self._before = float(earlier.get("total_seconds", 0.0))
         self.content: dict[str, Any] = {
@@ -140,7 +141,12 @@ class RunRecord:
     @property
     def total_seconds(self) -> float:
         """Wall time of this run so far, earlier parts included."""
-        return self._before + time.perf_counter() - self._began
+        return self._before + self.seconds
+
+    @property
+    def seconds(self) -> float:
+        """Wall time since this part of the run began."""
+        return time.perf_counter() - self._began
 
 
 def run_status(run: Path) -> str | None:

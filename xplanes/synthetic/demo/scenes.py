@@ -562,10 +562,10 @@ def demo_scene(name: str) -> DemoScene:
     if name in DEMO_SCENES:
         return DEMO_SCENES[name]
     close = difflib.get_close_matches(name, DEMO_SCENES, n=1)
-    hint = f" Did you mean {close[0]!r}?" if close else ""
+    hint = f" Did you mean {close[0]}?" if close else ""
     raise SceneError(
         f"no demo scene {name!r}; available: {', '.join(DEMO_SCENES)}.{hint} Scenes on disk need "
-        "data=dnerf."
+        "data=FORMAT, such as dnerf, nerfstudio or colmap: `xplanes inspect FOLDER` tells which."
     )
 
 

@@ -2,7 +2,8 @@
 
 docs/configuration.md comes from conf/ and the classes it names, docs/command_line.md from the
 parser of the command line, docs/api.md from the signatures and docstrings of what it lists,
-examples/first_minute.ipynb from the script beside it.
+examples/first_minute.ipynb from the script beside it. The project's addresses in other files come
+from pyproject.toml.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import json
 import pkgutil
 import re
 import textwrap
+import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -554,6 +556,29 @@ PAGES = {
 """The pages that are written, and what writes them."""
 
 
+ADDRESSED = {
+    "mkdocs.yml": {"site_url: ": "{Documentation}/", "repo_url: ": "{Repository}"},
+    "CITATION.cff": {"repository-code: ": "{Repository}", "\nurl: ": "{Documentation}"},
+    "README.md": {"  url = {": "{Repository}"},
+    "conf/hydra/help/train.yaml": {"Manual +": "{Documentation}/configuration/"},
+}
+"""Files with addresses of the project: what stands before one, and the address."""
+
+
+def addressed(name: str) -> str:
+    """A file with the addresses that pyproject.toml gives."""
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["urls"]
+    text = (ROOT / name).read_text(encoding="utf-8")
+    for before, address in ADDRESSED[name].items():
+        pattern = rf"({before})https://[^\s}}]+"
+        text, count = re.subn(pattern, rf"\g<1>{address.format(**urls)}", text)
+        if count != 1:
+            raise SystemExit(f"{name}: {count} addresses after {before!r}, not 1")
+    return text
+
+
 if __name__ == "__main__":
     for name, write in PAGES.items():
         (ROOT / "docs" / name).write_text(write(), encoding="utf-8", newline="\n")
+    for name in ADDRESSED:
+        (ROOT / name).write_text(addressed(name), encoding="utf-8", newline="\n")

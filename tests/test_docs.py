@@ -9,14 +9,25 @@ import runpy
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
+from tests.training.runs import small_config
+from xplanes import __version__
 from xplanes.cli import build_parser
 from xplanes.config import compose_plain, near_names
+from xplanes.evaluation.published import OWN, PUBLISHED
+from xplanes.evaluation.table import write_tables
+from xplanes.evaluation.tabulate import COLUMNS
 from xplanes.experiment import Experiment
+from xplanes.files import read_json
+from xplanes.run import run
 from xplanes.synthetic.pretraining.commands import add_commands
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -30,6 +41,18 @@ def test_generated_pages_are_what_the_generator_writes() -> None:
     for name, write in pages.items():
         page = (ROOT / "docs" / name).read_text(encoding="utf-8")
         assert page == write(), "run: python docs/generate.py"
+
+
+def test_addresses_and_version_are_the_same_wherever_they_stand() -> None:
+    generator = runpy.run_path(str(ROOT / "docs" / "generate.py"))
+    addressed = generator["addressed"]
+    for name in generator["ADDRESSED"]:
+        text = (ROOT / name).read_text(encoding="utf-8")
+        assert text == addressed(name), "run: python docs/generate.py"
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert f"version = {{{__version__}}}" in text
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert cited["version"] == __version__
 
 
 @pytest.mark.skipif(not find_spec("mkdocs"), reason="the site needs the extra docs")
@@ -172,3 +195,36 @@ def test_code_named_in_the_text_of_the_pages_exists() -> None:
     assert len(named) > 12
     for name in named:
         assert pkgutil.resolve_name(name), name
+
+
+def keys_of(node: Any) -> Iterator[str]:
+    """Names of everything in a JSON file, at every depth."""
+    for key, value in node.items() if isinstance(node, dict) else ():
+        yield key
+        yield from keys_of(value[0] if isinstance(value, list) and value else value)
+
+
+def test_the_glossary_has_every_column_and_key_that_a_run_writes(
+    scenes: Path, tmp_path: Path
+) -> None:
+    changes = ("lrm=tiny", "preparation.frames=3", f"preparation.cache={tmp_path / 'cache'}")
+    config = small_config(scenes, *changes, "trainer.max_steps=2", "media=true")
+    run(config, tmp_path / "runs" / "run", [], resume=False)
+    written = tmp_path / "runs" / "run"
+    metrics, record = (read_json(written / f"{name}.json") for name in ("metrics", "run"))
+    assert metrics["decomposition"]["xy"]
+    assert metrics["lrm"]["frames"] == 3
+    record = {key: None if key in ("versions", "files") else record[key] for key in record}
+    write_tables(tmp_path / "runs")
+    tables = (tmp_path / "runs" / "table.md").read_text(encoding="utf-8").splitlines()
+    headers = [row for row, rule in pairwise(tables) if rule.startswith("| --")]
+    columns = [cell.strip() for row in headers for cell in row.strip("|").split("|")]
+    assert "s to 20 dB" in columns
+    assert "drift" in columns
+    keyed = (tmp_path / "runs" / "table.csv").read_text(encoding="utf-8").splitlines()[0]
+    rows = (written / "curve.csv").read_text(encoding="utf-8").splitlines()[0]
+    page = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+    known = {text.rpartition(".")[2] for text in re.findall(r"`([^`]+)`", page)}
+    names = [*keys_of(metrics), *keys_of(record), *columns, *keyed.split(","), *rows.split(",")]
+    names += [*OWN, *PUBLISHED, *(heading for heading, _ in COLUMNS.values()), *COLUMNS]
+    assert not set(names) - known

@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -150,39 +151,72 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "CONTRIBUTING.md"
 
 
 @pytest.fixture
-def small_model(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict:
-    """The model of the docs, written to files as they say; its configuration."""
-    section = PAGE.read_text(encoding="utf-8").split("### A model\n")[1].split("\n### ")[0]
-    (code,) = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
-    (settings,) = re.findall(r"```yaml\n(.*?)```", section, re.DOTALL)
-    package, group = tmp_path / "my_project" / "my_package", tmp_path / "my_project/conf/model"
-    package.mkdir(parents=True)
-    group.mkdir(parents=True)
-    (package / "__init__.py").write_text("")
-    (package / "mlp.py").write_text(code)
-    (group / "mlp.yaml").write_text(settings)
-    monkeypatch.syspath_prepend(package.parent)
-    yield compose_plain(
-        "train",
-        [
-            f"hydra.searchpath=[file://{package.parent}/conf]",
-            "plugins=[my_package]",
-            "model=mlp",
-            f"data.root={scenes}",
-            "data.resolution=24",
-            "data.train_views=8",
-            "data.test_views=2",
-            "data.val_views=2",
-            "model.sampler.grid_resolution=24",
-            "trainer.accelerator=cpu",
-            "trainer.max_seconds=null",
-            "trainer.max_steps=60",
-            "callbacks.evaluation.at=[0]",
-            "media=false",
-        ],
-    )
+def example(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., dict]]:
+    """Writes an example of the docs to files as they say, and gives its configuration."""
+    project = tmp_path / "my_project"
+
+    def write(section: str, group: str, name: str, *changes: str) -> dict:
+        text = PAGE.read_text(encoding="utf-8").split(f"### {section}\n")[1].split("\n### ")[0]
+        (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+        (settings,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+        package, folder = project / "my_package", project / "conf" / group
+        package.mkdir(parents=True)
+        folder.mkdir(parents=True)
+        (package / "__init__.py").write_text("")
+        (package / f"{name}.py").write_text(code)
+        (folder / f"{name}.yaml").write_text(settings)
+        monkeypatch.syspath_prepend(project)
+        return compose_plain(
+            "train",
+            [
+                f"hydra.searchpath=[file://{project}/conf]",
+                "plugins=[my_package]",
+                f"{group}={name}",
+                f"data.root={scenes}",
+                "data.train_views=8",
+                "data.test_views=2",
+                "data.val_views=2",
+                "model.sampler.grid_resolution=24",
+                "trainer.accelerator=cpu",
+                "trainer.max_seconds=null",
+                "callbacks.evaluation.at=[0]",
+                "media=false",
+                *changes,
+            ],
+        )
+
+    yield write
     for name in [name for name in sys.modules if name.split(".")[0] == "my_package"]:
         del sys.modules[name]
+
+
+@pytest.fixture
+def small_model(example: Callable[..., dict]) -> dict:
+    """The configuration of the docs' model."""
+    return example("A model", "model", "mlp", "data.resolution=24", "trainer.max_steps=60")
+
+
+def first_psnr(folder: Path) -> float:
+    """PSNR before the first step."""
+    return float(next(csv.DictReader((folder / "curve.csv").open()))["psnr"])
+
+
+def test_the_lrm_of_the_docs_initialises_a_field(
+    example: Callable[..., dict], tmp_path: Path
+) -> None:
+    changes = ("data.resolution=48", "preparation.cache=null", "preparation.frames=4")
+    changes += ("trainer.max_steps=2",)
+    own = example("A Large Reconstruction Model", "lrm", "cardboard", *changes)
+    run(own, tmp_path / "own", [], resume=False)
+    metrics = json.loads((tmp_path / "own" / "metrics.json").read_text())
+    assert metrics["lrm"]["frames"] == 4
+    assert metrics["decomposition"]["xz"]["converged"]
+    assert (tmp_path / "own" / "media" / "fixed_view.png").is_file()
+    random = compose_plain("train", ["lrm=none"])["lrm"]
+    run(own | {"lrm": random}, tmp_path / "random", [], resume=False)
+    assert first_psnr(tmp_path / "own") > first_psnr(tmp_path / "random") + 1
 
 
 def test_the_model_of_the_docs_trains(small_model: dict, tmp_path: Path) -> None:

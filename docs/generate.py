@@ -2,8 +2,8 @@
 
 docs/configuration.md comes from conf/ and the classes it names, docs/command_line.md from the
 parser of the command line, docs/api.md from the signatures and docstrings of what it lists,
-examples/first_minute.ipynb from the script beside it. The project's
-addresses in other files come from pyproject.toml.
+examples/first_minute.ipynb from the script beside it. The project's addresses in other files come
+from pyproject.toml.
 """
 
 import argparse

@@ -4,6 +4,7 @@ Hydra imports this module whenever it starts, and takes sweepers from ``hydra_pl
 """
 
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
+from xplanes.config import CONF
 from xplanes.sweeps import jobs
 
 ALIASES = {
@@ -64,7 +66,13 @@ def case(key: str, choices: Mapping[str, Any], otherwise: Any, *, _root_: Any) -
     return choices.get(str(OmegaConf.select(_root_, key)), otherwise)
 
 
-for _name, _resolver in {"file_name": file_name, "case": case}.items():
+def options(group: str) -> str:
+    """The options of a group, as lines of conf/hydra/help/train.yaml."""
+    names = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+    return textwrap.fill(", ".join(names), 84, subsequent_indent=11 * " ")
+
+
+for _name, _resolver in {"file_name": file_name, "case": case, "options": options}.items():
     OmegaConf.register_new_resolver(_name, _resolver, replace=True)
 _store = ConfigStore.instance().store
 _sweeper = {"_target_": f"{__name__}.RowSweeper", "max_batch_size": None, "params": None}

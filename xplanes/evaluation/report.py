@@ -87,7 +87,7 @@ def header(
 def estimated(
     experiment: Experiment, data: SceneDataModule, expected: Estimate, spent: float
 ) -> str:
-    """Seconds that the run is going to take, in words.
+    """How long the run is going to take, as text.
 
     Args:
         experiment: The settings.
@@ -98,18 +98,19 @@ def estimated(
     trainer = experiment.trainer
     steps = float(trainer.get("max_steps", -1)) if trainer.get("max_steps", -1) > 0 else math.inf
     train = min(steps * expected.step, trainer.get("max_seconds") or math.inf)
+    pruned = expected.pruned_at * expected.step / train
     final = data.scene.splits[data.test_split]
     views = data.scene.splits[data.validation_split or data.test_split]
     shares = {*experiment.callbacks.get("evaluation", {}).get("at", []), 1.0}
-    count = scored_views(experiment.trainer.get("limit_val_batches", 1.0), len(views))
+    early = sum(share == 0 or share < pruned for share in shares)
+    count = scored_views(trainer.get("limit_val_batches", 1.0), len(views))
     pixels = views.height * views.width * count
-    first = pixels * (0 in shares)
-    later = pixels * len(shares - {0})
+    later = pixels * (len(shares) - early)
     if final is not views or count < len(views):
         later += final.height * final.width * len(final)
     if experiment.media:
         later += FRAMES * VIDEO_SIZE**2
-    images = first * expected.first_ray + later * expected.later_ray
+    images = early * pixels * expected.first_ray + later * expected.later_ray
     parts = f"{spent:.0f} s so far, {{}} of training, {images:.0f} s of scores and images"
     if train == math.inf:
         return parts.format("no end")

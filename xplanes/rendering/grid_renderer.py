@@ -298,6 +298,11 @@ class OccupancySampler(Sampler):
     def outline(self) -> str:
         return f"{100 * self.grid.occupied_fraction:.0f}% of the cube may be occupied"
 
+    @property
+    def pruned_at(self) -> int:
+        settings = self.settings
+        return min([*settings.sweep_at, settings.sweep_every]) if settings.skip_empty else 0
+
     def first_rays(self, most: int) -> int:
         return min(most, 256)
 

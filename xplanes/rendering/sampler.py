@@ -124,6 +124,11 @@ class Sampler(ABC):
         """Parameter groups of the sampler, trained together with the field; see `Model.groups`."""
         return []
 
+    @property
+    def pruned_at(self) -> int:
+        """Step at which empty space is pruned first, so that rays take less time; 0 for never."""
+        return 0
+
     def first_rays(self, most: int) -> int:
         """Number of rays in the first batch, at most ``most``."""
         return most

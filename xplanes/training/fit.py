@@ -17,6 +17,7 @@ from lightning.pytorch.plugins.io import CheckpointIO
 from xplanes.backend import cpu_loops, synchronize
 from xplanes.errors import ConfigError
 from xplanes.rendering.base import RayRenderer
+from xplanes.rendering.behind import look
 from xplanes.rendering.warming import warming_up
 from xplanes.scenes.batches import Batch
 from xplanes.scenes.datamodule import SceneDataModule
@@ -249,28 +250,30 @@ def rehearse(module: RadianceModule, rays: Batch) -> None:
 
 
 class Estimate(NamedTuple):
-    """What parts of a run are going to take, measured before its first step.
+    """How long parts of a run are going to take, measured before its first step.
 
     Attributes:
         step: Seconds of a step.
-        first_ray: Seconds of a ray of an image before the first step.
-        later_ray: Seconds of a ray of later images.
+        first_ray: Seconds of a ray of an image before empty space is pruned.
+        later_ray: Seconds of a ray afterwards.
+        pruned_at: Step at which it is pruned first.
     """
 
     step: float
     first_ray: float
     later_ray: float
+    pruned_at: int
 
 
-SOLID = 30.0
-"""Factor on the density that makes a field nearly as opaque as training makes it."""
+OPAQUE = 1000.0
+"""Factor on the density that makes a field about as opaque as training does."""
 
 
 def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
     """Time a step and some rays of a scored view.
 
-    Training makes a field opaque, so that its rays end sooner: a field that is denser in the same
-    places stands for it.
+    Training makes surfaces opaque, so that rays end after a few samples. A field that is far denser
+    in the same places stands for the trained one.
 
     Args:
         module: The module, its loops compiled.
@@ -283,30 +286,29 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
     views = data.scene.splits[data.test_split]
     camera, seen_at = views.camera(0), (float(views.times[0]), data.scene.background.to(device))
     pixels = camera.height * camera.width
-    chosen = torch.linspace(0, pixels - 1, min(2048, pixels)).long()
-    origins, directions = (part[chosen].to(device) for part in frame.rays(*camera.rays()))
 
     def step() -> None:
         module.sampler.render(field, rays, module.state).colour.sum().backward()
         module.zero_grad(set_to_none=True)
 
-    def image(seen: Any) -> None:
-        if isinstance(renderer, RayRenderer):
-            renderer.image(seen, origins, directions, *seen_at)
-        else:
-            renderer.view(seen, frame, camera, *seen_at)
-
-    solid = field
-    if isinstance(renderer, RayRenderer):
-        pixels = len(chosen)
-        solid = field.masked(lambda points: points.new_full(points.shape[:1], SOLID))
-    # The second time finds memory and kernels that the first has made.
-    first, later = (_seconds(lambda seen=seen: image(seen), device) for seen in (field, solid))
-    return Estimate(_seconds(step, device), first / pixels, later / pixels)
+    taken = _seconds(step, device)
+    if not isinstance(renderer, RayRenderer):
+        ray = _seconds(lambda: renderer.view(field, frame, camera, *seen_at), device) / pixels
+        return Estimate(taken, ray, ray, 0)
+    chosen = torch.linspace(0, pixels - 1, min(renderer.rays_at_once, pixels)).long()
+    ends = [part[chosen].to(device) for part in frame.rays(*camera.rays())]
+    first = later = _seconds(lambda: renderer.image(field, *ends, *seen_at), device)
+    if pruned_at := module.sampler.pruned_at:
+        solid = field.masked(lambda points: points.new_full(points.shape[:1], OPAQUE))
+        later = _seconds(lambda: renderer.image(solid, *ends, *seen_at), device)
+        if (background := getattr(field, "background", None)) is not None:
+            with torch.no_grad():  # Which shows where the cube turns out to be empty.
+                later += _seconds(lambda: look(background, *ends), device)
+    return Estimate(taken, first / len(chosen), later / len(chosen), pruned_at)
 
 
 def _seconds(work: Callable[[], Any], device: torch.device) -> float:
-    """The lesser time of two that some work takes."""
+    """The lesser time of two that some work takes: a first call makes memory, and GPU kernels."""
     spent = []
     for _ in range(2):
         began = time.perf_counter()

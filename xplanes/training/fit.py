@@ -296,14 +296,14 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
         ray = _seconds(lambda: renderer.view(field, frame, camera, *seen_at), device) / pixels
         return Estimate(taken, ray, ray, 0)
     chosen = torch.linspace(0, pixels - 1, min(renderer.rays_at_once, pixels)).long()
-    ends = [part[chosen].to(device) for part in frame.rays(*camera.rays())]
-    first = later = _seconds(lambda: renderer.image(field, *ends, *seen_at), device)
+    origins, directions = (part[chosen].to(device) for part in frame.rays(*camera.rays()))
+    first = later = _seconds(lambda: renderer.image(field, origins, directions, *seen_at), device)
     if pruned_at := module.sampler.pruned_at:
         solid = field.masked(lambda points: points.new_full(points.shape[:1], OPAQUE))
-        later = _seconds(lambda: renderer.image(solid, *ends, *seen_at), device)
+        later = _seconds(lambda: renderer.image(solid, origins, directions, *seen_at), device)
         if (background := getattr(field, "background", None)) is not None:
             with torch.no_grad():  # Which shows where the cube turns out to be empty.
-                later += _seconds(lambda: look(background, *ends), device)
+                later += _seconds(lambda: look(background, origins, directions), device)
     return Estimate(taken, first / len(chosen), later / len(chosen), pruned_at)
 
 

@@ -52,7 +52,7 @@ ROOT = Path(__file__).resolve().parents[1]
 OPTIONS = sorted(
     (path.parent.relative_to(CONF).as_posix(), path.stem)
     for path in CONF.rglob("*.yaml")
-    if path.parent != CONF and "pretrain" not in path.relative_to(CONF).parts
+    if path.parent != CONF and not {"pretrain", "hydra"} & {*path.relative_to(CONF).parts}
 )
 """Every option of every group that train.py knows."""
 

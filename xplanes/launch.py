@@ -6,7 +6,6 @@ Must stay quick: it imports neither torch nor lightning before the job begins.
 import re
 import shlex
 import sys
-import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -40,23 +39,9 @@ FORMER = {
 """Sweeps that were experiments, and what they are where their names are others now."""
 
 
-def file_name(scene: Any) -> str:
-    """The name of a scene as a part of a run directory's: no folders, and nothing to quote."""
-    return re.sub(r"[^\w.+-]+", "-", Path(str(scene)).name).strip("-") or "scene"
-
-
 def options(group: str) -> str:
     """The options of a group."""
     return ", ".join(sorted(path.stem for path in (CONF / group).glob("*.yaml")))
-
-
-def options_in_help(group: str) -> str:
-    """The same as lines of conf/hydra/help/train.yaml."""
-    return textwrap.fill(options(group), 84, subsequent_indent=11 * " ")
-
-
-OmegaConf.register_new_resolver("file_name", file_name, replace=True)
-OmegaConf.register_new_resolver("options", options_in_help, replace=True)
 
 
 def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:

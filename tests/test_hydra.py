@@ -58,7 +58,7 @@ def test_the_help_is_a_page_of_examples_that_compose_and_of_options(monkeypatch,
     for words in map(shlex.split, examples):
         chosen = [word.split(",")[0] for word in words if "=" in word and "resume" not in word]
         assert compose_plain("train", chosen)["model"]["name"], words
-    for group in ("data", "model", "lrm", "recipe", "trainer", "logger"):
+    for group in ("data", "model", "lrm", "recipe", "sweep", "trainer", "logger"):
         row = re.search(rf"^{group} +((?:.|\n {{11}})+)$", shown, re.MULTILINE)
         assert row is not None
         known = {path.stem for path in (CONF / group).glob("*.yaml")}

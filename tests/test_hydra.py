@@ -13,6 +13,7 @@ import pytest
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from hydra_plugins.xplanes import ALIASES
 from tests import warm
 from tests.training.runs import SMALL, small_config
 from tests.warm import forked
@@ -62,7 +63,10 @@ def test_the_help_is_a_page_of_examples_that_compose_and_of_options(monkeypatch,
         row = re.search(rf"^{group} +((?:.|\n {{11}})+)$", shown, re.MULTILINE)
         assert row is not None
         known = {path.stem for path in (CONF / group).glob("*.yaml")}
-        assert set(re.split(r",\s+", row[1])) == known, group
+        names = dict(re.findall(r"(\w+)(?: \((\w+)\))?", row[1]))
+        assert set(names) == known, group
+        aliases = {alias: name for name, alias in names.items() if alias}
+        assert aliases == (ALIASES if group == "lrm" else {})
     assert re.search(r"https://\S+/configuration/$", shown, re.MULTILINE)
 
 
@@ -82,6 +86,11 @@ ANSWERS = (
     ("train lrm=tripo", "Did you mean lrm=triposr?"),
     ("train lrm=TripoSR", "Did you mean lrm=large (TripoSR)?"),
     ("train lrm=openlrm", "Did you mean lrm=openlrm_base?"),
+    ("train experiment=tabel1", "Did you mean -m sweep=table1?"),
+    (
+        "train model.loss.world_variation=1",
+        "Did you mean model.loss.total_variation_with_background",
+    ),
     ("train trainer.gpus=2", "Did you mean trainer=ddp trainer.devices=2?"),
     ("train model.lr=0.1", "Did you mean model.plane_lr=0.1?"),
     ("train -m seed=0,1 --cfg job", "-m with --cfg: Hydra shows one run"),

@@ -84,12 +84,12 @@ def test_columns_are_the_settings_that_differ(tmp_path):
 def test_a_score_of_the_thing_has_a_column_where_any_run_has_one(tmp_path):
     for seed in (0, 1):
         make(tmp_path / f"{seed}", seed=seed)
-    assert "psnr_thing" not in table(tmp_path)[0]
+    assert "psnr_foreground" not in table(tmp_path)[0]
     path = tmp_path / "1" / "metrics.json"
     metrics = json.loads(path.read_text())
-    metrics["test"]["psnr_thing"] = 17.5
+    metrics["test"]["psnr_foreground"] = 17.5
     path.write_text(json.dumps(metrics))
-    assert [row["psnr_thing"] for row in table(tmp_path)] == ["", "17.5"]
+    assert [row["psnr_foreground"] for row in table(tmp_path)] == ["", "17.5"]
     assert "psnr object" in (tmp_path / "table.md").read_text()
 
 

@@ -18,7 +18,7 @@ from xplanes.training.checkpoints import AtomicCheckpointIO
 from xplanes.training.collapse import CollapseWatch, verdict
 from xplanes.training.meters import mean_opacities
 from xplanes.training.module import RadianceModule
-from xplanes.training.scores import blank_psnr, floaters, psnr_thing
+from xplanes.training.scores import blank_psnr, floaters, psnr_foreground
 
 QUICK = ("trainer.max_steps=24", "callbacks.evaluation.at=[]", "callbacks.checkpoints.every=14")
 
@@ -146,9 +146,9 @@ def test_the_thing_is_scored_where_most_of_a_pixel_shows_it() -> None:
     truth, colour = torch.zeros(2, 2, 3), torch.zeros(2, 2, 3)
     colour[0], colour[1] = 0.1, 1.0
     mask = torch.tensor([[255, 128], [127, 0]], dtype=torch.uint8)
-    assert psnr_thing(colour, truth, mask) == pytest.approx(20.0)
-    assert math.isnan(psnr_thing(colour, truth, None))
-    assert math.isnan(psnr_thing(colour, truth, torch.zeros_like(mask)))
+    assert psnr_foreground(colour, truth, mask) == pytest.approx(20.0)
+    assert math.isnan(psnr_foreground(colour, truth, None))
+    assert math.isnan(psnr_foreground(colour, truth, torch.zeros_like(mask)))
 
 
 def test_a_run_that_shows_nothing_says_so(

@@ -135,7 +135,9 @@ def test_light_that_passes_the_cube_costs_until_the_field_has_taken_shape():
 
 @pytest.mark.parametrize("kind", ["world", "white"])
 def test_before_a_background_planes_are_less_smooth_in_time_and_cells_stay_longer(kind):
-    module = built(kind, "model.sampler.sweep_at=[20,40]", "model.loss.world_time=0.25")
+    module = built(
+        kind, "model.sampler.sweep_at=[20,40]", "model.loss.time_factor_with_background=0.25"
+    )
     loss, world = module.model.settings.loss, kind == "world"
     used = module.model.weights
     for name in ("time_variation", "time_smoothness", "time_magnitude"):

@@ -223,8 +223,8 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
         more += f" trainer.max_seconds={2 * most:g}"
     prepare = sum(seconds["prepare"].values())
     more_scores = ""
-    if "psnr_thing" in metrics["test"]:
-        more_scores += f"  of the object {metrics['test']['psnr_thing']:.2f}"
+    if "psnr_foreground" in metrics["test"]:
+        more_scores += f"  of the object {metrics['test']['psnr_foreground']:.2f}"
     if "floaters" in metrics["test"]:
         more_scores += f"  floaters {100 * metrics['test']['floaters']:.2f}%"
     warnings = []

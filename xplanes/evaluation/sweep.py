@@ -23,7 +23,7 @@ from xplanes.settings import flatten
 SCORES = {
     "psnr": ("test", "psnr"),
     "ssim": ("test", "ssim"),
-    "psnr_thing": ("test", "psnr_thing"),
+    "psnr_foreground": ("test", "psnr_foreground"),
     "floaters": ("test", "floaters"),
     "steps": ("step",),
     "prepare_seconds": ("seconds", "prepare"),

@@ -19,13 +19,13 @@ UNLISTED = (
 )
 """Settings that say nothing about a result."""
 
-SPREAD = ("psnr", "ssim", "psnr_thing")
+SPREAD = ("psnr", "ssim", "psnr_foreground")
 """Scores whose standard deviation over seeds is shown."""
 
 COLUMNS = {
     "psnr": ("psnr", ".2f"),
     "ssim": ("ssim", ".4f"),
-    "psnr_thing": ("psnr object", ".2f"),
+    "psnr_foreground": ("psnr object", ".2f"),
     "floaters": ("floaters", ".4f"),
     "start_psnr": ("step 0", ".2f"),
     "seconds_to_20": ("s to 20 dB", ".1f"),
@@ -107,8 +107,8 @@ def run_table(rows: Sequence[RunRow], names: Sequence[str]) -> list[Line]:
 
 def _measures(rows: Iterable[RunRow]) -> list[str]:
     """Scores of a table: that of the foreground object is there if any run scores it alone."""
-    known = any("psnr_thing" in row.scores for row in rows)
-    return [name for name in COLUMNS if known or name != "psnr_thing"]
+    known = any("psnr_foreground" in row.scores for row in rows)
+    return [name for name in COLUMNS if known or name != "psnr_foreground"]
 
 
 def _settings(row: RunRow, names: Sequence[str]) -> Line:

@@ -35,7 +35,7 @@ class ViewScore:
         time: Its time, from 0 to 1.
         psnr: In dB.
         ssim: Structural similarity.
-        psnr_thing: In dB, over the pixels that show the foreground object; NaN where not known.
+        psnr_foreground: In dB, over the pixels of the foreground object; NaN where not known.
         floaters: Share of background pixels (alpha 0 in the true image) that are not transparent;
             NaN where the image has none.
     """
@@ -45,13 +45,13 @@ class ViewScore:
     psnr: float
     ssim: float
     floaters: float
-    psnr_thing: float = math.nan
+    psnr_foreground: float = math.nan
 
     @property
     def scores(self) -> dict[str, float]:
         """The numbers by name, those that are known."""
         found = {"psnr": self.psnr, "ssim": self.ssim}
-        maybe = {"psnr_thing": self.psnr_thing, "floaters": self.floaters}
+        maybe = {"psnr_foreground": self.psnr_foreground, "floaters": self.floaters}
         return found | {name: value for name, value in maybe.items() if not math.isnan(value)}
 
 
@@ -106,7 +106,7 @@ def score_image(image: Mapping[str, Tensor], item: Mapping[str, Any]) -> ViewSco
         psnr=psnr(colour, truth, shown),
         ssim=ssim(colour, truth, shown),
         floaters=floaters(opacity, alpha),
-        psnr_thing=psnr_thing(colour, truth, item.get("thing")),
+        psnr_foreground=psnr_foreground(colour, truth, item.get("foreground")),
     )
 
 
@@ -138,15 +138,15 @@ def gathered(scores: Sequence[ViewScore], trainer: Trainer) -> list[ViewScore]:
     return list({score.file: score for score in found}.values())
 
 
-def psnr_thing(colour: Tensor, truth: Tensor, thing: Tensor | None) -> float:
+def psnr_foreground(colour: Tensor, truth: Tensor, foreground: Tensor | None) -> float:
     """PSNR in dB of the pixels that show the foreground object; NaN where there are none.
 
     Args:
         colour: Rendered colours. [H, W, 3]
         truth: True colours. [H, W, 3]
-        thing: Share of each pixel that shows the object; None where not known. uint8 [H, W]
+        foreground: Share of each pixel that shows the object; None where not known. uint8 [H, W]
     """
-    if thing is None or not (shown := thing.cpu() >= SOLID).any():
+    if foreground is None or not (shown := foreground.cpu() >= SOLID).any():
         return math.nan
     return psnr(colour[shown], truth[shown])
 
@@ -161,7 +161,7 @@ def floaters(opacity: Tensor, alpha: Tensor) -> float:
 
 def mean_scores(scores: Sequence[ViewScore]) -> dict[str, float]:
     """Means over views of each score that any of them has."""
-    names = ("psnr", "ssim", "psnr_thing", "floaters")
+    names = ("psnr", "ssim", "psnr_foreground", "floaters")
     found = {name: [s.scores[name] for s in scores if name in s.scores] for name in names}
     return {name: mean(values) for name, values in found.items() if values}
 

@@ -23,8 +23,8 @@ from xplanes import __version__
 from xplanes.cli import build_parser
 from xplanes.config import compose_plain, near_names
 from xplanes.evaluation.published import OWN, PUBLISHED
+from xplanes.evaluation.sweep import SCORES
 from xplanes.evaluation.table import write_tables
-from xplanes.evaluation.tabulate import COLUMNS
 from xplanes.experiment import Experiment
 from xplanes.files import read_json
 from xplanes.run import run
@@ -227,5 +227,5 @@ def test_the_glossary_has_every_column_and_key_that_a_run_writes(
     page = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
     known = {text.rpartition(".")[2] for text in re.findall(r"`([^`]+)`", page)}
     names = [*keys_of(metrics), *keys_of(record), *columns, *keyed.split(","), *rows.split(",")]
-    names += [*OWN, *PUBLISHED, *(heading for heading, _ in COLUMNS.values()), *COLUMNS]
+    names += [*OWN, *PUBLISHED, *(score.heading for score in SCORES.values()), *SCORES]
     assert not set(names) - known

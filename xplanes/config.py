@@ -132,6 +132,12 @@ def to_plain(config: Any) -> dict[str, Any]:
     return {str(key): value for key, value in plain.items()}
 
 
+def key_and_value(override: str) -> tuple[str, str]:
+    """Key and value of an override; an empty key for anything else."""
+    key, equals, value = override.partition("=")
+    return (key.lstrip("+~"), value) if equals and not key.startswith("-") else ("", "")
+
+
 def quoted(text: str) -> str:
     """Text as Hydra reads it in an override."""
     if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:

@@ -18,7 +18,15 @@ from omegaconf import DictConfig, OmegaConf
 
 import hydra_plugins.xplanes  # noqa: F401  # Processes of launchers resolve run directories with it.
 from xplanes import __version__
-from xplanes.config import CONF, near_names, quoted, to_plain, unquoted, with_names
+from xplanes.config import (
+    CONF,
+    key_and_value,
+    near_names,
+    quoted,
+    to_plain,
+    unquoted,
+    with_names,
+)
 from xplanes.errors import ConfigError
 from xplanes.files import StorageError, read_json, require_writable
 from xplanes.hints import require_parsed, require_readable
@@ -72,7 +80,7 @@ def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
         hydra.main(config_path=str(CONF), config_name="train", version_base="1.3")(job)()
     except SystemExit as end:
         if isinstance(end.code, int) and end.code and not begun:  # A text is our own message.
-            chosen = [text for text in prepared if _split(text)[0]]
+            chosen = [text for text in prepared if key_and_value(text)[0]]
             if near := near_names(chosen):
                 print(near, file=sys.stderr)
         raise
@@ -93,7 +101,7 @@ class SettingsCheck(Callback):
 
         if config.hydra.runtime.choices.get("sweep") and config.resume is None:
             task: Any = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
-            given = shlex.join(text for text in task if _split(text)[0] != "resume")
+            given = shlex.join(text for text in task if key_and_value(text)[0] != "resume")
             sys.exit(f"error: a sweep is many runs: {train_command()} -m {given}")
         names = [str(name) for name in config if name != "hydra"]
         HydraConfig.instance().set_config(config)  # As Hydra does for the job, for ${hydra:...}.
@@ -146,8 +154,8 @@ def _job(config: DictConfig) -> float:
         if auto:
             _require_same_job(folder, settings.overrides.task)
         # A run that goes on must find the user's own groups again.
-        own = [text for text in settings.overrides.hydra if _split(text)[0] == SEARCHPATH]
-        task = [text for text in settings.overrides.task if _split(text)[0] != "resume"]
+        own = [text for text in settings.overrides.hydra if key_and_value(text)[0] == SEARCHPATH]
+        task = [text for text in settings.overrides.task if key_and_value(text)[0] != "resume"]
         job = None if sweep else _prepared.pop(settings.run.dir, None)
         began = None if sweep else STARTED
         return run(plain, folder, [*own, *task], resume=resume, job=job, began=began)
@@ -183,7 +191,7 @@ def _require_same_job(folder: Path, overrides: Iterable[str]) -> None:
 
 def _may_differ(override: str) -> bool:
     """Whether a run may go on with this changed: how long it trains, what it writes, and where."""
-    return not override or _split(override)[0].split(".")[0] in (
+    return not override or key_and_value(override)[0].split(".")[0] in (
         *("resume", "hydra", "trainer", "callbacks", "logger", "media", "viewer"),
     )
 
@@ -205,8 +213,8 @@ def prepare(arguments: list[str]) -> list[str]:
     several = _is_multirun(arguments)
     _require_present_names(arguments, several=several)
     arguments = [with_names(text, several=several) for text in arguments]
-    require_parsed([text for text in arguments if _split(text)[0]])
-    values = {key: value for key, value in map(_split, arguments) if key}
+    require_parsed([text for text in arguments if key_and_value(text)[0]])
+    values = {key: value for key, value in map(key_and_value, arguments) if key}
     for key, value in values.items():
         if value in ("null", "None") and (CONF / key).is_dir():
             raise ConfigError(f"{key}={value}: must be one of {options(key)}")
@@ -257,8 +265,8 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
             "one key=value a line"
         )
     new = [a for a in arguments if not a.startswith(("resume=", "hydra.run.dir="))]
-    changed = {key for key, _ in map(_split, new) if key}
-    old = [line for line in text.splitlines() if line and _split(line)[0] not in changed]
+    changed = {key for key, _ in map(key_and_value, new) if key}
+    old = [line for line in text.splitlines() if line and key_and_value(line)[0] not in changed]
     try:
         _require_present_names(old, several=False)
     except ConfigError as error:
@@ -345,7 +353,7 @@ def _latest(outputs: Path, overrides: list[str]) -> Path | None:
 
 def _without_resume(overrides: Iterable[str]) -> list[str]:
     """Overrides in order, but for what the command line alone says of the run that it continues."""
-    keys = {text: _split(text)[0] for text in overrides if text}
+    keys = {text: key_and_value(text)[0] for text in overrides if text}
     mine = {t for t, key in keys.items() if key.startswith("hydra.") and key != SEARCHPATH}
     return sorted(text for text, key in keys.items() if key != "resume" and text not in mine)
 
@@ -354,16 +362,8 @@ def _mtime(path: Path) -> float:
     return path.stat().st_mtime
 
 
-def _split(argument: str) -> tuple[str, str]:
-    """Key and value of an override; an empty key for anything else."""
-    key, equals, value = argument.partition("=")
-    if not equals or key.startswith("-"):
-        return "", ""
-    return key.lstrip("+~"), value
-
-
 def _is_multirun(arguments: list[str]) -> bool:
     """Whether Hydra will run several jobs, by an option or by its mode."""
     if not {"-m", "--multirun"}.isdisjoint(arguments):
         return True
-    return dict(map(_split, arguments)).get("hydra.mode") == "MULTIRUN"
+    return dict(map(key_and_value, arguments)).get("hydra.mode") == "MULTIRUN"

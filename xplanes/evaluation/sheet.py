@@ -16,7 +16,7 @@ from xplanes.errors import ConfigError
 from xplanes.evaluation.curves import SCENE, run_label
 from xplanes.evaluation.render import write_video
 from xplanes.evaluation.sweep import RunRow, read_rows
-from xplanes.evaluation.tabulate import SEED, align, differing, seed_groups
+from xplanes.evaluation.tabulate import SEED, differing, seed_groups
 from xplanes.files import replacing
 from xplanes.metrics import psnr
 from xplanes.rendering.pictures import STRIP
@@ -83,11 +83,7 @@ def write_sheet(
         )
     if size < 16:
         raise ConfigError(f"size={size}: a tile must have 16 pixels at least")
-    if not folder.is_dir():
-        raise ConfigError(f"{folder} is not a folder")
-    rows = align(read_rows(folder))
-    if not rows:
-        raise ConfigError(f"{folder}: no runs in it (folders with run.json)")
+    rows = read_rows(folder)
     if what == "runs":
         rows = _one_seed(rows)
     found = {_path(folder, row): row for row in rows}

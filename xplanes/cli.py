@@ -203,12 +203,13 @@ def _view(options: argparse.Namespace) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    from xplanes.evaluation.export import ExportOptions, check_folder, export
+    from xplanes.evaluation.export import ExportOptions, export
+    from xplanes.files import require_empty
 
     wanted = _filled(ExportOptions, options)
     wanted.check()
     if options.out is not None:
-        check_folder(options.out)
+        require_empty(options.out)
     _say(f"wrote {export(_load(options), wanted, options.out, say=_say)}")
 
 

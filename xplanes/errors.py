@@ -36,6 +36,16 @@ class BrokenFrameError(SceneError):
     """One frame cannot be used; a capture can do without it."""
 
 
+def require_between(name: str, value: float | None, low: float, high: float) -> None:
+    """Refuse a number out of range; None passes.
+
+    Raises:
+        ConfigError: With the name, the value and the range.
+    """
+    if value is not None and not low <= value <= high:
+        raise ConfigError(f"{name} {value}: must lie between {low} and {high}")
+
+
 SHOWN = 5
 """Problems of a capture that are shown in full."""
 

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from xplanes.errors import XPlanesError
+from xplanes.errors import ConfigError, XPlanesError
 
 MARK = ".tmp-"
 """Part of the name of every file that is not whole yet."""
@@ -125,6 +125,18 @@ def require_writable(folder: Path) -> None:
         if (words := storage_error(problem, folder)) is None:
             raise
         raise words from problem
+
+
+def require_empty(folder: Path) -> None:
+    """Refuse a folder, which need not exist yet, that holds files or is one.
+
+    Raises:
+        ConfigError: If it does.
+    """
+    if folder.is_file():
+        raise ConfigError(f"{folder} is a file: name a folder")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise ConfigError(f"{folder} holds files already: empty it, or name another with --out")
 
 
 @contextmanager

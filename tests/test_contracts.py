@@ -41,7 +41,7 @@ from xplanes.models.initialisation import (
 )
 from xplanes.rendering.sampler import SamplerSettings
 from xplanes.scenes.source import SceneSettings
-from xplanes.settings import Range, Settings, locations
+from xplanes.settings import HOME, Range, Settings
 from xplanes.settings import leaves as values_of
 from xplanes.synthetic.pretraining.settings import PretrainingSettings
 from xplanes.training.fit import Trainer
@@ -314,10 +314,19 @@ def test_yaml_files_set_every_field_of_their_class_and_no_other():
         assert yaml_names(content) - {"_target_"} == names_of(cls), f"conf/{group}/{name}.yaml"
 
 
+def locations(cls, prefix):
+    """Dotted names of the settings of a class that are files or folders."""
+    for name, hint in get_type_hints(cls, include_extras=True).items():
+        if (inner := nested(hint)) is not None:
+            yield from locations(inner, f"{prefix}{name}.")
+        elif HOME in repr(hint):
+            yield f"{prefix}{name}"
+
+
 def test_the_command_line_knows_all_settings_that_are_files_or_folders():
     classes = {(g, class_of(content_of(g, name))) for g, name in OPTIONS if g in KINDS}
-    found = {f"{group}.{key}" for group, cls in classes for key in locations(cls)}
-    found |= set(locations(PretrainingSettings))
+    classes |= {("", PretrainingSettings)}
+    found = {key for group, cls in classes for key in locations(cls, f"{group}.".lstrip("."))}
     assert found == {name for name in NAMES if name != "resume" and "hydra." not in name}
 
 

@@ -126,10 +126,9 @@ def _inspect(options: argparse.Namespace) -> None:
 
 
 def _triplanes(options: argparse.Namespace) -> None:
-    from xplanes.config import compose_plain
+    from xplanes.config import compose_plain, settings_and_paths
 
-    changed = [text for text in options.arguments if "=" in text and not Path(text).exists()]
-    paths = [Path(text) for text in options.arguments if text not in changed]
+    changed, paths = settings_and_paths(options.arguments)
     outs = [text for text in changed if text.startswith("out=")]
     plain = compose_plain("train", [text for text in changed if text not in outs])
     out = outs[-1].removeprefix("out=") if outs else "triplanes.safetensors"

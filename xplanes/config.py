@@ -138,6 +138,12 @@ def key_and_value(override: str) -> tuple[str, str]:
     return (key.lstrip("+~"), value) if equals and not key.startswith("-") else ("", "")
 
 
+def settings_and_paths(arguments: Sequence[str]) -> tuple[list[str], list[Path]]:
+    """Words of a command line that are settings, and those that are files or folders."""
+    changed = [text for text in arguments if "=" in text and not Path(text).exists()]
+    return changed, [Path(text) for text in arguments if text not in changed]
+
+
 def quoted(text: str) -> str:
     """Text as Hydra reads it in an override."""
     if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:

@@ -47,11 +47,6 @@ FORMER = {
 """Sweeps that were experiments, and what they are where their names are others now."""
 
 
-def options(group: str) -> str:
-    """The options of a group."""
-    return ", ".join(sorted(path.stem for path in (CONF / group).glob("*.yaml")))
-
-
 def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
     """Run one job of training, or a multirun.
 
@@ -214,22 +209,18 @@ def prepare(arguments: list[str]) -> list[str]:
     _require_present_names(arguments, several=several)
     arguments = [with_names(text, several=several) for text in arguments]
     require_parsed([text for text in arguments if key_and_value(text)[0]])
-    values = {key: value for key, value in map(key_and_value, arguments) if key}
+    # Lightning hands names on in quotes to the other processes of a run.
+    values = {key: unquoted(value) for key, value in map(key_and_value, arguments) if key}
     for key, value in values.items():
         if value in ("null", "None") and (CONF / key).is_dir():
-            raise ConfigError(f"{key}={value}: must be one of {options(key)}")
-    resume = unquoted(values.get("resume", "null"))
+            known = ", ".join(sorted(path.stem for path in (CONF / key).glob("*.yaml")))
+            raise ConfigError(f"{key}={value}: must be one of {known}")
+    resume, folder = values.get("resume", "null"), values.get("hydra.run.dir")
     if resume in ("null", "", "None", "auto"):
         # Before Hydra makes the folder, whose errors are tracebacks.
-        place = "hydra.sweep.dir" if several else "hydra.run.dir"
-        require_writable(Path(unquoted(values.get(place, "outputs"))))
-    if not resume or resume in ("null", "None") or "resume" not in values:
-        return arguments
-    folder = values.get("hydra.run.dir")
-    if folder is not None:
-        folder = unquoted(folder)  # As Lightning hands it on to the other processes of a run.
-    if resume == "auto":
-        if several:
+        place = values.get("hydra.sweep.dir") if several else folder
+        require_writable(Path(place or "outputs"))
+        if resume != "auto" or several:
             return arguments
         own = [a for a in arguments if not a.startswith("resume=")]
         found = Path(folder) if folder else _latest(Path("outputs"), own)

@@ -182,15 +182,6 @@ def _is_location(hint: Any) -> bool:
     return any(HOME in getattr(part, "__metadata__", ()) for part in (hint, *get_args(hint)))
 
 
-def locations(cls: type[Settings], prefix: str = "") -> Iterator[str]:
-    """Dotted names of the settings of a class that are files or folders."""
-    for name, hint in hints_of(cls):
-        if _is_location(hint):
-            yield f"{prefix}{name}"
-        elif isinstance(hint, type) and issubclass(hint, Settings):
-            yield from locations(hint, f"{prefix}{name}.")
-
-
 def kinds_of(hint: Any) -> tuple[list[Any], list[Range]]:
     """Alternatives of a type hint, and the ranges that it carries."""
     ranges: list[Range] = []

@@ -223,7 +223,7 @@ in `config.yaml` says (the demo scene is rendered where it is missing). In Pytho
 
 
 def _weights(lrm: dict[str, Any]) -> str:
-    """What a card says of the weights that training began with."""
+    """The card's line on the weights that training began with, and their licence."""
     name = lrm["name"]
     if name == "none":
         return "Training began with random initialisation: no weights of others are part of it."

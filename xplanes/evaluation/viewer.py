@@ -218,7 +218,7 @@ class Viewer:
 
     @property
     def needs_depth(self) -> bool:
-        """Whether lines are drawn, which things may hide."""
+        """Whether lines are drawn, which the scene may hide."""
         return bool(self.cameras.value or self.outline.visible)
 
     def _place_camera(self) -> None:

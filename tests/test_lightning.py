@@ -232,7 +232,7 @@ def test_gradients_are_clipped_and_accumulated(config: dict, tmp_path: Path) -> 
     used.fit(module, SceneDataModule(config["data"]))
     assert (used.global_step, module.batches) == (4, 8)
     assert max(steps.norms) < 1.001e-3
-    assert module.last["loss"] > 0
+    assert module.tally.last["loss"] > 0
 
 
 def test_two_halves_of_a_batch_make_the_same_step_as_the_whole(config: dict) -> None:

@@ -41,7 +41,7 @@ from xplanes.rendering.pictures import to_bytes
 from xplanes.scenes.cameras import PosedCamera, orbit
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
-from xplanes.training.scores import render_view
+from xplanes.training.scores import score_view
 
 trimesh: Any = pytest.importorskip("trimesh")
 pytest.importorskip("skimage")
@@ -348,14 +348,14 @@ def test_the_training_cameras_are_a_path_that_is_rendered_again(trained_run: Pat
         arguments = ["--path", str(out / name), "--out", f"{tmp_path}/{name}/"]
         assert main(["render", str(trained_run), *arguments]) == 0
         for number in (0, len(views) - 1):
-            expected = render_view(
+            expected = score_view(
                 trained.module.field,
                 trained.module.renderer,
                 trained.frame,
                 views,
                 int(order[number]),
                 trained.scene.background,
-            )
+            )[1]
             with Image.open(tmp_path / name / f"frame_{number:04d}.png") as frame:
                 found = torch.tensor(np.asarray(frame)).int()
             assert (found - to_bytes(expected["colour"]).int()).abs().max() <= 1

@@ -21,7 +21,7 @@ from xplanes.evaluation.render import (
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.optional import MissingExtraError
 from xplanes.rendering.pictures import to_bytes
-from xplanes.training.scores import render_view
+from xplanes.training.scores import score_view
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_a_view_is_found_by_its_name(trained: TrainedRun):
 def test_the_camera_of_a_view_renders_that_view(trained: TrainedRun, tmp_path: Path):
     views = trained.views
     parts = (trained.module.field, trained.module.renderer, trained.frame)
-    expected = to_bytes(render_view(*parts, views, 1, torch.ones(3))["colour"]).numpy()
+    expected = to_bytes(score_view(*parts, views, 1, torch.ones(3))[1]["colour"]).numpy()
     own = str(float(views.times[1]))
     for name, time in (("a.png", None), ("b.png", "own"), ("c.png", own), ("d.webp", "own")):
         path = render_video(trained, VideoOptions("view:test/r_001", time), str(tmp_path / name))

@@ -306,7 +306,7 @@ def test_training_is_the_same_with_a_viewer_to_the_last_bit(
     assert (getattr(seen.field, "background", None) is not None) == ("background" in name)
     for key, value in plain.state_dict().items():
         assert torch.equal(value, seen.state_dict()[key]), key
-    assert plain.counts == seen.counts
+    assert plain.tally.counts == seen.tally.counts
     assert plain.last == pytest.approx(seen.last, abs=0, nan_ok=True)
 
 

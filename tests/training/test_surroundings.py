@@ -17,7 +17,7 @@ from xplanes.scenes.views import Scene
 from xplanes.training.collapse import CollapseWatch
 from xplanes.training.fit import Trainer
 from xplanes.training.losses import loss_terms
-from xplanes.training.scores import render_view
+from xplanes.training.scores import score_view
 
 STEPS = 30
 
@@ -72,7 +72,7 @@ def fitted(module, kind, folder, steps=STEPS, checkpoint=None, **options):
 
 def picture(module, kind="world"):
     views, background = scene(kind).splits["train"], scene(kind).background
-    return render_view(module.field, module.renderer, module.frame, views, 0, background)
+    return score_view(module.field, module.renderer, module.frame, views, 0, background)[1]
 
 
 @pytest.mark.parametrize("kind", ["alpha", "white"])

@@ -14,7 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from xplanes.errors import ConfigError, require_between
-from xplanes.evaluation.camera_path import nerfstudio_content, path_of, transforms_content
+from xplanes.evaluation.camera_path import path_contents
 from xplanes.evaluation.export_web import Shape, write_page
 from xplanes.evaluation.render import FPS
 from xplanes.evaluation.runs import TrainedRun
@@ -559,10 +559,10 @@ def write_paths(folder: Path, trained: TrainedRun) -> list[str]:
     Returns:
         The files' names: ``camera_path.json``, as nerfstudio has it, and ``transforms.json``.
     """
-    path = path_of(trained.scene.splits["train"], FPS)
-    write_json(folder / "camera_path.json", nerfstudio_content(path))
-    write_json(folder / "transforms.json", transforms_content(path))
-    return ["camera_path.json", "transforms.json"]
+    contents = path_contents(trained.scene.splits["train"], FPS)
+    for name, content in contents.items():
+        write_json(folder / name, content)
+    return list(contents)
 
 
 def write_planes(folder: Path, trained: TrainedRun) -> list[str]:

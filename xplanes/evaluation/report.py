@@ -132,7 +132,7 @@ def summary(
 ) -> dict[str, Any]:
     """The content of metrics.json."""
     clock = training_seconds(trainer)
-    counts = module.counts
+    counts = module.tally.counts
     candidates = max(1, counts["candidates"])
     tested, blank = data.scene.splits[data.test_split], data.scene.background
     if data.scene.is_surrounded:
@@ -153,7 +153,7 @@ def summary(
             "background": background_skipped,
             "static": float(not module.field.moves),
         },
-        "steps_skipped": module.unusable,
+        "steps_skipped": module.tally.skipped,
         "restarts": module.restarts,
         "threads": torch.get_num_threads(),
         "loops": backend.name(module.device),

@@ -129,10 +129,10 @@ class Evaluation(Callback):
             write_png(run / "media" / f"step{step:06d}" / f"{name}.png", picture)
             log_image(trainer, tag, picture, step)
         if trainer.sanity_checking:  # Whose scores Lightning does not log.
+            last = module.tally.last
+            scores = {n: last[n] for n in last if n.startswith(("val/", "test/"))}
             for log in trainer.loggers:
-                log.log_metrics(
-                    {n: v for n, v in module.last.items() if n.startswith(("val/", "test/"))}, step
-                )
+                log.log_metrics(scores, step)
 
     def state_dict(self) -> dict[str, Any]:
         return {"seconds": self.seconds, "passed": self._passed, "rows": self._rows}

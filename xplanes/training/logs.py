@@ -54,11 +54,11 @@ def log_terms(module: "RadianceModule", terms: Mapping[str, Tensor], state: Trai
     values |= module.model.regularisers(state)
     values |= module.sampler.regularisers(module.field, state)
     entries = {f"train/{name}": value for name, value in values.items()}
-    entries |= {"train/loss": sum(values.values()), "train/psnr": module.last["psnr"]}
-    entries |= {"train/steps_skipped": float(module.unusable), "step": float(state.step)}
+    entries |= {"train/loss": sum(values.values()), "train/psnr": module.tally.last["psnr"]}
+    entries |= {"train/steps_skipped": float(module.tally.skipped), "step": float(state.step)}
     for group in module.trainer.optimizers[0].param_groups:
         entries[f"lr/{group['name']}"] = group["lr"]
-    counts = module.counts
+    counts = module.tally.counts
     entries["sampler/samples_per_ray"] = counts["samples"] / max(1, counts["rays"])
     if seconds := training_seconds(module.trainer):
         entries["time/rays_per_s"] = counts["rays"] / seconds

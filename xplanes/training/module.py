@@ -261,21 +261,6 @@ class RadianceModule(ViewScoring):
         done = (self.global_step, self.batches, self.global_rank)
         return TrainingState(self.method.seed, *done, progress=self.progress)
 
-    @property
-    def counts(self) -> dict[str, int]:
-        """What training has counted: rays, samples in their box, those dropped or kept."""
-        return self.tally.counts
-
-    @property
-    def last(self) -> dict[str, float]:
-        """Loss and PSNR of the last batch, mean opacities, and the last scores of views."""
-        return self.tally.last
-
-    @property
-    def unusable(self) -> int:
-        """Steps that were skipped because a loss or gradient was not finite."""
-        return self.tally.skipped
-
     def configure_optimizers(self) -> torch.optim.Optimizer:
         groups = [*self.model.groups(), *self.sampler.groups()]
         # Not part of the optimiser, whose state a resumed run takes over: settings may change.
@@ -333,9 +318,8 @@ class RadianceModule(ViewScoring):
         if self.trainer.world_size > 1:
             # All processes must skip a step together, for their planes must stay equal.
             torch.distributed.all_reduce(broken, op=torch.distributed.ReduceOp.MAX)
-        unusable: list[str] = []
-        if broken.device.type == "cpu" and broken:
-            unusable = unusable_gradients(self.named_parameters())
+        named = self.named_parameters() if broken.device.type == "cpu" and broken else ()
+        unusable = unusable_gradients(named)
         leave_out(optimizer, broken)
         self.tally.add_update(broken)
         if self.tally.skipped_in_a_row >= PATIENCE:

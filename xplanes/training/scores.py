@@ -74,18 +74,6 @@ def render_item(
     return found
 
 
-def render_view(
-    field: Representation,
-    renderer: Renderer,
-    frame: Frame,
-    views: Views,
-    index: int,
-    background: Tensor,
-) -> dict[str, Tensor]:
-    """As `render_item`, for one of some views in front of ``background`` [3]."""
-    return render_item(field, renderer, frame, whole_view(views, index, background))
-
-
 def score_image(image: Mapping[str, Tensor], item: Mapping[str, Any]) -> ViewScore:
     """Compare a rendered view with the true image.
 
@@ -118,7 +106,11 @@ def score_view(
     index: int,
     background: Tensor,
 ) -> tuple[ViewScore, dict[str, Tensor]]:
-    """As `render_view`, with the view's score, and its true colours as ``truth`` [H, W, 3]."""
+    """Render one of some views in front of ``background`` [3], and compare it with the truth.
+
+    Returns:
+        Its score, and its images as `render_item` gives them, with ``truth`` [H, W, 3].
+    """
     item = whole_view(views, index, background)
     image = render_item(field, renderer, frame, item)
     return score_image(image, item), image | {"truth": item["target"]}
@@ -161,9 +153,8 @@ def floaters(opacity: Tensor, alpha: Tensor) -> float:
 
 def mean_scores(scores: Sequence[ViewScore]) -> dict[str, float]:
     """Means over views of each score that any of them has."""
-    names = ("psnr", "ssim", "psnr_foreground", "floaters")
-    found = {name: [s.scores[name] for s in scores if name in s.scores] for name in names}
-    return {name: mean(values) for name, values in found.items() if values}
+    names = dict.fromkeys(name for score in scores for name in score.scores)
+    return {name: mean([s.scores[name] for s in scores if name in s.scores]) for name in names}
 
 
 def mean_colour(views: Views, background: Tensor) -> Tensor:

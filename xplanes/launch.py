@@ -242,7 +242,7 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
     """The run's own overrides, then the new ones, in the run's own folder."""
     path = run / "overrides.txt"
     if not path.is_file():
-        found = sorted(Path("outputs").glob("*/overrides.txt"), key=_mtime, reverse=True)
+        found = _newest(Path("outputs"), "overrides.txt")
         newest = ", ".join(str(each.parent) for each in found[:3]) or "there is none in outputs"
         raise ConfigError(
             f"resume={run}: not a run directory, no overrides.txt in it. The newest runs: {newest}"
@@ -330,7 +330,7 @@ def _require_version(run: Path) -> None:
 def _latest(outputs: Path, overrides: list[str]) -> Path | None:
     """The newest unfinished run with the same overrides."""
     wanted = _without_resume(overrides)
-    for record in sorted(outputs.glob("*/run.json"), key=_mtime, reverse=True):
+    for record in _newest(outputs, "run.json"):
         listed = record.parent / "overrides.txt"
         try:
             done = read_json(record).get("status") == "finished"
@@ -345,16 +345,16 @@ def _latest(outputs: Path, overrides: list[str]) -> Path | None:
 def _without_resume(overrides: Iterable[str]) -> list[str]:
     """Overrides in order, but for what the command line alone says of the run that it continues."""
     keys = {text: key_and_value(text)[0] for text in overrides if text}
-    mine = {t for t, key in keys.items() if key.startswith("hydra.") and key != SEARCHPATH}
-    return sorted(text for text, key in keys.items() if key != "resume" and text not in mine)
+    left_out = {"resume", *(key for key in keys.values() if key.startswith("hydra."))}
+    return sorted(t for t, key in keys.items() if key == SEARCHPATH or key not in left_out)
 
 
-def _mtime(path: Path) -> float:
-    return path.stat().st_mtime
+def _newest(outputs: Path, name: str) -> list[Path]:
+    """Files of a name in the folders of runs, the newest first."""
+    return sorted(outputs.glob(f"*/{name}"), key=lambda p: p.stat().st_mtime, reverse=True)
 
 
 def _is_multirun(arguments: list[str]) -> bool:
     """Whether Hydra will run several jobs, by an option or by its mode."""
-    if not {"-m", "--multirun"}.isdisjoint(arguments):
-        return True
-    return dict(map(key_and_value, arguments)).get("hydra.mode") == "MULTIRUN"
+    mode = dict(map(key_and_value, arguments)).get("hydra.mode")
+    return mode == "MULTIRUN" or not {"-m", "--multirun"}.isdisjoint(arguments)

@@ -108,24 +108,27 @@ class Checkpoints(ModelCheckpoint):
         # Else it waits for the scores, so that it knows of the best.
         validates = trainer.val_check_batch == trainer.fit_loop.epoch_loop.total_batch_idx + 1
         if self._due and not validates:
-            self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
+            self._save_last(trainer)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self.monitor in trainer.callback_metrics:
             super().on_validation_end(trainer, pl_module)
         if self._due and not trainer.sanity_checking:
-            self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
+            self._save_last(trainer)
             self._due = False
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
+        self._save_last(trainer)
 
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
         # Any other interrupt may have come in the middle of a step.
         if isinstance(exception, Stopped) and trainer.global_step:
-            self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
+            self._save_last(trainer)
+
+    def _save_last(self, trainer: Trainer) -> None:
+        self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
 
     def _should_skip_saving_checkpoint(self, trainer: Trainer) -> bool:
         # The last scores may be made up for after training, see `Trainer.train`.

@@ -31,7 +31,7 @@ COMPILING = 15
 
 @dataclass
 class WarmUp:
-    """The time that loops took to load and compile, which counts towards no stage.
+    """The time that loops took to load and compile, which no stage of a run includes.
 
     Attributes:
         seconds: Since the process began.
@@ -42,7 +42,7 @@ class WarmUp:
 
     @contextmanager
     def timed(self) -> Iterator[None]:
-        """Counts what is done inside, once."""
+        """Count the time of the block; nested blocks count once."""
         if self._inside:
             yield
             return

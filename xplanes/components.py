@@ -34,7 +34,7 @@ MOVED = {
     "xplanes.rendering.proposal": "xplanes.baselines.proposal",
     "xplanes.scenes.demo.write": "xplanes.synthetic.demo.write",
 }
-"""Modules that runs and checkpoints of early 0.3 name, and where their classes are now."""
+"""Former modules, as runs and checkpoints of early 0.3 name them, and their present names."""
 
 _plugins: ContextVar[tuple[str, ...]] = ContextVar("plugins", default=())
 

@@ -61,7 +61,7 @@ def refuse_all(problems: Sequence[str]) -> None:
 
 
 def all_of(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """What a function makes of each item.
+    """The results of a function for all items.
 
     Raises:
         SceneError: If it refuses some; with the problems of all, see `refuse_all`.
@@ -85,5 +85,5 @@ def first_of(problems: Sequence[str]) -> str:
 
 
 def warn(text: str) -> None:
-    """Warn of what a capture lacks, or may mean."""
+    """Warn about a capture."""
     warnings.warn(text, stacklevel=3)

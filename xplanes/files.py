@@ -32,7 +32,7 @@ def storage_error(problem: OSError, path: Path | None = None) -> StorageError | 
 
     Args:
         problem: What went wrong.
-        path: The file to be written; None takes the problem's own, which may have been read.
+        path: The file to be written; when None, that of the problem, which may have been read.
     """
     way_out = _WAYS_OUT.get(problem.errno or 0)
     if way_out is None or (path is None and problem.errno not in _ONLY_WRITING):
@@ -86,10 +86,10 @@ def is_there(path: Path) -> bool:
 
 
 def stand_in(path: Path) -> str | None:
-    """What a placeholder of a file that was not fetched is, and the way out; None for others.
+    """Why a file is only a placeholder of the real one, and what to do; None for other files.
 
     Args:
-        path: A file that cannot be read as what it should be.
+        path: A file that cannot be read.
     """
     try:
         with path.open("rb") as file:

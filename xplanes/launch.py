@@ -44,7 +44,7 @@ FORMER = {
     "table3": "sweep=tables2_3",
     "views": "lrm=none,tiny data.views=5,10,20,null",
 }
-"""Sweeps that were experiments, and what they are where their names are others now."""
+"""Former experiments and sweeps, and the command that replaces each of them."""
 
 
 def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:

@@ -56,9 +56,9 @@ Count = Annotated[int, ABOVE_0]
 Positive = Annotated[float, ABOVE_0]
 """A number above 0."""
 Weight = Annotated[float, FROM_0]
-"""A number from 0 on."""
+"""A number of at least 0."""
 Steps = Annotated[int, FROM_0]
-"""A whole number from 0 on."""
+"""A whole number of at least 0."""
 Share = Annotated[float, SHARE]
 """A number from 0 to 1."""
 
@@ -169,7 +169,7 @@ def _converted(value: Any, hint: Any) -> Any:
 
 
 def at_home(path: str) -> str:
-    """A path with ``~`` at its beginning as the user's folder; unchanged if there is no such."""
+    """A path with ``~`` at its beginning expanded; unchanged if there is no such home."""
     if not path.startswith("~"):
         return path
     try:

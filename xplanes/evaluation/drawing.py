@@ -112,7 +112,7 @@ def draw(
     background = background.to(device)
     shown, solid = field, renderer
     if box is not None or shot.mode == "floaters":
-        # What the grid knows to be opaque may be left out, and hides nothing then.
+        # Surfaces that the grid knows may be cropped away; they must hide nothing then.
         solid = replace(renderer, occlusion=0.0) if isinstance(renderer, GridRenderer) else renderer
     if box is not None:
         shown = field.masked(in_box(box.to(device)))

@@ -56,7 +56,7 @@ PLATEAU = 0.001
 
 
 Z_UP_TO_Y_UP = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
-"""Turns a world whose z axis points up, as this program's, into one whose y axis does."""
+"""Rotates a scene whose z axis points up, as here, so that its y axis does."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
 
 CONSEQUENCES = {"scale": ("cut", "texels"), "astray": ("cut",)}
-"""Findings that say no more than another one does."""
+"""Findings that merely follow from another one."""
 
 NATIVE = "data.resolution=null"
 """The setting that takes images at their native size."""
@@ -46,7 +46,7 @@ MANY_POSES = 20
 
 @dataclass(frozen=True)
 class Choice:
-    """What a capture is read with.
+    """The settings with which a capture is read.
 
     Attributes:
         overrides: Settings of train.py that read the same.

@@ -27,7 +27,7 @@ from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore, blank_psnr, mean_colour, mean_scores
 
 LITTLE = 0.5
-"""PSNR in dB above that of empty images below which a run shows nothing."""
+"""Gain in dB over empty images below which a run has learnt nothing."""
 
 CLUTTERED = 0.2
 """Share of floaters above which a run warns; successful scenes have less than a tenth."""
@@ -162,7 +162,7 @@ def summary(
 
 
 def rest(seconds: dict[str, Any], total: float) -> dict[str, float]:
-    """``other``, what a run did besides the stages of ``seconds``, and ``total``."""
+    """``other``, the time that no stage of ``seconds`` accounts for, and ``total``."""
     # Stages from the cache count with what they took to make: they may exceed the run's own time.
     named = sum(seconds["prepare"].values())
     named += sum(value for name, value in seconds.items() if name != "prepare")

@@ -108,8 +108,8 @@ def _protocol(rows: Sequence[RunRow]) -> str:
 class SweepTable(Callback):
     """Reports how each job of a multirun ended, and writes and prints the table at its end.
 
-    The table comes at the end of the process, whichever that is: Hydra leaves out
-    ``on_multirun_end`` when a job has failed or the sweep is stopped.
+    The table is written when the process ends: Hydra does not call ``on_multirun_end`` if a job
+    has failed or the sweep was stopped.
 
     Args:
         published: Published tables to show with it, whatever the data.

@@ -23,7 +23,7 @@ Line = dict[str, Any]
 
 
 def differing(rows: Sequence[RunRow]) -> list[str]:
-    """Settings in which runs differ, less those that follow from a group or the model."""
+    """Settings in which runs differ, without those that a group or the model determines."""
     known = [row for row in rows if row.settings]
     whole = [row for row in known if not row.missing]
     overridden = {name for row in rows for name in row.overridden}
@@ -44,7 +44,7 @@ def differing(rows: Sequence[RunRow]) -> list[str]:
 
 
 def _follows(rows: Sequence[RunRow], name: str, group: str) -> bool:
-    """Whether the group's name decides the setting, where there is one."""
+    """Whether the group's name determines the setting, among runs that have it."""
     having = [row.settings for row in rows if name in row.settings]
     pairs = {(_text(settings.get(group)), _text(settings[name])) for settings in having}
     return len(pairs) == len({choice for choice, _ in pairs})
@@ -70,7 +70,7 @@ def run_table(rows: Sequence[RunRow], names: Sequence[str]) -> list[Line]:
 
 
 def _measures(rows: Iterable[RunRow]) -> list[str]:
-    """Scores of a table: that of the foreground object is there if any run scores it alone."""
+    """Scores of a table; that of the foreground object only if any run has it."""
     known = any("psnr_foreground" in row.scores for row in rows)
     return [name for name in SCORES if known or name != "psnr_foreground"]
 
@@ -101,7 +101,7 @@ def seed_table(groups: Sequence[Sequence[RunRow]], names: Sequence[str]) -> list
         line = _settings(group[0], names) | {"seeds": len(group)}
         for name in _measures(row for group in groups for row in group):
             values = [row.scores[name] for row in group if name in row.scores]
-            # A mean of those that reached it alone would favour settings where most did not.
+            # A mean over only the seeds that reached it would favour settings that rarely do.
             line[name] = mean(values) if len(values) == len(group) else None
             if name in SPREAD:
                 line[f"{name}_std"] = stdev(values) if len(values) > 1 else None

@@ -30,14 +30,14 @@ LOOP_SECONDS = 4.0
 """Duration of one playback from time 0 to 1, at speed 1."""
 TICK_SECONDS = 0.04
 SETTLE_SECONDS = 0.25
-"""How long a camera must rest before the picture is drawn in full."""
+"""Seconds that a camera must rest before the picture is drawn at full size."""
 MOVING_SECONDS = 0.08
-"""What a picture may take while the camera moves or time plays."""
+"""Seconds that a picture may take while the camera moves or time plays."""
 FEWEST = 16
 """Rows of a picture at least."""
 REFRESH_SECONDS, SHARE = 0.5, 3
-"""A still picture of a field in training is drawn again once this number of seconds, and this
-multiple of the time that it took, have passed since it was begun."""
+"""A still picture of a field in training is redrawn after this number of seconds, and not before
+this multiple of its own drawing time."""
 AWAY = 1.4
 """The first camera's distance from the scene, as a share of the training cameras'."""
 FRUSTUM = 0.1

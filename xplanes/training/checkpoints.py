@@ -105,7 +105,7 @@ class Checkpoints(ModelCheckpoint):
         # Gradients of batches that wait for others are in no checkpoint.
         whole = getattr(pl_module, "between_updates", True)
         self._due = whole and trainer.global_step % self.every == 0
-        # Else it waits for the scores, so that it knows of the best.
+        # Otherwise it waits for the scores, so that it records the best one.
         validates = trainer.val_check_batch == trainer.fit_loop.epoch_loop.total_batch_idx + 1
         if self._due and not validates:
             self._save_last(trainer)
@@ -131,7 +131,7 @@ class Checkpoints(ModelCheckpoint):
         self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
 
     def _should_skip_saving_checkpoint(self, trainer: Trainer) -> bool:
-        # The last scores may be made up for after training, see `Trainer.train`.
+        # The last scores may come after training, see `Trainer.train`.
         return trainer.sanity_checking or not trainer.global_step
 
     def _save_checkpoint(self, trainer: Trainer, filepath: str) -> None:

@@ -1,4 +1,4 @@
-"""Detects fields that collapse to nothing or to fog, and restarts them once."""
+"""Detects fields that become empty or foggy, and restarts them once."""
 
 import logging
 import math

@@ -1,4 +1,4 @@
-"""When views are scored during training, and the curve of their scores."""
+"""Scores views at given times during training, and writes the curve of their scores."""
 
 import sys
 import time
@@ -64,7 +64,7 @@ class Evaluation(Callback):
         if trainer.global_step and trainer.is_global_zero:
             forget_later(trainer, trainer.global_step)
         passed = sum(share <= pl_module.progress for share in self.at)
-        # Stopped while it scored, a run scores again; with more of a budget, less of it is passed.
+        # A run that was stopped while scoring scores again; a larger budget passes fewer shares.
         self._passed = passed if self._passed is None else min(self._passed, passed)
 
     def on_train_batch_end(
@@ -128,7 +128,7 @@ class Evaluation(Callback):
             name = tag.replace("/", "_").removesuffix(".png")
             write_png(run / "media" / f"step{step:06d}" / f"{name}.png", picture)
             log_image(trainer, tag, picture, step)
-        if trainer.sanity_checking:  # Whose scores Lightning does not log.
+        if trainer.sanity_checking:  # Lightning does not log its scores.
             last = module.tally.last
             scores = {n: last[n] for n in last if n.startswith(("val/", "test/"))}
             for log in trainer.loggers:

@@ -1,4 +1,4 @@
-"""Scores of views: rendered, compared with the true images, and averaged; when Lightning asks."""
+"""Scores of views: rendered, compared with the true images, and averaged."""
 
 import math
 from abc import abstractmethod
@@ -23,7 +23,7 @@ VISIBLE = 0.05
 """Opacity above which a background pixel shows a floater."""
 
 SOLID = 128
-"""Share of a pixel, of 255, from which it counts as showing the foreground object."""
+"""Least coverage of a pixel, of 255, by the foreground object for the pixel to count."""
 
 
 @dataclass(frozen=True)

@@ -327,38 +327,35 @@ def test_the_data_serve_other_modules(config: dict, tmp_path: Path) -> None:
     assert float(module.colour.min()) > 0.5  # Most of the images is white.
 
 
-def test_the_script_of_the_docs_runs(
-    config: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    (script,) = re.findall(r"```python\n(import lightning.*?)```", page, re.DOTALL)
-    monkeypatch.chdir(tmp_path)
+def execute(page: str, pattern: str, config: dict, replaced: dict, **names) -> dict:
+    """Run a script of the docs on the demo scene, and give its variables."""
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    (script,) = re.findall(rf"```python\n({pattern})```", text, re.DOTALL)
     folder = SceneDataModule(config["data"]).settings.folder
-    script = script.replace('"data.root=data/dnerf"', f'"data.root={folder.parent.resolve()}"')
-    script = script.replace(
-        '"data.scene=lego"', f'"data.scene={folder.name}", "data.resolution=null"'
-    )
-    script = script.replace("max_steps=2000", "max_steps=20")
-    exec(compile(script, "recipes.md", "exec"), {})
+    here = {
+        '"data.root=data/dnerf"': f'"data.root={folder.parent.resolve()}"',
+        '"data.scene=lego"': f'"data.scene={folder.name}", "data.resolution=null"',
+    }
+    for old, new in (here | replaced).items():
+        script = script.replace(old, new)
+    exec(compile(script, page, "exec"), names)
+    return names
+
+
+def test_the_script_of_the_docs_runs(config, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    execute("recipes.md", "import lightning.*?", config, {"max_steps=2000": "max_steps=20"})
     assert (tmp_path / "field.ckpt").is_file()
     assert (tmp_path / "view.png").is_file()
 
 
-def test_the_page_on_your_own_trainer_runs(
-    config: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page = (ROOT / "docs" / "own_trainer.md").read_text(encoding="utf-8")
-    (script,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+def test_the_page_on_your_own_trainer_runs(config, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    folder = SceneDataModule(config["data"]).settings.folder
-    script = script.replace('"data.root=data/dnerf"', f'"data.root={folder.parent.resolve()}"')
-    script = script.replace(
-        '"data.scene=lego"', f'"data.scene={folder.name}", "data.resolution=null"'
-    )
-    script = script.replace("max_steps=2000", 'max_steps=12, accelerator="cpu"')
-    script = script.replace("val_check_interval=500", "val_check_interval=6")
-    names: dict = {}
-    exec(compile(script, "own_trainer.md", "exec"), names)
+    short = {
+        "max_steps=2000": 'max_steps=12, accelerator="cpu"',
+        "val_check_interval=500": "val_check_interval=6",
+    }
+    names = execute("own_trainer.md", ".*?", config, short)
     assert names["trainer"].global_step == 12
     kept = torch.load(tmp_path / "checkpoints" / "best.ckpt", weights_only=True)
     assert {"current_model_state", "averaging_state"} <= kept.keys()
@@ -379,17 +376,16 @@ def test_a_checkpoint_of_another_version_is_refused_with_its_number(
             RadianceModule.load_from_checkpoint(tmp_path / "old.ckpt")
 
 
-def test_plugins_of_the_docs_are_composed_and_loaded_again(
-    config: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    (script,) = re.findall(r"```python\n(module = .*?)```", page, re.DOTALL)
+def test_plugins_of_the_docs_are_composed_and_loaded_again(config, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    script = script.replace("my_package.extras", "tests.plugins.opacity_loss")
-    script = script.replace("my_package", "tests.plugins").replace("max_steps=2000", "max_steps=3")
+    ours = {
+        "my_package.extras": "tests.plugins.opacity_loss",
+        "my_package": "tests.plugins",
+        "max_steps=2000": "max_steps=3",
+    }
+    given = {"lightning": lightning, "RadianceModule": RadianceModule}
     data = SceneDataModule(config["data"])
-    names = {"lightning": lightning, "RadianceModule": RadianceModule, "data": data}
-    exec(compile(script, "recipes.md", "exec"), names)
+    names = execute("recipes.md", "module = .*?", config, ours, data=data, **given)
     assert names["again"].method.losses["op"].weight == 0.1
     words = r"name a module of your own with load_from_checkpoint\(path, plugins=\[MODULE\]\)$"
     with pytest.raises(ConfigError, match=rf"^losses\.op\._target_=tests\.plugins.*{words}"):

@@ -275,20 +275,19 @@ def written_reader(name: str = "Planes") -> Any:
     return names[name]
 
 
+def x_planes(plane_set: str, **parts: Any) -> XPlanes:
+    """A small field with random planes."""
+    size = {"channels": 5, "resolution": 9, "time_resolution": 4}
+    random = {"space_scale": 1, "time_scale": 1, "generator": torch.Generator().manual_seed(0)}
+    made = random_planes(plane_set, **size, **random)
+    return XPlanes(planes=made, plane_set=plane_set, **parts)
+
+
 @pytest.mark.parametrize("plane_set", ["three", "six", "nine"])
 def test_the_documented_reader_gives_the_values_of_the_field(tmp_path: Path, plane_set: str):
     options: dict[str, Any] = {"activation": "silu", "density": "exp", "density_scale": 3.0}
     options = {} if plane_set == "six" else options | {"colour_margin": 0.0}
-    made = random_planes(
-        plane_set,
-        channels=5,
-        resolution=9,
-        time_resolution=4,
-        space_scale=1,
-        time_scale=1,
-        generator=torch.Generator().manual_seed(0),
-    )
-    field = XPlanes(planes=made, decoder=Decoder(5, width=16, **options), plane_set=plane_set)
+    field = x_planes(plane_set, decoder=Decoder(5, width=16, **options))
     trained = set_up(tmp_path, field)
     folder = export(trained, ExportOptions(what="planes"), say=quiet)
     world = FRAME.to_world(torch.rand(200, 3) * 2.2 - 1.1)
@@ -307,16 +306,7 @@ def test_the_documented_reader_sees_the_background_of_the_field(tmp_path: Path, 
     background = Background(4, 12, width=8, samples=samples)
     with torch.no_grad():
         background.planes.mul_(30)
-    made = random_planes(
-        "six",
-        channels=5,
-        resolution=9,
-        time_resolution=4,
-        space_scale=1,
-        time_scale=1,
-        generator=torch.Generator().manual_seed(0),
-    )
-    field = XPlanes(planes=made, decoder=Decoder(5), plane_set="six", background=background)
+    field = x_planes("six", decoder=Decoder(5), background=background)
     trained = set_up(tmp_path, field)
     folder = export(trained, ExportOptions(what="planes"), say=quiet)
     origins, aims = FRAME.to_world(torch.randn(2, 300, 3))

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from PIL import Image, ImageSequence
 
-from tests.evaluation.test_table import make
+from tests.evaluation.test_table import make, set_to
 from xplanes.cli import main
 from xplanes.errors import ConfigError
 from xplanes.evaluation.sheet import WHAT, check_what, write_sheet
@@ -32,9 +31,7 @@ def pictured(
     views=("v0", "v1"),
 ) -> Path:
     run = make(folder, model=model, seed=seed)
-    config = yaml.safe_load((run / "config.yaml").read_text())
-    config["data"]["scene"] = scene
-    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    set_to(run, data={"scene": scene})
     for step in steps:
         for view in views:
             strip = np.concatenate(

@@ -43,9 +43,6 @@ def in_turn(path: Path | None) -> Iterator[bool]:
 def if_free(path: Path) -> Iterator[bool]:
     """Hold a lock, unless another process holds it.
 
-    Args:
-        path: The lock's file.
-
     Returns:
         Whether this process holds it.
     """

@@ -73,10 +73,6 @@ class Job:
 def prepare(config: dict[str, Any], folder: Path) -> Job:
     """Parse the settings of a run and build its Trainer.
 
-    Args:
-        config: The resolved configuration, builtins only.
-        folder: The run directory.
-
     Raises:
         ConfigError: If settings are missing, out of range, or contradict one another.
     """

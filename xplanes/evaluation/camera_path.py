@@ -99,10 +99,6 @@ def path_contents(views: Views, fps: int) -> dict[str, dict[str, Any]]:
     Cameras of a path are perspective and look through the middle of their images: lenses and
     principal points are left out, the vertical field of view is that of each image.
 
-    Args:
-        views: The views.
-        fps: Frames per second.
-
     Returns:
         ``camera_path.json``, as nerfstudio has it, and ``transforms.json``, by name.
     """

@@ -21,11 +21,6 @@ PLACES = 60
 def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bool:
     """Draw PSNR against seconds, preparation included, and against steps, a column per scene.
 
-    Args:
-        rows: Runs.
-        names: Settings in which they differ.
-        path: Picture to write, PNG.
-
     Returns:
         Whether there was something to draw, and matplotlib (extra ``plots``) to draw it with.
     """
@@ -66,11 +61,6 @@ def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> boo
 
 def plot_against(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bool:
     """Draw final PSNR against a setting that has three values or more, mean over scenes and seeds.
-
-    Args:
-        rows: Runs.
-        names: Settings in which they differ.
-        path: Picture to write, PNG.
 
     Returns:
         Whether there was one such setting, and matplotlib (extra ``plots``) to draw it with.

@@ -552,10 +552,6 @@ def surface_colours(trained: TrainedRun, points: Tensor, normals: Tensor, time: 
 def write_paths(folder: Path, trained: TrainedRun) -> list[str]:
     """Write the training cameras in the order of their times as camera paths.
 
-    Args:
-        folder: Where to.
-        trained: The run.
-
     Returns:
         The files' names: ``camera_path.json``, as nerfstudio has it, and ``transforms.json``.
     """
@@ -567,10 +563,6 @@ def write_paths(folder: Path, trained: TrainedRun) -> list[str]:
 
 def write_planes(folder: Path, trained: TrainedRun) -> list[str]:
     """Write an X-Planes field as safetensors; docs/recipes.md describes the layout.
-
-    Args:
-        folder: Where to.
-        trained: The run.
 
     Returns:
         The files' names.

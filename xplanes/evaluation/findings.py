@@ -184,12 +184,7 @@ def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
 
 
 def image_findings(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iterator[Finding]:
-    """Problems that the images' pixels show.
-
-    Args:
-        scene: The scene.
-        images: What `image_facts` gives of each split.
-    """
+    """Problems that the images' pixels show."""
     seen = [each for split in images.values() for each in split]
     masks = list(_masks(seen))
     yield from masks
@@ -314,23 +309,19 @@ def _shared(scene: Scene) -> Iterator[Finding]:
     names = dict(zip(train.files, range(len(train)), strict=True))
     poses = train.camera_to_world.double()
     room = 1e-5 * float((poses[:, :3, 3] - poses[:, :3, 3].mean(dim=0)).norm(dim=-1).median())
-    for split, views in scene.splits.items():
-        if split == "train":
-            continue
-        found = []
+    for split in [name for name in scene.splits if name != "train"]:
+        views, found = scene.splits[split], []
         for index, file in enumerate(views.files):
             pose, time = views.camera_to_world[index], views.times[index]
+            near = (poses - pose.double()).abs().flatten(1).amax(dim=1) <= max(room, 1e-9)
+            near &= (train.times - time).abs() <= 1e-6
             other = names.get(file)
             # Formats of the user's own may name the files of each split by themselves.
             if other is not None and torch.equal(views.image(index), train.image(other)):
                 found.append((file, file))
-                continue
-            near = (poses - pose.double()).abs().flatten(1).amax(dim=1) <= max(room, 1e-9)
-            near &= (train.times - time).abs() <= 1e-6
-            if near.any():
+            elif near.any():
                 found.append((file, train.files[int(near.nonzero()[0, 0])]))
-        if found:
-            yield _shared_finding(split, len(views), found, "file, or the same camera and time")
+        yield from _shared_finding(split, views, found, "file, or the same camera and time")
 
 
 def _shared_images(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iterator[Finding]:
@@ -339,28 +330,28 @@ def _shared_images(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iter
         return
     train = scene.splits["train"]
     known = {each.digest: each.index for each in images["train"] if each.digest is not None}
-    for split, views in scene.splits.items():
-        if split == "train":
-            continue
-        found = []
+    for split in [name for name in scene.splits if name != "train"]:
+        poses, found = scene.splits[split].camera_to_world, []
         for each in images[split]:
-            other = known.get(each.digest) if each.digest is not None else None
+            other = known.get(each.digest or b"")
             # One camera shows the same again as long as nothing moves.
             if other is not None and not torch.equal(
-                views.camera_to_world[each.index], train.camera_to_world[other]
+                poses[each.index], train.camera_to_world[other]
             ):
                 found.append((each.file, train.files[other]))
-        if found:
-            yield _shared_finding(split, len(views), found, "pixels")
+        yield from _shared_finding(split, scene.splits[split], found, "pixels")
 
 
-def _shared_finding(split: str, total: int, found: list[tuple[str, str]], what: str) -> Finding:
-    file, other = found[0]
-    return Finding(
-        "shared",
-        f"{len(found)} of {total} {split} views are training views too, by the same {what} "
-        f"({file} is {other}): scores would flatter the field. Take them out of one of the splits",
-    )
+def _shared_finding(
+    split: str, views: Views, found: list[tuple[str, str]], what: str
+) -> Iterator[Finding]:
+    for file, other in found[:1]:
+        yield Finding(
+            "shared",
+            f"{len(found)} of {len(views)} {split} views are training views too, by the same "
+            f"{what} ({file} is {other}): scores would flatter the field. Take them out of one of "
+            "the splits",
+        )
 
 
 def _sizes(scene: Scene) -> Iterator[Finding]:

@@ -358,11 +358,6 @@ def cameras(options: VideoOptions, splits: dict[str, Views], frame: Frame) -> li
     """The camera of each frame.
 
     That of a view shows exactly what the view shows; the others show as much as the training views.
-
-    Args:
-        options: What to render.
-        splits: The views of the scene.
-        frame: The field's frame.
     """
     rows, columns = options.shape(splits)
     if (path := options.cameras) is not None:
@@ -383,12 +378,7 @@ def cameras(options: VideoOptions, splits: dict[str, Views], frame: Frame) -> li
 
 
 def pixels_with_rays(options: VideoOptions, splits: dict[str, Views]) -> Tensor | None:
-    """Pixels of a frame that its lens has rays for; None for all. bool [rows, columns]
-
-    Args:
-        options: What to render.
-        splits: The views of the scene.
-    """
+    """Pixels of a frame that its lens has rays for; None for all. bool [rows, columns]"""
     if (found := options.view(splits)) is None:
         return None
     views, index = found
@@ -439,13 +429,7 @@ VIDEO_SIZE = 200
 
 
 def write_orbit(module: RadianceModule, scene: Scene, run: Path) -> Path:
-    """Write media/orbit.webp: one camera orbit while time runs from 0 to 1 and back.
-
-    Args:
-        module: What was trained.
-        scene: The scene.
-        run: The run directory.
-    """
+    """Write media/orbit.webp: one camera orbit while time runs from 0 to 1 and back."""
     views = scene.splits["train"]
     options = VideoOptions(frames=FRAMES, size=min(VIDEO_SIZE, max(views.height, views.width)))
     frames = _frames(module, scene, options)

@@ -86,14 +86,7 @@ def header(
 def estimated(
     experiment: Experiment, data: SceneDataModule, expected: Estimate, spent: float
 ) -> str:
-    """How long the run is going to take, as text.
-
-    Args:
-        experiment: The settings.
-        data: The data.
-        expected: What a step and a ray take.
-        spent: Seconds since the run began.
-    """
+    """How long the run is going to take, ``spent`` seconds after it began, as text."""
     trainer = experiment.trainer
     steps = float(trainer.get("max_steps", -1)) if trainer.get("max_steps", -1) > 0 else math.inf
     train = min(steps * expected.step, trainer.get("max_seconds") or math.inf)

@@ -178,12 +178,10 @@ class Viewer:
             self._play()
             now = time.monotonic()
             waiting = sorted(self._browsers.values(), key=lambda browser: browser.began)
-            due = ((browser, browser.wanted(now)) for browser in waiting)
-            browser, height = next((found for found in due if found[1]), (None, 0))
-            if browser is None:
-                return
-            browser.draw(height, now)
-            if time.monotonic() >= end:
+            due = [(browser, height) for browser in waiting if (height := browser.wanted(now))]
+            for browser, height in due[:1]:
+                browser.draw(height, now)
+            if not due or time.monotonic() >= end:
                 return
 
     def tell(self, text: str) -> None:
@@ -200,15 +198,8 @@ class Viewer:
     def shot(self, camera: Any, height: int) -> Shot:
         """What a viser camera sees now, in a given number of rows."""
         pose = camera_pose(torch.from_numpy(camera.wxyz), torch.from_numpy(camera.position))
-        return Shot(
-            pose,
-            time=float(self.time.value),
-            fov=camera.fov,
-            height=height,
-            aspect=camera.aspect,
-            mode=self.mode.value,
-            box=self.box,
-        )
+        view = float(self.time.value), camera.fov, height, camera.aspect
+        return Shot(pose, *view, mode=self.mode.value, box=self.box)
 
     @property
     def box(self) -> Tensor | None:
@@ -398,9 +389,8 @@ class _Browser:
         self.again = now + max(REFRESH_SECONDS, SHARE * spent)
 
     def _send(self, picture: Picture) -> None:
-        depth = None
-        if self.viewer.needs_depth:
-            depth = picture.depth.clamp_max(LARGEST_DEPTH).numpy()
+        hides = self.viewer.needs_depth
+        depth = picture.depth.clamp_max(LARGEST_DEPTH).numpy() if hides else None
         self.client.scene.set_background_image(
             to_bytes(picture.colours).numpy(),
             format="jpeg",

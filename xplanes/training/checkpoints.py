@@ -159,9 +159,6 @@ def has_checkpoint(run: Path) -> bool:
 def find_resumable(folder: Path) -> Path | None:
     """The checkpoint that training goes on from; the best takes the place of a damaged last one.
 
-    Args:
-        folder: Where they lie.
-
     Returns:
         ``last.ckpt``; None where there is none, so that training starts afresh.
 

@@ -274,10 +274,6 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
 
     Training makes surfaces opaque, so that rays end after a few samples. A much denser copy of the
     field stands in for the trained one.
-
-    Args:
-        module: The module, its loops compiled.
-        data: Its data.
     """
     frame, field, renderer = module.frame, module.field, module.renderer
     assert frame is not None

@@ -75,12 +75,7 @@ def render_item(
 
 
 def score_image(image: Mapping[str, Tensor], item: Mapping[str, Any]) -> ViewScore:
-    """Compare a rendered view with the true image.
-
-    Args:
-        image: What `render_item` gives.
-        item: What `whole_view` gives.
-    """
+    """Compare a rendered view with the true image."""
     truth = item["target"].cpu()
     colour = image["colour"].float().clamp(0, 1)
     opacity, alpha = image["opacity"].float(), item["alpha"].cpu()

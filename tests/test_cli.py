@@ -16,7 +16,6 @@ def test_evaluate_as_a_program(trained_run: Path, tmp_path: Path):
     done = warm.run(
         *("-m", "xplanes", "evaluate", str(trained_run), "--lpips", "none"), cwd=tmp_path
     )
-    assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert lines[0] == f"run         {trained_run}"
     assert lines[1].startswith("checkpoint  last.ckpt, step 40")

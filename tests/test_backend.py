@@ -41,7 +41,7 @@ except ModuleNotFoundError as error:
 """
 
 
-def test_loops_share_the_threads_of_torch_and_may_be_absent(tmp_path: Path) -> None:
+def test_loops_share_the_threads_of_torch_and_may_be_absent(tmp_path):
     """With one thread, with two, and where numba does not load."""
     broken = tmp_path / "broken"
     (broken / "numba").mkdir(parents=True)
@@ -60,7 +60,7 @@ def test_loops_share_the_threads_of_torch_and_may_be_absent(tmp_path: Path) -> N
     assert "pip install --upgrade numba" in printed
 
 
-def test_warming_up_inside_warming_up_counts_once() -> None:
+def test_warming_up_inside_warming_up_counts_once():
     clock = WarmUp()
     with clock.timed(), clock.timed():
         time.sleep(0.05)
@@ -144,7 +144,7 @@ def test_loops_are_kept_where_they_can_be(sealed, tmp_path):
     assert list((tmp_path / "kept").rglob("*.nbi"))
 
 
-def test_triton_gets_a_folder_where_it_has_none(tmp_path: Path, monkeypatch, caplog) -> None:
+def test_triton_gets_a_folder_where_it_has_none(tmp_path, monkeypatch, caplog):
     own, file, removed = tmp_path / "own", tmp_path / "file", []
     file.write_text("")
     monkeypatch.setattr(backend.atexit, "register", lambda _, path, **__: removed.append(path))

@@ -6,7 +6,6 @@ import re
 import shlex
 import sys
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -68,12 +67,12 @@ def test_what_is_mistyped_gets_hydras_error_and_what_is_near():
         compose_plain("train", ["data=dnerf", "data.train_views=3"])
 
 
-def test_other_configurations_have_suggestions_of_their_own() -> None:
+def test_other_configurations_have_suggestions_of_their_own():
     with pytest.raises(ConfigError, match=r"\nDid you mean schedule\.max_seconds or .*schedule"):
         compose_plain("pretrain_lrm", ["schedule.max_second=3"])
 
 
-def test_the_help_is_a_page_of_examples_that_compose_and_of_options(monkeypatch, capsys) -> None:
+def test_the_help_is_a_page_of_examples_that_compose_and_of_options(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["xplanes", "train", "--help"])
     with pytest.raises(SystemExit, match="0"):
         main()
@@ -130,8 +129,8 @@ ANSWERS = (
 
 @pytest.mark.parametrize(("typed", "answer"), ANSWERS)
 def test_what_is_mistyped_is_answered_with_what_was_meant(
-    typed: str, answer: str, tmp_path: Path, monkeypatch, capsys
-) -> None:
+    typed, answer, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["xplanes", *typed.split(" ")])
     for age, name in enumerate(("new", "old")):
@@ -150,7 +149,7 @@ def test_what_is_mistyped_is_answered_with_what_was_meant(
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_no_command_is_answered_with_the_commands(capsys) -> None:
+def test_no_command_is_answered_with_the_commands(capsys):
     assert main([]) == 0
     assert "usage: xplanes" in capsys.readouterr().out
 
@@ -182,7 +181,7 @@ finally:
 """
 
 
-def test_command_lines_without_a_job_are_hydras_and_load_nothing_heavy(tmp_path: Path) -> None:
+def test_command_lines_without_a_job_are_hydras_and_load_nothing_heavy(tmp_path):
     found = forked("import hydra", [QUICK.format(list(given)) for given in COMMANDS], tmp_path)
     for (code, printed), (arguments, words) in zip(found, COMMANDS.items(), strict=True):
         refused = words.startswith("Did you mean")
@@ -190,7 +189,7 @@ def test_command_lines_without_a_job_are_hydras_and_load_nothing_heavy(tmp_path:
         assert code == int(refused), (arguments, printed)
 
 
-def test_misfits_of_the_trainer_are_said_with_a_message(scenes: Path, tmp_path: Path) -> None:
+def test_misfits_of_the_trainer_are_said_with_a_message(scenes, tmp_path):
     cases = [
         ({"max_secnds": 3}, "trainer.max_secnds=3: Trainer has no such argument"),
         ({"accelerator": "tpu"}, "trainer.accelerator=tpu: must be one of auto, cpu, gpu"),
@@ -205,10 +204,7 @@ def test_misfits_of_the_trainer_are_said_with_a_message(scenes: Path, tmp_path: 
         assert not (tmp_path / f"run_{words[:12]}").exists()
 
 
-def test_an_unknown_argument_of_a_logger_is_refused_before_anything_is_written(
-    scenes: Path,
-    tmp_path: Path,
-) -> None:
+def test_an_unknown_argument_of_a_logger_is_refused_before_anything_is_written(scenes, tmp_path):
     config = small_config(scenes, "logger=tensorboard")
     config["logger"]["tensorboard"]["foo"] = 1
     with pytest.raises(ConfigError, match=r"logger\.tensorboard\.foo=1: .* no such argument"):
@@ -216,7 +212,7 @@ def test_an_unknown_argument_of_a_logger_is_refused_before_anything_is_written(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_of_an_earlier_version_is_refused_with_its_version(tmp_path: Path) -> None:
+def test_a_run_of_an_earlier_version_is_refused_with_its_version(tmp_path):
     (tmp_path / "overrides.txt").write_text("loss.every=4\n")
     (tmp_path / "run.json").write_text(json.dumps({"xplanes": "0.1.0", "status": "interrupted"}))
     with pytest.raises(ConfigError, match=r"made by xplanes 0\.1\.0.*start a new run"):
@@ -224,8 +220,8 @@ def test_a_run_of_an_earlier_version_is_refused_with_its_version(tmp_path: Path)
 
 
 def test_a_run_that_failed_before_its_first_checkpoint_blocks_nothing(
-    scenes: Path, tmp_path: Path, monkeypatch
-) -> None:
+    scenes, tmp_path, monkeypatch
+):
     config = small_config(scenes, "trainer.max_steps=3")
     monkeypatch.setattr(RadianceModule, "training_step", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
@@ -249,9 +245,7 @@ REFUSED = (
 
 
 @pytest.mark.parametrize("changes", REFUSED, ids=str)
-def test_a_refused_run_leaves_no_directory(
-    changes, scenes: Path, tmp_path: Path, monkeypatch
-) -> None:
+def test_a_refused_run_leaves_no_directory(changes, scenes, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setenv("HF_HOME", str(scenes))
@@ -264,7 +258,7 @@ def test_a_refused_run_leaves_no_directory(
     assert not list(tmp_path.iterdir())
 
 
-def test_what_stood_in_the_folder_of_a_refused_run_stays(scenes: Path, tmp_path: Path) -> None:
+def test_what_stood_in_the_folder_of_a_refused_run_stays(scenes, tmp_path):
     (tmp_path / "mine.txt").write_text("keep")
     broken = small_config(scenes, "data.scene=excavator", "data.views=999")
     with pytest.raises(SceneError, match=r"data\.views=999"):
@@ -272,7 +266,7 @@ def test_what_stood_in_the_folder_of_a_refused_run_stays(scenes: Path, tmp_path:
     assert (tmp_path / "mine.txt").read_text() == "keep"
 
 
-def test_tensorboard_drops_what_a_run_that_was_cut_off_has_left(tmp_path) -> None:
+def test_tensorboard_drops_what_a_run_that_was_cut_off_has_left(tmp_path):
     def trainer():
         log = TensorBoardLogger(str(tmp_path), name="", version="tb")
         return SimpleNamespace(loggers=[log]), log
@@ -305,18 +299,14 @@ def test_tensorboard_drops_what_a_run_that_was_cut_off_has_left(tmp_path) -> Non
     ],
     ids=str,
 )
-def test_arguments_of_lightnings_trainer_and_its_callbacks_work(
-    extra, scenes: Path, tmp_path: Path
-) -> None:
+def test_arguments_of_lightnings_trainer_and_its_callbacks_work(extra, scenes, tmp_path):
     short = (f"data.root={scenes}", "callbacks.evaluation.at=[1]", "trainer.max_steps=3")
     run(compose_plain("train", [*SMALL, *short, *extra]), tmp_path / "run", [], resume=False)
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["step"] == (1 if "fast" in extra[0] else 3)
 
 
-def test_a_run_says_at_its_ends_what_it_takes_and_what_comes_next(
-    scenes: Path, tmp_path: Path, capsys
-) -> None:
+def test_a_run_says_at_its_ends_what_it_takes_and_what_comes_next(scenes, tmp_path, capsys):
     changes = ("logger=tensorboard", "trainer.max_steps=6", "trainer.log_every_n_steps=2")
     run(small_config(scenes, *changes, "data.eval_split=val"), tmp_path, [], resume=False)
     printed = capsys.readouterr().out
@@ -343,7 +333,7 @@ def test_a_run_says_at_its_ends_what_it_takes_and_what_comes_next(
     assert {"_hparams_/experiment", "_hparams_/session_start_info"} <= set(parts)
 
 
-def test_nothing_is_offered_that_a_run_does_not_leave(scenes: Path, tmp_path: Path, capsys) -> None:
+def test_nothing_is_offered_that_a_run_does_not_leave(scenes, tmp_path, capsys):
     config = small_config(scenes, "trainer.max_steps=2", "logger=none")
     config["callbacks"]["checkpoints"] = None
     run(config, tmp_path / "run", [], resume=False)

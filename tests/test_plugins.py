@@ -53,7 +53,7 @@ def config(tmp_path: Path) -> dict:
     return found | {"losses": {"opacity": LOSS}, "plugins": ["tests.plugins"]}
 
 
-def test_all_four_train_log_and_load_again(config: dict, tmp_path: Path) -> None:
+def test_all_four_train_log_and_load_again(config, tmp_path):
     folder = tmp_path / "run"
     run(config, folder, [], resume=False)
     curve = list(csv.DictReader((folder / "curve.csv").open()))
@@ -71,7 +71,7 @@ def test_all_four_train_log_and_load_again(config: dict, tmp_path: Path) -> None
     assert json.loads((folder / "metrics.json").read_text())["step"] == 40
 
 
-def test_a_recipe_reaches_a_model_of_ones_own_or_names_itself(tmp_path: Path) -> None:
+def test_a_recipe_reaches_a_model_of_ones_own_or_names_itself(tmp_path):
     group = tmp_path / "model"
     group.mkdir()
     rays = dict.fromkeys(("per_batch", "samples_per_batch"), "auto")
@@ -89,7 +89,7 @@ def test_a_recipe_reaches_a_model_of_ones_own_or_names_itself(tmp_path: Path) ->
             Experiment.read(compose_plain("train", [*own, f"recipe={recipe}"]))
 
 
-def test_data_of_ones_own_is_composed_in_python() -> None:
+def test_data_of_ones_own_is_composed_in_python():
     own = ["data._target_=tests.plugins.shell_format.DiscSettings", "+data.count=6"]
     own += [f"~data.{name}" for name in ("seed", "train_views", "test_views", "val_views")]
     data = SceneDataModule.compose("plugins=[tests.plugins]", *own, "data.scene=disc")
@@ -98,7 +98,7 @@ def test_data_of_ones_own_is_composed_in_python() -> None:
         SceneDataModule.compose(*own)
 
 
-def test_a_run_of_somebody_else_names_no_classes_by_itself(config: dict, tmp_path: Path) -> None:
+def test_a_run_of_somebody_else_names_no_classes_by_itself(config, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
@@ -124,16 +124,14 @@ def test_a_run_of_somebody_else_names_no_classes_by_itself(config: dict, tmp_pat
         ("tests.plugins.gaussian_blob.RadianceField", "must be a class derived from"),
     ],
 )
-def test_classes_that_may_not_stand_there_are_refused(
-    config: dict, tmp_path: Path, target: str, words: str
-) -> None:
+def test_classes_that_may_not_stand_there_are_refused(config, tmp_path, target, words):
     config["model"]["_target_"] = target
     with pytest.raises(ConfigError, match=rf"model\._target_={target}: .*{words}"):
         run(config, tmp_path / "run", [], resume=False)
     assert not (tmp_path / "run" / "run.json").exists()
 
 
-def test_settings_of_plugins_are_checked_alike(config: dict, tmp_path: Path) -> None:
+def test_settings_of_plugins_are_checked_alike(config, tmp_path):
     config["model"]["width"] = -1.0
     with pytest.raises(ConfigError, match=r"model\.width=-1\.0: must be above 0"):
         run(config, tmp_path / "run", [], resume=False)
@@ -142,7 +140,7 @@ def test_settings_of_plugins_are_checked_alike(config: dict, tmp_path: Path) -> 
         run(config, tmp_path / "run", [], resume=False)
 
 
-def test_a_module_that_is_not_there_is_said(config: dict, tmp_path: Path) -> None:
+def test_a_module_that_is_not_there_is_said(config, tmp_path):
     with pytest.raises(ConfigError, match=r"plugins: not_here cannot be imported.*PYTHONPATH"):
         run(config | {"plugins": ["not_here"]}, tmp_path / "run", [], resume=False)
 
@@ -203,9 +201,7 @@ def first_psnr(folder: Path) -> float:
     return float(next(csv.DictReader((folder / "curve.csv").open()))["psnr"])
 
 
-def test_the_lrm_of_the_docs_initialises_a_field(
-    example: Callable[..., dict], tmp_path: Path
-) -> None:
+def test_the_lrm_of_the_docs_initialises_a_field(example, tmp_path):
     changes = ("data.resolution=48", "preparation.cache=null", "preparation.frames=4")
     changes += ("trainer.max_steps=2",)
     own = example("A Large Reconstruction Model", "lrm", "cardboard", *changes)
@@ -219,7 +215,7 @@ def test_the_lrm_of_the_docs_initialises_a_field(
     assert first_psnr(tmp_path / "own") > first_psnr(tmp_path / "random") + 1
 
 
-def test_the_model_of_the_docs_trains(small_model: dict, tmp_path: Path) -> None:
+def test_the_model_of_the_docs_trains(small_model, tmp_path):
     assert small_model["lrm"]["name"] == "none"
     run(small_model, tmp_path / "run", [], resume=False)
     curve = list(csv.DictReader((tmp_path / "run" / "curve.csv").open()))
@@ -242,8 +238,8 @@ def test_the_model_of_the_docs_trains(small_model: dict, tmp_path: Path) -> None
     ],
 )
 def test_groups_that_cannot_be_trained_are_refused_when_the_model_is_built(
-    small_model: dict, groups: list, words: str
-) -> None:
+    small_model, groups, words
+):
     module = RadianceModule(small_model, plugins=["my_package"])
     scene = SceneDataModule(small_model["data"]).scene
     model = sys.modules["my_package.mlp"].MLPModel
@@ -252,7 +248,7 @@ def test_groups_that_cannot_be_trained_are_refused_when_the_model_is_built(
         module.build(scene)
 
 
-def test_a_field_of_another_class_is_refused(small_model: dict) -> None:
+def test_a_field_of_another_class_is_refused(small_model):
     module = RadianceModule(small_model, plugins=["my_package"])
     scene = SceneDataModule(small_model["data"]).scene
     sys.modules["my_package.mlp"].MLPModel.field = torch.nn.Linear(4, 4)
@@ -260,7 +256,7 @@ def test_a_field_of_another_class_is_refused(small_model: dict) -> None:
         module.build(scene)
 
 
-def test_a_part_of_a_field_may_not_hide_behind_a_property() -> None:
+def test_a_part_of_a_field_may_not_hide_behind_a_property():
     field = RadianceField()
     with pytest.raises(AttributeError, match=r"RadianceField\.planes is a property; rename"):
         field.planes = torch.nn.ParameterDict()

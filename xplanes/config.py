@@ -20,7 +20,7 @@ NAMES = (
     *("data.times", "lrm.weights", "lrm.config", "lrm.triplanes", "preparation.cache"),
     *("resume", "hydra.run.dir", "hydra.sweep.dir", "run", "pool.root", "init_from"),
 )
-"""Settings whose values are names or paths, whatever they look like."""
+"""Settings whose values are names or paths, even if they look like numbers or lists."""
 
 ELSEWHERE = {
     "gpus": "trainer=ddp trainer.devices={}",

@@ -17,7 +17,7 @@ class ConfigError(XPlanesError, ValueError):
 
 
 class DeviceError(XPlanesError, RuntimeError):
-    """A device stopped working; the message names what it was doing and the way out."""
+    """A device stopped working; the message names what it was doing and the remedy."""
 
 
 class LRMError(XPlanesError, ValueError):

@@ -82,7 +82,7 @@ class Settings:
         """Refuse settings that contradict one another.
 
         Raises:
-            ConfigError: With the setting, its value and the way out.
+            ConfigError: With the setting, its value and the remedy.
         """
 
     @classmethod

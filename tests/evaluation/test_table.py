@@ -337,7 +337,7 @@ def published_lines(folder: Path) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
 
 
-def test_means_stand_beside_what_was_published(tmp_path: Path) -> None:
+def test_means_stand_beside_what_was_published(tmp_path):
     dnerf(tmp_path / "a", "lego", 24.0)
     dnerf(tmp_path / "b", "hook", 27.0)
     dnerf(tmp_path / "c", "lego", 25.0, model="six_planes", sampler="occupancy")
@@ -354,7 +354,7 @@ def test_means_stand_beside_what_was_published(tmp_path: Path) -> None:
     assert set(lines[-1][7:]) == {""}
 
 
-def test_published_figures_stand_beside_equal_resolutions_and_all_views_alone(tmp_path) -> None:
+def test_published_figures_stand_beside_equal_resolutions_and_all_views_alone(tmp_path):
     for number, (resolution, views) in enumerate(((64, None), (128, None), (128, 10))):
         run = dnerf(tmp_path / f"{number}", "lego", 30.0, model="nine_planes")
         set_to(run, model={"resolution": resolution}, lrm={"name": "xlarge"}, data={"views": views})
@@ -376,7 +376,7 @@ def named(folder: Path, *tables: str, early: bool = False) -> None:
 
 
 @pytest.mark.parametrize("early", [False, True])
-def test_a_named_table_is_shown_whole_whatever_the_data(tmp_path: Path, early: bool) -> None:
+def test_a_named_table_is_shown_whole_whatever_the_data(tmp_path, early):
     make(tmp_path / "a", model="kplanes")
     named(tmp_path, "Table 1", early=early)
     text = write_tables(tmp_path)
@@ -393,7 +393,7 @@ def test_a_named_table_is_shown_whole_whatever_the_data(tmp_path: Path, early: b
     assert "| 4D-GS " in write_tables(tmp_path)
 
 
-def test_an_unknown_table_is_refused() -> None:
+def test_an_unknown_table_is_refused():
     for names in (["Table 9"], "Table 1", None):
         with pytest.raises(ConfigError, match=r"published=.*: must be a list of some of Table 1"):
             check_published(names)
@@ -408,7 +408,7 @@ def decomposed(folder: Path, ranks: tuple[int, int, int]) -> Path:
     return run
 
 
-def test_decompositions_and_their_mean_rank_stand_in_the_table(tmp_path: Path) -> None:
+def test_decompositions_and_their_mean_rank_stand_in_the_table(tmp_path):
     decomposed(tmp_path / "0", (1, 2, 3))
     decomposed(tmp_path / "1", (4, 5, 9))
     make(tmp_path / "2", model="kplanes")
@@ -424,7 +424,7 @@ def test_decompositions_and_their_mean_rank_stand_in_the_table(tmp_path: Path) -
     assert f"Mean rank of the low-rank part: 4.00 over these 2 runs; published: {published}" in text
 
 
-def test_the_protocol_stands_above_the_table(tmp_path: Path) -> None:
+def test_the_protocol_stands_above_the_table(tmp_path):
     run = dnerf(tmp_path / "a", "lego", 24.0)
     trainer = {"max_steps": 30000, "max_seconds": None}
     set_to(run, trainer=trainer, model={"rays": {"background": "one"}})
@@ -435,7 +435,7 @@ def test_the_protocol_stands_above_the_table(tmp_path: Path) -> None:
     ) in write_tables(tmp_path)
 
 
-def test_psnr_is_drawn_against_a_setting_of_several_numbers(tmp_path: Path) -> None:
+def test_psnr_is_drawn_against_a_setting_of_several_numbers(tmp_path):
     pytest.importorskip("matplotlib", reason="needs the extra plots")
     for number, (model, resolution) in enumerate(itertools.product("ab", (64, 32))):
         make(tmp_path / f"{number}", model=model, resolution=resolution)
@@ -446,7 +446,7 @@ def test_psnr_is_drawn_against_a_setting_of_several_numbers(tmp_path: Path) -> N
         assert min(picture.size) > 300
 
 
-def test_means_keep_runs_with_other_settings_apart(tmp_path: Path) -> None:
+def test_means_keep_runs_with_other_settings_apart(tmp_path):
     for weight, psnr in ((0.0, 26.0), (0.5, 24.0)):
         run = dnerf(tmp_path / f"{weight}", "lego", psnr)
         set_to(run, model={"loss": {"initial_weight": weight}})
@@ -457,7 +457,7 @@ def test_means_keep_runs_with_other_settings_apart(tmp_path: Path) -> None:
     ]
 
 
-def test_nothing_is_set_beside_other_data(tmp_path: Path) -> None:
+def test_nothing_is_set_beside_other_data(tmp_path):
     make(tmp_path / "a", model="kplanes")
     assert "published" not in write_tables(tmp_path)
 
@@ -489,7 +489,7 @@ PRINTED = {
 """PSNR, SSIM and minutes that the paper prints, by LRM; those of Table 4 by texels, PSNR alone."""
 
 
-def test_the_papers_figures_are_those_that_it_prints() -> None:
+def test_the_papers_figures_are_those_that_it_prints():
     found: dict[tuple[str, str], dict[str, str]] = {}
     for entry in read_published():
         if entry["table"].startswith("Table"):
@@ -505,7 +505,7 @@ def test_the_papers_figures_are_those_that_it_prints() -> None:
     assert found == PRINTED
 
 
-def test_the_page_on_the_paper_quotes_them_where_they_stand() -> None:
+def test_the_page_on_the_paper_quotes_them_where_they_stand():
     page = (Path(__file__).parents[2] / "docs" / "paper.md").read_text(encoding="utf-8")
     six = "Table 2: {}; Table 3: {}, at the same PSNR"
     rows = (PRINTED[table, "six_planes"] for table in ("Table 2", "Table 3"))
@@ -514,7 +514,7 @@ def test_the_page_on_the_paper_quotes_them_where_they_stand() -> None:
     assert f"33.67 in Tables {' and '.join(t[-1] for t in held)}, 33.56 in Table 4" in page
 
 
-def test_published_figures_name_their_source_and_models_that_exist() -> None:
+def test_published_figures_name_their_source_and_models_that_exist():
     models = {path.stem for path in (CONF / "model").glob("*.yaml")}
     for entry in read_published():
         assert entry["source"]
@@ -524,7 +524,7 @@ def test_published_figures_name_their_source_and_models_that_exist() -> None:
         assert not entry["ssim"] or 0.5 < float(entry["ssim"]) < 1
 
 
-def test_settings_of_jobs_that_never_began_are_no_columns(tmp_path: Path) -> None:
+def test_settings_of_jobs_that_never_began_are_no_columns(tmp_path):
     for number, enabled in enumerate((False, "${viewer}")):
         run = make(tmp_path / f"{number}_lego", resolution=64 + number)
         set_to(run, callbacks={"viewer": {"enabled": enabled}})

@@ -28,7 +28,7 @@ def rendered(opacity: torch.Tensor, colour: torch.Tensor) -> Rendering:
     return Rendering(colour, opacity, empty, empty, samples=None)  # type: ignore[arg-type]
 
 
-def test_opacity_is_compared_with_alpha_or_with_what_a_colour_takes() -> None:
+def test_opacity_is_compared_with_alpha_or_with_what_a_colour_takes():
     opacity = torch.tensor([0.2, 0.9, 0.5], dtype=torch.float64, requires_grad=True)
     rays = {
         "alpha": torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64),
@@ -53,7 +53,7 @@ def test_opacity_is_compared_with_alpha_or_with_what_a_colour_takes() -> None:
     )
 
 
-def test_opacities_of_foreground_and_background() -> None:
+def test_opacities_of_foreground_and_background():
     rays = {
         "alpha": torch.tensor([0.0, 0.0, 1.0, 1.0, 0.4]),
         "target": torch.tensor([[1.0], [1], [0.2], [0.9], [0.2]]).expand(5, 3),
@@ -66,7 +66,7 @@ def test_opacities_of_foreground_and_background() -> None:
     assert all(math.isnan(value) for value in found.values())
 
 
-def test_a_verdict_needs_rays_that_tell() -> None:
+def test_a_verdict_needs_rays_that_tell():
     nothing, sound, unknown = (0.01, 0.01), (0.9, 0.02), (math.nan, math.nan)
     assert "shows nothing" in verdict([nothing] * 9 + [unknown], fog=False)
     assert verdict([sound] * 9 + [nothing], fog=True) == ""
@@ -85,8 +85,8 @@ def dead(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_dead_field_starts_again_once_and_then_a_warning_is_enough(
-    scenes: Path, tmp_path: Path, dead: None, caplog: pytest.LogCaptureFixture
-) -> None:
+    scenes, tmp_path, dead, caplog
+):
     fields = []
     restart = RadianceModule.restart
 
@@ -111,9 +111,7 @@ def test_a_dead_field_starts_again_once_and_then_a_warning_is_enough(
     assert fields[0].model.opacity == 1.0
 
 
-def test_a_run_that_began_again_resumes_to_the_same_numbers(
-    scenes: Path, tmp_path: Path, dead: None
-) -> None:
+def test_a_run_that_began_again_resumes_to_the_same_numbers(scenes, tmp_path, dead):
     config = small_config(scenes, *QUICK, "trainer.deterministic=true")
     run(config, tmp_path / "whole", [], resume=False)
     save = AtomicCheckpointIO.save_checkpoint
@@ -135,14 +133,14 @@ def test_a_run_that_began_again_resumes_to_the_same_numbers(
         assert whole[key] == parts[key], key
 
 
-def test_floaters_are_background_pixels_that_show_something() -> None:
+def test_floaters_are_background_pixels_that_show_something():
     alpha = torch.tensor([[0, 0, 0, 255], [0, 0, 128, 255]], dtype=torch.uint8)
     opacity = torch.tensor([[0.0, 0.06, 0.04, 1], [1, 0, 1, 1]])
     assert floaters(opacity, alpha) == pytest.approx(2 / 5)
     assert math.isnan(floaters(opacity, torch.full_like(alpha, 255)))
 
 
-def test_the_thing_is_scored_where_most_of_a_pixel_shows_it() -> None:
+def test_the_thing_is_scored_where_most_of_a_pixel_shows_it():
     truth, colour = torch.zeros(2, 2, 3), torch.zeros(2, 2, 3)
     colour[0], colour[1] = 0.1, 1.0
     mask = torch.tensor([[255, 128], [127, 0]], dtype=torch.uint8)
@@ -151,9 +149,7 @@ def test_the_thing_is_scored_where_most_of_a_pixel_shows_it() -> None:
     assert math.isnan(psnr_foreground(colour, truth, torch.zeros_like(mask)))
 
 
-def test_a_run_that_shows_nothing_says_so(
-    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_shows_nothing_says_so(scenes, tmp_path, capsys):
     """The decoder's density bias leaves the field empty, and there is no step to change it."""
     config = small_config(
         scenes, "trainer.max_steps=1", "model.decoder.density_bias=-60", "data.seed=0"
@@ -167,7 +163,7 @@ def test_a_run_that_shows_nothing_says_so(
         assert len(list(csv.DictReader(file))) == 2
 
 
-def test_blank_images_are_the_background() -> None:
+def test_blank_images_are_the_background():
     from tests.balls import ball_scene
 
     views = ball_scene().splits["test"]

@@ -47,7 +47,7 @@ def test_the_default_initialisation_is_a_bundled_model():
 
 
 @pytest.mark.parametrize("name", bundled_models())
-def test_it_knows_the_scene_before_the_first_step(train, random, tmp_path: Path, name):
+def test_it_knows_the_scene_before_the_first_step(train, random, tmp_path, name):
     informed = train(tmp_path / "run", f"lrm={name}")
     assert informed[0] > random[0] + 3
     assert informed[-1] > random[-1] + 1
@@ -57,7 +57,7 @@ def test_it_knows_the_scene_before_the_first_step(train, random, tmp_path: Path,
     assert content["seconds"]["prepare"]["fill"] > 0
 
 
-def test_a_scene_without_motion_trains_as_a_static_one(train, tmp_path: Path):
+def test_a_scene_without_motion_trains_as_a_static_one(train, tmp_path):
     folder = tmp_path / "run"
     train(folder, "lrm=tiny", "data.scene=still_life", "trainer.max_steps=1")
     assert (told(folder)["lrm"]["frames"], told(folder)["lrm"]["distinct"]) == (1, 1)

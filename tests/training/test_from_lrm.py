@@ -38,7 +38,7 @@ def metrics(folder: Path) -> dict:
     return json.loads((folder / "metrics.json").read_text())
 
 
-def test_a_run_from_the_scenes_video(settings, tmp_path: Path):
+def test_a_run_from_the_scenes_video(settings, tmp_path):
     folder = tmp_path / "run"
     run(settings(tmp_path, "triposr", "model=nine_planes"), folder, [], resume=False)
     told = metrics(folder)
@@ -67,7 +67,7 @@ def uninterrupted(settings, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("stopped", ["encode", "from_sequence"])
 def test_a_stopped_preparation_resumes_from_the_last_finished_stage(
-    settings, uninterrupted: Path, tmp_path: Path, monkeypatch, stopped
+    settings, uninterrupted, tmp_path, monkeypatch, stopped
 ):
     folder = tmp_path / "run"
     config = settings(tmp_path, "openlrm-1.1", "preparation.fixed_view=train")

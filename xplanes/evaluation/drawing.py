@@ -34,7 +34,7 @@ class Shot:
     """What a picture is to show.
 
     Attributes:
-        pose: Camera-to-world matrix, where the world is the field's frame. [4, 4]
+        pose: Camera-to-world matrix, in the field's frame. [4, 4]
         time: From 0 to 1.
         fov: Vertical field of view, in radians.
         height: Rows.
@@ -58,7 +58,7 @@ class Shot:
 
     @property
     def camera(self) -> PosedCamera:
-        """The camera, where the world is the field's frame."""
+        """The camera, in the field's frame."""
         focal = 0.5 * self.height / math.tan(0.5 * self.fov)
         return PosedCamera(self.pose, focal, self.height, self.width)
 

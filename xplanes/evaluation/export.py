@@ -196,8 +196,8 @@ def _write_times(
     """Write what changes with time; what `export.json` says of it."""
     paths = [folder / f"{options.what}_{number:04d}" for number in range(len(times))]
     if (write_own := trained.module.field.exports.get(options.what)) is not None:
-        moments = zip(paths, times, strict=True)
-        return {"files": [write_own(path, time, trained.frame).name for path, time in moments]}
+        pairs = zip(paths, times, strict=True)
+        return {"files": [write_own(path, time, trained.frame).name for path, time in pairs]}
     threshold = _threshold(trained, options, times)
     if threshold is not None:
         say(f"threshold   density {threshold:.4g}")
@@ -209,7 +209,7 @@ def _write_times(
         for _ in tqdm(written, "times", len(times), leave=False, delay=2, disable=None):
             pass
     except ConfigError:
-        for path in files:  # So that the way out, another threshold, may write here.
+        for path in files:  # So that another threshold can be tried in this folder.
             path.unlink(missing_ok=True)
         raise
     facts = {"resolution": options.resolution, "threshold": threshold}
@@ -247,7 +247,7 @@ def _threshold(trained: TrainedRun, options: ExportOptions, times: list[float]) 
 def shape_at(
     trained: TrainedRun, time: float, resolution: int, threshold: float | None, count: int | None
 ) -> Shape:
-    """The coloured surface of one timestep, in the world.
+    """The coloured surface of one timestep, in world coordinates.
 
     Args:
         trained: The run.

@@ -1,4 +1,4 @@
-"""What may be wrong with a capture: findings, each with its numbers and the way out."""
+"""What may be wrong with a capture: findings, each with its numbers and a remedy."""
 
 import hashlib
 import math
@@ -316,7 +316,7 @@ def _shared(scene: Scene) -> Iterator[Finding]:
             near = (poses - pose.double()).abs().flatten(1).amax(dim=1) <= max(room, 1e-9)
             near &= (train.times - time).abs() <= 1e-6
             other = names.get(file)
-            # Formats of the user's own may name the files of each split by themselves.
+            # User-defined formats may use the same file names in several splits.
             if other is not None and torch.equal(views.image(index), train.image(other)):
                 found.append((file, file))
             elif near.any():

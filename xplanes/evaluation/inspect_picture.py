@@ -152,7 +152,7 @@ class _Plan:
 def _cameras(side: int, title: str, axes: str, capture: Capture) -> Image.Image:
     """Cameras with their frusta, points, the cube, and rays through the corners of some images.
 
-    They are drawn by themselves, since rays leave the panel.
+    They have a sheet of their own, since rays leave the panel.
     """
     sheet = _Sheet(side, side)
     sheet.box((0, 0, side, side), fill=PANEL)

@@ -148,7 +148,7 @@ class SweepTable(Callback):
         reason = f"{type(value).__name__}: {value}"
         _say(f"job {config.hydra.job.num} failed: {reason}  {run.name}")
         if not (run / "run.json").exists():
-            # It failed before it could keep a record of its own.
+            # It failed before it wrote its record.
             write_json(run / "run.json", {"status": "failed", "reason": reason})
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:

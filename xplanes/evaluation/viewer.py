@@ -140,7 +140,7 @@ class Viewer:
         self._ticked = time.monotonic()
         # A browser may leave while its picture is drawn.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
-        with _silence():  # It prints an address of its own.
+        with _silence():  # viser prints its own message.
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.gui.set_panel_label("X-Planes")

@@ -114,7 +114,7 @@ def score_view(
 def gathered(scores: Sequence[ViewScore], trainer: Trainer) -> list[ViewScore]:
     """The scores of all processes, each of which scores every n-th view, in order.
 
-    A process without a view of its own has scored one of another's, which counts once.
+    A process that has no view scores one of another process, which counts once.
     """
     if trainer.world_size == 1:
         return list(scores)

@@ -39,7 +39,7 @@ def check_outputs(folder: Path) -> None:
     assert len(json.loads((written / "web" / "export.json").read_text())["times"]) == 8
 
 
-def test_the_script_runs(settings, tmp_path):
+def test_the_script_runs(settings: None, tmp_path: Path) -> None:
     command = [sys.executable, str(EXAMPLES / "first_minute.py")]
     done = subprocess.run(command, env=os.environ, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -48,7 +48,7 @@ def test_the_script_runs(settings, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_notebook_runs(settings, tmp_path):
+def test_the_notebook_runs(settings: None, tmp_path: Path) -> None:
     """Its cells are those of the script, which tests/test_docs.py checks."""
     nbformat: Any = pytest.importorskip("nbformat")
     nbclient: Any = pytest.importorskip("nbclient")

@@ -54,7 +54,7 @@ REFUSED = (
 )
 
 
-def test_settings_are_checked_before_the_run_directory_is_made(tmp_path, monkeypatch):
+def test_settings_are_checked_before_the_run_directory_is_made(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     for override in REFUSED:
         with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -68,19 +68,19 @@ def test_settings_are_checked_before_the_run_directory_is_made(tmp_path, monkeyp
     assert not list(tmp_path.iterdir())
 
 
-def test_missing_scene_says_where_to_get_one(tmp_path):
+def test_missing_scene_says_where_to_get_one(tmp_path: Path) -> None:
     folder = f"hydra.run.dir={tmp_path / 'run'}"
     result = train("data=dnerf", f"data.root={tmp_path}", "data.scene=nothing", folder, code=1)
     assert str(tmp_path / "nothing") in result.stderr
     assert "data=demo" in result.stderr
 
 
-def test_devices_in_a_sweep_are_refused(tmp_path):
+def test_devices_in_a_sweep_are_refused(tmp_path: Path) -> None:
     result = train("-m", "trainer=ddp", "seed=0,1", f"hydra.sweep.dir={tmp_path}", code=1)
     assert "one device per job" in (result.stdout + result.stderr)
 
 
-def test_sweeps_are_resumed_job_by_job():
+def test_sweeps_are_resumed_job_by_job() -> None:
     for sweep in (["-m", "sweep=fair"], ["-m"], ["--multirun"], ["hydra.mode=MULTIRUN"]):
         with pytest.raises(ConfigError, match="one run at a time"):
             prepare([*sweep, "resume=somewhere"])
@@ -89,7 +89,7 @@ def test_sweeps_are_resumed_job_by_job():
             prepare([*single, "resume=somewhere"])
 
 
-def test_auto_goes_on_with_the_newest_run_of_the_same_settings(tmp_path, monkeypatch):
+def test_auto_goes_on_with_the_newest_run_of_the_same_settings(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     own = ["model.resolution=8", "data.scene=a/b"]
     assert prepare([*own, "resume=auto"]) == [*own, "resume=null"]
@@ -105,7 +105,7 @@ def test_auto_goes_on_with_the_newest_run_of_the_same_settings(tmp_path, monkeyp
     assert prepare([*own, "resume=auto"])[-1] == "resume=null"
 
 
-def test_runs_in_folders_of_any_name_are_resumed(tmp_path):
+def test_runs_in_folders_of_any_name_are_resumed(tmp_path: Path) -> None:
     run = tmp_path / "my scene (1), a=b & c"
     run.mkdir()
     (run / "overrides.txt").write_text("seed=3\n")
@@ -116,7 +116,7 @@ def test_runs_in_folders_of_any_name_are_resumed(tmp_path):
     assert shlex.split(resume_command(run))[-1] == f"resume={run}"
 
 
-def test_auto_finds_runs_whatever_was_said_to_hydra(tmp_path, monkeypatch):
+def test_auto_finds_runs_whatever_was_said_to_hydra(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "outputs" / "run"
     run.mkdir(parents=True)
@@ -127,7 +127,7 @@ def test_auto_finds_runs_whatever_was_said_to_hydra(tmp_path, monkeypatch):
     assert prepare([own[0], own[2], "resume=auto"])[-1] == "resume=null"
 
 
-def test_a_sweep_does_not_take_other_jobs_for_its_own(tmp_path):
+def test_a_sweep_does_not_take_other_jobs_for_its_own(tmp_path: Path) -> None:
     (tmp_path / "overrides.txt").write_text("model.plane_lr=0.002\ntrainer.max_steps=9\n")
     for same in (
         ["model.plane_lr=0.002", "resume=auto"],
@@ -139,7 +139,7 @@ def test_a_sweep_does_not_take_other_jobs_for_its_own(tmp_path):
             launch._require_same_job(tmp_path, other)
 
 
-def test_what_hydra_knows_may_stand_in_settings(scenes, tmp_path):
+def test_what_hydra_knows_may_stand_in_settings(scenes: Path, tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(scenes)
     result = train(
         *(option for option in SMALL if not option.startswith("trainer.max_steps")),
@@ -153,13 +153,13 @@ def test_what_hydra_knows_may_stand_in_settings(scenes, tmp_path):
     assert "psnr" in result.stdout
 
 
-def test_a_group_set_to_null_is_answered_with_its_choices():
+def test_a_group_set_to_null_is_answered_with_its_choices() -> None:
     for group, choice in (("logger", "none"), ("lrm", "tiny"), ("callbacks", "default")):
         with pytest.raises(ConfigError, match=rf"{group}=null: must be one of .*{choice}"):
             prepare([f"{group}=null"])
 
 
-def test_a_run_goes_on_from_another_directory(scenes, tmp_path):
+def test_a_run_goes_on_from_another_directory(scenes: Path, tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     (tmp_path / "a" / "scenes").symlink_to(scenes)
@@ -172,7 +172,7 @@ def test_a_run_goes_on_from_another_directory(scenes, tmp_path):
     assert not list((tmp_path / "b").iterdir())
 
 
-def test_a_stopped_sweep_says_how_the_whole_of_it_goes_on(tmp_path, monkeypatch, capsys):
+def test_a_stopped_sweep_says_how_the_whole_of_it_goes_on(tmp_path, monkeypatch, capsys) -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         chosen = ["hydra.mode=MULTIRUN", f"hydra.sweep.dir={tmp_path}", "hydra.job.num=0"]
         chosen += [f"hydra.runtime.output_dir={tmp_path}", "hydra.job.id=0"]
@@ -202,7 +202,7 @@ def test_a_stopped_sweep_says_how_the_whole_of_it_goes_on(tmp_path, monkeypatch,
         (".5", ".5"),
     ],
 )
-def test_run_directories_have_names_that_need_no_quotes(scene, name):
+def test_run_directories_have_names_that_need_no_quotes(scene: str, name: str) -> None:
     assert file_name(scene) == name
     with initialize_config_dir(str(CONF), version_base="1.3"):
         overrides = [f"data.scene={quoted(scene)}", "hydra.job.num=3"]
@@ -211,7 +211,7 @@ def test_run_directories_have_names_that_need_no_quotes(scene, name):
     assert config.hydra.sweep.subdir == f"3_{name}_six_planes_tiny_s0"
 
 
-def test_names_of_scenes_may_look_like_numbers():
+def test_names_of_scenes_may_look_like_numbers() -> None:
     for name in ("2024_05_01", "1e3", "007", "1.0", "12"):
         with initialize_config_dir(str(CONF), version_base="1.3"):
             config = compose("train", prepare([f"data.scene={name}", f"data.root={name}"]))
@@ -230,7 +230,7 @@ HARD = (
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_any_path_can_be_given(name, tmp_path, monkeypatch):
+def test_any_path_can_be_given(name: str, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     keys = ("data.root", "data.cache", "resume", "hydra.run.dir")
     given = [f"{key}={name}" for key in keys if key != "resume"]
@@ -242,13 +242,13 @@ def test_any_path_can_be_given(name, tmp_path, monkeypatch):
     assert unquoted(quoted(name)) == name
 
 
-def test_quotes_keep_any_text():
+def test_quotes_keep_any_text() -> None:
     for length in range(1, 5):
         for text in map("".join, itertools.product("\\\\'\"a ", repeat=length)):
             assert unquoted(quoted(text)) == text
 
 
-def test_home_is_expanded(monkeypatch, tmp_path):
+def test_home_is_expanded(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("USERPROFILE", str(tmp_path))
     assert with_names("data.root=~/my captures") == f"data.root='{tmp_path}/my captures'"
@@ -264,7 +264,7 @@ def test_home_is_expanded(monkeypatch, tmp_path):
     assert (settings.masks, settings.times) == (f"{tmp_path}/m", f"{tmp_path}/t.csv")
 
 
-def test_piped_output_is_plain_and_ends_with_scores_and_paths(root, tmp_path):
+def test_piped_output_is_plain_and_ends_with_scores_and_paths(root: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     result = train(root, *SMALL, "trainer.max_steps=5", f"hydra.run.dir={run}")
     assert "\x1b" not in result.stdout
@@ -296,7 +296,7 @@ exec(compile(open({train!r}).read(), {train!r}, "exec"), globals())
 
 
 @pytest.mark.slow
-def test_two_processes_share_the_rays_and_end_with_one_model(root, tmp_path):
+def test_two_processes_share_the_rays_and_end_with_one_model(root: str, tmp_path: Path) -> None:
     run, script = tmp_path / "run", tmp_path / "each_rank.py"
     script.write_text(
         EACH_RANK.format(root=str(ROOT), train=str(ROOT / "train.py"), folder=str(tmp_path))
@@ -341,7 +341,7 @@ def test_two_processes_share_the_rays_and_end_with_one_model(root, tmp_path):
 
 
 @pytest.mark.slow
-def test_two_processes_stop_together_and_resume(root, tmp_path):
+def test_two_processes_stop_together_and_resume(root: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     checkpoint = run / "checkpoints" / "last.ckpt"
     process = subprocess.Popen(
@@ -376,7 +376,7 @@ def start(run: Path, root: str) -> warm.Running:
     )
 
 
-def test_ctrl_c_saves_and_says_how_to_go_on(root, tmp_path):
+def test_ctrl_c_saves_and_says_how_to_go_on(root: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     process = start(run, root)
     warm.wait_for(run / "checkpoints" / "last.ckpt", process)
@@ -386,7 +386,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(root, tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_and_resumed_run_ends_with_the_same_numbers(root, tmp_path):
+def test_killed_and_resumed_run_ends_with_the_same_numbers(root: str, tmp_path: Path) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert start(whole, root).wait(240) == 0
     process = start(killed, root)
@@ -399,7 +399,7 @@ def test_killed_and_resumed_run_ends_with_the_same_numbers(root, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_resumed_run_finds_groups_of_the_users_own_again(root, tmp_path):
+def test_a_resumed_run_finds_groups_of_the_users_own_again(root: str, tmp_path: Path) -> None:
     conf, run = tmp_path / "conf", tmp_path / "run"
     (conf / "model").mkdir(parents=True)
     (conf / "model" / "own.yaml").write_text("defaults: [six_planes]\nname: own\n")
@@ -415,7 +415,7 @@ def test_a_resumed_run_finds_groups_of_the_users_own_again(root, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_field_renders_the_scene_inside_a_job(root, tmp_path):
+def test_a_field_renders_the_scene_inside_a_job(root: str, tmp_path: Path) -> None:
     # That field's own settings are composed while Hydra's job is under way.
     folder = tmp_path / "run"
     result = train(

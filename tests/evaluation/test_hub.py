@@ -124,7 +124,7 @@ def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, type[Hub]]]:
     server.server_close()
 
 
-def test_a_run_comes_back_from_the_hub_as_it_was_pushed(hub, trained_run, tmp_path):
+def test_a_run_comes_back_from_the_hub_as_it_was_pushed(hub, trained_run: Path, tmp_path: Path):
     address, held = hub
     said: list[str] = []
     url = push(trained_run, "somebody/excavator", say=said.append, endpoint=address)
@@ -155,7 +155,7 @@ def test_a_run_comes_back_from_the_hub_as_it_was_pushed(hub, trained_run, tmp_pa
     assert said[-1].startswith("offline     ")
 
 
-def test_what_names_the_machine_stays_there(hub, trained_run):
+def test_what_names_the_machine_stays_there(hub, trained_run: Path):
     address, held = hub
     push(trained_run, "somebody/excavator", say=print, endpoint=address)
     mine = json.loads((trained_run / "run.json").read_text())
@@ -169,7 +169,7 @@ def card_of(run: Path) -> tuple[dict[str, Any], str]:
     return yaml.safe_load(head), text
 
 
-def test_the_model_card_has_scores_command_and_licence(trained_run, tmp_path):
+def test_the_model_card_has_scores_command_and_licence(trained_run: Path, tmp_path: Path):
     head, text = card_of(trained_run)
     metrics = json.loads((trained_run / "metrics.json").read_text())
     assert head["library_name"] == "xplanes"
@@ -199,7 +199,9 @@ def test_the_model_card_has_scores_command_and_licence(trained_run, tmp_path):
     assert "bundled with X-Planes (MIT licence)" in card_of(run)[1]
 
 
-def test_commands_read_a_run_of_the_hub(hub, trained_run, tmp_path, monkeypatch, capsys):
+def test_commands_read_a_run_of_the_hub(
+    hub, trained_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+):
     address, _ = hub
     monkeypatch.chdir(tmp_path)
     for name, verb in (("push", push), ("fetch", fetch)):
@@ -213,7 +215,9 @@ def test_commands_read_a_run_of_the_hub(hub, trained_run, tmp_path, monkeypatch,
     assert "fetching    hf://somebody/excavator" in capsys.readouterr().out
 
 
-def test_what_cannot_be_is_refused_in_words(hub, trained_run, tmp_path, monkeypatch):
+def test_what_cannot_be_is_refused_in_words(
+    hub, trained_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     address, _ = hub
     options: dict[str, Any] = {"say": print, "outputs": tmp_path}
     with pytest.raises(ConfigError, match="excavator: a repository on the hub is written USER/"):

@@ -301,7 +301,7 @@ def test_training_is_the_same_with_a_viewer_to_the_last_bit(name, tmp_path, watc
     for key, value in plain.state_dict().items():
         assert torch.equal(value, seen.state_dict()[key]), key
     assert plain.tally.counts == seen.tally.counts
-    assert plain.last == pytest.approx(seen.last, abs=0, nan_ok=True)
+    assert plain.tally.last == pytest.approx(seen.tally.last, abs=0, nan_ok=True)
 
 
 def test_a_run_has_a_viewer_when_asked_to(scenes, tmp_path, watched, capsys):

@@ -1,7 +1,6 @@
 """Callbacks, loggers and arguments of Lightning's that do not go with training as it is here."""
 
 import csv
-import json
 import warnings
 from pathlib import Path
 from typing import Any
@@ -9,11 +8,10 @@ from typing import Any
 import lightning
 import numpy as np
 import pytest
-import torch
 from lightning.pytorch import callbacks
 from lightning.pytorch.loggers import CSVLogger
 
-from tests.training.runs import small_config
+from tests.training.runs import checkpoint, metrics, small_config
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError
 from xplanes.evaluation.evaluate import evaluate
@@ -78,7 +76,7 @@ def test_a_state_that_could_not_be_read_again_is_refused_at_once(scenes, tmp_pat
     assert not list((tmp_path / "numpy").rglob("*.ckpt"))
     config["callbacks"]["mine"]["kind"] = "float"
     run(config, tmp_path / "float", [], resume=False)
-    kept = torch.load(tmp_path / "float" / "checkpoints" / "last.ckpt", weights_only=True)
+    kept = checkpoint(tmp_path / "float")
     assert {"mean": 1.5} in kept["callbacks"].values()
 
 
@@ -111,12 +109,12 @@ def test_scores_are_of_the_averaged_weights_that_checkpoints_hold(scenes, tmp_pa
     name = "lightning.pytorch.callbacks.EMAWeightAveraging"
     config["callbacks"]["average"] = {"_target_": name, "decay": 0.98}
     run(config, tmp_path / "run", [], resume=False)
-    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    found = metrics(tmp_path / "run")
     again = evaluate(load_run(tmp_path / "run"), "none")
     assert found["test"]["psnr"] == pytest.approx(again["test"]["psnr"], abs=1e-6)
     plain = small_config(scenes, "trainer.max_steps=60", "data.eval_split=val")
     run(plain, tmp_path / "plain", [], resume=False)
-    raw = json.loads((tmp_path / "plain" / "metrics.json").read_text())
+    raw = metrics(tmp_path / "plain")
     assert abs(raw["test"]["psnr"] - found["test"]["psnr"]) > 0.1
 
 

@@ -14,7 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from hydra_plugins.xplanes import ALIASES
 from tests import warm
-from tests.training.runs import SMALL, small_config
+from tests.training.runs import SMALL, metrics, small_config, status
 from tests.warm import forked
 from xplanes.cli import main
 from xplanes.config import CONF, compose_plain
@@ -226,7 +226,7 @@ def test_a_run_that_failed_before_its_first_checkpoint_blocks_nothing(
     monkeypatch.setattr(RadianceModule, "training_step", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         run(config, tmp_path / "run", [], resume=False)
-    assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "failed"
+    assert status(tmp_path / "run")["status"] == "failed"
     monkeypatch.undo()
     run(config, tmp_path / "run", [], resume=False)
     with pytest.raises(ConfigError, match="holds a run already"):
@@ -302,8 +302,8 @@ def test_tensorboard_drops_what_a_run_that_was_cut_off_has_left(tmp_path):
 def test_arguments_of_lightnings_trainer_and_its_callbacks_work(extra, scenes, tmp_path):
     short = (f"data.root={scenes}", "callbacks.evaluation.at=[1]", "trainer.max_steps=3")
     run(compose_plain("train", [*SMALL, *short, *extra]), tmp_path / "run", [], resume=False)
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert metrics["step"] == (1 if "fast" in extra[0] else 3)
+    content = metrics(tmp_path / "run")
+    assert content["step"] == (1 if "fast" in extra[0] else 3)
 
 
 def test_a_run_says_at_its_ends_what_it_takes_and_what_comes_next(scenes, tmp_path, capsys):
@@ -317,7 +317,7 @@ def test_a_run_says_at_its_ends_what_it_takes_and_what_comes_next(scenes, tmp_pa
     assert "GB" not in line  # Fragments of the heap, which nothing foretells, are half of it.
     assert printed.index("estimate") < printed.index("step 6/6")
     last = printed.split("step 6/6")[1]
-    peak = json.loads((tmp_path / "metrics.json").read_text())["peak_memory_bytes"]
+    peak = metrics(tmp_path)["peak_memory_bytes"]
     assert f"memory   {peak / 2**30:.1f} GB" in last
     assert "tensorboard --logdir" in last
     assert f"xplanes render {tmp_path}" in last

@@ -1,7 +1,6 @@
 """Models, samplers, data formats and losses from outside the package, chosen by configuration."""
 
 import csv
-import json
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -11,7 +10,7 @@ import pytest
 import torch
 import yaml
 
-from tests.training.runs import small_config
+from tests.training.runs import metrics, small_config
 from xplanes import RadianceModule, SceneDataModule, __version__
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
@@ -68,7 +67,7 @@ def test_all_four_train_log_and_load_again(config, tmp_path):
     assert again.field.width == BLOB["width"]
     views = SceneDataModule.from_run(folder, plugins=["tests.plugins"]).scene.splits["train"]
     assert len(views) == DATA["count"]
-    assert json.loads((folder / "metrics.json").read_text())["step"] == 40
+    assert metrics(folder)["step"] == 40
 
 
 def test_a_recipe_reaches_a_model_of_ones_own_or_names_itself(tmp_path):
@@ -206,9 +205,9 @@ def test_the_lrm_of_the_docs_initialises_a_field(example, tmp_path):
     changes += ("trainer.max_steps=2",)
     own = example("A Large Reconstruction Model", "lrm", "cardboard", *changes)
     run(own, tmp_path / "own", [], resume=False)
-    metrics = json.loads((tmp_path / "own" / "metrics.json").read_text())
-    assert metrics["lrm"]["frames"] == 4
-    assert metrics["decomposition"]["xz"]["converged"]
+    content = metrics(tmp_path / "own")
+    assert content["lrm"]["frames"] == 4
+    assert content["decomposition"]["xz"]["converged"]
     assert (tmp_path / "own" / "media" / "fixed_view.png").is_file()
     random = compose_plain("train", ["lrm=none"])["lrm"]
     run(own | {"lrm": random}, tmp_path / "random", [], resume=False)

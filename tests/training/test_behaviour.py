@@ -1,7 +1,6 @@
 """Runs: outputs, determinism, interruption and resuming."""
 
 import csv
-import json
 import signal
 import weakref
 from collections.abc import Callable
@@ -12,7 +11,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from tests.training.runs import small_config
+from tests.training.runs import checkpoint, metrics, small_config, status
 from xplanes.errors import ConfigError
 from xplanes.files import read_rows
 from xplanes.models.initialisation import STAGES
@@ -24,14 +23,6 @@ from xplanes.training.checkpoints import AtomicCheckpointIO
 from xplanes.training.clock import TrainingClock
 from xplanes.training.evaluation import Evaluation
 from xplanes.training.module import RadianceModule
-
-
-def metrics(folder: Path) -> dict:
-    return json.loads((folder / "metrics.json").read_text())
-
-
-def status(folder: Path) -> dict:
-    return json.loads((folder / "run.json").read_text())
 
 
 def curve(folder: Path) -> list[dict[str, str]]:
@@ -191,7 +182,7 @@ def test_a_second_interrupt_saves_no_half_of_a_step(scenes, tmp_path, monkeypatc
     folder = tmp_path / "stopped"
     with pytest.raises(KeyboardInterrupt):
         run(small_config(scenes, "callbacks.evaluation.at=[]"), folder, [], resume=False)
-    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    state = checkpoint(folder)
     assert (state["global_step"], state["progress"]["batches"]) == (10, 10)
 
 
@@ -201,7 +192,7 @@ def test_an_interrupt_waits_for_the_update_of_its_batches(scenes, tmp_path, monk
     config = small_config(scenes, "trainer.accumulate_grad_batches=3", "callbacks.evaluation.at=[]")
     with pytest.raises(KeyboardInterrupt):
         run(config, folder, [], resume=False)
-    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    state = checkpoint(folder)
     assert (state["global_step"], state["progress"]["batches"]) == (3, 9)
 
 
@@ -217,7 +208,7 @@ def test_interrupt_saves_the_step_it_stopped_at_and_its_evaluation_is_done_again
         run(config, folder, [], resume=False)
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
     assert status(folder)["status"] == "interrupted"
-    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    state = checkpoint(folder)
     assert state["global_step"] == 20
     assert [row["step"] for row in curve(folder)] == ["0"]
     monkeypatch.undo()
@@ -328,7 +319,7 @@ def test_few_shot_run_names_its_views_and_accumulated_batches_make_one_step(scen
     assert len(files) == 3
     assert files[0].endswith("r_000.png")
     assert files[-1].endswith("r_009.png")
-    state = torch.load(tmp_path / "few" / "checkpoints" / "last.ckpt", weights_only=True)
+    state = checkpoint(tmp_path / "few")
     assert (state["global_step"], state["progress"]["batches"]) == (4, 8)
 
 
@@ -344,7 +335,7 @@ def test_a_scene_without_motion_has_no_time_planes(scenes, tmp_path):
             scenes, "trainer.max_steps=2", "callbacks.evaluation.at=[]", *overrides
         )
         run(config, folder, [], resume=False)
-        state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+        state = checkpoint(folder)
         assert ("field.time" in state["state_dict"]) == (reason is None), overrides
         assert metrics(folder)["skipped"]["static"] == (0.0 if reason is None else 1.0), overrides
         text = (folder / "train.log").read_text()
@@ -371,5 +362,5 @@ def test_a_bad_batch_takes_those_of_its_update_along(scenes, tmp_path, monkeypat
     run(config, tmp_path / "run", [], resume=False)
     content = metrics(tmp_path / "run")
     assert (content["steps_skipped"], content["step"]) == (1, 3)
-    state = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
+    state = checkpoint(tmp_path / "run")
     assert {float(each["step"]) for each in state["optimizer_states"][0]["state"].values()} == {2}

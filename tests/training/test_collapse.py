@@ -1,14 +1,13 @@
 """A field that shows nothing is noticed, said and started again; opacity is supervised."""
 
 import csv
-import json
 import math
 from pathlib import Path
 
 import pytest
 import torch
 
-from tests.training.runs import small_config
+from tests.training.runs import metrics, small_config
 from xplanes.errors import ConfigError
 from xplanes.models.base import background_opacity, opacity_error, opacity_shortfall
 from xplanes.rendering.base import Rendering
@@ -106,8 +105,8 @@ def test_a_dead_field_starts_again_once_and_then_a_warning_is_enough(
     assert ["again" in line for line in words] == [True, False]
     assert "at step 10" in words[0]
     assert "data.half_side" in words[1]
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert metrics["restarts"] == 1
+    content = metrics(tmp_path / "run")
+    assert content["restarts"] == 1
     assert fields[0].model.opacity == 1.0
 
 
@@ -126,9 +125,7 @@ def test_a_run_that_began_again_resumes_to_the_same_numbers(scenes, tmp_path, de
         with pytest.raises(OSError, match="cut off"):
             run(config, tmp_path / "parts", [], resume=False)
     run(config, tmp_path / "parts", [], resume=True)
-    whole, parts = (
-        json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("whole", "parts")
-    )
+    whole, parts = (metrics(tmp_path / name) for name in ("whole", "parts"))
     for key in ("test", "views", "restarts", "samples_per_ray"):
         assert whole[key] == parts[key], key
 
@@ -156,9 +153,9 @@ def test_a_run_that_shows_nothing_says_so(scenes, tmp_path, capsys):
     )
     run(config, tmp_path / "run", [], resume=False)
     assert "this run shows nothing yet" in capsys.readouterr().out
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert metrics["test"]["psnr"] == pytest.approx(metrics["blank_psnr"], abs=0.01)
-    assert metrics["test"]["floaters"] == 0
+    content = metrics(tmp_path / "run")
+    assert content["test"]["psnr"] == pytest.approx(content["blank_psnr"], abs=0.01)
+    assert content["test"]["floaters"] == 0
     with (tmp_path / "run" / "curve.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 2
 

@@ -1,6 +1,5 @@
 """Runs initialised from a triplane file: outputs, resuming, loading."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -8,7 +7,7 @@ import torch
 from PIL import Image
 
 from tests.preparation.sequences import moving_sequence
-from tests.training.runs import small_config
+from tests.training.runs import checkpoint, metrics, small_config
 from xplanes.decomposition import decompose, unexplained_energy
 from xplanes.decomposition.conversion import frame_profiles
 from xplanes.errors import ConfigError
@@ -73,12 +72,8 @@ UNSCORED = "callbacks.evaluation.at=[]"
 """Training alone is looked at."""
 
 
-def metrics(folder: Path) -> dict:
-    return json.loads((folder / "metrics.json").read_text())
-
-
 def weights(folder: Path) -> dict[str, torch.Tensor]:
-    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    state = checkpoint(folder)
     return state["state_dict"]
 
 
@@ -123,7 +118,7 @@ def test_the_parts_are_logged_as_an_image_and_the_loss_as_a_curve(trained):
 
 
 def test_the_sparse_part_is_in_no_checkpoint(trained, place):
-    state = torch.load(trained / "checkpoints" / "last.ckpt", weights_only=True)
+    state = checkpoint(trained)
     elements = 8 * 3 * 8 * 16 * 16
     assert all(value.numel() != elements for value in state["state_dict"].values())
     assert not [key for key in state["state_dict"] if "sparse" in key or "product" in key]

@@ -1,6 +1,5 @@
 """Numbers that are not finite reach neither parameters nor checkpoints."""
 
-import json
 import math
 import re
 import shutil
@@ -13,7 +12,7 @@ import pytest
 import torch
 from torch import nn
 
-from tests.training.runs import small_config
+from tests.training.runs import checkpoint, metrics, small_config, status
 from xplanes.errors import ConfigError
 from xplanes.models.base import LossTerm
 from xplanes.models.x_planes import XPlanesModel
@@ -35,10 +34,6 @@ LONG = ("trainer.max_steps=40", "callbacks.checkpoints.every=5", "callbacks.eval
 
 FEW = ("trainer.max_steps=12", "callbacks.checkpoints.every=5", "callbacks.evaluation.at=[]")
 SCORED = (*FEW, "callbacks.evaluation.at=[0.4]")
-
-
-def state(run_folder: Path) -> dict:
-    return torch.load(run_folder / "checkpoints" / "last.ckpt", weights_only=True)
 
 
 def test_a_gradient_is_usable_if_adam_can_square_it():
@@ -82,9 +77,9 @@ def spoil_gradient(monkeypatch: pytest.MonkeyPatch, value: float, steps: range) 
 def test_one_bad_gradient_costs_one_step(scenes, tmp_path, monkeypatch):
     spoil_gradient(monkeypatch, 1e25, range(3, 4))
     run(small_config(scenes, *FEW, "trainer.max_steps=6"), tmp_path, [], resume=False)
-    content = json.loads((tmp_path / "metrics.json").read_text())
+    content = metrics(tmp_path)
     assert (content["steps_skipped"], content["step"]) == (1, 6)
-    assert not_finite(state(tmp_path)["state_dict"].items()) == []
+    assert not_finite(checkpoint(tmp_path)["state_dict"].items()) == []
 
 
 def test_gradients_that_stay_bad_end_training_with_a_message(scenes, tmp_path, monkeypatch):
@@ -92,7 +87,7 @@ def test_gradients_that_stay_bad_end_training_with_a_message(scenes, tmp_path, m
     words = r"20 steps.*from step 7 on.*gradient of field\.space.*resume="
     with pytest.raises(TrainingError, match=words):
         run(small_config(scenes, *LONG), tmp_path / "all", [], resume=False)
-    kept = state(tmp_path / "all")
+    kept = checkpoint(tmp_path / "all")
     # Left out, a step counts, and changes nothing.
     assert kept["global_step"] == 25
     assert {float(each["step"]) for each in kept["optimizer_states"][0]["state"].values()} == {7}
@@ -221,10 +216,10 @@ def test_a_checkpoint_never_holds_what_is_not_finite(scenes, tmp_path, monkeypat
     monkeypatch.setattr(TrainingClock, "on_train_batch_end", spoil)
     with pytest.raises(TrainingError, match=r"step 10: field\.decoder\.layers\.0\.bias"):
         run(small_config(scenes, *FEW), tmp_path / "spoiled", [], resume=False)
-    assert state(tmp_path / "spoiled")["global_step"] == 5
+    assert checkpoint(tmp_path / "spoiled")["global_step"] == 5
     monkeypatch.undo()
     run(small_config(scenes, *FEW), tmp_path / "spoiled", [], resume=True)
-    assert state(tmp_path / "spoiled")["global_step"] == 12
+    assert checkpoint(tmp_path / "spoiled")["global_step"] == 12
 
 
 @pytest.fixture(scope="module")
@@ -274,8 +269,8 @@ def test_a_damaged_checkpoint_gives_way_to_the_best(scenes, whole, folder, caplo
     run(small_config(scenes, *SCORED), folder, [], resume=True)
     assert "last.ckpt cannot be read" in caplog.text
     assert "Continuing from" in caplog.text
-    for name, value in state(whole)["state_dict"].items():
-        assert torch.equal(value, state(folder)["state_dict"][name]), name
+    for name, value in checkpoint(whole)["state_dict"].items():
+        assert torch.equal(value, checkpoint(folder)["state_dict"][name]), name
 
 
 def test_damaged_checkpoints_alone_are_refused_with_a_message(tmp_path):
@@ -304,5 +299,5 @@ def test_a_damaged_record_does_not_end_a_run(scenes, folder, caplog):
         run(small_config(scenes, *SCORED), folder, [], resume=False)
     run(small_config(scenes, *SCORED), folder, [], resume=True)
     assert "record of this run starts again" in caplog.text
-    record = json.loads((folder / "run.json").read_text())
+    record = status(folder)
     assert (record["status"], record["resumed"]) == ("finished", 1)

@@ -2,8 +2,10 @@
 
 import atexit
 import os
+import re
 import sys
 import traceback
+from collections import Counter
 from collections.abc import MutableMapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -73,8 +75,8 @@ def write_tables(folder: Path, out: Path | None = None) -> str:
 
 def _counts(rows: Sequence[RunRow]) -> str:
     """Number of runs by how they ended, and the split of their scores."""
-    kinds = [row.status.split(":")[0].split(",")[0].split(";")[0] for row in rows]
-    tally = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+    kinds = Counter(re.split("[:,;]", row.status)[0] for row in rows)
+    tally = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
     splits = {row.split for row in rows if row.split}
     scored = f" Scores of the {splits.pop()} split." if len(splits) == 1 else ""
     return f"{len(rows)} runs: {tally}.{scored}"

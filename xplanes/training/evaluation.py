@@ -94,9 +94,8 @@ class Evaluation(Callback):
         dataloader_idx: int = 0,
     ) -> None:
         if batch_idx < SHOWN and trainer.is_global_zero:
-            parts = (outputs[name].float() for name in ("colour", "depth", "opacity"))
-            colour, depth, opacity = parts
-            picture = strip(batch["target"].cpu(), colour.clamp(0, 1), depth, opacity)
+            colour, *others = (outputs[name].float() for name in ("colour", "depth", "opacity"))
+            picture = strip(batch["target"].cpu(), colour.clamp(0, 1), *others)
             self._pictures[batch["file"]] = picture
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -116,15 +115,12 @@ class Evaluation(Callback):
         row = [f"{training_seconds(trainer):.3f}", str(step), split, f"{psnr:.4f}", f"{ssim:.5f}"]
         self._rows = [*(old for old in self._rows if old[1] != row[1]), row]
         write_rows(run / "curve.csv", CURVE, self._rows)
-        pictures = {
-            file if file.startswith(f"{split}/") else f"{split}/{file}": picture
-            for file, picture in self._pictures.items()
-        }
         if planes := module.field.planes:
             sheet = plane_sheet(planes)
             write_png(run / "media" / "planes.png", sheet)
             log_image(trainer, "planes", sheet, step)
-        for tag, picture in pictures.items():
+        for file, picture in self._pictures.items():
+            tag = f"{split}/{file.removeprefix(f'{split}/')}"
             name = tag.replace("/", "_").removesuffix(".png")
             write_png(run / "media" / f"step{step:06d}" / f"{name}.png", picture)
             log_image(trainer, tag, picture, step)

@@ -96,18 +96,15 @@ class Trainer(lightning.Trainer):
         own = list(plugins) if isinstance(plugins, list | tuple) else [plugins] * bool(plugins)
         if not any(isinstance(plugin, CheckpointIO) for plugin in own):
             own.append(AtomicCheckpointIO())
-        used = list(callbacks)
-        if not others.get("enable_progress_bar", True):
-            used = [callback for callback in used if not isinstance(callback, ProgressBar)]
+        bar = others.get("enable_progress_bar", True)
+        used = [each for each in callbacks if bar or not isinstance(each, ProgressBar)]
         # These hold for the whole process, the LRM included.
         torch.set_float32_matmul_precision("high" if tf32 else "highest")
         torch.backends.cudnn.allow_tf32 = tf32
         # `Evaluation` says when views are scored; without it, nothing does.
-        others.setdefault("check_val_every_n_epoch", None)
-        others.setdefault("val_check_interval", sys.maxsize)
-        others.setdefault("num_sanity_val_steps", 0)
+        usual = {"check_val_every_n_epoch": None, "val_check_interval": sys.maxsize}
         # Lightning ends after 1000 epochs where no number of steps is given.
-        others.setdefault("max_epochs", -1)
+        usual |= {"num_sanity_val_steps": 0, "max_epochs": -1}
         self.interrupt = Interrupt()
         quiet_lightning()
         super().__init__(
@@ -118,7 +115,7 @@ class Trainer(lightning.Trainer):
             log_every_n_steps=log_every_n_steps,
             callbacks=[TrainingClock(max_seconds), *used, self.interrupt],
             plugins=own,
-            **others,
+            **(usual | others),
         )
 
     def train(

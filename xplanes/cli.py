@@ -267,7 +267,9 @@ RUN = {
     "--checkpoint": _option("", "last", choices=["last", "best"]),
     "--plugin": _option(
         "your module with classes that the run's settings name; repeatable",
-        **{"action": "append", "default": [], "metavar": "MODULE"},
+        action="append",
+        default=[],
+        metavar="MODULE",
     ),
 }
 
@@ -295,7 +297,8 @@ COMMANDS = {
         {
             "arguments": _option(
                 "the folder of a scene, settings of train.py, or both",
-                **{"nargs": "+", "metavar": "FOLDER data.KEY=VALUE"},
+                nargs="+",
+                metavar="FOLDER data.KEY=VALUE",
             ),
             "--out": _option(
                 "the picture, a PNG; default: inspect_SCENE.png in the current directory", type=Path
@@ -391,7 +394,9 @@ COMMANDS = {
             ),
             "--points": _option(
                 "points of a point cloud; default: 100000; with --what web, in place of the mesh",
-                **{"type": int, "dest": "count", "metavar": "COUNT"},
+                type=int,
+                dest="count",
+                metavar="COUNT",
             ),
             "--format": _option(
                 "of meshes and point clouds", "ply", dest="form", choices=["ply", "glb"]
@@ -439,7 +444,8 @@ COMMANDS = {
             "--out": _option(
                 "FILE.png, or with --what steps a video, FILE.webp; default: sheet_WHAT.png in "
                 "FOLDER",
-                **{"type": Path, "metavar": "FILE"},
+                type=Path,
+                metavar="FILE",
             ),
         },
         _sheet,

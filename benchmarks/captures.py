@@ -35,8 +35,12 @@ VARIANTS = {
     "cut_tiny": ["lrm=tiny", "data.mask_use=lrm"],
     "masks_tiny": ["lrm=tiny", "data.mask_use=alpha"],
     "rough_world": ["lrm=none", "model.background.total_variation=0"],
-    "rough_field": ["lrm=none", "model.loss.world_variation=0", "model.loss.time_variation=0"],
-    "thin_fog": ["lrm=none", "model.sampler.world_threshold=0.001"],
+    "rough_field": [
+        "lrm=none",
+        "model.loss.total_variation_with_background=0",
+        "model.loss.time_variation=0",
+    ],
+    "thin_fog": ["lrm=none", "model.sampler.threshold_with_background=0.001"],
     "even_rays": ["lrm=none", "model.rays.skip_background=false"],
     "kplanes": [
         *("model=kplanes", "model.scales=[2]", "model.warmup_steps=50"),
@@ -106,7 +110,7 @@ def row(scene: str, variant: str, runs: list[Measured]) -> list[str]:
         return f"{statistics.mean(found):.{digits}f}{spread}"
 
     steps, seconds = mean("step"), mean("seconds", "train")
-    whole = [score("psnr"), score("psnr_thing"), score("ssim", digits=3)]
+    whole = [score("psnr"), score("psnr_foreground"), score("ssim", digits=3)]
     if variant.startswith("masks"):
         whole = ["", whole[1], ""]
     scores = [*whole, score("floaters", 100)]
@@ -130,7 +134,7 @@ def plot(found: dict[tuple[str, str], list[Measured]], name: str) -> None:
         return statistics.mean(run.metrics["test"].get(key, math.nan) for run in runs)
 
     figure, axes = panels(2, 9, 0.45 * len(variants) + 1.6, sharey=True)
-    keys = {"psnr": "PSNR, dB", "psnr_thing": "PSNR of the foreground object, dB"}
+    keys = {"psnr": "PSNR, dB", "psnr_foreground": "PSNR of the foreground object, dB"}
     for axis, (key, label) in zip(axes, keys.items(), strict=True):
         groups = {s: [score(s, variant, key) for variant in variants] for s in scenes}
         bars(axis, variants, groups)

@@ -33,12 +33,12 @@ from runner import RESULTS, command, lego, machine, markdown, spread
 from xplanes.baselines.gaussians.field import Gaussians
 from xplanes.config import compose_plain
 from xplanes.files import read_json, write_json, write_rows, write_text
-from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.datamodule import SceneDataModule, whole_view
 from xplanes.scenes.views import Views
 from xplanes.training.clock import training_seconds
 from xplanes.training.fit import Trainer
 from xplanes.training.module import RadianceModule
-from xplanes.training.scores import ViewScore, mean_scores, render_view, score_view
+from xplanes.training.scores import ViewScore, mean_scores, render_item, score_view
 
 time.perf_counter = time.process_time  # So that the training clock counts CPU time, too.
 
@@ -107,10 +107,10 @@ def measure(
         )
         trainer.train(module, data)
     scores = _scores(module, data, views)
-    seen = (module.field, module.renderer, module.frame, views)
+    seen = (module.field, module.renderer, module.frame)
     began = time.process_time()
     for index in range(len(views)):
-        render_view(*seen, index, data.scene.background)
+        render_item(*seen, whole_view(views, index, data.scene.background))
     return {
         **mean_scores(scores),
         "first psnr": first["psnr"],

@@ -24,8 +24,9 @@ from runner import RESULTS, command, lego, machine, markdown, run_apart
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.files import write_rows, write_text
 from xplanes.rendering.grid_renderer import GridRenderer
+from xplanes.scenes.datamodule import whole_view
 from xplanes.scenes.views import Views
-from xplanes.training.scores import mean, render_view, score_view
+from xplanes.training.scores import mean, render_item, score_view
 
 SIZES = (100, 200, 400, 800)
 SAMPLES = (64, 128, 256)
@@ -59,21 +60,23 @@ def measure(run: TrainedRun, size: int, samples: int) -> tuple:
     assert isinstance(renderer, GridRenderer)
     renderer = replace(renderer, samples=samples)
     views, known = views_at(run, size)
-    parts = (run.module.field, renderer, run.frame, views)
+    parts = (run.module.field, renderer, run.frame)
     background = run.scene.background
-    render_view(*parts, 0, background)
+    render_item(*parts, whole_view(views, 0, background))
     seconds = []
     for index in range(FRAMES):
         rounds = []
         for _ in range(REPEATS):
             began = time.perf_counter()
-            render_view(*parts, index, background)
+            render_item(*parts, whole_view(views, index, background))
             rounds.append(time.perf_counter() - began)
         seconds.append(min(rounds))
     spent = statistics.median(seconds)
     score = ""
     if known:
-        score = f"{mean([score_view(*parts, i, background)[0].psnr for i in range(FRAMES)]):.2f}"
+        score = (
+            f"{mean([score_view(*parts, views, i, background)[0].psnr for i in range(FRAMES)]):.2f}"
+        )
     return (
         size,
         samples,

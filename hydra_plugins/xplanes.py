@@ -67,9 +67,11 @@ def case(key: str, choices: Mapping[str, Any], otherwise: Any, *, _root_: Any) -
 
 
 def options(group: str) -> str:
-    """The options of a group, as lines of conf/hydra/help/train.yaml."""
-    names = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
-    return textwrap.fill(", ".join(names), 84, subsequent_indent=11 * " ")
+    """The options of a group and further names of them, for conf/hydra/help/train.yaml."""
+    also = {name: f"{name}\xa0({alias})" for alias, name in ALIASES.items() if group == "lrm"}
+    names = sorted(also.get(path.stem, path.stem) for path in (CONF / group).glob("*.yaml"))
+    lines = textwrap.fill(", ".join(names), 84, subsequent_indent=11 * " ")
+    return lines.replace("\xa0", " ")  # Which kept names and aliases on one line.
 
 
 for _name, _resolver in {"file_name": file_name, "case": case, "options": options}.items():

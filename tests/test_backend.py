@@ -41,7 +41,7 @@ except ModuleNotFoundError as error:
 """
 
 
-def test_loops_share_the_threads_of_torch_and_may_be_absent(tmp_path: Path) -> None:
+def test_loops_share_the_threads_of_torch_and_may_be_absent(tmp_path):
     """With one thread, with two, and where numba does not load."""
     broken = tmp_path / "broken"
     (broken / "numba").mkdir(parents=True)
@@ -60,7 +60,7 @@ def test_loops_share_the_threads_of_torch_and_may_be_absent(tmp_path: Path) -> N
     assert "pip install --upgrade numba" in printed
 
 
-def test_warming_up_inside_warming_up_counts_once() -> None:
+def test_warming_up_inside_warming_up_counts_once():
     clock = WarmUp()
     with clock.timed(), clock.timed():
         time.sleep(0.05)
@@ -105,13 +105,16 @@ def sealed(tmp_path: Path) -> tuple[Path, dict[str, str]]:
     return package, os.environ | {name: f"{file}/{name}" for name in names} | others
 
 
-def test_loops_run_where_numba_can_keep_nothing(sealed, tmp_path: Path) -> None:
-    package, environment = sealed
-    command = [sys.executable, "-c", SEALED, str(package)]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment
-    )
+def python(*arguments: str, **options) -> subprocess.CompletedProcess:
+    """A process of its own, to its end."""
+    done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, **options)
     assert done.returncode == 0, done.stderr
+    return done
+
+
+def test_loops_run_where_numba_can_keep_nothing(sealed, tmp_path):
+    package, environment = sealed
+    done = python("-c", SEALED, str(package), cwd=tmp_path, env=environment)
     assert done.stdout == "compiled loops\n"
     said = [line for line in done.stderr.splitlines() if "numba" in line]
     assert len(said) == 1, done.stderr
@@ -120,36 +123,28 @@ def test_loops_run_where_numba_can_keep_nothing(sealed, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_needs_no_folder_but_its_own(sealed, tmp_path: Path) -> None:
-    environment = sealed[1]
+def test_a_run_needs_no_folder_but_its_own(sealed, tmp_path):
     place, data = tmp_path / "place", tmp_path / "data"
     place.mkdir()
     given = [*SMALL, "lrm=tiny", f"data.root={data}", f"preparation.cache={tmp_path}/file/cache"]
-    command = [sys.executable, "-m", "xplanes", "train", *given, "hydra.run.dir=run"]
     before = set(tmp_path.rglob("*"))
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, cwd=place, env=environment
-    )
-    assert done.returncode == 0, done.stderr
+    command = ("-m", "xplanes", "train", *given, "hydra.run.dir=run")
+    done = python(*command, cwd=place, env=sealed[1])
     assert "Traceback" not in done.stderr
     assert "NUMBA_CACHE_DIR=FOLDER" in (place / "run" / "train.log").read_text()
     for path in set(tmp_path.rglob("*")) - before:
         assert path.is_relative_to(place / "run") or path.is_relative_to(data), path
 
 
-def test_loops_are_kept_where_they_can_be(sealed, tmp_path: Path) -> None:
+def test_loops_are_kept_where_they_can_be(sealed, tmp_path):
     package, environment = sealed
     environment |= {"NUMBA_CACHE_DIR": str(tmp_path / "kept")}
-    command = [sys.executable, "-c", SEALED, str(package)]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment
-    )
-    assert done.returncode == 0, done.stderr
+    done = python("-c", SEALED, str(package), cwd=tmp_path, env=environment)
     assert "numba" not in done.stderr
     assert list((tmp_path / "kept").rglob("*.nbi"))
 
 
-def test_triton_gets_a_folder_where_it_has_none(tmp_path: Path, monkeypatch, caplog) -> None:
+def test_triton_gets_a_folder_where_it_has_none(tmp_path, monkeypatch, caplog):
     own, file, removed = tmp_path / "own", tmp_path / "file", []
     file.write_text("")
     monkeypatch.setattr(backend.atexit, "register", lambda _, path, **__: removed.append(path))

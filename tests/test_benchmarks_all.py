@@ -20,7 +20,7 @@ def every(monkeypatch):
         sys.modules.pop(name, None)
 
 
-def test_only_code_and_settings_make_a_result_stale(every, tmp_path: Path) -> None:
+def test_only_code_and_settings_make_a_result_stale(every, tmp_path):
     code, settings = tmp_path / "code.py", tmp_path / "settings.yaml"
 
     def digest(text: str, values: str) -> str:
@@ -38,7 +38,7 @@ def test_only_code_and_settings_make_a_result_stale(every, tmp_path: Path) -> No
         assert digest(text, values) != first
 
 
-def test_what_has_changed_is_said(every) -> None:
+def test_what_has_changed_is_said(every):
     now = {"version": "2", "machine": "big", "parts": {"xplanes/lrm": "a", "conf": "b"}}
     assert every.why_stale(now, None) == "not recorded"
     assert every.why_stale(now, dict(now)) == ""
@@ -51,13 +51,13 @@ def test_what_has_changed_is_said(every) -> None:
     assert every.why_stale(cores, {**cores, "machine": "1 of 4 cores, small"}) != ""
 
 
-def test_printed_commands_name_no_folder(every) -> None:
+def test_printed_commands_name_no_folder(every):
     words = ["--lego", "/there/lego", "data.root=/there", "data.scene=lego", "--seeds", "3"]
     printed = ["--lego", "FOLDER", "data.root=FOLDER", "data.scene=lego", "--seeds", "3"]
     assert sys.modules["runner"].without_folders(words) == printed
 
 
-def test_every_part_and_script_exists(every) -> None:
+def test_every_part_and_script_exists(every):
     for name, parts in every.PARTS.items():
         assert (FOLDER / f"{name}.py").is_file(), name
         for part in parts:
@@ -65,9 +65,7 @@ def test_every_part_and_script_exists(every) -> None:
     assert list(every.scripts(Path("lego"))) == list(every.PARTS)
 
 
-def test_what_is_made_is_recorded_and_what_fails_is_not(
-    every, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_what_is_made_is_recorded_and_what_fails_is_not(every, tmp_path, monkeypatch, capsys):
     ran = []
     monkeypatch.chdir(tmp_path)
 

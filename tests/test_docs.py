@@ -23,8 +23,8 @@ from xplanes import __version__
 from xplanes.cli import build_parser
 from xplanes.config import compose_plain, near_names
 from xplanes.evaluation.published import OWN, PUBLISHED
+from xplanes.evaluation.sweep import SCORES
 from xplanes.evaluation.table import write_tables
-from xplanes.evaluation.tabulate import COLUMNS
 from xplanes.experiment import Experiment
 from xplanes.files import read_json
 from xplanes.run import run
@@ -34,7 +34,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
-def test_generated_pages_are_what_the_generator_writes() -> None:
+def test_generated_pages_are_what_the_generator_writes():
     pages = runpy.run_path(str(ROOT / "docs" / "generate.py"))["PAGES"]
     notebook = "../examples/first_minute.ipynb"
     assert set(pages) == {"configuration.md", "command_line.md", "api.md", notebook}
@@ -43,7 +43,7 @@ def test_generated_pages_are_what_the_generator_writes() -> None:
         assert page == write(), "run: python docs/generate.py"
 
 
-def test_addresses_and_version_are_the_same_wherever_they_stand() -> None:
+def test_addresses_and_version_are_the_same_wherever_they_stand():
     generator = runpy.run_path(str(ROOT / "docs" / "generate.py"))
     addressed = generator["addressed"]
     for name in generator["ADDRESSED"]:
@@ -56,7 +56,7 @@ def test_addresses_and_version_are_the_same_wherever_they_stand() -> None:
 
 
 @pytest.mark.skipif(not find_spec("mkdocs"), reason="the site needs the extra docs")
-def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+def test_the_site_builds_without_a_warning(tmp_path):
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     silent = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     built = subprocess.run(
@@ -73,7 +73,7 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
         assert f'id="xplanes.{name}"' in api, name
 
 
-def test_the_configuration_page_says_what_every_setting_means() -> None:
+def test_the_configuration_page_says_what_every_setting_means():
     text = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `([\w.]+)` \| (.*?) \| (.*) \|$", text, re.MULTILINE)
     assert len(rows) > 250
@@ -82,13 +82,13 @@ def test_the_configuration_page_says_what_every_setting_means() -> None:
         assert value, key
 
 
-def test_links_between_pages_lead_somewhere() -> None:
+def test_links_between_pages_lead_somewhere():
     for page in PAGES:
         for link in re.findall(r"\]\((?!https?:)([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
             assert (page.parent / link).exists(), f"{page.name}: {link}"
 
 
-def test_the_api_page_has_the_signatures_of_all_that_it_lists() -> None:
+def test_the_api_page_has_the_signatures_of_all_that_it_lists():
     text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     found = re.findall(r"```python\n((?:(?!```).)+)```\n\n::: ([\w.]+)", text, re.DOTALL)
     assert len(found) == len(re.findall(r"^::: ", text, re.MULTILINE)) > 20
@@ -126,7 +126,7 @@ def commands() -> list[list[str]]:
     ]
 
 
-def test_training_commands_of_the_pages_compose() -> None:
+def test_training_commands_of_the_pages_compose():
     training = [words[1:] for words in commands() if words[:1] == ["train"]]
     assert len(training) > 12
     for chosen in {first_of(arguments) for arguments in training}:
@@ -141,14 +141,14 @@ def first_of(arguments: list[str]) -> tuple[str, ...]:
     return tuple(a if "[" in a else a.split(",")[0] for a in settings)
 
 
-def test_other_commands_of_the_pages_parse() -> None:
+def test_other_commands_of_the_pages_parse():
     others = [words for words in commands() if words[:1] != ["train"]]
     assert len(others) > 12
     for arguments in others:
         assert build_parser([add_commands]).parse_args(arguments), arguments
 
 
-def test_shells_leave_the_commands_of_the_pages_alone() -> None:
+def test_shells_leave_the_commands_of_the_pages_alone():
     # zsh, the shell of every Mac, takes brackets, braces, * and ? outside of quotes for file names.
     for page in PAGES:
         for line in page.read_text(encoding="utf-8").splitlines():
@@ -168,7 +168,7 @@ KEY = re.compile(
 FILES = {".ckpt", ".pth", ".safetensors", ".py", ".yaml", ".pt"}
 
 
-def test_keys_in_the_text_of_the_pages_exist() -> None:
+def test_keys_in_the_text_of_the_pages_exist():
     text = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
     known = set(re.findall(r"^\| `([\w.]+)` \|", text, re.MULTILINE))
     known |= {key.rpartition(".")[0] for key in known}
@@ -190,7 +190,7 @@ CODE = re.compile(r"`(xplanes(?:\.\w+)+)`")
 """A module, class or function in the text of a page."""
 
 
-def test_code_named_in_the_text_of_the_pages_exists() -> None:
+def test_code_named_in_the_text_of_the_pages_exists():
     text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
     named = sorted(set(CODE.findall(text)))
     assert len(named) > 12
@@ -205,9 +205,7 @@ def keys_of(node: Any) -> Iterator[str]:
         yield from keys_of(value[0] if isinstance(value, list) and value else value)
 
 
-def test_the_glossary_has_every_column_and_key_that_a_run_writes(
-    scenes: Path, tmp_path: Path
-) -> None:
+def test_the_glossary_has_every_column_and_key_that_a_run_writes(scenes, tmp_path):
     changes = ("lrm=tiny", "preparation.frames=3", f"preparation.cache={tmp_path / 'cache'}")
     config = small_config(scenes, *changes, "trainer.max_steps=2", "media=true")
     run(config, tmp_path / "runs" / "run", [], resume=False)
@@ -227,5 +225,5 @@ def test_the_glossary_has_every_column_and_key_that_a_run_writes(
     page = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
     known = {text.rpartition(".")[2] for text in re.findall(r"`([^`]+)`", page)}
     names = [*keys_of(metrics), *keys_of(record), *columns, *keyed.split(","), *rows.split(",")]
-    names += [*OWN, *PUBLISHED, *(heading for heading, _ in COLUMNS.values()), *COLUMNS]
+    names += [*OWN, *PUBLISHED, *(score.heading for score in SCORES.values()), *SCORES]
     assert not set(names) - known

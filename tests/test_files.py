@@ -32,7 +32,7 @@ def listed(folder: Path) -> list[str]:
     return [path.name for path in folder.iterdir()]
 
 
-def test_a_block_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+def test_a_block_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "a.json"
     write_text(path, "whole")
     with pytest.raises(ValueError, match="half"):
@@ -51,7 +51,7 @@ def test_a_block_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path)
         (errno.EIO, r"disk or its connection"),
     ],
 )
-def test_a_disk_that_refuses_is_said_with_a_message(tmp_path: Path, code: int, words: str) -> None:
+def test_a_disk_that_refuses_is_said_with_a_message(tmp_path, code, words):
     path = tmp_path / "last.ckpt"
     write_text(path, "old")
     with pytest.raises(StorageError, match=rf"last\.ckpt cannot be written.*{words}"):
@@ -60,7 +60,7 @@ def test_a_disk_that_refuses_is_said_with_a_message(tmp_path: Path, code: int, w
     assert listed(tmp_path) == ["last.ckpt"]
 
 
-def test_other_problems_are_not_the_disk_s(tmp_path: Path) -> None:
+def test_other_problems_are_not_the_disk_s(tmp_path):
     assert storage_error(ConnectionRefusedError(errno.ECONNREFUSED, "refused")) is None
     assert storage_error(PermissionError(errno.EACCES, "denied", "weights.ckpt")) is None
     with pytest.raises(OSError, match="power cut") as caught:
@@ -68,7 +68,7 @@ def test_other_problems_are_not_the_disk_s(tmp_path: Path) -> None:
     assert not isinstance(caught.value, StorageError)
 
 
-def test_a_file_in_the_place_of_a_folder_is_named(tmp_path: Path) -> None:
+def test_a_file_in_the_place_of_a_folder_is_named(tmp_path):
     (tmp_path / "outputs").write_text("")
     with pytest.raises(StorageError, match=r"outputs/run/a\.txt.*file stands where a folder"):
         write_text(tmp_path / "outputs" / "run" / "a.txt", "")
@@ -76,18 +76,18 @@ def test_a_file_in_the_place_of_a_folder_is_named(tmp_path: Path) -> None:
         require_writable(tmp_path / "outputs" / "run")
 
 
-def test_a_folder_that_can_be_written_stays_as_it_is(tmp_path: Path) -> None:
+def test_a_folder_that_can_be_written_stays_as_it_is(tmp_path):
     require_writable(tmp_path / "new" / "run")
     assert listed(tmp_path) == []
 
 
-def test_numbers_that_json_does_not_know_become_null(tmp_path: Path) -> None:
+def test_numbers_that_json_does_not_know_become_null(tmp_path):
     path = tmp_path / "metrics.json"
     write_json(path, {"ssim": math.nan, "views": [{"psnr": math.inf}, 1.5, None, "nan"]})
     assert read_json(path) == {"ssim": None, "views": [{"psnr": None}, 1.5, None, "nan"]}
 
 
-def test_only_unfinished_files_are_cleared(tmp_path: Path) -> None:
+def test_only_unfinished_files_are_cleared(tmp_path):
     kept = tmp_path / "checkpoints" / "last.ckpt"
     write_text(kept, "whole")
     hidden = tmp_path / ".lock"

@@ -1,7 +1,6 @@
 """Callbacks, loggers and arguments of Lightning's that do not go with training as it is here."""
 
 import csv
-import json
 import warnings
 from pathlib import Path
 from typing import Any
@@ -9,11 +8,10 @@ from typing import Any
 import lightning
 import numpy as np
 import pytest
-import torch
 from lightning.pytorch import callbacks
 from lightning.pytorch.loggers import CSVLogger
 
-from tests.training.runs import small_config
+from tests.training.runs import checkpoint, metrics, small_config
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError
 from xplanes.evaluation.evaluate import evaluate
@@ -51,12 +49,12 @@ def rows(folder: Path) -> list[dict[str, str]]:
         ),
     ],
 )
-def test_what_would_train_wrongly_is_refused(options: dict, words: str) -> None:
+def test_what_would_train_wrongly_is_refused(options, words):
     with pytest.raises(ConfigError, match=words):
         Trainer(max_steps=2, **PLAIN, **options)
 
 
-def test_a_plain_trainer_that_scales_or_widens_numbers_is_refused(scenes: Path) -> None:
+def test_a_plain_trainer_that_scales_or_widens_numbers_is_refused(scenes):
     config = small_config(scenes)
     module, data = RadianceModule(config), SceneDataModule(config["data"])
     trainer = lightning.Trainer(max_steps=2, precision="64-true", logger=False, **PLAIN)
@@ -65,13 +63,11 @@ def test_a_plain_trainer_that_scales_or_widens_numbers_is_refused(scenes: Path) 
 
 
 @pytest.mark.parametrize("precision", [None, 32, "32", "32-true"])
-def test_whole_floats_are_accepted(precision: Any) -> None:
+def test_whole_floats_are_accepted(precision):
     assert Trainer(max_steps=2, precision=precision, **PLAIN).precision == "32-true"
 
 
-def test_a_state_that_could_not_be_read_again_is_refused_at_once(
-    scenes: Path, tmp_path: Path
-) -> None:
+def test_a_state_that_could_not_be_read_again_is_refused_at_once(scenes, tmp_path):
     config = small_config(scenes, "trainer.max_steps=4")
     config["plugins"] = ["tests.test_foreign_parts"]
     config["callbacks"]["mine"] = {"_target_": "tests.test_foreign_parts.Numbers"}
@@ -80,11 +76,11 @@ def test_a_state_that_could_not_be_read_again_is_refused_at_once(
     assert not list((tmp_path / "numpy").rglob("*.ckpt"))
     config["callbacks"]["mine"]["kind"] = "float"
     run(config, tmp_path / "float", [], resume=False)
-    kept = torch.load(tmp_path / "float" / "checkpoints" / "last.ckpt", weights_only=True)
+    kept = checkpoint(tmp_path / "float")
     assert {"mean": 1.5} in kept["callbacks"].values()
 
 
-def test_a_resumed_run_goes_on_with_its_csv(scenes: Path, tmp_path: Path) -> None:
+def test_a_resumed_run_goes_on_with_its_csv(scenes, tmp_path):
     options = ("logger=csv", "trainer.log_every_n_steps=2", "callbacks.checkpoints.every=4")
 
     def train(folder: str, steps: int, *, resume: bool) -> None:
@@ -108,23 +104,21 @@ def test_a_resumed_run_goes_on_with_its_csv(scenes: Path, tmp_path: Path) -> Non
     assert [{k: row[k] for k in before[0]} for row in kept][:4] == before[:4]
 
 
-def test_scores_are_of_the_averaged_weights_that_checkpoints_hold(
-    scenes: Path, tmp_path: Path
-) -> None:
+def test_scores_are_of_the_averaged_weights_that_checkpoints_hold(scenes, tmp_path):
     config = small_config(scenes, "trainer.max_steps=60", "data.eval_split=val")
     name = "lightning.pytorch.callbacks.EMAWeightAveraging"
     config["callbacks"]["average"] = {"_target_": name, "decay": 0.98}
     run(config, tmp_path / "run", [], resume=False)
-    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    found = metrics(tmp_path / "run")
     again = evaluate(load_run(tmp_path / "run"), "none")
     assert found["test"]["psnr"] == pytest.approx(again["test"]["psnr"], abs=1e-6)
     plain = small_config(scenes, "trainer.max_steps=60", "data.eval_split=val")
     run(plain, tmp_path / "plain", [], resume=False)
-    raw = json.loads((tmp_path / "plain" / "metrics.json").read_text())
+    raw = metrics(tmp_path / "plain")
     assert abs(raw["test"]["psnr"] - found["test"]["psnr"]) > 0.1
 
 
-def test_epochs_end_the_schedules_too(scenes: Path) -> None:
+def test_epochs_end_the_schedules_too(scenes):
     config = small_config(scenes, "model.rays.per_batch=1024")
 
     def rates(**options: Any) -> tuple[int, list[float]]:
@@ -138,7 +132,7 @@ def test_epochs_end_the_schedules_too(scenes: Path) -> None:
     assert rates(max_steps=steps) == (steps, both)
 
 
-def test_a_module_that_was_loaded_logs_as_a_fresh_one(scenes: Path, tmp_path: Path) -> None:
+def test_a_module_that_was_loaded_logs_as_a_fresh_one(scenes, tmp_path):
     config = small_config(scenes)
 
     def fit(module: RadianceModule, folder: str, steps: int) -> lightning.Trainer:
@@ -186,16 +180,14 @@ def test_a_module_that_was_loaded_logs_as_a_fresh_one(scenes: Path, tmp_path: Pa
         ),
     ],
 )
-def test_settings_that_were_ignored_are_refused(
-    scenes: Path, tmp_path: Path, key: str, node: dict, words: str
-) -> None:
+def test_settings_that_were_ignored_are_refused(scenes, tmp_path, key, node, words):
     config = small_config(scenes, "trainer.max_steps=4")
     config[key] |= node
     with pytest.raises(ConfigError, match=words):
         run(config, tmp_path / "run", [], resume=False)
 
 
-def test_a_logger_may_have_a_folder_of_its_own(scenes: Path, tmp_path: Path) -> None:
+def test_a_logger_may_have_a_folder_of_its_own(scenes, tmp_path):
     config = small_config(scenes, "logger=csv", "trainer.max_steps=4")
     config["logger"]["csv"]["save_dir"] = str(tmp_path / "elsewhere")
     run(config, tmp_path / "run", [], resume=False)

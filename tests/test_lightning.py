@@ -68,7 +68,7 @@ def fitted(config: dict, tmp_path_factory: pytest.TempPathFactory) -> tuple:
     return folder, module, data, used
 
 
-def test_fit_logs_every_term_of_the_loss_validates_and_keeps_the_best(fitted: tuple) -> None:
+def test_fit_logs_every_term_of_the_loss_validates_and_keeps_the_best(fitted):
     folder, module, _, used = fitted
     values = logged(folder)
     terms = {"colour", "opacity", "floaters", "total_variation", "time_variation"}
@@ -86,7 +86,7 @@ def test_fit_logs_every_term_of_the_loss_validates_and_keeps_the_best(fitted: tu
     assert any(name.startswith("lr-") or name.startswith("lr/") for name in values)
 
 
-def test_validate_and_test_score_their_own_splits(fitted: tuple) -> None:
+def test_validate_and_test_score_their_own_splits(fitted):
     _, module, data, used = fitted
     found = used.validate(module, data, verbose=False)[0]
     assert set(found) == {"val/psnr", "val/ssim", "val/floaters"}
@@ -98,7 +98,7 @@ def test_validate_and_test_score_their_own_splits(fitted: tuple) -> None:
     assert [image["colour"].shape for image in images] == [(32, 32, 3)] * 3
 
 
-def test_pixels_without_rays_are_background_in_every_score(fitted: tuple) -> None:
+def test_pixels_without_rays_are_background_in_every_score(fitted):
     """As fisheye images have them at their corners."""
     _, module, data, _ = fitted
     batch = next(iter(data.test_dataloader()))
@@ -112,14 +112,14 @@ def test_pixels_without_rays_are_background_in_every_score(fitted: tuple) -> Non
     assert not part["opacity"][~shown].any()
 
 
-def test_no_number_of_steps_is_no_limit(tmp_path: Path) -> None:
+def test_no_number_of_steps_is_no_limit(tmp_path):
     """Lightning's own Trainer ends after 1000 epochs."""
     options = {"accelerator": "cpu", "default_root_dir": tmp_path, "logger": False}
     assert Trainer(**options, max_steps=-1, max_seconds=5.0).max_epochs == -1
     assert Trainer(**options, max_steps=-1, max_seconds=5.0, max_epochs=3).max_epochs == 3
 
 
-def test_a_checkpoint_alone_gives_the_field_back(fitted: tuple) -> None:
+def test_a_checkpoint_alone_gives_the_field_back(fitted):
     folder, _, data, used = fitted
     path = folder / "last.ckpt"
     used.save_checkpoint(path)
@@ -140,7 +140,7 @@ class SaveAt(lightning.Callback):
             trainer.save_checkpoint(self.path)
 
 
-def test_a_resumed_fit_ends_with_the_same_numbers(config: dict, tmp_path: Path) -> None:
+def test_a_resumed_fit_ends_with_the_same_numbers(config, tmp_path):
     path = tmp_path / "half.ckpt"
 
     def fit(checkpoint: Path | None = None, *callbacks: lightning.Callback) -> dict:
@@ -163,7 +163,7 @@ def test_a_resumed_fit_ends_with_the_same_numbers(config: dict, tmp_path: Path) 
         assert torch.equal(resumed[name], value), name
 
 
-def test_callbacks_that_watch_a_metric_see_every_evaluation(scenes: Path, tmp_path: Path) -> None:
+def test_callbacks_that_watch_a_metric_see_every_evaluation(scenes, tmp_path):
     config = small_config(scenes, "trainer.max_steps=60", "callbacks.evaluation.at=[0,0.2,0.4,0.6]")
     watched = {"monitor": "val/psnr", "mode": "max"}
     config["callbacks"] |= {
@@ -196,7 +196,7 @@ class Lines(Logger):
         pass
 
 
-def test_loggers_need_no_folder(tmp_path: Path) -> None:
+def test_loggers_need_no_folder(tmp_path):
     config = small_config(tmp_path, "trainer.max_steps=2")
     config["logger"] = {"lines": {"_target_": "tests.test_lightning.Lines"}}
     config["plugins"] = ["tests.test_lightning"]
@@ -216,7 +216,7 @@ class Steps(lightning.Callback):
             self.norms.append(torch.stack([g.norm() for g in gradients]).norm().item())
 
 
-def test_gradients_are_clipped_and_accumulated(config: dict, tmp_path: Path) -> None:
+def test_gradients_are_clipped_and_accumulated(config, tmp_path):
     """Regularisers count towards the norm, once for each update."""
     steps = Steps()
     used = trainer(
@@ -232,10 +232,10 @@ def test_gradients_are_clipped_and_accumulated(config: dict, tmp_path: Path) -> 
     used.fit(module, SceneDataModule(config["data"]))
     assert (used.global_step, module.batches) == (4, 8)
     assert max(steps.norms) < 1.001e-3
-    assert module.last["loss"] > 0
+    assert module.tally.last["loss"] > 0
 
 
-def test_two_halves_of_a_batch_make_the_same_step_as_the_whole(config: dict) -> None:
+def test_two_halves_of_a_batch_make_the_same_step_as_the_whole(config):
     """Each is half of the rays; the loss is a mean."""
     data = SceneDataModule(config["data"])
     found = []
@@ -252,7 +252,7 @@ def test_two_halves_of_a_batch_make_the_same_step_as_the_whole(config: dict) -> 
     torch.testing.assert_close(found[0], found[1], rtol=1e-3, atol=1e-7)
 
 
-def test_an_average_of_weights_is_scored_and_kept(config: dict, tmp_path: Path) -> None:
+def test_an_average_of_weights_is_scored_and_kept(config, tmp_path):
     """Without buffers: an averaged grid would never empty."""
     average = EMAWeightAveraging(decay=0.9, use_buffers=False)
     keep = ModelCheckpoint(tmp_path, filename="mean", save_on_exception=False)
@@ -269,9 +269,7 @@ def test_an_average_of_weights_is_scored_and_kept(config: dict, tmp_path: Path) 
     assert scored["val/psnr"] == pytest.approx(float(used.callback_metrics["val/psnr"]), abs=1e-3)
 
 
-def test_a_scene_without_a_test_split_is_tested_on_its_validation_views(
-    config: dict, tmp_path: Path
-) -> None:
+def test_a_scene_without_a_test_split_is_tested_on_its_validation_views(config, tmp_path):
     made = SceneDataModule(config["data"])
     shutil.copytree(made.settings.folder, tmp_path / "scene")
     (tmp_path / "scene" / "transforms_test.json").unlink()
@@ -288,7 +286,7 @@ def test_a_scene_without_a_test_split_is_tested_on_its_validation_views(
         SceneDataModule.compose(*options).setup("validate")
 
 
-def test_test_views_are_scored_in_training_only_where_the_settings_say_so(config: dict) -> None:
+def test_test_views_are_scored_in_training_only_where_the_settings_say_so(config):
     data = SceneDataModule(config["data"])
     assert (data.validation_split, data.test_split) == ("val", "test")
     for split in ("val", "test"):
@@ -299,7 +297,7 @@ def test_test_views_are_scored_in_training_only_where_the_settings_say_so(config
     assert [batch["target"].shape for batch in data.val_dataloader()] == [(32, 32, 3)] * 3
 
 
-def test_a_module_without_data_says_what_it_needs(config: dict, tmp_path: Path) -> None:
+def test_a_module_without_data_says_what_it_needs(config, tmp_path):
     loader = torch.utils.data.DataLoader([0])
     with pytest.raises(ConfigError, match="trains with a SceneDataModule"):
         trainer(tmp_path, logger=False).fit(RadianceModule(config), loader)
@@ -319,7 +317,7 @@ class Other(lightning.LightningModule):
         return (self.colour - batch["target"]).square().mean()
 
 
-def test_the_data_serve_other_modules(config: dict, tmp_path: Path) -> None:
+def test_the_data_serve_other_modules(config, tmp_path):
     module = Other()
     trainer(tmp_path, logger=False, limit_val_batches=0).fit(
         module, SceneDataModule(config["data"])
@@ -327,38 +325,35 @@ def test_the_data_serve_other_modules(config: dict, tmp_path: Path) -> None:
     assert float(module.colour.min()) > 0.5  # Most of the images is white.
 
 
-def test_the_script_of_the_docs_runs(
-    config: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    (script,) = re.findall(r"```python\n(import lightning.*?)```", page, re.DOTALL)
-    monkeypatch.chdir(tmp_path)
+def execute(page: str, pattern: str, config: dict, replaced: dict, **names) -> dict:
+    """Run a script of the docs on the demo scene, and give its variables."""
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    (script,) = re.findall(rf"```python\n({pattern})```", text, re.DOTALL)
     folder = SceneDataModule(config["data"]).settings.folder
-    script = script.replace('"data.root=data/dnerf"', f'"data.root={folder.parent.resolve()}"')
-    script = script.replace(
-        '"data.scene=lego"', f'"data.scene={folder.name}", "data.resolution=null"'
-    )
-    script = script.replace("max_steps=2000", "max_steps=20")
-    exec(compile(script, "recipes.md", "exec"), {})
+    here = {
+        '"data.root=data/dnerf"': f'"data.root={folder.parent.resolve()}"',
+        '"data.scene=lego"': f'"data.scene={folder.name}", "data.resolution=null"',
+    }
+    for old, new in (here | replaced).items():
+        script = script.replace(old, new)
+    exec(compile(script, page, "exec"), names)
+    return names
+
+
+def test_the_script_of_the_docs_runs(config, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    execute("recipes.md", "import lightning.*?", config, {"max_steps=2000": "max_steps=20"})
     assert (tmp_path / "field.ckpt").is_file()
     assert (tmp_path / "view.png").is_file()
 
 
-def test_the_page_on_your_own_trainer_runs(
-    config: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page = (ROOT / "docs" / "own_trainer.md").read_text(encoding="utf-8")
-    (script,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+def test_the_page_on_your_own_trainer_runs(config, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    folder = SceneDataModule(config["data"]).settings.folder
-    script = script.replace('"data.root=data/dnerf"', f'"data.root={folder.parent.resolve()}"')
-    script = script.replace(
-        '"data.scene=lego"', f'"data.scene={folder.name}", "data.resolution=null"'
-    )
-    script = script.replace("max_steps=2000", 'max_steps=12, accelerator="cpu"')
-    script = script.replace("val_check_interval=500", "val_check_interval=6")
-    names: dict = {}
-    exec(compile(script, "own_trainer.md", "exec"), names)
+    short = {
+        "max_steps=2000": 'max_steps=12, accelerator="cpu"',
+        "val_check_interval=500": "val_check_interval=6",
+    }
+    names = execute("own_trainer.md", ".*?", config, short)
     assert names["trainer"].global_step == 12
     kept = torch.load(tmp_path / "checkpoints" / "best.ckpt", weights_only=True)
     assert {"current_model_state", "averaging_state"} <= kept.keys()
@@ -366,9 +361,7 @@ def test_the_page_on_your_own_trainer_runs(
         assert torch.equal(names["again"].state_dict()[name], value), name
 
 
-def test_a_checkpoint_of_another_version_is_refused_with_its_number(
-    fitted: tuple, tmp_path: Path
-) -> None:
+def test_a_checkpoint_of_another_version_is_refused_with_its_number(fitted, tmp_path):
     fitted[3].save_checkpoint(tmp_path / "old.ckpt")
     content = torch.load(tmp_path / "old.ckpt", weights_only=True)
     content["hyper_parameters"]["config"]["model"]["rays"]["accumulate"] = 1
@@ -379,33 +372,30 @@ def test_a_checkpoint_of_another_version_is_refused_with_its_number(
             RadianceModule.load_from_checkpoint(tmp_path / "old.ckpt")
 
 
-def test_plugins_of_the_docs_are_composed_and_loaded_again(
-    config: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    (script,) = re.findall(r"```python\n(module = .*?)```", page, re.DOTALL)
+def test_plugins_of_the_docs_are_composed_and_loaded_again(config, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    script = script.replace("my_package.extras", "tests.plugins.opacity_loss")
-    script = script.replace("my_package", "tests.plugins").replace("max_steps=2000", "max_steps=3")
+    ours = {
+        "my_package.extras": "tests.plugins.opacity_loss",
+        "my_package": "tests.plugins",
+        "max_steps=2000": "max_steps=3",
+    }
+    given = {"lightning": lightning, "RadianceModule": RadianceModule}
     data = SceneDataModule(config["data"])
-    names = {"lightning": lightning, "RadianceModule": RadianceModule, "data": data}
-    exec(compile(script, "recipes.md", "exec"), names)
+    names = execute("recipes.md", "module = .*?", config, ours, data=data, **given)
     assert names["again"].method.losses["op"].weight == 0.1
     words = r"name a module of your own with load_from_checkpoint\(path, plugins=\[MODULE\]\)$"
     with pytest.raises(ConfigError, match=rf"^losses\.op\._target_=tests\.plugins.*{words}"):
         RadianceModule.load_from_checkpoint("field.ckpt")
 
 
-def test_a_list_of_settings_is_refused() -> None:
+def test_a_list_of_settings_is_refused():
     with pytest.raises(ConfigError, match=r"^compose\(\['seed=1'\]\): takes settings one by one"):
         RadianceModule.compose(["seed=1"])  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=r"^compose\(\['seed=1'\]\): takes settings one by one"):
         SceneDataModule.compose(["seed=1"])  # type: ignore[arg-type]
 
 
-def test_processes_do_not_send_each_other_the_grid_before_each_step(
-    config: dict, tmp_path: Path
-) -> None:
+def test_processes_do_not_send_each_other_the_grid_before_each_step(config, tmp_path):
     """In a group of one process, which torch treats like any other."""
     sent = []
 
@@ -426,7 +416,7 @@ def test_processes_do_not_send_each_other_the_grid_before_each_step(
     assert not grid & sent[-1]
 
 
-def test_what_a_trainer_of_ours_settles_for_gpus(tmp_path: Path) -> None:
+def test_what_a_trainer_of_ours_settles_for_gpus(tmp_path):
     before = torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
     options = {"accelerator": "cpu", "default_root_dir": tmp_path, "logger": False}
     try:

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -21,7 +20,7 @@ with alone_in(Path(sys.argv[1])):
 """
 
 
-def test_a_second_process_is_refused_until_the_first_is_killed(tmp_path: Path) -> None:
+def test_a_second_process_is_refused_until_the_first_is_killed(tmp_path):
     holder = subprocess.Popen(
         [sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True
     )
@@ -37,7 +36,7 @@ def test_a_second_process_is_refused_until_the_first_is_killed(tmp_path: Path) -
         assert (tmp_path / ".lock").is_file()
 
 
-def test_turns_are_free_when_nobody_holds_them(tmp_path: Path) -> None:
+def test_turns_are_free_when_nobody_holds_them(tmp_path):
     with in_turn(tmp_path / "a.lock") as waited:
         assert not waited
     with in_turn(None) as waited:

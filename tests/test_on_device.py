@@ -143,8 +143,8 @@ def test_training_there_comes_to_the_numbers_of_plain_torch(fake_gpu, monkeypatc
     )
     there, _, _ = trained(name, 16, *options)
     here, _, _ = trained(name, 16, *options, trainer=on_the_cpu)
-    assert there.counts == here.counts
-    assert there.counts["no_room"] == 0
+    assert there.tally.counts == here.tally.counts
+    assert there.tally.counts["no_room"] == 0
     for ours, theirs in zip(there.parameters(), here.parameters(), strict=True):
         # Adam makes as much of a tiny gradient, in which rounding shows, as of a large one.
         torch.testing.assert_close(ours.cpu(), theirs, atol=3e-4, rtol=1e-4)
@@ -158,13 +158,13 @@ def test_what_a_step_shows_is_read_now_and_then(fake_gpu):
     waiting = {n + 1 for n, counts in enumerate(steps) if counts.waits["to the CPU"]}
     assert waiting == {1, 2, 4, 8, 16, 32}
     assert module.batches == 33
-    seen = module.counts
+    seen = module.tally.counts
     left = seen["candidates"] - seen["empty"] - seen["occluded"]
     assert 0 < seen["samples"] <= left  # Others would be of rays without room.
     # The last batch is read at the end.
     assert 33 * 128 < seen["rays"] + seen["no_room"] <= 33 * 256
-    assert 0 < module.last["psnr"] < 40
-    assert 0 < module.last["foreground"] < 1
+    assert 0 < module.tally.last["psnr"] < 40
+    assert 0 < module.tally.last["foreground"] < 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,7 +196,7 @@ def test_steps_that_are_not_finite_are_left_out(fake_gpu, monkeypatch, gradient)
     assert torch.equal(seen[3], seen[6])
     assert not torch.equal(seen[2], seen[3])
     assert not torch.equal(seen[6], seen[7])
-    assert module.unusable == 3
+    assert module.tally.skipped == 3
     monkeypatch.setattr(Broken, "steps", range(100))
     with pytest.raises(TrainingError, match=r"for [23]\d steps in a row.*losses\.broken"):
         trained("six", 32, losses={"broken": Broken(weight=1.0)})

@@ -1,7 +1,6 @@
 """Models, samplers, data formats and losses from outside the package, chosen by configuration."""
 
 import csv
-import json
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -11,7 +10,7 @@ import pytest
 import torch
 import yaml
 
-from tests.training.runs import small_config
+from tests.training.runs import metrics, small_config
 from xplanes import RadianceModule, SceneDataModule, __version__
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
@@ -53,7 +52,7 @@ def config(tmp_path: Path) -> dict:
     return found | {"losses": {"opacity": LOSS}, "plugins": ["tests.plugins"]}
 
 
-def test_all_four_train_log_and_load_again(config: dict, tmp_path: Path) -> None:
+def test_all_four_train_log_and_load_again(config, tmp_path):
     folder = tmp_path / "run"
     run(config, folder, [], resume=False)
     curve = list(csv.DictReader((folder / "curve.csv").open()))
@@ -68,10 +67,10 @@ def test_all_four_train_log_and_load_again(config: dict, tmp_path: Path) -> None
     assert again.field.width == BLOB["width"]
     views = SceneDataModule.from_run(folder, plugins=["tests.plugins"]).scene.splits["train"]
     assert len(views) == DATA["count"]
-    assert json.loads((folder / "metrics.json").read_text())["step"] == 40
+    assert metrics(folder)["step"] == 40
 
 
-def test_a_recipe_reaches_a_model_of_ones_own_or_names_itself(tmp_path: Path) -> None:
+def test_a_recipe_reaches_a_model_of_ones_own_or_names_itself(tmp_path):
     group = tmp_path / "model"
     group.mkdir()
     rays = dict.fromkeys(("per_batch", "samples_per_batch"), "auto")
@@ -89,7 +88,7 @@ def test_a_recipe_reaches_a_model_of_ones_own_or_names_itself(tmp_path: Path) ->
             Experiment.read(compose_plain("train", [*own, f"recipe={recipe}"]))
 
 
-def test_data_of_ones_own_is_composed_in_python() -> None:
+def test_data_of_ones_own_is_composed_in_python():
     own = ["data._target_=tests.plugins.shell_format.DiscSettings", "+data.count=6"]
     own += [f"~data.{name}" for name in ("seed", "train_views", "test_views", "val_views")]
     data = SceneDataModule.compose("plugins=[tests.plugins]", *own, "data.scene=disc")
@@ -98,7 +97,7 @@ def test_data_of_ones_own_is_composed_in_python() -> None:
         SceneDataModule.compose(*own)
 
 
-def test_a_run_of_somebody_else_names_no_classes_by_itself(config: dict, tmp_path: Path) -> None:
+def test_a_run_of_somebody_else_names_no_classes_by_itself(config, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
@@ -124,16 +123,14 @@ def test_a_run_of_somebody_else_names_no_classes_by_itself(config: dict, tmp_pat
         ("tests.plugins.gaussian_blob.RadianceField", "must be a class derived from"),
     ],
 )
-def test_classes_that_may_not_stand_there_are_refused(
-    config: dict, tmp_path: Path, target: str, words: str
-) -> None:
+def test_classes_that_may_not_stand_there_are_refused(config, tmp_path, target, words):
     config["model"]["_target_"] = target
     with pytest.raises(ConfigError, match=rf"model\._target_={target}: .*{words}"):
         run(config, tmp_path / "run", [], resume=False)
     assert not (tmp_path / "run" / "run.json").exists()
 
 
-def test_settings_of_plugins_are_checked_alike(config: dict, tmp_path: Path) -> None:
+def test_settings_of_plugins_are_checked_alike(config, tmp_path):
     config["model"]["width"] = -1.0
     with pytest.raises(ConfigError, match=r"model\.width=-1\.0: must be above 0"):
         run(config, tmp_path / "run", [], resume=False)
@@ -142,7 +139,7 @@ def test_settings_of_plugins_are_checked_alike(config: dict, tmp_path: Path) -> 
         run(config, tmp_path / "run", [], resume=False)
 
 
-def test_a_module_that_is_not_there_is_said(config: dict, tmp_path: Path) -> None:
+def test_a_module_that_is_not_there_is_said(config, tmp_path):
     with pytest.raises(ConfigError, match=r"plugins: not_here cannot be imported.*PYTHONPATH"):
         run(config | {"plugins": ["not_here"]}, tmp_path / "run", [], resume=False)
 
@@ -203,23 +200,21 @@ def first_psnr(folder: Path) -> float:
     return float(next(csv.DictReader((folder / "curve.csv").open()))["psnr"])
 
 
-def test_the_lrm_of_the_docs_initialises_a_field(
-    example: Callable[..., dict], tmp_path: Path
-) -> None:
+def test_the_lrm_of_the_docs_initialises_a_field(example, tmp_path):
     changes = ("data.resolution=48", "preparation.cache=null", "preparation.frames=4")
     changes += ("trainer.max_steps=2",)
     own = example("A Large Reconstruction Model", "lrm", "cardboard", *changes)
     run(own, tmp_path / "own", [], resume=False)
-    metrics = json.loads((tmp_path / "own" / "metrics.json").read_text())
-    assert metrics["lrm"]["frames"] == 4
-    assert metrics["decomposition"]["xz"]["converged"]
+    content = metrics(tmp_path / "own")
+    assert content["lrm"]["frames"] == 4
+    assert content["decomposition"]["xz"]["converged"]
     assert (tmp_path / "own" / "media" / "fixed_view.png").is_file()
     random = compose_plain("train", ["lrm=none"])["lrm"]
     run(own | {"lrm": random}, tmp_path / "random", [], resume=False)
     assert first_psnr(tmp_path / "own") > first_psnr(tmp_path / "random") + 1
 
 
-def test_the_model_of_the_docs_trains(small_model: dict, tmp_path: Path) -> None:
+def test_the_model_of_the_docs_trains(small_model, tmp_path):
     assert small_model["lrm"]["name"] == "none"
     run(small_model, tmp_path / "run", [], resume=False)
     curve = list(csv.DictReader((tmp_path / "run" / "curve.csv").open()))
@@ -242,8 +237,8 @@ def test_the_model_of_the_docs_trains(small_model: dict, tmp_path: Path) -> None
     ],
 )
 def test_groups_that_cannot_be_trained_are_refused_when_the_model_is_built(
-    small_model: dict, groups: list, words: str
-) -> None:
+    small_model, groups, words
+):
     module = RadianceModule(small_model, plugins=["my_package"])
     scene = SceneDataModule(small_model["data"]).scene
     model = sys.modules["my_package.mlp"].MLPModel
@@ -252,7 +247,7 @@ def test_groups_that_cannot_be_trained_are_refused_when_the_model_is_built(
         module.build(scene)
 
 
-def test_a_field_of_another_class_is_refused(small_model: dict) -> None:
+def test_a_field_of_another_class_is_refused(small_model):
     module = RadianceModule(small_model, plugins=["my_package"])
     scene = SceneDataModule(small_model["data"]).scene
     sys.modules["my_package.mlp"].MLPModel.field = torch.nn.Linear(4, 4)
@@ -260,7 +255,7 @@ def test_a_field_of_another_class_is_refused(small_model: dict) -> None:
         module.build(scene)
 
 
-def test_a_part_of_a_field_may_not_hide_behind_a_property() -> None:
+def test_a_part_of_a_field_may_not_hide_behind_a_property():
     field = RadianceField()
     with pytest.raises(AttributeError, match=r"RadianceField\.planes is a property; rename"):
         field.planes = torch.nn.ParameterDict()

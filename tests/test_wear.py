@@ -26,7 +26,7 @@ def aged(path: Path) -> Path:
     return path
 
 
-def test_the_cache_clears_what_is_a_day_old(tmp_path: Path) -> None:
+def test_the_cache_clears_what_is_a_day_old(tmp_path):
     old, new = (tmp_path / f".parts-{age}.pt{MARK}x.pt" for age in ("old", "new"))
     old.write_bytes(b"half")
     new.write_bytes(b"half")
@@ -35,7 +35,7 @@ def test_the_cache_clears_what_is_a_day_old(tmp_path: Path) -> None:
     assert (old.exists(), new.exists()) == (False, True)
 
 
-def test_rendering_a_scene_clears_what_is_a_day_old(tmp_path: Path, monkeypatch) -> None:
+def test_rendering_a_scene_clears_what_is_a_day_old(tmp_path, monkeypatch):
     monkeypatch.setattr(write, "VIDEO_FRAMES", 2)
     small = {"resolution": 8, "train_views": 1, "val_views": 1, "test_views": 1}
     folder = ensure_demo_scene(tmp_path, "balls", **small)
@@ -48,7 +48,7 @@ def test_rendering_a_scene_clears_what_is_a_day_old(tmp_path: Path, monkeypatch)
     assert (old.exists(), new.exists(), folder.exists()) == (False, True, True)
 
 
-def test_a_damaged_demo_scene_says_to_delete_it(tmp_path: Path) -> None:
+def test_a_damaged_demo_scene_says_to_delete_it(tmp_path):
     config = small_config(tmp_path / "scenes")
     data = Experiment.read(config).data
     data.read()
@@ -58,19 +58,19 @@ def test_a_damaged_demo_scene_says_to_delete_it(tmp_path: Path) -> None:
         data.read()
 
 
-def test_a_damaged_record_of_a_pool_is_named(tmp_path: Path) -> None:
+def test_a_damaged_record_of_a_pool_is_named(tmp_path):
     (tmp_path / RECORD).write_text('{"version": 1,')
     with pytest.raises(ConfigError, match=r"pool\.json is damaged.*delete it"):
         ensure_pool(tmp_path, range(SHARD), views=1, side=4)
 
 
-def test_no_place_for_the_output_is_said_before_anything_is_loaded(tmp_path: Path) -> None:
+def test_no_place_for_the_output_is_said_before_anything_is_loaded(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match=r"file/run cannot be written: Not a directory"):
         prepare([f"hydra.run.dir={tmp_path / 'file' / 'run'}"])
 
 
-def test_overrides_that_were_cut_short_are_not_taken_for_whole(tmp_path: Path) -> None:
+def test_overrides_that_were_cut_short_are_not_taken_for_whole(tmp_path):
     path = tmp_path / "overrides.txt"
     path.write_text("seed=3\ntrainer.max_steps=400")
     with pytest.raises(ConfigError, match=r"overrides\.txt is damaged.*config\.yaml"):
@@ -79,9 +79,7 @@ def test_overrides_that_were_cut_short_are_not_taken_for_whole(tmp_path: Path) -
     assert "trainer.max_steps=400" in prepare([f"resume={tmp_path}"])
 
 
-def test_a_disk_that_fills_up_ends_a_run_with_a_message(
-    scenes: Path, tmp_path: Path, monkeypatch, capsys
-) -> None:
+def test_a_disk_that_fills_up_ends_a_run_with_a_message(scenes, tmp_path, monkeypatch, capsys):
     from lightning import Trainer
 
     original = Trainer.save_checkpoint

@@ -53,7 +53,7 @@ for arguments in {!r}:
 """
 
 
-def test_commands_work_from_an_empty_folder(installed: Path, tmp_path: Path) -> None:
+def test_commands_work_from_an_empty_folder(installed, tmp_path):
     # The compiled loops would take half a minute to compile for this copy.
     settings = {"PYTHONPATH": str(installed), "XPLANES_CPU_LOOPS": "0"}
     script = next((installed / "bin").glob("xplanes*"))
@@ -75,7 +75,7 @@ def test_commands_work_from_an_empty_folder(installed: Path, tmp_path: Path) -> 
     assert {path.name for path in tmp_path.iterdir()} == {"data", "outputs", "video.webp"}
 
 
-def test_the_page_and_its_scripts_are_shipped(installed: Path) -> None:
+def test_the_page_and_its_scripts_are_shipped(installed):
     parts = Path("xplanes", "evaluation", "web")
     shipped = [{path.name for path in (place / parts).iterdir()} for place in (ROOT, installed)]
     assert shipped[0] == shipped[1]

@@ -108,7 +108,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_the_page_has_a_section_for_each_format() -> None:
+def test_the_page_has_a_section_for_each_format():
     named = {
         text.partition("=")[2]
         for words in commands(r"python train\.py")
@@ -119,7 +119,7 @@ def test_the_page_has_a_section_for_each_format() -> None:
 
 
 @pytest.mark.parametrize("words", commands("xplanes inspect"), ids=" ".join)
-def test_inspect_as_the_page_says(words: list[str], place: Path, monkeypatch, capsys) -> None:
+def test_inspect_as_the_page_says(words, place, monkeypatch, capsys):
     monkeypatch.chdir(place)
     before = {path: path.stat().st_mtime_ns for path in (place / "captures").rglob("*")}
     assert main(["inspect", *words]) == 0, capsys.readouterr().err
@@ -141,7 +141,7 @@ def small(words: list[str]) -> list[str]:
 
 
 @pytest.mark.parametrize("words", commands(r"python train\.py"), ids=" ".join)
-def test_training_reads_what_the_page_says(words: list[str], place: Path, monkeypatch) -> None:
+def test_training_reads_what_the_page_says(words, place, monkeypatch):
     monkeypatch.chdir(place)
     settings = [text for text in small(words) if not text.startswith("hydra.")]
     scene = SceneDataModule(compose_plain("train", settings)["data"]).scene
@@ -150,7 +150,7 @@ def test_training_reads_what_the_page_says(words: list[str], place: Path, monkey
 
 
 @pytest.mark.slow
-def test_training_and_rendering_as_the_page_says(place: Path, monkeypatch) -> None:
+def test_training_and_rendering_as_the_page_says(place, monkeypatch):
     from xplanes.launch import train
 
     monkeypatch.chdir(place)

@@ -96,18 +96,17 @@ def start(*arguments: str, cwd: Path = ROOT) -> Running:
     return Running(warm.stdout, folder)
 
 
-def run(
-    *arguments: str, cwd: Path = ROOT, timeout: float = 240
-) -> subprocess.CompletedProcess[str]:
-    """``python ARGUMENTS`` to its end."""
+def run(*arguments: str, cwd: Path = ROOT, code: int = 0) -> subprocess.CompletedProcess[str]:
+    """``python ARGUMENTS`` to its end, with this exit status."""
     running = start(*arguments, cwd=cwd)
-    code = running.wait(timeout)
+    ended = running.wait(240)
+    assert ended == code, running.text("err")
     return subprocess.CompletedProcess(arguments, code, running.text("out"), running.text("err"))
 
 
-def train(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    """``python train.py ARGUMENTS`` to its end."""
-    return run(str(ROOT / "train.py"), *arguments, cwd=cwd)
+def train(*arguments: str, **options) -> subprocess.CompletedProcess[str]:
+    """``python train.py ARGUMENTS`` to its end, see `run`."""
+    return run(str(ROOT / "train.py"), *arguments, **options)
 
 
 FORK = """

@@ -31,7 +31,7 @@ COMPILING = 15
 
 @dataclass
 class WarmUp:
-    """The time that loops took to load and compile, which counts towards no stage.
+    """The time that loops took to load and compile, which no stage of a run includes.
 
     Attributes:
         seconds: Since the process began.
@@ -42,7 +42,7 @@ class WarmUp:
 
     @contextmanager
     def timed(self) -> Iterator[None]:
-        """Counts what is done inside, once."""
+        """Count the time of the block; nested blocks count once."""
         if self._inside:
             yield
             return
@@ -179,13 +179,12 @@ def proven(
     except Exception as error:
         # No failure of a compiler ends the run: torch does the same.
         reason = str(error).strip().split("\n")[0] or "no reason given"
-        _require_alive(device, what, f"{type(error).__name__}: {reason}")
+        reason = f"{type(error).__name__}: {reason}"
+        _require_alive(device, what, reason)
         logger.warning(
-            "the Triton kernels for %s are not used: %s: %s. Plain torch does the same, slower; "
+            "the Triton kernels for %s are not used: %s. Plain torch does the same, slower; "
             "XPLANES_GPU_KERNELS=0 hides this message.",
-            what,
-            type(error).__name__,
-            reason,
+            *(what, reason),
         )
         _refused.add(what)
         return False

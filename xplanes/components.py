@@ -34,7 +34,7 @@ MOVED = {
     "xplanes.rendering.proposal": "xplanes.baselines.proposal",
     "xplanes.scenes.demo.write": "xplanes.synthetic.demo.write",
 }
-"""Modules that runs and checkpoints of early 0.3 name, and where their classes are now."""
+"""Former modules, as runs and checkpoints of early 0.3 name them, and their present names."""
 
 _plugins: ContextVar[tuple[str, ...]] = ContextVar("plugins", default=())
 
@@ -95,17 +95,16 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
     else:
         cls = class_of(target, kind, f"{key}._target_")
     arguments = {name: value for name, value in node.items() if name != "_target_"}
-    if not issubclass(cls, Settings):
-        for name, value in arguments.items():
-            if isinstance(value, Mapping) and "_target_" in value:
-                raise ConfigError(
-                    f"{key}.{name}._target_={value['_target_']}: {cls.__name__} takes plain values "
-                    "here; derive a class that makes this one, and name it instead (plugins)"
-                )
     try:
         if issubclass(cls, Settings):
             # What `instantiate` would do takes longer.
             return cast(T, read_settings(cls, {**arguments, **more}))
+        for name, value in arguments.items():
+            if isinstance(value, Mapping) and "_target_" in value:
+                raise ConfigError(
+                    f"{name}._target_={value['_target_']}: {cls.__name__} takes plain values here; "
+                    "derive a class that makes this one, and name it instead (plugins)"
+                )
         if cls.__module__.startswith("xplanes."):
             check_arguments(cls.__init__, arguments)
         # Arguments may be called as those of `instantiate` are, such as config.

@@ -20,7 +20,7 @@ NAMES = (
     *("data.times", "lrm.weights", "lrm.config", "lrm.triplanes", "preparation.cache"),
     *("resume", "hydra.run.dir", "hydra.sweep.dir", "run", "pool.root", "init_from"),
 )
-"""Settings whose values are names or paths, whatever they look like."""
+"""Settings whose values are names or paths, even if they look like numbers or lists."""
 
 ELSEWHERE = {
     "gpus": "trainer=ddp trainer.devices={}",
@@ -30,8 +30,11 @@ ELSEWHERE = {
     "iterations": "trainer.max_steps={}",
     "device": "trainer.accelerator={}",
     "output_dir": "hydra.run.dir={}",
+    "world_variation": "model.loss.total_variation_with_background={}",
+    "world_time": "model.loss.time_factor_with_background={}",
+    "world_threshold": "model.sampler.threshold_with_background={}",
 }
-"""Settings by the names that they have in other programs, with a place for their value."""
+"""Settings by their names in other programs or earlier versions, with a place for their value."""
 
 _PLAIN = re.compile(r"(?!\.\d)[A-Za-z_./][A-Za-z0-9_./-]*")
 """Text that Hydra reads as it is; other letters it takes in quotes alone."""
@@ -129,6 +132,18 @@ def to_plain(config: Any) -> dict[str, Any]:
     return {str(key): value for key, value in plain.items()}
 
 
+def key_and_value(override: str) -> tuple[str, str]:
+    """Key and value of an override; an empty key for anything else."""
+    key, equals, value = override.partition("=")
+    return (key.lstrip("+~"), value) if equals and not key.startswith("-") else ("", "")
+
+
+def settings_and_paths(arguments: Sequence[str]) -> tuple[list[str], list[Path]]:
+    """Words of a command line that are settings, and those that are files or folders."""
+    changed = [text for text in arguments if "=" in text and not Path(text).exists()]
+    return changed, [Path(text) for text in arguments if text not in changed]
+
+
 def quoted(text: str) -> str:
     """Text as Hydra reads it in an override."""
     if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
@@ -204,10 +219,13 @@ def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "
                 values = list(each.sweep_string_iterator()) if swept else [each.value()]
                 for option in values:
                     if isinstance(option, str) and option not in options:
-                        near = difflib.get_close_matches(option, options, n=1, cutoff=0.6)
-                        meant = [f"{group}={each}" for each in near] or _described(
-                            conf, group, option
-                        )
+                        named = {f"{group}={name}": name for name in options}
+                        if group == "experiment":
+                            sweeps = loader.get_group_options("sweep", config_name=name)
+                            named |= {f"-m sweep={sweep}": sweep for sweep in sweeps}
+                        near = difflib.get_close_matches(option, named.values(), n=1)
+                        meant = [each for each, name in named.items() if name in near]
+                        meant = meant or _described(conf, group, option)
                         return f"Did you mean {' or '.join(meant)}?" if meant else ""
                 line = str(each.input_line)
                 chosen.append(f"{line.partition('=')[0]}={values[0]}" if swept else line)

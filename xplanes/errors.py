@@ -17,7 +17,7 @@ class ConfigError(XPlanesError, ValueError):
 
 
 class DeviceError(XPlanesError, RuntimeError):
-    """A device stopped working; the message names what it was doing and the way out."""
+    """A device stopped working; the message names what it was doing and the remedy."""
 
 
 class LRMError(XPlanesError, ValueError):
@@ -36,6 +36,16 @@ class BrokenFrameError(SceneError):
     """One frame cannot be used; a capture can do without it."""
 
 
+def require_between(name: str, value: float | None, low: float, high: float) -> None:
+    """Refuse a number out of range; None passes.
+
+    Raises:
+        ConfigError: With the name, the value and the range.
+    """
+    if value is not None and not low <= value <= high:
+        raise ConfigError(f"{name} {value}: must lie between {low} and {high}")
+
+
 SHOWN = 5
 """Problems of a capture that are shown in full."""
 
@@ -51,7 +61,7 @@ def refuse_all(problems: Sequence[str]) -> None:
 
 
 def all_of(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """What a function makes of each item.
+    """The results of a function for all items.
 
     Raises:
         SceneError: If it refuses some; with the problems of all, see `refuse_all`.
@@ -75,5 +85,5 @@ def first_of(problems: Sequence[str]) -> str:
 
 
 def warn(text: str) -> None:
-    """Warn of what a capture lacks, or may mean."""
+    """Warn about a capture."""
     warnings.warn(text, stacklevel=3)

@@ -140,20 +140,17 @@ def _logger(name: str, node: Mapping[str, Any], run: Path) -> Logger:
     """
     key = f"logger.{name}"
     cls = class_of(node.get("_target_"), Logger, f"{key}._target_")
-    taken = inspect.signature(cls).parameters.values()
-    known = any(each.name == "save_dir" or each.kind is each.VAR_KEYWORD for each in taken)
-    place = {"save_dir": str(run)} if known and "save_dir" not in node else {}
-    logger = build(node, Logger, key, **place)
+    taken = inspect.signature(cls).parameters
+    open_ended = any(each.kind is each.VAR_KEYWORD for each in taken.values())
+    place = {"save_dir": str(run)} if open_ended or "save_dir" in taken else {}
+    logger = build(node, Logger, key, **{k: v for k, v in place.items() if k not in node})
     if isinstance(logger, TensorBoardLogger):
         from torch.utils.tensorboard import SummaryWriter
 
-        known = [
-            inspect.signature(cls.__init__).parameters for cls in (type(logger), SummaryWriter)
-        ]
-        for key, value in node.items():
-            if key != "_target_" and not any(key in parameters for parameters in known):
-                raise ConfigError(
-                    f"logger.{name}.{key}={value}: {type(logger).__name__} has no such argument; "
-                    "leave it out"
-                )
+        known = {"_target_", *taken, *inspect.signature(SummaryWriter).parameters}
+        if foreign := [entry for entry in node if entry not in known]:
+            raise ConfigError(
+                f"{key}.{foreign[0]}={node[foreign[0]]}: {cls.__name__} has no such argument; "
+                "leave it out"
+            )
     return logger

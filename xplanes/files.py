@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from xplanes.errors import XPlanesError
+from xplanes.errors import ConfigError, XPlanesError
 
 MARK = ".tmp-"
 """Part of the name of every file that is not whole yet."""
@@ -32,7 +32,7 @@ def storage_error(problem: OSError, path: Path | None = None) -> StorageError | 
 
     Args:
         problem: What went wrong.
-        path: The file to be written; None takes the problem's own, which may have been read.
+        path: The file to be written; when None, that of the problem, which may have been read.
     """
     way_out = _WAYS_OUT.get(problem.errno or 0)
     if way_out is None or (path is None and problem.errno not in _ONLY_WRITING):
@@ -86,10 +86,10 @@ def is_there(path: Path) -> bool:
 
 
 def stand_in(path: Path) -> str | None:
-    """What a placeholder of a file that was not fetched is, and the way out; None for others.
+    """Why a file is only a placeholder of the real one, and what to do; None for other files.
 
     Args:
-        path: A file that cannot be read as what it should be.
+        path: A file that cannot be read.
     """
     try:
         with path.open("rb") as file:
@@ -125,6 +125,18 @@ def require_writable(folder: Path) -> None:
         if (words := storage_error(problem, folder)) is None:
             raise
         raise words from problem
+
+
+def require_empty(folder: Path) -> None:
+    """Refuse a folder, which need not exist yet, that holds files or is one.
+
+    Raises:
+        ConfigError: If it does.
+    """
+    if folder.is_file():
+        raise ConfigError(f"{folder} is a file: name a folder")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise ConfigError(f"{folder} holds files already: empty it, or name another with --out")
 
 
 @contextmanager

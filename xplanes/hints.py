@@ -11,9 +11,6 @@ from xplanes.errors import ConfigError
 def require_readable(arguments: Sequence[str]) -> None:
     """Refuse what is not ``key=value`` or an option of Hydra.
 
-    Args:
-        arguments: Overrides and options of Hydra, as typed.
-
     Raises:
         ConfigError: With the arguments as they were probably meant.
     """

@@ -18,7 +18,15 @@ from omegaconf import DictConfig, OmegaConf
 
 import hydra_plugins.xplanes  # noqa: F401  # Processes of launchers resolve run directories with it.
 from xplanes import __version__
-from xplanes.config import CONF, near_names, quoted, to_plain, unquoted, with_names
+from xplanes.config import (
+    CONF,
+    key_and_value,
+    near_names,
+    quoted,
+    to_plain,
+    unquoted,
+    with_names,
+)
 from xplanes.errors import ConfigError
 from xplanes.files import StorageError, read_json, require_writable
 from xplanes.hints import require_parsed, require_readable
@@ -36,12 +44,7 @@ FORMER = {
     "table3": "sweep=tables2_3",
     "views": "lrm=none,tiny data.views=5,10,20,null",
 }
-"""Sweeps that were experiments, and what they are where their names are others now."""
-
-
-def options(group: str) -> str:
-    """The options of a group."""
-    return ", ".join(sorted(path.stem for path in (CONF / group).glob("*.yaml")))
+"""Former experiments and sweeps, and the command that replaces each of them."""
 
 
 def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
@@ -72,7 +75,7 @@ def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
         hydra.main(config_path=str(CONF), config_name="train", version_base="1.3")(job)()
     except SystemExit as end:
         if isinstance(end.code, int) and end.code and not begun:  # A text is our own message.
-            chosen = [text for text in prepared if _split(text)[0]]
+            chosen = [text for text in prepared if key_and_value(text)[0]]
             if near := near_names(chosen):
                 print(near, file=sys.stderr)
         raise
@@ -93,7 +96,7 @@ class SettingsCheck(Callback):
 
         if config.hydra.runtime.choices.get("sweep") and config.resume is None:
             task: Any = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
-            given = shlex.join(text for text in task if _split(text)[0] != "resume")
+            given = shlex.join(text for text in task if key_and_value(text)[0] != "resume")
             sys.exit(f"error: a sweep is many runs: {train_command()} -m {given}")
         names = [str(name) for name in config if name != "hydra"]
         HydraConfig.instance().set_config(config)  # As Hydra does for the job, for ${hydra:...}.
@@ -146,8 +149,8 @@ def _job(config: DictConfig) -> float:
         if auto:
             _require_same_job(folder, settings.overrides.task)
         # A run that goes on must find the user's own groups again.
-        own = [text for text in settings.overrides.hydra if _split(text)[0] == SEARCHPATH]
-        task = [text for text in settings.overrides.task if _split(text)[0] != "resume"]
+        own = [text for text in settings.overrides.hydra if key_and_value(text)[0] == SEARCHPATH]
+        task = [text for text in settings.overrides.task if key_and_value(text)[0] != "resume"]
         job = None if sweep else _prepared.pop(settings.run.dir, None)
         began = None if sweep else STARTED
         return run(plain, folder, [*own, *task], resume=resume, job=job, began=began)
@@ -183,7 +186,7 @@ def _require_same_job(folder: Path, overrides: Iterable[str]) -> None:
 
 def _may_differ(override: str) -> bool:
     """Whether a run may go on with this changed: how long it trains, what it writes, and where."""
-    return not override or _split(override)[0].split(".")[0] in (
+    return not override or key_and_value(override)[0].split(".")[0] in (
         *("resume", "hydra", "trainer", "callbacks", "logger", "media", "viewer"),
     )
 
@@ -205,23 +208,19 @@ def prepare(arguments: list[str]) -> list[str]:
     several = _is_multirun(arguments)
     _require_present_names(arguments, several=several)
     arguments = [with_names(text, several=several) for text in arguments]
-    require_parsed([text for text in arguments if _split(text)[0]])
-    values = {key: value for key, value in map(_split, arguments) if key}
+    require_parsed([text for text in arguments if key_and_value(text)[0]])
+    # Lightning hands names on in quotes to the other processes of a run.
+    values = {key: unquoted(value) for key, value in map(key_and_value, arguments) if key}
     for key, value in values.items():
         if value in ("null", "None") and (CONF / key).is_dir():
-            raise ConfigError(f"{key}={value}: must be one of {options(key)}")
-    resume = unquoted(values.get("resume", "null"))
+            known = ", ".join(sorted(path.stem for path in (CONF / key).glob("*.yaml")))
+            raise ConfigError(f"{key}={value}: must be one of {known}")
+    resume, folder = values.get("resume", "null"), values.get("hydra.run.dir")
     if resume in ("null", "", "None", "auto"):
         # Before Hydra makes the folder, whose errors are tracebacks.
-        place = "hydra.sweep.dir" if several else "hydra.run.dir"
-        require_writable(Path(unquoted(values.get(place, "outputs"))))
-    if not resume or resume in ("null", "None") or "resume" not in values:
-        return arguments
-    folder = values.get("hydra.run.dir")
-    if folder is not None:
-        folder = unquoted(folder)  # As Lightning hands it on to the other processes of a run.
-    if resume == "auto":
-        if several:
+        place = values.get("hydra.sweep.dir") if several else folder
+        require_writable(Path(place or "outputs"))
+        if resume != "auto" or several:
             return arguments
         own = [a for a in arguments if not a.startswith("resume=")]
         found = Path(folder) if folder else _latest(Path("outputs"), own)
@@ -243,7 +242,7 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
     """The run's own overrides, then the new ones, in the run's own folder."""
     path = run / "overrides.txt"
     if not path.is_file():
-        found = sorted(Path("outputs").glob("*/overrides.txt"), key=_mtime, reverse=True)
+        found = _newest(Path("outputs"), "overrides.txt")
         newest = ", ".join(str(each.parent) for each in found[:3]) or "there is none in outputs"
         raise ConfigError(
             f"resume={run}: not a run directory, no overrides.txt in it. The newest runs: {newest}"
@@ -257,8 +256,8 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
             "one key=value a line"
         )
     new = [a for a in arguments if not a.startswith(("resume=", "hydra.run.dir="))]
-    changed = {key for key, _ in map(_split, new) if key}
-    old = [line for line in text.splitlines() if line and _split(line)[0] not in changed]
+    changed = {key for key, _ in map(key_and_value, new) if key}
+    old = [line for line in text.splitlines() if line and key_and_value(line)[0] not in changed]
     try:
         _require_present_names(old, several=False)
     except ConfigError as error:
@@ -331,7 +330,7 @@ def _require_version(run: Path) -> None:
 def _latest(outputs: Path, overrides: list[str]) -> Path | None:
     """The newest unfinished run with the same overrides."""
     wanted = _without_resume(overrides)
-    for record in sorted(outputs.glob("*/run.json"), key=_mtime, reverse=True):
+    for record in _newest(outputs, "run.json"):
         listed = record.parent / "overrides.txt"
         try:
             done = read_json(record).get("status") == "finished"
@@ -345,25 +344,17 @@ def _latest(outputs: Path, overrides: list[str]) -> Path | None:
 
 def _without_resume(overrides: Iterable[str]) -> list[str]:
     """Overrides in order, but for what the command line alone says of the run that it continues."""
-    keys = {text: _split(text)[0] for text in overrides if text}
-    mine = {t for t, key in keys.items() if key.startswith("hydra.") and key != SEARCHPATH}
-    return sorted(text for text, key in keys.items() if key != "resume" and text not in mine)
+    keys = {text: key_and_value(text)[0] for text in overrides if text}
+    left_out = {"resume", *(key for key in keys.values() if key.startswith("hydra."))}
+    return sorted(t for t, key in keys.items() if key == SEARCHPATH or key not in left_out)
 
 
-def _mtime(path: Path) -> float:
-    return path.stat().st_mtime
-
-
-def _split(argument: str) -> tuple[str, str]:
-    """Key and value of an override; an empty key for anything else."""
-    key, equals, value = argument.partition("=")
-    if not equals or key.startswith("-"):
-        return "", ""
-    return key.lstrip("+~"), value
+def _newest(outputs: Path, name: str) -> list[Path]:
+    """Files of a name in the folders of runs, the newest first."""
+    return sorted(outputs.glob(f"*/{name}"), key=lambda p: p.stat().st_mtime, reverse=True)
 
 
 def _is_multirun(arguments: list[str]) -> bool:
     """Whether Hydra will run several jobs, by an option or by its mode."""
-    if not {"-m", "--multirun"}.isdisjoint(arguments):
-        return True
-    return dict(map(_split, arguments)).get("hydra.mode") == "MULTIRUN"
+    mode = dict(map(key_and_value, arguments)).get("hydra.mode")
+    return mode == "MULTIRUN" or not {"-m", "--multirun"}.isdisjoint(arguments)

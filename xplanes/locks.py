@@ -18,7 +18,7 @@ RUN_LOCK = ".lock"
 
 @contextmanager
 def in_turn(path: Path | None) -> Iterator[bool]:
-    """Hold what other processes wait for.
+    """Hold a lock, once no other process holds it.
 
     Args:
         path: The lock's file; None holds nothing.
@@ -41,10 +41,7 @@ def in_turn(path: Path | None) -> Iterator[bool]:
 
 @contextmanager
 def if_free(path: Path) -> Iterator[bool]:
-    """Hold what other processes wait for, unless one of them holds it.
-
-    Args:
-        path: The lock's file.
+    """Hold a lock, unless another process holds it.
 
     Returns:
         Whether this process holds it.

@@ -1,7 +1,7 @@
 """Image quality, one number per view.
 
-Scores of several views are means of the views' scores: pooling the error first gives other numbers
-than the field's papers print.
+Scores of several views are means of the views' scores, as in the literature; pooling the errors
+first gives different numbers.
 """
 
 import torch

@@ -18,22 +18,22 @@ WAIT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "10000"}
 
 
 KEEP = {"ONEDNN_PRIMITIVE_CACHE_CAPACITY": "256"}
-"""Compiled products that are kept, of 0.4 MB each, scattered over memory that is free in between.
+"""Number of compiled matrix products that oneDNN keeps; each takes 0.4 MB and fragments the heap.
 
-Every number of samples has its own. With oneDNN's 1024 a process grows by 150 MB at each evaluation
-of eleven 400 px images; from 64 on training is as fast.
+Each number of samples needs its own. With oneDNN's default of 1024 a process grows by 150 MB at
+each evaluation of eleven 400 px images; 64 are enough for full speed.
 """
 
 
 NOWHERE = {"HOME": os.devnull}
-"""A home in which no library can make a folder, for users who have none, as in containers.
+"""A home directory for users without one, as in containers; nothing can be written there.
 
-Without it some fail, and others write into a folder called ``~`` of the working directory.
+Without it some libraries fail, and others write into a folder called ``~``.
 """
 
 
 def defaults(environment: Mapping[str, str]) -> dict[str, str]:
-    """The variables to add. Of `WAIT` none where one is set, since they only work together."""
+    """The variables to add; `WAIT` only if neither of its two is set, as they work together."""
     try:
         Path.home()
         groups = [WAIT, KEEP]

@@ -73,10 +73,6 @@ class Job:
 def prepare(config: dict[str, Any], folder: Path) -> Job:
     """Parse the settings of a run and build its Trainer.
 
-    Args:
-        config: The resolved configuration, builtins only.
-        folder: The run directory.
-
     Raises:
         ConfigError: If settings are missing, out of range, or contradict one another.
     """
@@ -112,7 +108,7 @@ def run(
         KeyboardInterrupt: If the user stopped it; the state is saved.
     """
     if resume and isinstance(root := config.get("data", {}).get("root"), str):
-        # It may be relative to where the run was started.
+        # It may be relative to the folder in which the run was started.
         found = found_root(folder, root)
         job = job if found == root else None
         config = config | {"data": config["data"] | {"root": found}}
@@ -194,7 +190,7 @@ def train(
     loaded = time.perf_counter() - warm_up.seconds - began
 
     # Initialisation and field
-    # The module comes first: Lightning holds on to the variables around a new one.
+    # Made before the initialisation: Lightning keeps the local variables of its caller alive.
     module = RadianceModule(method)
     found = Initialisation(method.model, frame)
     if source is not None:

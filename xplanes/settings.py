@@ -56,9 +56,9 @@ Count = Annotated[int, ABOVE_0]
 Positive = Annotated[float, ABOVE_0]
 """A number above 0."""
 Weight = Annotated[float, FROM_0]
-"""A number from 0 on."""
+"""A number of at least 0."""
 Steps = Annotated[int, FROM_0]
-"""A whole number from 0 on."""
+"""A whole number of at least 0."""
 Share = Annotated[float, SHARE]
 """A number from 0 to 1."""
 
@@ -82,7 +82,7 @@ class Settings:
         """Refuse settings that contradict one another.
 
         Raises:
-            ConfigError: With the setting, its value and the way out.
+            ConfigError: With the setting, its value and the remedy.
         """
 
     @classmethod
@@ -169,7 +169,7 @@ def _converted(value: Any, hint: Any) -> Any:
 
 
 def at_home(path: str) -> str:
-    """A path with ``~`` at its beginning as the user's folder; unchanged if there is no such."""
+    """A path with ``~`` at its beginning expanded; unchanged if there is no such home."""
     if not path.startswith("~"):
         return path
     try:
@@ -180,15 +180,6 @@ def at_home(path: str) -> str:
 
 def _is_location(hint: Any) -> bool:
     return any(HOME in getattr(part, "__metadata__", ()) for part in (hint, *get_args(hint)))
-
-
-def locations(cls: type[Settings], prefix: str = "") -> Iterator[str]:
-    """Dotted names of the settings of a class that are files or folders."""
-    for name, hint in hints_of(cls):
-        if _is_location(hint):
-            yield f"{prefix}{name}"
-        elif isinstance(hint, type) and issubclass(hint, Settings):
-            yield from locations(hint, f"{prefix}{name}.")
 
 
 def kinds_of(hint: Any) -> tuple[list[Any], list[Range]]:

@@ -29,8 +29,8 @@ SMALL = "experiment=demo"
 def jobs(hydra: Mapping[str, Any], loader: ConfigLoader | None = None) -> list[list[str]]:
     """Overrides of each job of a multirun.
 
-    Every combination of the grid is run for each row. Where the command line or the grid sets what
-    all rows set, the rows with this value are left; otherwise a row has the last word.
+    Every combination of the grid is run for each row. If the command line or the grid sets a key
+    that all rows set, only rows with that value are run; otherwise rows override the grid.
 
     Args:
         hydra: Hydra's part of the configuration as builtins, as in multirun.yaml, with a sweeper
@@ -72,12 +72,12 @@ def look_ahead(config: DictConfig) -> str:
         config: The configuration of the multirun.
 
     Returns:
-        How many runs there are and for how long they train; nothing where Hydra has to say what is
-        wrong, or the sweeper is not over a grid.
+        How many runs there are and how long they train; empty if the sweeper is not over a grid,
+        or if Hydra itself is going to report an error.
 
     Raises:
-        ConfigError, SceneError, LRMError: For sweeps that cannot be run together, or what is not
-            there.
+        ConfigError, SceneError, LRMError: If sweeps cannot be run together, or data or weights are
+            missing.
     """
     hydra: Any = OmegaConf.to_container(config.hydra, resolve=False)
     if not str(hydra["sweeper"]["_target_"]).endswith(GRIDS):
@@ -119,7 +119,7 @@ def _require_one_sweep(hydra: Mapping[str, Any], found: Sequence[Sequence[str]])
 
 
 def _read(job: DictConfig) -> "Experiment | None":
-    """The settings of a job; None where it is to refuse them itself."""
+    """The settings of a job; None if they are invalid, which the job itself reports."""
     from xplanes.experiment import Experiment
 
     own = [str(name) for name in job if name != "hydra"]

@@ -101,7 +101,7 @@ def click(page: Any, text: str) -> None:
     page.find_element("xpath", f"//button[contains(., '{text}')]").click()
 
 
-def test_the_page_shows_and_steers_a_field_that_trains(viewer: Recorded, page: Any):
+def test_the_page_shows_and_steers_a_field_that_trains(viewer, page):
     # It changes as the field is trained.
     first, step = screen(page), viewer.step
     until(lambda: viewer.step > step + 50 and np.abs(screen(page) - first).mean() > 0.5)

@@ -60,9 +60,7 @@ def transforms(views: Views, **changed: Any) -> dict[str, Any]:
     return {"camera_angle_x": 0.8, "w": 16, "h": 10, "frames": frames, **changed}
 
 
-def test_a_frame_is_the_render_from_its_camera_at_its_time(
-    trained: TrainedRun, views: Views, tmp_path: Path
-):
+def test_a_frame_is_the_render_from_its_camera_at_its_time(trained, views, tmp_path):
     path = write(tmp_path / "camera_path.json", nerfstudio(views))
     folder = render_video(trained, VideoOptions(path=str(path)), f"{tmp_path}/frames/")
     for index, (fov, time) in enumerate(((40, 0.75), (55, 0.25))):
@@ -77,7 +75,7 @@ def test_a_frame_is_the_render_from_its_camera_at_its_time(
         assert np.ptp(expected) > 30
 
 
-def test_a_transforms_file_is_a_path(views: Views, tmp_path: Path):
+def test_a_transforms_file_is_a_path(views, tmp_path):
     path = read_camera_path(write(tmp_path / "a.json", transforms(views, fps=7)))
     assert torch.equal(path.poses, views.camera_to_world[:3])
     assert path.times.tolist() == [0, 0.5, 1]
@@ -85,7 +83,7 @@ def test_a_transforms_file_is_a_path(views: Views, tmp_path: Path):
     assert path.focal(10, 16).tolist() == pytest.approx([8 / math.tan(0.4)] * 3)
 
 
-def test_sizes_rates_and_times_can_be_set(views: Views, tmp_path: Path):
+def test_sizes_rates_and_times_can_be_set(views, tmp_path):
     path = str(write(tmp_path / "a.json", nerfstudio(views)))
     written, changed = VideoOptions(path=path), VideoOptions(path=path, size=10, fps=9, time="0.5")
     assert (written.shape({"train": views}), written.rate) == ((12, 20), 4)
@@ -94,7 +92,7 @@ def test_sizes_rates_and_times_can_be_set(views: Views, tmp_path: Path):
     assert changed.times.tolist() == [0.5, 0.5]
 
 
-def test_times_of_a_spline_that_overshoots_stay_in_range(views: Views, tmp_path: Path, caplog):
+def test_times_of_a_spline_that_overshoots_stay_in_range(views, tmp_path, caplog):
     content = nerfstudio(views)
     for entry, time in zip(content["camera_path"], (-0.03, 1.08), strict=True):
         entry["render_time"] = time
@@ -102,7 +100,7 @@ def test_times_of_a_spline_that_overshoots_stay_in_range(views: Views, tmp_path:
     assert "2 of 2 times lie a little below 0 or above 1" in caplog.text
 
 
-def test_damaged_paths_are_refused(views: Views, tmp_path: Path):
+def test_damaged_paths_are_refused(views, tmp_path):
     def entry(**changed: Any) -> dict[str, Any]:
         first, second = nerfstudio(views)["camera_path"]
         return nerfstudio(views, camera_path=[first, {**second, **changed}])
@@ -127,7 +125,7 @@ def test_damaged_paths_are_refused(views: Views, tmp_path: Path):
         VideoOptions(path=str(tmp_path / "none.json")).check()
 
 
-def test_options_that_contradict_the_path_are_refused(views: Views, tmp_path: Path):
+def test_options_that_contradict_the_path_are_refused(views, tmp_path):
     path = str(write(tmp_path / "a.json", nerfstudio(views)))
     with pytest.raises(ConfigError, match=r"--frames 5.*2 cameras"):
         VideoOptions(path=path, frames=5).check()

@@ -163,7 +163,7 @@ def every_renderer() -> dict[str, tuple[Any, RayRenderer]]:
 
 
 @pytest.mark.parametrize("name", ["occupancy", "proposal", "fixed step", "neus"])
-def test_every_renderer_crops(name: str):
+def test_every_renderer_crops(name):
     field, renderer = every_renderer()[name]
     everything = torch.tensor([[-9.0] * 3, [9.0] * 3])
     box = torch.tensor([[-0.5, -0.5, -0.2], [0.4, 0.5, 0.5]])
@@ -199,7 +199,7 @@ def test_bounds_of_the_training_cameras_do_not_cut_the_scene_off():
 
 
 @pytest.mark.parametrize("hidden", [False, True])
-def test_floaters_are_what_no_silhouette_covers(hidden: bool):
+def test_floaters_are_what_no_silhouette_covers(hidden):
     """A ball that the images show, and one that they do not, beside it or behind it."""
     there = Balls(FRONT)
     floater = BACK if hidden else torch.tensor([0.75, 0.5, 0.0])
@@ -252,7 +252,7 @@ def test_drawing_ends_once_it_is_not_wanted():
 
 
 @pytest.mark.parametrize("lens", [False, True])
-def test_outlines_of_cameras_end_at_the_corners_of_their_images(lens: bool):
+def test_outlines_of_cameras_end_at_the_corners_of_their_images(lens):
     poses = orbit(3, radius=4, elevation=30, target=FRAME.centre)
     focal = torch.tensor([[30.0, 32.0]]).repeat(3, 1)
     centre = torch.tensor([[22.0, 11.0]]).repeat(3, 1)

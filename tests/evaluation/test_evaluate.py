@@ -2,7 +2,6 @@
 
 import json
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -10,7 +9,7 @@ from xplanes.evaluation.evaluate import UnavailableError, evaluate, lpips, score
 from xplanes.evaluation.runs import load_run
 
 
-def test_scores_equal_those_of_the_run(trained_run: Path):
+def test_scores_equal_those_of_the_run(trained_run):
     metrics = json.loads((trained_run / "metrics.json").read_text())
     scores = evaluate(load_run(trained_run), "none")
     assert scores["step"] == metrics["step"]
@@ -23,7 +22,7 @@ def test_scores_equal_those_of_the_run(trained_run: Path):
         )
 
 
-def test_each_split_and_checkpoint_has_its_own_file(trained_run: Path):
+def test_each_split_and_checkpoint_has_its_own_file(trained_run):
     metrics = (trained_run / "metrics.json").read_bytes()
     names = []
     for checkpoint, split in (("last", "val"), ("best", "val"), ("last", "train")):
@@ -36,7 +35,7 @@ def test_each_split_and_checkpoint_has_its_own_file(trained_run: Path):
     assert (trained_run / "metrics.json").read_bytes() == metrics
 
 
-def test_lpips_that_is_not_installed_is_a_reason_not_a_failure(trained_run: Path, monkeypatch):
+def test_lpips_that_is_not_installed_is_a_reason_not_a_failure(trained_run, monkeypatch):
     for name in ("torchvision", "torchvision.models"):
         monkeypatch.setitem(sys.modules, name, None)
     scores = evaluate(load_run(trained_run), "alex")

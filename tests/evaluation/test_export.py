@@ -41,7 +41,7 @@ from xplanes.rendering.pictures import to_bytes
 from xplanes.scenes.cameras import PosedCamera, orbit
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
-from xplanes.training.scores import render_view
+from xplanes.training.scores import score_view
 
 trimesh: Any = pytest.importorskip("trimesh")
 pytest.importorskip("skimage")
@@ -125,7 +125,7 @@ def agreement(first: Tensor, second: Tensor) -> float:
 
 
 @pytest.mark.parametrize("form", ["ply", "glb"])
-def test_a_ball_comes_out_where_it_is_in_the_world(tmp_path: Path, form: str):
+def test_a_ball_comes_out_where_it_is_in_the_world(tmp_path, form):
     trained, resolution = set_up(tmp_path, Ball(500.0, 0.002)), 40
     options = ExportOptions(times="0,1", resolution=resolution, form=form)
     folder = export(trained, options, say=quiet)
@@ -147,7 +147,7 @@ def test_a_ball_comes_out_where_it_is_in_the_world(tmp_path: Path, form: str):
 
 
 @pytest.mark.parametrize("what", ["mesh", "points"])
-def test_glb_files_are_matt_and_leave_the_world_to_a_node(tmp_path: Path, what: str):
+def test_glb_files_are_matt_and_leave_the_world_to_a_node(tmp_path, what):
     options = ExportOptions(what, times="0,1", resolution=24, form="glb")
     folder = export(set_up(tmp_path, Ball(500.0, 0.002)), options, say=quiet)
     content = (folder / f"{what}_0000.glb").read_bytes()
@@ -161,7 +161,7 @@ def test_glb_files_are_matt_and_leave_the_world_to_a_node(tmp_path: Path, what: 
     assert (turn[:3, :3] @ [0, 0, 1]).round(6).tolist() == [0, 1, 0]
 
 
-def test_the_silhouette_of_a_mesh_is_that_of_the_field(tmp_path: Path):
+def test_the_silhouette_of_a_mesh_is_that_of_the_field(tmp_path):
     trained = set_up(tmp_path, Ball(6.0, 0.05))
     folder = export(trained, ExportOptions(times="0.5", resolution=32), say=quiet)
     mesh = trimesh.load(folder / "mesh_0000.ply")
@@ -171,7 +171,7 @@ def test_the_silhouette_of_a_mesh_is_that_of_the_field(tmp_path: Path):
     assert agreement(covered, shown) > 0.95
 
 
-def test_colours_of_vertices_are_those_that_the_field_shows_along_normals(tmp_path: Path):
+def test_colours_of_vertices_are_those_that_the_field_shows_along_normals(tmp_path):
     trained = set_up(tmp_path, Ball())
     folder = export(trained, ExportOptions(times="0.5", resolution=32), say=quiet)
     mesh = trimesh.load(folder / "mesh_0000.ply")
@@ -184,7 +184,7 @@ def test_colours_of_vertices_are_those_that_the_field_shows_along_normals(tmp_pa
     assert np.ptp(expected, axis=0).min() > 0.4
 
 
-def test_a_point_cloud_lies_on_the_surface(tmp_path: Path):
+def test_a_point_cloud_lies_on_the_surface(tmp_path):
     trained = set_up(tmp_path, Ball())
     options = ExportOptions(what="points", times="0.5", resolution=40, count=500)
     cloud = trimesh.load(export(trained, options, say=quiet) / "points_0000.ply")
@@ -197,7 +197,7 @@ def test_a_point_cloud_lies_on_the_surface(tmp_path: Path):
     assert np.abs(cloud.colors[:, :3] / 255 - expected).max() < 0.08
 
 
-def test_what_lies_in_empty_cells_is_left_out_and_not_asked_for(tmp_path: Path):
+def test_what_lies_in_empty_cells_is_left_out_and_not_asked_for(tmp_path):
     grid = whole_grid()
     allowed = torch.ones(2, 16, 16, 16, dtype=torch.bool)
     allowed[:, :, :, 9:] = False  # x
@@ -231,7 +231,7 @@ def dense(tmp_path: Path, name: str) -> TrainedRun:
 
 
 @pytest.mark.parametrize("name", ["K-Planes", "TiNeuVox"])
-def test_the_threshold_is_the_density_of_the_surface(tmp_path: Path, name: str):
+def test_the_threshold_is_the_density_of_the_surface(tmp_path, name):
     trained, resolution = dense(tmp_path, name), 48
     volume, _ = module.solidity(trained, 0.5, resolution)
     threshold = float(-torch.log1p(-volume[volume > 0]).median()) * resolution / 2
@@ -246,7 +246,7 @@ def test_the_threshold_is_the_density_of_the_surface(tmp_path: Path, name: str):
     assert density.median() == pytest.approx(threshold, rel=0.05)
 
 
-def test_a_field_of_signed_distances_gives_its_own_surface(tmp_path: Path):
+def test_a_field_of_signed_distances_gives_its_own_surface(tmp_path):
     torch.manual_seed(0)
     field = tensor4d(width=64, filled=False)
     renderer = NeusRenderer(field, samples=8, more=8, coarse_sharpness=64.0)
@@ -275,20 +275,19 @@ def written_reader(name: str = "Planes") -> Any:
     return names[name]
 
 
+def x_planes(plane_set: str, **parts: Any) -> XPlanes:
+    """A small field with random planes."""
+    size = {"channels": 5, "resolution": 9, "time_resolution": 4}
+    random = {"space_scale": 1, "time_scale": 1, "generator": torch.Generator().manual_seed(0)}
+    made = random_planes(plane_set, **size, **random)
+    return XPlanes(planes=made, plane_set=plane_set, **parts)
+
+
 @pytest.mark.parametrize("plane_set", ["three", "six", "nine"])
-def test_the_documented_reader_gives_the_values_of_the_field(tmp_path: Path, plane_set: str):
+def test_the_documented_reader_gives_the_values_of_the_field(tmp_path, plane_set):
     options: dict[str, Any] = {"activation": "silu", "density": "exp", "density_scale": 3.0}
     options = {} if plane_set == "six" else options | {"colour_margin": 0.0}
-    made = random_planes(
-        plane_set,
-        channels=5,
-        resolution=9,
-        time_resolution=4,
-        space_scale=1,
-        time_scale=1,
-        generator=torch.Generator().manual_seed(0),
-    )
-    field = XPlanes(planes=made, decoder=Decoder(5, width=16, **options), plane_set=plane_set)
+    field = x_planes(plane_set, decoder=Decoder(5, width=16, **options))
     trained = set_up(tmp_path, field)
     folder = export(trained, ExportOptions(what="planes"), say=quiet)
     world = FRAME.to_world(torch.rand(200, 3) * 2.2 - 1.1)
@@ -302,21 +301,12 @@ def test_the_documented_reader_gives_the_values_of_the_field(tmp_path: Path, pla
 
 
 @pytest.mark.parametrize("samples", [0, 7])
-def test_the_documented_reader_sees_the_background_of_the_field(tmp_path: Path, samples: int):
+def test_the_documented_reader_sees_the_background_of_the_field(tmp_path, samples):
     torch.manual_seed(0)
     background = Background(4, 12, width=8, samples=samples)
     with torch.no_grad():
         background.planes.mul_(30)
-    made = random_planes(
-        "six",
-        channels=5,
-        resolution=9,
-        time_resolution=4,
-        space_scale=1,
-        time_scale=1,
-        generator=torch.Generator().manual_seed(0),
-    )
-    field = XPlanes(planes=made, decoder=Decoder(5), plane_set="six", background=background)
+    field = x_planes("six", decoder=Decoder(5), background=background)
     trained = set_up(tmp_path, field)
     folder = export(trained, ExportOptions(what="planes"), say=quiet)
     origins, aims = FRAME.to_world(torch.randn(2, 300, 3))
@@ -328,7 +318,7 @@ def test_the_documented_reader_sees_the_background_of_the_field(tmp_path: Path, 
     assert float(expected.std()) > 0.05
 
 
-def test_the_training_cameras_are_a_path_that_is_rendered_again(trained_run: Path, tmp_path: Path):
+def test_the_training_cameras_are_a_path_that_is_rendered_again(trained_run, tmp_path):
     out = tmp_path / "path"
     assert main(["export", str(trained_run), "--what", "path", "--out", str(out)]) == 0
     trained = load_run(trained_run)
@@ -348,20 +338,20 @@ def test_the_training_cameras_are_a_path_that_is_rendered_again(trained_run: Pat
         arguments = ["--path", str(out / name), "--out", f"{tmp_path}/{name}/"]
         assert main(["render", str(trained_run), *arguments]) == 0
         for number in (0, len(views) - 1):
-            expected = render_view(
+            expected = score_view(
                 trained.module.field,
                 trained.module.renderer,
                 trained.frame,
                 views,
                 int(order[number]),
                 trained.scene.background,
-            )
+            )[1]
             with Image.open(tmp_path / name / f"frame_{number:04d}.png") as frame:
                 found = torch.tensor(np.asarray(frame)).int()
             assert (found - to_bytes(expected["colour"]).int()).abs().max() <= 1
 
 
-def test_the_command_exports_a_run(trained_run: Path, tmp_path: Path, capsys):
+def test_the_command_exports_a_run(trained_run, tmp_path, capsys):
     out = tmp_path / "meshes"
     arguments = ["--times", "2", "--resolution", "32", "--out", str(out)]
     assert main(["export", str(trained_run), *arguments]) == 0
@@ -385,7 +375,7 @@ def test_times():
             export_times(text)
 
 
-def test_bad_options_are_refused(tmp_path: Path):
+def test_bad_options_are_refused(tmp_path):
     for options, words in {
         ExportOptions(form="obj"): "--format obj",
         ExportOptions(resolution=4): "--resolution 4: must lie between 8 and",
@@ -401,7 +391,7 @@ def test_bad_options_are_refused(tmp_path: Path):
             options.check()
 
 
-def test_exports_that_cannot_be_are_refused(tmp_path: Path):
+def test_exports_that_cannot_be_are_refused(tmp_path):
     trained, out = set_up(tmp_path, Ball(density=0.1)), tmp_path / "out"
     with pytest.raises(ConfigError, match="stops half of the light in no pixel"):
         export(trained, ExportOptions(resolution=16), out, say=quiet)

@@ -57,7 +57,7 @@ def read(shape: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return places, colours, unpacked(content[9 * count :], 3, "<u4")
 
 
-def test_a_page_holds_the_meshes_that_are_exported_as_files(tmp_path: Path):
+def test_a_page_holds_the_meshes_that_are_exported_as_files(tmp_path):
     trained = set_up(tmp_path, Ball())
     content = content_of(page_of(trained))
     wanted = ExportOptions("mesh", times="0,1", resolution=24)
@@ -72,7 +72,7 @@ def test_a_page_holds_the_meshes_that_are_exported_as_files(tmp_path: Path):
         assert shape["faces"] == len(faces) > 100
 
 
-def test_the_page_needs_no_other_file(tmp_path: Path):
+def test_the_page_needs_no_other_file(tmp_path):
     trained = set_up(tmp_path, Ball())
     page = page_of(trained)
     text = page.read_text(encoding="utf-8")
@@ -86,7 +86,7 @@ def test_the_page_needs_no_other_file(tmp_path: Path):
     assert listed["triangles"] == sum(shape["faces"] for shape in content_of(page)["shapes"])
 
 
-def test_the_copy_of_three_is_the_one_that_is_stated(tmp_path: Path):
+def test_the_copy_of_three_is_the_one_that_is_stated(tmp_path):
     stated = json.loads((module.PARTS / "three.json").read_text(encoding="utf-8"))
     script = (module.PARTS / stated["file"]).read_bytes()
     assert hashlib.sha256(script).hexdigest() == stated["sha256"]
@@ -97,16 +97,14 @@ def test_the_copy_of_three_is_the_one_that_is_stated(tmp_path: Path):
     assert f"three@{stated['version']}" in stated["build"]
 
 
-def test_names_are_text_and_fill_nothing(tmp_path: Path):
+def test_names_are_text_and_fill_nothing(tmp_path):
     trained = set_up(tmp_path, Ball())
     named = replace(trained, path=tmp_path / "a<b>{{run}}")
     text = page_of(named).read_text(encoding="utf-8")
     assert "<title>a&lt;b&gt;{{run}}</title>" in text
 
 
-def test_triangles_are_left_out_until_the_page_fits(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_triangles_are_left_out_until_the_page_fits(tmp_path, monkeypatch):
     trained, said = set_up(tmp_path, Ball()), []
     options = ExportOptions("web", times="3", resolution=64)
     whole = export(trained, options, tmp_path / "whole", say=said.append) / "index.html"
@@ -120,11 +118,11 @@ def test_triangles_are_left_out_until_the_page_fits(
     assert 16 < listed["resolution"] < 64
     assert f"resolution {listed['resolution']}; " in said[-1]
     monkeypatch.setattr(module, "LIMIT", scripts + module.SPARE + 100)
-    with pytest.raises(ConfigError, match="--times 3: so many timesteps do not fit"):
+    with pytest.raises(ConfigError, match="--times 3: these timesteps do not fit"):
         export(trained, options, tmp_path / "none", say=quiet)
 
 
-def test_points_are_shown_where_their_number_is_given(tmp_path: Path):
+def test_points_are_shown_where_their_number_is_given(tmp_path):
     content = content_of(page_of(set_up(tmp_path, Ball(500.0, 0.002)), count=700))
     for shape, time in zip(content["shapes"], (0.0, 1.0), strict=True):
         places, _, faces = read(shape)
@@ -144,7 +142,7 @@ class Swarm(Ball):
         return points, torch.eye(3)
 
 
-def test_a_field_without_a_density_shows_its_own_points(tmp_path: Path):
+def test_a_field_without_a_density_shows_its_own_points(tmp_path):
     trained = set_up(tmp_path, Swarm(), SimpleNamespace())  # type: ignore[arg-type]
     places, colours, _ = read(content_of(page_of(trained, tmp_path / "all"))["shapes"][1])
     expected, _ = Swarm().cloud(1.0)
@@ -156,13 +154,13 @@ def test_a_field_without_a_density_shows_its_own_points(tmp_path: Path):
         page_of(trained, tmp_path / "none", threshold=3.0)
 
 
-def test_without_the_extra_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_without_the_extra_it_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with pytest.raises(MissingExtraError, match="export"):
         page_of(set_up(tmp_path, Ball()))
 
 
-def test_the_command_writes_a_page(trained_run: Path, tmp_path: Path, capsys):
+def test_the_command_writes_a_page(trained_run, tmp_path, capsys):
     arguments = ["--what", "web", "--times", "2", "--resolution", "32"]
     assert main(["export", str(trained_run), *arguments, "--out", str(tmp_path / "web")]) == 0
     assert re.search(r"page        2 timesteps, [\d,]+ triangles", capsys.readouterr().out)
@@ -180,7 +178,7 @@ def ball_on(page: Any) -> tuple[float, float, np.ndarray]:
 
 
 @needs_browser
-def test_a_browser_plays_the_page(tmp_path: Path):
+def test_a_browser_plays_the_page(tmp_path):
     """The ball moves along y, here to the right, and is bluer above: its colour tells z."""
     frame = Frame(0.5, torch.eye(3), torch.tensor([1.0, -2.0, 0.5]))
     trained = set_up(tmp_path, Ball(), frame=frame)

@@ -184,31 +184,38 @@ def astray():
     return with_train(scene, camera_to_world=poses)
 
 
-def same_file():
+def with_test(change):
+    """The ball with what ``change`` makes of its test and training views."""
     scene = ball()
     train, test = scene.splits["train"], scene.splits["test"]
-    images = test.images.clone()
-    images[0] = train.images[3]
-    files = (train.files[3], *test.files[1:])
-    changed = replace(test, images=images, files=files)
-    return replace(scene, splits={"train": train, "test": changed})
+    return replace(scene, splits={"train": train, "test": replace(test, **change(test, train))})
+
+
+def same_file():
+    def change(test, train):
+        images = test.images.clone()
+        images[0] = train.images[3]
+        return {"images": images, "files": (train.files[3], *test.files[1:])}
+
+    return with_test(change)
 
 
 def same_camera():
-    scene = ball()
-    train, test = scene.splits["train"], scene.splits["test"]
-    poses, times = test.camera_to_world.clone(), test.times.clone()
-    poses[2], times[2] = train.camera_to_world[5], train.times[5]
-    changed = replace(test, camera_to_world=poses, times=times)
-    return replace(scene, splits={"train": train, "test": changed})
+    def change(test, train):
+        poses, times = test.camera_to_world.clone(), test.times.clone()
+        poses[2], times[2] = train.camera_to_world[5], train.times[5]
+        return {"camera_to_world": poses, "times": times}
+
+    return with_test(change)
 
 
 def same_pixels():
-    scene = ball()
-    train, test = scene.splits["train"], scene.splits["test"]
-    images = test.images.clone()
-    images[1] = train.images[7]
-    return replace(scene, splits={"train": train, "test": replace(test, images=images)})
+    def change(test, train):
+        images = test.images.clone()
+        images[1] = train.images[7]
+        return {"images": images}
+
+    return with_test(change)
 
 
 def white(images):

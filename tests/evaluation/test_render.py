@@ -21,7 +21,7 @@ from xplanes.evaluation.render import (
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.optional import MissingExtraError
 from xplanes.rendering.pictures import to_bytes
-from xplanes.training.scores import render_view
+from xplanes.training.scores import score_view
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def poses(trained: TrainedRun, options: VideoOptions) -> torch.Tensor:
     return torch.stack([camera.camera_to_world for camera in seen])
 
 
-def test_camera_paths(trained: TrainedRun):
+def test_camera_paths(trained):
     centre = trained.frame.centre
     orbit = poses(trained, VideoOptions(frames=6, elevation=30))
     reach = (orbit[:, :3, 3] - centre).norm(dim=-1)
@@ -57,7 +57,7 @@ def test_camera_paths(trained: TrainedRun):
     assert torch.equal(fixed, orbit[:1].expand(3, 4, 4))
 
 
-def test_a_view_is_found_by_its_name(trained: TrainedRun):
+def test_a_view_is_found_by_its_name(trained):
     splits = trained.scene.splits
     expected = splits["test"].camera_to_world[1]
     for name in ("test/r_001.png", "test/r_001"):
@@ -67,10 +67,10 @@ def test_a_view_is_found_by_its_name(trained: TrainedRun):
         find_view(splits, "test/r_0011")
 
 
-def test_the_camera_of_a_view_renders_that_view(trained: TrainedRun, tmp_path: Path):
+def test_the_camera_of_a_view_renders_that_view(trained, tmp_path):
     views = trained.views
     parts = (trained.module.field, trained.module.renderer, trained.frame)
-    expected = to_bytes(render_view(*parts, views, 1, torch.ones(3))["colour"]).numpy()
+    expected = to_bytes(score_view(*parts, views, 1, torch.ones(3))[1]["colour"]).numpy()
     own = str(float(views.times[1]))
     for name, time in (("a.png", None), ("b.png", "own"), ("c.png", own), ("d.webp", "own")):
         path = render_video(trained, VideoOptions("view:test/r_001", time), str(tmp_path / name))
@@ -86,7 +86,7 @@ def test_the_camera_of_a_view_renders_that_view(trained: TrainedRun, tmp_path: P
     assert VideoOptions("view:test/r_001", frames=3).written_to("a.png").count == 3
 
 
-def test_a_webp_is_the_default(trained: TrainedRun):
+def test_a_webp_is_the_default(trained):
     options = VideoOptions(frames=3, size=20, fps=10, time="sweep", what="depth")
     path = render_video(trained, options)
     assert path == trained.path / "media" / "render_orbit_sweep_depth.webp"
@@ -96,7 +96,7 @@ def test_a_webp_is_the_default(trained: TrainedRun):
         assert picture.info["duration"] == 100
 
 
-def test_a_folder_takes_a_png_per_frame_and_no_others(trained: TrainedRun, tmp_path: Path):
+def test_a_folder_takes_a_png_per_frame_and_no_others(trained, tmp_path):
     options = VideoOptions(frames=2, size=16)
     folder = render_video(trained, options, f"{tmp_path}/frames/")
     assert sorted(p.name for p in folder.iterdir()) == ["frame_0000.png", "frame_0001.png"]
@@ -104,7 +104,7 @@ def test_a_folder_takes_a_png_per_frame_and_no_others(trained: TrainedRun, tmp_p
         render_video(trained, options, f"{tmp_path}/frames/")
 
 
-def test_an_mp4_keeps_its_frames(tmp_path: Path):
+def test_an_mp4_keeps_its_frames(tmp_path):
     imageio = pytest.importorskip("imageio.v2")
     pytest.importorskip("imageio_ffmpeg")
     frames = [torch.full((35, 50, 3), value, dtype=torch.uint8) for value in (20, 120, 220)]

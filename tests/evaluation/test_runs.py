@@ -59,7 +59,7 @@ def test_no_runs_at_all_says_how_to_make_one(tmp_path):
     assert said.endswith(("python train.py", "xplanes train")), said
 
 
-def test_what_is_loaded_is_announced_first(trained_run: Path):
+def test_what_is_loaded_is_announced_first(trained_run):
     lines: list[str] = []
     trained = load_run(trained_run, checkpoint="best", announce=lines.append)
     assert str(trained_run) in lines[0]
@@ -67,7 +67,7 @@ def test_what_is_loaded_is_announced_first(trained_run: Path):
     assert not trained.module.training
 
 
-def test_damaged_files_are_named(copied: Path):
+def test_damaged_files_are_named(copied):
     cases = [
         ("config.yaml", "a: [", "damaged"),
         ("config.yaml", "seed: 0\n", "damaged, or from another version"),
@@ -90,7 +90,7 @@ def test_damaged_files_are_named(copied: Path):
         load_run(copied)
 
 
-def test_another_model_than_the_checkpoints_is_refused(copied: Path):
+def test_another_model_than_the_checkpoints_is_refused(copied):
     config = yaml.safe_load((copied / "config.yaml").read_text())
     model = config["model"]
     for change in ({"channels": 2 * model["channels"]}, {"name": "nine", "plane_set": "nine"}):
@@ -100,7 +100,7 @@ def test_another_model_than_the_checkpoints_is_refused(copied: Path):
             load_run(copied)
 
 
-def test_the_data_of_a_run_is_that_which_it_was_trained_on(trained_run: Path):
+def test_the_data_of_a_run_is_that_which_it_was_trained_on(trained_run):
     data, trained = SceneDataModule.from_run(trained_run), load_run(trained_run)
     assert data.seed == 0
     assert data.settings == trained.experiment.data
@@ -108,7 +108,7 @@ def test_the_data_of_a_run_is_that_which_it_was_trained_on(trained_run: Path):
         assert torch.equal(data.scene.splits[split].images, views.images)
 
 
-def test_other_training_views_are_refused(copied: Path):
+def test_other_training_views_are_refused(copied):
     record = json.loads((copied / "run.json").read_text())
     record["files"]["train"] = record["files"]["train"][:-1]
     (copied / "run.json").write_text(json.dumps(record))
@@ -116,7 +116,7 @@ def test_other_training_views_are_refused(copied: Path):
         load_run(copied)
 
 
-def test_a_relative_data_folder_is_found_from_elsewhere(copied: Path, monkeypatch, tmp_path):
+def test_a_relative_data_folder_is_found_from_elsewhere(copied, monkeypatch, tmp_path):
     config = yaml.safe_load((copied / "config.yaml").read_text())
     root = Path(config["data"]["root"])
     config["data"]["root"] = root.name

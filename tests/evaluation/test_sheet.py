@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from PIL import Image, ImageSequence
 
-from tests.evaluation.test_table import make
+from tests.evaluation.test_table import make, set_to
 from xplanes.cli import main
 from xplanes.errors import ConfigError
 from xplanes.evaluation.sheet import WHAT, check_what, write_sheet
@@ -32,9 +31,7 @@ def pictured(
     views=("v0", "v1"),
 ) -> Path:
     run = make(folder, model=model, seed=seed)
-    config = yaml.safe_load((run / "config.yaml").read_text())
-    config["data"]["scene"] = scene
-    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    set_to(run, data={"scene": scene})
     for step in steps:
         for view in views:
             strip = np.concatenate(
@@ -58,7 +55,7 @@ def areas(path: Path) -> dict[tuple[int, ...], int]:
     }
 
 
-def test_runs_stand_side_by_side_a_row_per_scene(tmp_path: Path) -> None:
+def test_runs_stand_side_by_side_a_row_per_scene(tmp_path):
     for number, (scene, model) in enumerate([("lego", "a"), ("lego", "b"), ("hook", "a")]):
         pictured(tmp_path / f"{number}", scene=scene, model=model)
     found = areas(write_sheet(tmp_path, size=40))
@@ -68,7 +65,7 @@ def test_runs_stand_side_by_side_a_row_per_scene(tmp_path: Path) -> None:
     assert not {ERROR, DEPTH, green(0)} & set(found)
 
 
-def test_a_setting_is_shown_with_its_first_seed(tmp_path: Path) -> None:
+def test_a_setting_is_shown_with_its_first_seed(tmp_path):
     for number, (model, seed) in enumerate([("a", 0), ("a", 1), ("b", 0), ("b", 1)]):
         pictured(tmp_path / f"{number}", model=model, seed=seed)
     assert areas(write_sheet(tmp_path, size=40))[green(50)] == 2 * 40 * 40
@@ -79,7 +76,7 @@ def test_a_setting_is_shown_with_its_first_seed(tmp_path: Path) -> None:
     assert areas(write_sheet(tmp_path, size=40))[green(50)] == 2 * 40 * 40
 
 
-def test_steps_stand_side_by_side_a_row_per_run(tmp_path: Path) -> None:
+def test_steps_stand_side_by_side_a_row_per_run(tmp_path):
     for number, model in enumerate("ab"):
         pictured(tmp_path / f"{number}", model=model, steps=(0, 20, 50))
     path = write_sheet(tmp_path, tmp_path / "other.png", what="steps", size=40)
@@ -88,7 +85,7 @@ def test_steps_stand_side_by_side_a_row_per_run(tmp_path: Path) -> None:
     assert areas(path) == {TRUE: 2 * 40 * 40, DEPTH: 2 * 40 * 40}
 
 
-def test_a_film_shows_a_step_after_the_other_beside_the_truth(tmp_path: Path) -> None:
+def test_a_film_shows_a_step_after_the_other_beside_the_truth(tmp_path):
     for number, steps in enumerate([(0, 20, 50), (0, 80)]):
         pictured(tmp_path / f"{number}", model=f"{number}", steps=steps)
     film = write_sheet(tmp_path, tmp_path / "film.webp", what="steps", size=40)
@@ -110,7 +107,7 @@ def test_a_film_shows_a_step_after_the_other_beside_the_truth(tmp_path: Path) ->
     assert milliseconds == [500, 500, 2000]
 
 
-def test_parts_are_shown_whole(tmp_path: Path) -> None:
+def test_parts_are_shown_whole(tmp_path):
     run = pictured(tmp_path / "0")
     with pytest.raises(ConfigError, match=r"no run has media/decomposition\.png: only runs that"):
         write_sheet(tmp_path, what="parts")
@@ -118,7 +115,7 @@ def test_parts_are_shown_whole(tmp_path: Path) -> None:
     assert areas(write_sheet(tmp_path, what="parts")) == {(1, 2, 3): 60 * 30}
 
 
-def test_a_single_run_is_a_sheet_of_itself_and_the_command_writes_it(tmp_path: Path, capsys):
+def test_a_single_run_is_a_sheet_of_itself_and_the_command_writes_it(tmp_path, capsys):
     run = pictured(tmp_path / "run")
     assert main(["sheet", str(run), "--what", "steps", "--steps", "0,50", "--view", "v1"]) == 0
     assert capsys.readouterr().out == f"wrote {run / 'sheet_steps.png'}\n"
@@ -127,14 +124,14 @@ def test_a_single_run_is_a_sheet_of_itself_and_the_command_writes_it(tmp_path: P
     assert "--steps x: must be numbers" in capsys.readouterr().err
 
 
-def test_each_kind_of_sheet_has_a_file_of_its_own(tmp_path: Path) -> None:
+def test_each_kind_of_sheet_has_a_file_of_its_own(tmp_path):
     run = pictured(tmp_path / "run")
     Image.new("RGB", (60, 30), (1, 2, 3)).save(run / "media" / "decomposition.png")
     written = [write_sheet(run, what=what).name for what in WHAT]
     assert written == ["sheet_runs.png", "sheet_steps.png", "sheet_parts.png"]
 
 
-def test_a_view_is_found_by_the_end_of_its_name(tmp_path: Path) -> None:
+def test_a_view_is_found_by_the_end_of_its_name(tmp_path):
     pictured(tmp_path / "new", views=("val_r_003", "val_r_013"))
     # Earlier runs wrote the split twice before images in a folder of its name.
     pictured(tmp_path / "old", model="b", views=("val_val_r_003", "val_val_r_013"))
@@ -149,7 +146,7 @@ def test_a_view_is_found_by_the_end_of_its_name(tmp_path: Path) -> None:
         write_sheet(tmp_path, view="r_9")
 
 
-def test_what_is_missing_is_named(tmp_path: Path) -> None:
+def test_what_is_missing_is_named(tmp_path):
     pictured(tmp_path / "0")
     pictured(tmp_path / "1", model="b", views=("v1",))
     write_sheet(tmp_path, view="v1")

@@ -56,6 +56,15 @@ def make(
     return folder
 
 
+def set_to(run: Path, name: str = "config.yaml", **changed: Any) -> None:
+    """Change groups or entries of a run's file; mappings are merged with what there is."""
+    content = yaml.safe_load((run / name).read_text())
+    for key, value in changed.items():
+        merge = isinstance(value, dict) and isinstance(content.get(key), dict)
+        content[key] = content[key] | value if merge else value
+    (run / name).write_text(json.dumps(content))
+
+
 def table(folder: Path) -> list[dict[str, str]]:
     write_tables(folder)
     with (folder / "table.csv").open() as file:
@@ -84,12 +93,9 @@ def test_columns_are_the_settings_that_differ(tmp_path):
 def test_a_score_of_the_thing_has_a_column_where_any_run_has_one(tmp_path):
     for seed in (0, 1):
         make(tmp_path / f"{seed}", seed=seed)
-    assert "psnr_thing" not in table(tmp_path)[0]
-    path = tmp_path / "1" / "metrics.json"
-    metrics = json.loads(path.read_text())
-    metrics["test"]["psnr_thing"] = 17.5
-    path.write_text(json.dumps(metrics))
-    assert [row["psnr_thing"] for row in table(tmp_path)] == ["", "17.5"]
+    assert "psnr_foreground" not in table(tmp_path)[0]
+    set_to(tmp_path / "1", "metrics.json", test={"psnr_foreground": 17.5})
+    assert [row["psnr_foreground"] for row in table(tmp_path)] == ["", "17.5"]
     assert "psnr object" in (tmp_path / "table.md").read_text()
 
 
@@ -242,17 +248,16 @@ def test_a_damaged_file_is_a_row_not_a_crash(tmp_path):
         assert rows[1]["psnr"] == ("" if name == "metrics.json" else "20.0"), case
 
 
+def swept(folder: Path, *task: str) -> None:
+    """Make a folder that of a sweep with Hydra's own sweeper."""
+    target = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
+    sweeper = {"_target_": target, "params": None}
+    hydra = {"sweeper": sweeper, "overrides": {"task": list(task)}}
+    (folder / "multirun.yaml").write_text(yaml.safe_dump({"hydra": hydra}))
+
+
 def test_jobs_without_a_run_are_rows(tmp_path):
-    sweep = {
-        "hydra": {
-            "sweeper": {
-                "_target_": "hydra._internal.core_plugins.basic_sweeper.BasicSweeper",
-                "params": None,
-            },
-            "overrides": {"task": ["model=six_planes,nine_planes", "seed=range(0,2)", "a.b='x,y'"]},
-        }
-    }
-    (tmp_path / "multirun.yaml").write_text(yaml.safe_dump(sweep))
+    swept(tmp_path, "model=six_planes,nine_planes", "seed=range(0,2)", "a.b='x,y'")
     lines = ("model=six_planes", "seed=0", "a.b='x,y'")
     make(tmp_path / "0_a", model="six_planes", seed=0, overrides=lines)
     rows = read_rows(tmp_path)
@@ -268,16 +273,7 @@ def test_jobs_without_a_run_are_rows(tmp_path):
 
 
 def test_jobs_in_nested_folders_and_begun_by_resume_are_not_missing(tmp_path):
-    sweep = {
-        "hydra": {
-            "sweeper": {
-                "_target_": "hydra._internal.core_plugins.basic_sweeper.BasicSweeper",
-                "params": None,
-            },
-            "overrides": {"task": ["seed=0,1", "resume=auto"]},
-        }
-    }
-    (tmp_path / "multirun.yaml").write_text(yaml.safe_dump(sweep))
+    swept(tmp_path, "seed=0,1", "resume=auto")
     for seed in (0, 1):
         lines = (f"seed={seed}", "hydra.searchpath=[file://mine]")
         make(tmp_path / "six" / f"{seed}", seed=seed, overrides=lines)
@@ -287,10 +283,8 @@ def test_jobs_in_nested_folders_and_begun_by_resume_are_not_missing(tmp_path):
 def test_where_a_run_logs_keeps_no_seeds_apart(tmp_path):
     for seed in (0, 1):
         run = make(tmp_path / f"{seed}", seed=seed)
-        config = yaml.safe_load((run / "config.yaml").read_text())
-        config["logger"] = {"csv": {"prefix": f"s{seed}"}}
-        config["callbacks"] = {"keep": {"dirpath": f"{run}/mine"}}
-        (run / "config.yaml").write_text(yaml.safe_dump(config))
+        logger, callbacks = {"csv": {"prefix": f"s{seed}"}}, {"keep": {"dirpath": f"{run}/mine"}}
+        set_to(run, logger=logger, callbacks=callbacks)
     assert "Mean and standard deviation over seeds" in write_tables(tmp_path)
 
 
@@ -332,10 +326,8 @@ def dnerf(
 ) -> Path:
     """A run of a published model on D-NeRF's data."""
     run = make(folder, model=model, psnr=psnr)
-    config = yaml.safe_load((run / "config.yaml").read_text())
-    config["data"] |= {"name": "dnerf", "scene": scene, "resolution": 400}
-    config["model"]["sampler"] = {"name": settings.get("sampler", "proposal")}
-    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    data = {"name": "dnerf", "scene": scene, "resolution": 400}
+    set_to(run, data=data, model={"sampler": {"name": settings.get("sampler", "proposal")}})
     return run
 
 
@@ -345,7 +337,7 @@ def published_lines(folder: Path) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
 
 
-def test_means_stand_beside_what_was_published(tmp_path: Path) -> None:
+def test_means_stand_beside_what_was_published(tmp_path):
     dnerf(tmp_path / "a", "lego", 24.0)
     dnerf(tmp_path / "b", "hook", 27.0)
     dnerf(tmp_path / "c", "lego", 25.0, model="six_planes", sampler="occupancy")
@@ -362,13 +354,10 @@ def test_means_stand_beside_what_was_published(tmp_path: Path) -> None:
     assert set(lines[-1][7:]) == {""}
 
 
-def test_published_figures_stand_beside_equal_resolutions_and_all_views_alone(tmp_path) -> None:
+def test_published_figures_stand_beside_equal_resolutions_and_all_views_alone(tmp_path):
     for number, (resolution, views) in enumerate(((64, None), (128, None), (128, 10))):
         run = dnerf(tmp_path / f"{number}", "lego", 30.0, model="nine_planes")
-        config = yaml.safe_load((run / "config.yaml").read_text())
-        config["model"]["resolution"], config["lrm"]["name"] = resolution, "xlarge"
-        config["data"]["views"] = views
-        (run / "config.yaml").write_text(yaml.safe_dump(config))
+        set_to(run, model={"resolution": resolution}, lrm={"name": "xlarge"}, data={"views": views})
     found = [(line[3], line[8], line[-1].split(",")[0]) for line in published_lines(tmp_path)]
     at_64 = [e for e in read_published() if e["model"] == "nine_planes" and e["lrm"] == "xlarge"]
     wanted = [(e["psnr"], e["table"]) for e in at_64 if e["resolution"] == "64"]
@@ -387,7 +376,7 @@ def named(folder: Path, *tables: str, early: bool = False) -> None:
 
 
 @pytest.mark.parametrize("early", [False, True])
-def test_a_named_table_is_shown_whole_whatever_the_data(tmp_path: Path, early: bool) -> None:
+def test_a_named_table_is_shown_whole_whatever_the_data(tmp_path, early):
     make(tmp_path / "a", model="kplanes")
     named(tmp_path, "Table 1", early=early)
     text = write_tables(tmp_path)
@@ -404,7 +393,7 @@ def test_a_named_table_is_shown_whole_whatever_the_data(tmp_path: Path, early: b
     assert "| 4D-GS " in write_tables(tmp_path)
 
 
-def test_an_unknown_table_is_refused() -> None:
+def test_an_unknown_table_is_refused():
     for names in (["Table 9"], "Table 1", None):
         with pytest.raises(ConfigError, match=r"published=.*: must be a list of some of Table 1"):
             check_published(names)
@@ -412,16 +401,14 @@ def test_an_unknown_table_is_refused() -> None:
 
 def decomposed(folder: Path, ranks: tuple[int, int, int]) -> Path:
     run = make(folder)
-    metrics = json.loads((run / "metrics.json").read_text())
     report = {"drift": 0.125, "low_rank_energy": 0.9, "sparse_energy": 0.05, "converged": True}
-    metrics["decomposition"] = {
-        name: {**report, "rank": rank} for name, rank in zip(("xy", "xz", "yz"), ranks, strict=True)
-    } | {"unexplained": {"before": 1.0, "after": 0.5}}
-    (run / "metrics.json").write_text(json.dumps(metrics))
+    found: dict[str, Any] = {"unexplained": {"before": 1.0, "after": 0.5}}
+    found |= {n: {**report, "rank": r} for n, r in zip(("xy", "xz", "yz"), ranks, strict=True)}
+    set_to(run, "metrics.json", decomposition=found)
     return run
 
 
-def test_decompositions_and_their_mean_rank_stand_in_the_table(tmp_path: Path) -> None:
+def test_decompositions_and_their_mean_rank_stand_in_the_table(tmp_path):
     decomposed(tmp_path / "0", (1, 2, 3))
     decomposed(tmp_path / "1", (4, 5, 9))
     make(tmp_path / "2", model="kplanes")
@@ -437,21 +424,18 @@ def test_decompositions_and_their_mean_rank_stand_in_the_table(tmp_path: Path) -
     assert f"Mean rank of the low-rank part: 4.00 over these 2 runs; published: {published}" in text
 
 
-def test_the_protocol_stands_above_the_table(tmp_path: Path) -> None:
+def test_the_protocol_stands_above_the_table(tmp_path):
     run = dnerf(tmp_path / "a", "lego", 24.0)
-    config = yaml.safe_load((run / "config.yaml").read_text())
-    config["trainer"] = {"max_steps": 30000, "max_seconds": None}
-    config["model"]["rays"] = {"background": "one"}
-    (run / "config.yaml").write_text(yaml.safe_dump(config))
-    record = json.loads((run / "run.json").read_text())
-    (run / "run.json").write_text(json.dumps(record | {"device": "RTX 3090", "cpus": 16}))
+    trainer = {"max_steps": 30000, "max_seconds": None}
+    set_to(run, trainer=trainer, model={"rays": {"background": "one"}})
+    set_to(run, "run.json", device="RTX 3090", cpus=16)
     assert (
         "Scores of the test split. Protocol: data: dnerf · width, px: 400 · background: one · "
         "steps: 30000 · seconds: no limit · machine: RTX 3090, 16 CPU cores.\n"
     ) in write_tables(tmp_path)
 
 
-def test_psnr_is_drawn_against_a_setting_of_several_numbers(tmp_path: Path) -> None:
+def test_psnr_is_drawn_against_a_setting_of_several_numbers(tmp_path):
     pytest.importorskip("matplotlib", reason="needs the extra plots")
     for number, (model, resolution) in enumerate(itertools.product("ab", (64, 32))):
         make(tmp_path / f"{number}", model=model, resolution=resolution)
@@ -462,12 +446,10 @@ def test_psnr_is_drawn_against_a_setting_of_several_numbers(tmp_path: Path) -> N
         assert min(picture.size) > 300
 
 
-def test_means_keep_runs_with_other_settings_apart(tmp_path: Path) -> None:
+def test_means_keep_runs_with_other_settings_apart(tmp_path):
     for weight, psnr in ((0.0, 26.0), (0.5, 24.0)):
         run = dnerf(tmp_path / f"{weight}", "lego", psnr)
-        config = yaml.safe_load((run / "config.yaml").read_text())
-        config["model"]["loss"] = {"initial_weight": weight}
-        (run / "config.yaml").write_text(yaml.safe_dump(config))
+        set_to(run, model={"loss": {"initial_weight": weight}})
     found = [line[3:6] for line in published_lines(tmp_path) if line[4]]
     assert sorted(found) == [
         ["model.loss.initial_weight=0.0", "1", "26.00"],
@@ -475,7 +457,7 @@ def test_means_keep_runs_with_other_settings_apart(tmp_path: Path) -> None:
     ]
 
 
-def test_nothing_is_set_beside_other_data(tmp_path: Path) -> None:
+def test_nothing_is_set_beside_other_data(tmp_path):
     make(tmp_path / "a", model="kplanes")
     assert "published" not in write_tables(tmp_path)
 
@@ -507,7 +489,7 @@ PRINTED = {
 """PSNR, SSIM and minutes that the paper prints, by LRM; those of Table 4 by texels, PSNR alone."""
 
 
-def test_the_papers_figures_are_those_that_it_prints() -> None:
+def test_the_papers_figures_are_those_that_it_prints():
     found: dict[tuple[str, str], dict[str, str]] = {}
     for entry in read_published():
         if entry["table"].startswith("Table"):
@@ -523,7 +505,7 @@ def test_the_papers_figures_are_those_that_it_prints() -> None:
     assert found == PRINTED
 
 
-def test_the_page_on_the_paper_quotes_them_where_they_stand() -> None:
+def test_the_page_on_the_paper_quotes_them_where_they_stand():
     page = (Path(__file__).parents[2] / "docs" / "paper.md").read_text(encoding="utf-8")
     six = "Table 2: {}; Table 3: {}, at the same PSNR"
     rows = (PRINTED[table, "six_planes"] for table in ("Table 2", "Table 3"))
@@ -532,7 +514,7 @@ def test_the_page_on_the_paper_quotes_them_where_they_stand() -> None:
     assert f"33.67 in Tables {' and '.join(t[-1] for t in held)}, 33.56 in Table 4" in page
 
 
-def test_published_figures_name_their_source_and_models_that_exist() -> None:
+def test_published_figures_name_their_source_and_models_that_exist():
     models = {path.stem for path in (CONF / "model").glob("*.yaml")}
     for entry in read_published():
         assert entry["source"]
@@ -542,12 +524,10 @@ def test_published_figures_name_their_source_and_models_that_exist() -> None:
         assert not entry["ssim"] or 0.5 < float(entry["ssim"]) < 1
 
 
-def test_settings_of_jobs_that_never_began_are_no_columns(tmp_path: Path) -> None:
+def test_settings_of_jobs_that_never_began_are_no_columns(tmp_path):
     for number, enabled in enumerate((False, "${viewer}")):
         run = make(tmp_path / f"{number}_lego", resolution=64 + number)
-        config = yaml.safe_load((run / "config.yaml").read_text())
-        config["callbacks"] = {"viewer": {"enabled": enabled}}
-        (run / "config.yaml").write_text(yaml.safe_dump(config))
+        set_to(run, callbacks={"viewer": {"enabled": enabled}})
     header = table(tmp_path)[0].keys()
     assert "model.resolution" in header
     assert not [name for name in header if "viewer" in name]

@@ -42,7 +42,7 @@ def few(monkeypatch):
     monkeypatch.setattr(module, "SIDE", 24)
 
 
-def test_images_become_triplanes_and_a_video(tmp_path: Path, pictures, few, capsys):
+def test_images_become_triplanes_and_a_video(tmp_path, pictures, few, capsys):
     weights, out = publish(tmp_path, "openlrm-1.1"), tmp_path / "made.safetensors"
     arguments = ["lrm=small", f"lrm.weights={weights}", f"preparation.cache={tmp_path}/cache"]
     assert main(["triplanes", str(pictures), *arguments, f"out={out}"]) == 0
@@ -59,7 +59,7 @@ def test_images_become_triplanes_and_a_video(tmp_path: Path, pictures, few, caps
         assert video.size == (24, 24)
 
 
-def test_images_of_a_folder_come_in_the_order_of_their_numbers(tmp_path: Path):
+def test_images_of_a_folder_come_in_the_order_of_their_numbers(tmp_path):
     for name in ("f_10.png", "f_2.png", "f_1.png", ".f_3.png", "notes.txt"):
         (tmp_path / name).touch()
     assert [p.name for p in module.find_pictures([tmp_path])] == ["f_1.png", "f_2.png", "f_10.png"]
@@ -89,7 +89,7 @@ def test_the_video_begins_at_the_models_camera_and_completes_one_orbit(few):
     assert right > 250
 
 
-def test_settings_that_make_no_triplanes_are_refused(tmp_path: Path, pictures):
+def test_settings_that_make_no_triplanes_are_refused(tmp_path, pictures):
     def make(*arguments, out="made.pt"):
         write_triplanes([pictures], Path(out), settings(*arguments), say=lambda _: None)
 
@@ -103,7 +103,7 @@ def test_settings_that_make_no_triplanes_are_refused(tmp_path: Path, pictures):
         make("lrm=small", "lrm.weights=absent.pt")
 
 
-def test_missing_images_are_named(tmp_path: Path):
+def test_missing_images_are_named(tmp_path):
     with pytest.raises(SceneError, match="absent"):
         find_pictures([tmp_path / "absent.png"])
     with pytest.raises(SceneError, match="holds no pictures"):
@@ -112,7 +112,7 @@ def test_missing_images_are_named(tmp_path: Path):
         find_pictures([])
 
 
-def test_opaque_images_cause_a_message(tmp_path: Path, few):
+def test_opaque_images_cause_a_message(tmp_path, few):
     picture = tmp_path / "opaque.png"
     Image.fromarray(np.full((30, 30, 3), 90, np.uint8)).save(picture)
     said: list[str] = []

@@ -113,15 +113,13 @@ def client(trained: TrainedRun, viewer: Viewer) -> Client:
     return found
 
 
-def test_cameras_come_back_as_ours(trained: TrainedRun):
+def test_cameras_come_back_as_ours(trained):
     for pose in orbit_poses(trained.views, trained.frame, 5, elevation=35):
         back = camera_pose(quaternion(pose), pose[:3, 3])
         assert torch.allclose(back, pose, atol=1e-5)
 
 
-def test_pictures_are_small_while_something_changes_and_full_at_rest(
-    viewer: Viewer, client: Client, monkeypatch
-):
+def test_pictures_are_small_while_something_changes_and_full_at_rest(viewer, client, monkeypatch):
     monkeypatch.setattr(module, "MOVING_SECONDS", 0.0)
     for change in (lambda: None, client.move, lambda: setattr(viewer.time, "value", 0.3)):
         before = len(client.rows)
@@ -137,9 +135,7 @@ def test_pictures_are_small_while_something_changes_and_full_at_rest(
         assert len(client.rows) == before + 2
 
 
-def test_a_full_picture_is_given_up_when_the_camera_moves(
-    viewer: Viewer, client: Client, monkeypatch
-):
+def test_a_full_picture_is_given_up_when_the_camera_moves(viewer, client, monkeypatch):
     monkeypatch.setattr(module, "MOVING_SECONDS", 0.0)
     viewer.catch_up()
     time.sleep(module.SETTLE_SECONDS + 0.01)
@@ -157,7 +153,7 @@ def test_a_full_picture_is_given_up_when_the_camera_moves(
     assert client.rows == [module.FEWEST] * 2
 
 
-def test_controls_change_the_picture(viewer: Viewer, client: Client):
+def test_controls_change_the_picture(viewer, client):
     def picture() -> np.ndarray:
         viewer.catch_up()
         time.sleep(module.SETTLE_SECONDS + 0.01)
@@ -188,7 +184,7 @@ def test_controls_change_the_picture(viewer: Viewer, client: Client):
     assert client.depths[-1] is None
 
 
-def test_time_passes_while_it_plays(viewer: Viewer, client: Client):
+def test_time_passes_while_it_plays(viewer, client):
     viewer.speed.value = "2"
     viewer._toggle_play()
     times, end = [], time.monotonic() + 0.6
@@ -204,7 +200,7 @@ def test_time_passes_while_it_plays(viewer: Viewer, client: Client):
     assert viewer.time.value == stopped
 
 
-def test_nobody_is_drawn_for_once_the_browser_has_left(viewer: Viewer, client: Client):
+def test_nobody_is_drawn_for_once_the_browser_has_left(viewer, client):
     viewer.catch_up()
     count = len(client.rows)
     assert viewer.is_watched
@@ -215,7 +211,7 @@ def test_nobody_is_drawn_for_once_the_browser_has_left(viewer: Viewer, client: C
     assert len(client.rows) == count
 
 
-def test_addresses_that_cannot_be_served_are_refused(trained_run: Path, monkeypatch, capsys):
+def test_addresses_that_cannot_be_served_are_refused(trained_run, monkeypatch, capsys):
     with socket.socket() as taken:
         taken.bind((HOST, 0))
         taken.listen()
@@ -290,9 +286,7 @@ def fitted(name: str, folder: Path, *callbacks: Callback, steps: int = 12) -> Ra
 
 
 @pytest.mark.parametrize("name", ["six_planes with a background", "kplanes"])
-def test_training_is_the_same_with_a_viewer_to_the_last_bit(
-    name: str, tmp_path: Path, watched: list[Watched]
-):
+def test_training_is_the_same_with_a_viewer_to_the_last_bit(name, tmp_path, watched):
     plain = fitted(name, tmp_path)
     assert not watched
     seen = fitted(name, tmp_path, LiveViewer(port=0))
@@ -306,13 +300,11 @@ def test_training_is_the_same_with_a_viewer_to_the_last_bit(
     assert (getattr(seen.field, "background", None) is not None) == ("background" in name)
     for key, value in plain.state_dict().items():
         assert torch.equal(value, seen.state_dict()[key]), key
-    assert plain.counts == seen.counts
-    assert plain.last == pytest.approx(seen.last, abs=0, nan_ok=True)
+    assert plain.tally.counts == seen.tally.counts
+    assert plain.tally.last == pytest.approx(seen.tally.last, abs=0, nan_ok=True)
 
 
-def test_a_run_has_a_viewer_when_asked_to(
-    scenes: Path, tmp_path: Path, watched: list[Watched], capsys
-):
+def test_a_run_has_a_viewer_when_asked_to(scenes, tmp_path, watched, capsys):
     short = ("trainer.max_steps=2", "callbacks.evaluation.at=[1]", "callbacks.viewer.port=0")
     run(small_config(scenes, *short), tmp_path / "plain", [], resume=False)
     assert not watched
@@ -323,7 +315,7 @@ def test_a_run_has_a_viewer_when_asked_to(
         free.bind((HOST, viewer.served))
 
 
-def test_a_pause_stops_training_and_its_clock(tmp_path: Path, watched: list[Watched]):
+def test_a_pause_stops_training_and_its_clock(tmp_path, watched):
     class Pausing(LiveViewer):
         """Someone pauses training for a second, some steps on."""
 
@@ -359,7 +351,7 @@ def test_a_pause_stops_training_and_its_clock(tmp_path: Path, watched: list[Watc
 
 
 def test_a_picture_that_fails_ends_the_viewer_and_not_training(
-    tmp_path: Path, watched: list[Watched], monkeypatch, caplog
+    tmp_path, watched, monkeypatch, caplog
 ):
     def broken(*_: Any, **__: Any) -> None:
         raise RuntimeError("out of memory")

@@ -45,7 +45,7 @@ def mount(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("kilobytes", [64, 200, 500, 900, 1300, 1700])
-def test_full_disk(tally, nursery, shared, whole, tmp_path: Path, kilobytes: int) -> None:
+def test_full_disk(tally, nursery, shared, whole, tmp_path, kilobytes):
     """Disk full, from the first file to the last checkpoint"""
     config = config_of(shared, "none", None)
     folder = tmp_path / "disk" / "run"
@@ -63,7 +63,7 @@ def test_full_disk(tally, nursery, shared, whole, tmp_path: Path, kilobytes: int
 
 
 @pytest.mark.parametrize("kilobytes", [1, 20, 200, 600])
-def test_limited_files(tally, nursery, shared, whole, tmp_path: Path, kilobytes: int) -> None:
+def test_limited_files(tally, nursery, shared, whole, tmp_path, kilobytes):
     """Limit on the size of files (ulimit -f)"""
     config = config_of(shared, "none", None)
     folder = tmp_path / "run"
@@ -78,7 +78,7 @@ def test_limited_files(tally, nursery, shared, whole, tmp_path: Path, kilobytes:
 
 
 @pytest.mark.parametrize("what", ["scenes", "cache"])
-def test_full_disk_elsewhere(tally, nursery, shared, whole, tmp_path: Path, what: str) -> None:
+def test_full_disk_elsewhere(tally, nursery, shared, whole, tmp_path, what):
     """Disk full below data.root or preparation.cache"""
     folder, disk = tmp_path / "run", tmp_path / "disk"
     with small_disk(disk, 40) as change:
@@ -99,7 +99,7 @@ def test_full_disk_elsewhere(tally, nursery, shared, whole, tmp_path: Path, what
     tally.recovered()
 
 
-def test_log_on_a_full_device(tally, nursery, shared, whole, tmp_path: Path) -> None:
+def test_log_on_a_full_device(tally, nursery, shared, whole, tmp_path):
     """A log that cannot take a line (/dev/full)"""
     folder = tmp_path / "run"
     folder.mkdir()
@@ -110,7 +110,7 @@ def test_log_on_a_full_device(tally, nursery, shared, whole, tmp_path: Path) -> 
     tally.recovered()
 
 
-def test_read_only(tally, nursery, shared, whole, tmp_path: Path) -> None:
+def test_read_only(tally, nursery, shared, whole, tmp_path):
     """Read-only output directory, or a file in its place"""
     disk = tmp_path / "disk"
     config = config_of(shared, "none", None)

@@ -40,7 +40,7 @@ def go_on(nursery, config, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("number", range(RANDOM_MOMENTS))
-def test_random_times(tally, nursery, shared, whole, tmp_path: Path, number: int) -> None:
+def test_random_times(tally, nursery, shared, whole, tmp_path, number):
     """kill -9 at random times of a run, lrm=none and lrm=tiny"""
     lrm = ("none", "tiny")[number % 2]
     config = config_of(shared, lrm, tmp_path / "cache")
@@ -63,9 +63,7 @@ def test_random_times(tally, nursery, shared, whole, tmp_path: Path, number: int
 
 
 @pytest.mark.parametrize("number", range(WRITING))
-def test_while_a_checkpoint_is_written(
-    tally, nursery, shared, whole, tmp_path: Path, number: int
-) -> None:
+def test_while_a_checkpoint_is_written(tally, nursery, shared, whole, tmp_path, number):
     """kill -9 while a checkpoint is being written"""
     lrm = ("none", "tiny")[number % 2]
     config = config_of(shared, lrm, tmp_path / "cache")
@@ -86,7 +84,7 @@ def test_while_a_checkpoint_is_written(
 
 
 @pytest.mark.parametrize("wait", [0.1, 0.3, 0.6])
-def test_while_the_scene_is_rendered(tally, nursery, whole, tmp_path: Path, wait: float) -> None:
+def test_while_the_scene_is_rendered(tally, nursery, whole, tmp_path, wait):
     """kill -9 while the demo scene is rendered"""
     config = config_of(tmp_path, "none", None)
     child = nursery.start(config, tmp_path / "run", resume=False)

@@ -25,7 +25,7 @@ def other(tmp_path: Path):
 
 
 @pytest.mark.parametrize("resume", [False, True])
-def test_one_directory(tally, nursery, other, shared, whole, tmp_path: Path, resume: bool) -> None:
+def test_one_directory(tally, nursery, other, shared, whole, tmp_path, resume):
     """Two runs in one directory at once, started and resumed"""
     config, folder = config_of(shared, "none", None), tmp_path / "run"
     first = nursery.start(config, folder, resume=False)
@@ -42,7 +42,7 @@ def test_one_directory(tally, nursery, other, shared, whole, tmp_path: Path, res
 
 
 @pytest.mark.parametrize("seconds", [-3600.0, 86_400.0, -86_400.0])
-def test_clock_jumps(tally, nursery, shared, whole, tmp_path: Path, seconds: float) -> None:
+def test_clock_jumps(tally, nursery, shared, whole, tmp_path, seconds):
     """Wall clock set back or on at every reading"""
     config = config_of(shared, "none", None, "trainer.max_seconds=600")
     nursery.run(config, tmp_path / "run", resume=False, clock=seconds)

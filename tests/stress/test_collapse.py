@@ -26,7 +26,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(("kind", "lrm", "seed"), BEGINNINGS)
-def test_no_field_collapses(folder: Path, tmp_path: Path, kind: str, lrm: str, seed: int) -> None:
+def test_no_field_collapses(folder, tmp_path, kind, lrm, seed):
     config = compose_plain(
         "train",
         [

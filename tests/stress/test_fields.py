@@ -1,7 +1,5 @@
 """X-Planes fields with extreme values: forward, backward, and as initialisations."""
 
-from pathlib import Path
-
 import pytest
 import torch
 
@@ -47,7 +45,7 @@ def seen(field, samples, rays=16):
 @pytest.mark.parametrize("density", ["softplus", "exp"])
 @pytest.mark.parametrize("precision", ["32", "bf16", "64"])
 @pytest.mark.parametrize("plane_set", ["three", "six", "nine"])
-def test_planes_of_every_size(tally, plane_set, precision, density) -> None:
+def test_planes_of_every_size(tally, plane_set, precision, density):
     """Fields: planes of 0 to 1e4, 1 to 1024 samples, three types"""
     dtype = torch.float64 if precision == "64" else torch.float32
     for value in (0.0, 1e-30, 1.0, 1e4):
@@ -60,7 +58,7 @@ def test_planes_of_every_size(tally, plane_set, precision, density) -> None:
 
 @pytest.mark.parametrize("frames", [1, 6, 300])
 @pytest.mark.parametrize("value", VALUES)
-def test_initial_values_of_every_size(tally, tmp_path: Path, value, frames) -> None:
+def test_initial_values_of_every_size(tally, tmp_path, value, frames):
     """Runs from triplanes of 0, 1e-30, 1, 1e4, 1e30 and mixed, 1 to 300 frames"""
     scene = write_scene(tmp_path / "scenes", "ball")
     planes = spread((frames, 3, 4, 8, 8), value, torch.Generator().manual_seed(0)).float()

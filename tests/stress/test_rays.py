@@ -53,7 +53,7 @@ def module(request, tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.mark.parametrize("loops", ["1", "0"])
-def test_degenerate_rays(tally, module, monkeypatch, loops) -> None:
+def test_degenerate_rays(tally, module, monkeypatch, loops):
     """Degenerate rays, one at a time and together, forward and backward, all models"""
     monkeypatch.setenv("XPLANES_CPU_LOOPS", loops)
     state = TrainingState(seed=0, step=20, batch=0, rank=0)

@@ -1,7 +1,5 @@
 """Results do not depend on the number of threads and are deterministic given the seed."""
 
-from pathlib import Path
-
 import numba
 import pytest
 import torch
@@ -22,7 +20,7 @@ needs_two = pytest.mark.skipif(
 @needs_two
 @pytest.mark.parametrize("precision", ["32", "bf16"])
 @pytest.mark.parametrize("plane_set", ["three", "six", "nine"])
-def test_values_and_gradients(tally, plane_set, precision) -> None:
+def test_values_and_gradients(tally, plane_set, precision):
     """Threads: values and gradients with 1 and 2"""
     results = []
     for count in (1, 2):
@@ -37,7 +35,7 @@ def test_values_and_gradients(tally, plane_set, precision) -> None:
 
 @needs_two
 @pytest.mark.parametrize("model", MODELS)
-def test_training(tally, tmp_path: Path, model) -> None:
+def test_training(tally, tmp_path, model):
     """Threads: parameters after 10 steps with 1 and 2, all models"""
     config = settings(model, write_scene(tmp_path, "ball"), "trainer.max_steps=10")
     states = []
@@ -52,7 +50,7 @@ def test_training(tally, tmp_path: Path, model) -> None:
 
 @pytest.mark.parametrize("precision", ["32", "bf16"])
 @pytest.mark.parametrize("model", MODELS)
-def test_same_seed(tally, tmp_path: Path, model, precision) -> None:
+def test_same_seed(tally, tmp_path, model, precision):
     """Same seed twice, trainer.deterministic=true: bit-identical, all models"""
     if precision == "bf16" and model in SLOW:
         pytest.skip("this model computes in float32 alone")

@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import hydra
 import pytest
+import torch
 from hydra import initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
@@ -79,6 +81,21 @@ def changed(base: tuple[str, ...], *overrides: str) -> dict[str, Any]:
 def small_config(root: Path, *overrides: str) -> dict[str, Any]:
     """A configuration that trains in seconds, as plain builtins."""
     return changed(SMALL, f"data.root={root}", *overrides)
+
+
+def metrics(folder: Path) -> dict[str, Any]:
+    """What metrics.json of a run says."""
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def status(folder: Path) -> dict[str, Any]:
+    """What run.json of a run says."""
+    return json.loads((folder / "run.json").read_text())
+
+
+def checkpoint(folder: Path, name: str = "last") -> dict[str, Any]:
+    """A checkpoint of a run."""
+    return torch.load(folder / "checkpoints" / f"{name}.ckpt", weights_only=True)
 
 
 @contextmanager

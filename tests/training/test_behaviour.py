@@ -1,7 +1,6 @@
 """Runs: outputs, determinism, interruption and resuming."""
 
 import csv
-import json
 import signal
 import weakref
 from collections.abc import Callable
@@ -12,7 +11,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from tests.training.runs import small_config
+from tests.training.runs import checkpoint, metrics, small_config, status
 from xplanes.errors import ConfigError
 from xplanes.files import read_rows
 from xplanes.models.initialisation import STAGES
@@ -24,14 +23,6 @@ from xplanes.training.checkpoints import AtomicCheckpointIO
 from xplanes.training.clock import TrainingClock
 from xplanes.training.evaluation import Evaluation
 from xplanes.training.module import RadianceModule
-
-
-def metrics(folder: Path) -> dict:
-    return json.loads((folder / "metrics.json").read_text())
-
-
-def status(folder: Path) -> dict:
-    return json.loads((folder / "run.json").read_text())
 
 
 def curve(folder: Path) -> list[dict[str, str]]:
@@ -78,7 +69,7 @@ def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Watched:
     return notes
 
 
-def test_run_directory_holds_what_it_promises(trained_run: Path) -> None:
+def test_run_directory_holds_what_it_promises(trained_run):
     for name in (
         "config.yaml overrides.txt run.json metrics.json curve.csv train.log "
         "checkpoints/last.ckpt checkpoints/best.ckpt media/planes.png"
@@ -137,8 +128,8 @@ def same(folder: Path, whole: Path) -> None:
 
 
 def test_a_run_resumed_after_failures_equals_an_uninterrupted_one(
-    trained_run: Path, watched: Watched, scenes: Path, tmp_path: Path, monkeypatch
-) -> None:
+    trained_run, watched, scenes, tmp_path, monkeypatch
+):
     """It fails between checkpoints, at one with an evaluation, and between later ones."""
     folder, config = tmp_path / "broken", small_config(scenes)
     stopped_at((13, 20, 27), config, folder, monkeypatch)
@@ -147,9 +138,7 @@ def test_a_run_resumed_after_failures_equals_an_uninterrupted_one(
     same(watched.folder, trained_run)
 
 
-def test_a_run_on_images_from_disk_resumes_in_a_later_epoch(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_on_images_from_disk_resumes_in_a_later_epoch(scenes, tmp_path, monkeypatch):
     """An epoch is ten batches; the decoded images are gone and are decoded again."""
     monkeypatch.setattr(store, "IN_MEMORY", 0)
     cache, folder, whole = (tmp_path / name for name in ("cache", "broken", "whole"))
@@ -180,9 +169,7 @@ def interrupt_where(
     monkeypatch.setattr(TrainingClock, "on_train_batch_end", press_ctrl_c)
 
 
-def test_a_second_interrupt_saves_no_half_of_a_step(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_interrupt_saves_no_half_of_a_step(scenes, tmp_path, monkeypatch):
     original = RadianceModule.on_after_backward
 
     def press_twice(self) -> None:
@@ -195,25 +182,23 @@ def test_a_second_interrupt_saves_no_half_of_a_step(
     folder = tmp_path / "stopped"
     with pytest.raises(KeyboardInterrupt):
         run(small_config(scenes, "callbacks.evaluation.at=[]"), folder, [], resume=False)
-    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    state = checkpoint(folder)
     assert (state["global_step"], state["progress"]["batches"]) == (10, 10)
 
 
-def test_an_interrupt_waits_for_the_update_of_its_batches(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupt_waits_for_the_update_of_its_batches(scenes, tmp_path, monkeypatch):
     interrupt_where(lambda module: module.batches == 7, monkeypatch)
     folder = tmp_path / "stopped"
     config = small_config(scenes, "trainer.accumulate_grad_batches=3", "callbacks.evaluation.at=[]")
     with pytest.raises(KeyboardInterrupt):
         run(config, folder, [], resume=False)
-    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    state = checkpoint(folder)
     assert (state["global_step"], state["progress"]["batches"]) == (3, 9)
 
 
 def test_interrupt_saves_the_step_it_stopped_at_and_its_evaluation_is_done_again(
-    trained_run: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    trained_run, scenes, tmp_path, monkeypatch
+):
     # The evaluation at step 20 is due then.
     interrupt_where(lambda module: module.global_step == 20, monkeypatch)
     folder = tmp_path / "stopped"
@@ -223,7 +208,7 @@ def test_interrupt_saves_the_step_it_stopped_at_and_its_evaluation_is_done_again
         run(config, folder, [], resume=False)
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
     assert status(folder)["status"] == "interrupted"
-    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    state = checkpoint(folder)
     assert state["global_step"] == 20
     assert [row["step"] for row in curve(folder)] == ["0"]
     monkeypatch.undo()
@@ -234,8 +219,8 @@ def test_interrupt_saves_the_step_it_stopped_at_and_its_evaluation_is_done_again
 
 
 def test_a_final_evaluation_that_was_interrupted_is_made_up_for(
-    trained_run: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    trained_run, scenes, tmp_path, monkeypatch
+):
     """Though not a step is left to train."""
     original = Evaluation.on_validation_start
 
@@ -262,9 +247,7 @@ def test_a_final_evaluation_that_was_interrupted_is_made_up_for(
             torch.testing.assert_close(ours["state_dict"][key], value, msg=f"{name}, {key}")
 
 
-def test_an_evaluation_waits_for_the_update_of_its_batches(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_evaluation_waits_for_the_update_of_its_batches(scenes, tmp_path, monkeypatch):
     """It may stop where it is, and the best checkpoint holds no gradients."""
     original, start = TrainingClock.on_train_batch_end, Evaluation.on_validation_start
     batches = []
@@ -290,7 +273,7 @@ def test_an_evaluation_waits_for_the_update_of_its_batches(
     assert batches == [0, 9, 12]
 
 
-def test_only_displayed_images_are_kept_in_memory(watched: Watched) -> None:
+def test_only_displayed_images_are_kept_in_memory(watched):
     assert len(watched.pictures) == 3 * 2
     assert not any(colour() is not None for colour in watched.pictures)
     written = sorted((watched.folder / "media" / "step000040").glob("*.png"))
@@ -298,38 +281,32 @@ def test_only_displayed_images_are_kept_in_memory(watched: Watched) -> None:
     assert [path.name for path in written] == ["val_r_000.png", "val_r_001.png"]
 
 
-def test_best_and_last_are_written_at_the_steps_that_say_so(watched: Watched) -> None:
+def test_best_and_last_are_written_at_the_steps_that_say_so(watched):
     assert [step for step, name in watched.saved if name == "best.ckpt"] == [20, 40]
     assert [step for step, name in watched.saved if name == "last.ckpt"] == [10, 20, 30, 40, 40]
 
 
-def test_deterministic_training_is_refused_on_a_gpu(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_deterministic_training_is_refused_on_a_gpu(scenes, tmp_path, monkeypatch):
     monkeypatch.setattr(fit, "find_device", lambda _: torch.device("cuda"))
     with pytest.raises(ConfigError, match=r"trainer\.deterministic=true.*trainer\.accelerator=cpu"):
         run(small_config(scenes, "trainer.deterministic=true"), tmp_path / "run", [], resume=False)
 
 
-def test_more_gpus_than_there_are_are_refused_at_once(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_more_gpus_than_there_are_are_refused_at_once(scenes, tmp_path, monkeypatch):
     monkeypatch.setattr(fit, "find_device", lambda _: torch.device("cuda"))
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     with pytest.raises(ConfigError, match=r"trainer\.devices=2: 1 GPUs found"):
         run(small_config(scenes, "trainer=ddp"), tmp_path / "run", [], resume=False)
 
 
-def test_folder_with_a_run_is_refused_without_resume(trained_run: Path, scenes: Path) -> None:
+def test_folder_with_a_run_is_refused_without_resume(trained_run, scenes):
     before = (trained_run / "metrics.json").read_bytes()
     with pytest.raises(ConfigError, match="holds a run already"):
         run(small_config(scenes), trained_run, [], resume=False)
     assert (trained_run / "metrics.json").read_bytes() == before
 
 
-def test_few_shot_run_names_its_views_and_accumulated_batches_make_one_step(
-    scenes: Path, tmp_path: Path
-) -> None:
+def test_few_shot_run_names_its_views_and_accumulated_batches_make_one_step(scenes, tmp_path):
     config = small_config(
         scenes,
         "data.views=3",
@@ -342,11 +319,11 @@ def test_few_shot_run_names_its_views_and_accumulated_batches_make_one_step(
     assert len(files) == 3
     assert files[0].endswith("r_000.png")
     assert files[-1].endswith("r_009.png")
-    state = torch.load(tmp_path / "few" / "checkpoints" / "last.ckpt", weights_only=True)
+    state = checkpoint(tmp_path / "few")
     assert (state["global_step"], state["progress"]["batches"]) == (4, 8)
 
 
-def test_a_scene_without_motion_has_no_time_planes(scenes: Path, tmp_path: Path) -> None:
+def test_a_scene_without_motion_has_no_time_planes(scenes, tmp_path):
     cases = {
         ("data.scene=still_life",): "frames are equal",
         ("data.scene=still_life", "data.static=false"): None,
@@ -358,7 +335,7 @@ def test_a_scene_without_motion_has_no_time_planes(scenes: Path, tmp_path: Path)
             scenes, "trainer.max_steps=2", "callbacks.evaluation.at=[]", *overrides
         )
         run(config, folder, [], resume=False)
-        state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+        state = checkpoint(folder)
         assert ("field.time" in state["state_dict"]) == (reason is None), overrides
         assert metrics(folder)["skipped"]["static"] == (0.0 if reason is None else 1.0), overrides
         text = (folder / "train.log").read_text()
@@ -366,9 +343,7 @@ def test_a_scene_without_motion_has_no_time_planes(scenes: Path, tmp_path: Path)
         assert reason is None or reason in text, overrides
 
 
-def test_a_bad_batch_takes_those_of_its_update_along(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bad_batch_takes_those_of_its_update_along(scenes, tmp_path, monkeypatch):
     original = RayBatches.draw
 
     def spoil(self, step: int, *rest):
@@ -387,5 +362,5 @@ def test_a_bad_batch_takes_those_of_its_update_along(
     run(config, tmp_path / "run", [], resume=False)
     content = metrics(tmp_path / "run")
     assert (content["steps_skipped"], content["step"]) == (1, 3)
-    state = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
+    state = checkpoint(tmp_path / "run")
     assert {float(each["step"]) for each in state["optimizer_states"][0]["state"].values()} == {2}

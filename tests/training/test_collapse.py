@@ -1,14 +1,13 @@
 """A field that shows nothing is noticed, said and started again; opacity is supervised."""
 
 import csv
-import json
 import math
 from pathlib import Path
 
 import pytest
 import torch
 
-from tests.training.runs import small_config
+from tests.training.runs import metrics, small_config
 from xplanes.errors import ConfigError
 from xplanes.models.base import background_opacity, opacity_error, opacity_shortfall
 from xplanes.rendering.base import Rendering
@@ -18,7 +17,7 @@ from xplanes.training.checkpoints import AtomicCheckpointIO
 from xplanes.training.collapse import CollapseWatch, verdict
 from xplanes.training.meters import mean_opacities
 from xplanes.training.module import RadianceModule
-from xplanes.training.scores import blank_psnr, floaters, psnr_thing
+from xplanes.training.scores import blank_psnr, floaters, psnr_foreground
 
 QUICK = ("trainer.max_steps=24", "callbacks.evaluation.at=[]", "callbacks.checkpoints.every=14")
 
@@ -28,7 +27,7 @@ def rendered(opacity: torch.Tensor, colour: torch.Tensor) -> Rendering:
     return Rendering(colour, opacity, empty, empty, samples=None)  # type: ignore[arg-type]
 
 
-def test_opacity_is_compared_with_alpha_or_with_what_a_colour_takes() -> None:
+def test_opacity_is_compared_with_alpha_or_with_what_a_colour_takes():
     opacity = torch.tensor([0.2, 0.9, 0.5], dtype=torch.float64, requires_grad=True)
     rays = {
         "alpha": torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64),
@@ -53,7 +52,7 @@ def test_opacity_is_compared_with_alpha_or_with_what_a_colour_takes() -> None:
     )
 
 
-def test_opacities_of_foreground_and_background() -> None:
+def test_opacities_of_foreground_and_background():
     rays = {
         "alpha": torch.tensor([0.0, 0.0, 1.0, 1.0, 0.4]),
         "target": torch.tensor([[1.0], [1], [0.2], [0.9], [0.2]]).expand(5, 3),
@@ -66,7 +65,7 @@ def test_opacities_of_foreground_and_background() -> None:
     assert all(math.isnan(value) for value in found.values())
 
 
-def test_a_verdict_needs_rays_that_tell() -> None:
+def test_a_verdict_needs_rays_that_tell():
     nothing, sound, unknown = (0.01, 0.01), (0.9, 0.02), (math.nan, math.nan)
     assert "shows nothing" in verdict([nothing] * 9 + [unknown], fog=False)
     assert verdict([sound] * 9 + [nothing], fog=True) == ""
@@ -85,8 +84,8 @@ def dead(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_dead_field_starts_again_once_and_then_a_warning_is_enough(
-    scenes: Path, tmp_path: Path, dead: None, caplog: pytest.LogCaptureFixture
-) -> None:
+    scenes, tmp_path, dead, caplog
+):
     fields = []
     restart = RadianceModule.restart
 
@@ -106,14 +105,12 @@ def test_a_dead_field_starts_again_once_and_then_a_warning_is_enough(
     assert ["again" in line for line in words] == [True, False]
     assert "at step 10" in words[0]
     assert "data.half_side" in words[1]
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert metrics["restarts"] == 1
+    content = metrics(tmp_path / "run")
+    assert content["restarts"] == 1
     assert fields[0].model.opacity == 1.0
 
 
-def test_a_run_that_began_again_resumes_to_the_same_numbers(
-    scenes: Path, tmp_path: Path, dead: None
-) -> None:
+def test_a_run_that_began_again_resumes_to_the_same_numbers(scenes, tmp_path, dead):
     config = small_config(scenes, *QUICK, "trainer.deterministic=true")
     run(config, tmp_path / "whole", [], resume=False)
     save = AtomicCheckpointIO.save_checkpoint
@@ -128,46 +125,42 @@ def test_a_run_that_began_again_resumes_to_the_same_numbers(
         with pytest.raises(OSError, match="cut off"):
             run(config, tmp_path / "parts", [], resume=False)
     run(config, tmp_path / "parts", [], resume=True)
-    whole, parts = (
-        json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("whole", "parts")
-    )
+    whole, parts = (metrics(tmp_path / name) for name in ("whole", "parts"))
     for key in ("test", "views", "restarts", "samples_per_ray"):
         assert whole[key] == parts[key], key
 
 
-def test_floaters_are_background_pixels_that_show_something() -> None:
+def test_floaters_are_background_pixels_that_show_something():
     alpha = torch.tensor([[0, 0, 0, 255], [0, 0, 128, 255]], dtype=torch.uint8)
     opacity = torch.tensor([[0.0, 0.06, 0.04, 1], [1, 0, 1, 1]])
     assert floaters(opacity, alpha) == pytest.approx(2 / 5)
     assert math.isnan(floaters(opacity, torch.full_like(alpha, 255)))
 
 
-def test_the_thing_is_scored_where_most_of_a_pixel_shows_it() -> None:
+def test_the_thing_is_scored_where_most_of_a_pixel_shows_it():
     truth, colour = torch.zeros(2, 2, 3), torch.zeros(2, 2, 3)
     colour[0], colour[1] = 0.1, 1.0
     mask = torch.tensor([[255, 128], [127, 0]], dtype=torch.uint8)
-    assert psnr_thing(colour, truth, mask) == pytest.approx(20.0)
-    assert math.isnan(psnr_thing(colour, truth, None))
-    assert math.isnan(psnr_thing(colour, truth, torch.zeros_like(mask)))
+    assert psnr_foreground(colour, truth, mask) == pytest.approx(20.0)
+    assert math.isnan(psnr_foreground(colour, truth, None))
+    assert math.isnan(psnr_foreground(colour, truth, torch.zeros_like(mask)))
 
 
-def test_a_run_that_shows_nothing_says_so(
-    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_shows_nothing_says_so(scenes, tmp_path, capsys):
     """The decoder's density bias leaves the field empty, and there is no step to change it."""
     config = small_config(
         scenes, "trainer.max_steps=1", "model.decoder.density_bias=-60", "data.seed=0"
     )
     run(config, tmp_path / "run", [], resume=False)
     assert "this run shows nothing yet" in capsys.readouterr().out
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert metrics["test"]["psnr"] == pytest.approx(metrics["blank_psnr"], abs=0.01)
-    assert metrics["test"]["floaters"] == 0
+    content = metrics(tmp_path / "run")
+    assert content["test"]["psnr"] == pytest.approx(content["blank_psnr"], abs=0.01)
+    assert content["test"]["floaters"] == 0
     with (tmp_path / "run" / "curve.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 2
 
 
-def test_blank_images_are_the_background() -> None:
+def test_blank_images_are_the_background():
     from tests.balls import ball_scene
 
     views = ball_scene().splits["test"]

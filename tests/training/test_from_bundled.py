@@ -1,11 +1,10 @@
 """Runs initialised from the bundled model, the default of `python train.py`."""
 
-import json
 from pathlib import Path
 
 import pytest
 
-from tests.training.runs import composed, small_config
+from tests.training.runs import composed, metrics, small_config
 from xplanes.evaluation.runs import load_run
 from xplanes.files import read_rows
 from xplanes.lrm.bundled import bundled_models
@@ -38,30 +37,26 @@ def random(train, tmp_path_factory: pytest.TempPathFactory) -> list[float]:
     return train(tmp_path_factory.mktemp("random") / "run", "lrm=none")
 
 
-def told(folder: Path) -> dict:
-    return json.loads((folder / "metrics.json").read_text())
-
-
 def test_the_default_initialisation_is_a_bundled_model():
     assert composed().lrm.name in bundled_models()
 
 
 @pytest.mark.parametrize("name", bundled_models())
-def test_it_knows_the_scene_before_the_first_step(train, random, tmp_path: Path, name):
+def test_it_knows_the_scene_before_the_first_step(train, random, tmp_path, name):
     informed = train(tmp_path / "run", f"lrm={name}")
     assert informed[0] > random[0] + 3
     assert informed[-1] > random[-1] + 1
-    content = told(tmp_path / "run")
+    content = metrics(tmp_path / "run")
     assert content["lrm"]["mismatch_pixels"]["largest"] < 0.1
     assert content["seconds"]["prepare"]["lrm"] > 0
     assert content["seconds"]["prepare"]["fill"] > 0
 
 
-def test_a_scene_without_motion_trains_as_a_static_one(train, tmp_path: Path):
+def test_a_scene_without_motion_trains_as_a_static_one(train, tmp_path):
     folder = tmp_path / "run"
     train(folder, "lrm=tiny", "data.scene=still_life", "trainer.max_steps=1")
-    assert (told(folder)["lrm"]["frames"], told(folder)["lrm"]["distinct"]) == (1, 1)
-    assert told(folder)["decomposition"] == {}
+    assert (metrics(folder)["lrm"]["frames"], metrics(folder)["lrm"]["distinct"]) == (1, 1)
+    assert metrics(folder)["decomposition"] == {}
     loaded = load_run(folder)
     assert loaded.is_static
     assert loaded.module.renderer.grid.time_bins == 1

@@ -1,12 +1,11 @@
 """Runs initialised from a Large Reconstruction Model: stages, files, resuming."""
 
-import json
 from pathlib import Path
 
 import pytest
 
 from tests.preparation.test_reconstruct import CHOICES, publish
-from tests.training.runs import small_config
+from tests.training.runs import metrics, small_config, status
 from xplanes.evaluation.evaluate import evaluate
 from xplanes.evaluation.runs import load_run
 from xplanes.models.initialisation import STAGES
@@ -34,11 +33,7 @@ def settings(scenes: Path):
     return settings
 
 
-def metrics(folder: Path) -> dict:
-    return json.loads((folder / "metrics.json").read_text())
-
-
-def test_a_run_from_the_scenes_video(settings, tmp_path: Path):
+def test_a_run_from_the_scenes_video(settings, tmp_path):
     folder = tmp_path / "run"
     run(settings(tmp_path, "triposr", "model=nine_planes"), folder, [], resume=False)
     told = metrics(folder)
@@ -67,7 +62,7 @@ def uninterrupted(settings, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("stopped", ["encode", "from_sequence"])
 def test_a_stopped_preparation_resumes_from_the_last_finished_stage(
-    settings, uninterrupted: Path, tmp_path: Path, monkeypatch, stopped
+    settings, uninterrupted, tmp_path, monkeypatch, stopped
 ):
     folder = tmp_path / "run"
     config = settings(tmp_path, "openlrm-1.1", "preparation.fixed_view=train")
@@ -80,7 +75,7 @@ def test_a_stopped_preparation_resumes_from_the_last_finished_stage(
         patch.setattr(owner, stopped, stop)
         with pytest.raises(KeyboardInterrupt):
             run(config, folder, [], resume=False)
-    assert json.loads((folder / "run.json").read_text())["status"] == "interrupted"
+    assert status(folder)["status"] == "interrupted"
     kept = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "cache").glob("*.pt")}
     assert any(name.startswith("fixed_view") for name in kept)
     assert any(name.startswith("triplane") for name in kept) == (stopped == "from_sequence")

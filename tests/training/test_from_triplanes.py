@@ -1,6 +1,5 @@
 """Runs initialised from a triplane file: outputs, resuming, loading."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -8,7 +7,7 @@ import torch
 from PIL import Image
 
 from tests.preparation.sequences import moving_sequence
-from tests.training.runs import small_config
+from tests.training.runs import checkpoint, metrics, small_config
 from xplanes.decomposition import decompose, unexplained_energy
 from xplanes.decomposition.conversion import frame_profiles
 from xplanes.errors import ConfigError
@@ -73,12 +72,8 @@ UNSCORED = "callbacks.evaluation.at=[]"
 """Training alone is looked at."""
 
 
-def metrics(folder: Path) -> dict:
-    return json.loads((folder / "metrics.json").read_text())
-
-
 def weights(folder: Path) -> dict[str, torch.Tensor]:
-    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    state = checkpoint(folder)
     return state["state_dict"]
 
 
@@ -89,7 +84,7 @@ def trained(place: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_run_reports_its_initialisation(trained: Path, place: Path) -> None:
+def test_the_run_reports_its_initialisation(trained, place):
     content = metrics(trained)
     assert set(content["decomposition"]) == {"xy", "xz", "yz", "unexplained"}
     wanted = "rank iterations residual converged sparsity drift low_rank_energy sparse_energy"
@@ -107,7 +102,7 @@ def test_the_run_reports_its_initialisation(trained: Path, place: Path) -> None:
     assert content["skipped"]["frames"] == 0
 
 
-def test_the_parts_are_logged_as_an_image_and_the_loss_as_a_curve(trained: Path) -> None:
+def test_the_parts_are_logged_as_an_image_and_the_loss_as_a_curve(trained):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     with Image.open(trained / "media" / "decomposition.png") as picture:
@@ -122,8 +117,8 @@ def test_the_parts_are_logged_as_an_image_and_the_loss_as_a_curve(trained: Path)
     assert all(point.value > 0 for point in points)
 
 
-def test_the_sparse_part_is_in_no_checkpoint(trained: Path, place: Path) -> None:
-    state = torch.load(trained / "checkpoints" / "last.ckpt", weights_only=True)
+def test_the_sparse_part_is_in_no_checkpoint(trained, place):
+    state = checkpoint(trained)
     elements = 8 * 3 * 8 * 16 * 16
     assert all(value.numel() != elements for value in state["state_dict"].values())
     assert not [key for key in state["state_dict"] if "sparse" in key or "product" in key]
@@ -132,9 +127,7 @@ def test_the_sparse_part_is_in_no_checkpoint(trained: Path, place: Path) -> None
     assert state["site"]["initialised"]
 
 
-def test_a_resumed_run_equals_an_uninterrupted_one(
-    trained: Path, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_resumed_run_equals_an_uninterrupted_one(trained, place, tmp_path, monkeypatch):
     config, whole = settings(place), trained
     original = TrainingClock.on_train_batch_end
 
@@ -162,7 +155,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
         assert metrics(folder)[key] == metrics(whole)[key]
 
 
-def test_planes_are_not_resumed_in_another_frame(empty_place: Path, tmp_path: Path) -> None:
+def test_planes_are_not_resumed_in_another_frame(empty_place, tmp_path):
     def save(scale: float) -> None:
         frame = Frame(scale, torch.eye(3), torch.zeros(3))
         sequence = TriplaneSequence(moving_sequence(), frame=frame)
@@ -188,7 +181,7 @@ def built(config: dict) -> XPlanesModel:
     return module.model
 
 
-def test_regularisers_towards_the_initialisation_fade(place: Path) -> None:
+def test_regularisers_towards_the_initialisation_fade(place):
     """Without other terms, a gradient is what it would be without fading times what is left."""
     quiet = [
         "model.loss.total_variation=0",
@@ -217,7 +210,7 @@ def test_regularisers_towards_the_initialisation_fade(place: Path) -> None:
     assert not any(gradient.any() for gradient in gradients(96, "288") + gradients(104, "288"))
 
 
-def test_a_field_that_starts_again_keeps_l_r_while_it_is_of_use(place: Path) -> None:
+def test_a_field_that_starts_again_keeps_l_r_while_it_is_of_use(place):
     module = RadianceModule(config := settings(place, "model.loss.initial_steps=288"))
     module.build(Experiment.read(config).data.read())
     sparse = module.model.sparse
@@ -228,9 +221,7 @@ def test_a_field_that_starts_again_keeps_l_r_while_it_is_of_use(place: Path) -> 
     assert again.stronger().model.sparse is None
 
 
-def test_total_variation_has_a_weight_for_the_planes_of_space_and_one_for_those_of_time(
-    place: Path,
-) -> None:
+def test_total_variation_has_a_weight_for_the_planes_of_space_and_one_for_those_of_time(place):
     """Values and gradients, against the formula in float64."""
     weights = {"total_variation": 0.3, "time_variation": 0.7}
     off = [f"model.loss.time_{name}=0" for name in ("smoothness", "magnitude", "identity")]
@@ -262,7 +253,7 @@ def test_total_variation_has_a_weight_for_the_planes_of_space_and_one_for_those_
         torch.testing.assert_close(plane.grad.double(), exact.grad, rtol=1e-4, atol=1e-9)
 
 
-def test_the_regulariser_scales_with_the_inverse_square_of_the_views(place: Path) -> None:
+def test_the_regulariser_scales_with_the_inverse_square_of_the_views(place):
     def hold(lrm: str, views: int) -> float:
         overrides = [f"data.views={views}", "model.loss.initial_weight=8"]
         return built(settings(place, *overrides) | ({} if lrm == "file" else none)).initial_weight
@@ -272,7 +263,7 @@ def test_the_regulariser_scales_with_the_inverse_square_of_the_views(place: Path
     assert hold("none", 2) == 0.0
 
 
-def test_l_r_moves_random_planes_towards_the_sparse_part(place: Path, tmp_path: Path) -> None:
+def test_l_r_moves_random_planes_towards_the_sparse_part(place, tmp_path):
     """Colours are taken out of the loss as far as they go, so that L_r alone is seen."""
     left = {}
     sparse = decompose(moving_sequence(), sparsity_weight="auto").sparse
@@ -300,7 +291,7 @@ def test_l_r_moves_random_planes_towards_the_sparse_part(place: Path, tmp_path: 
     assert left[100] < 0.5 * left[0]
 
 
-def test_a_run_is_loaded_without_its_source(empty_place: Path) -> None:
+def test_a_run_is_loaded_without_its_source(empty_place):
     """Planes, decoder, frame and channels are the file's; the file is gone afterwards."""
     decoder = Decoder(4, **OPTIONS)
     frame = Frame(0.55, torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), torch.zeros(3))
@@ -325,7 +316,7 @@ def test_a_run_is_loaded_without_its_source(empty_place: Path) -> None:
         run(config, folder, [], resume=True)
 
 
-def test_a_run_from_one_triplane_is_loaded_too(place: Path, tmp_path: Path) -> None:
+def test_a_run_from_one_triplane_is_loaded_too(place, tmp_path):
     sequence = TriplaneSequence(moving_sequence(frames=1))
     save_triplanes(tmp_path / "one.pt", sequence)
     config = settings(place, f"lrm.triplanes={tmp_path}/one.pt", "trainer.max_steps=2", UNSCORED)
@@ -335,9 +326,7 @@ def test_a_run_from_one_triplane_is_loaded_too(place: Path, tmp_path: Path) -> N
     assert load_run(tmp_path / "run").is_static
 
 
-def test_an_unconverged_decomposition_warns_once(
-    place: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unconverged_decomposition_warns_once(place, tmp_path, capfd):
     config = settings(
         place,
         "decomposition.max_iterations=3",
@@ -352,9 +341,7 @@ def test_an_unconverged_decomposition_warns_once(
     assert not metrics(tmp_path / "run")["decomposition"]["xy"]["converged"]
 
 
-def test_triplanes_of_a_trained_field_initialise_a_field_with_equal_renders(
-    place: Path, tmp_path: Path
-) -> None:
+def test_triplanes_of_a_trained_field_initialise_a_field_with_equal_renders(place, tmp_path):
     """Checks end to end that orientation, time, decoder and frame of a file match the field's."""
     common = ("model=nine_planes", "model.precision=32")
     config = small_config(place / "scenes", *common, "trainer.max_steps=80", UNSCORED)

@@ -1,6 +1,5 @@
 """Numbers that are not finite reach neither parameters nor checkpoints."""
 
-import json
 import math
 import re
 import shutil
@@ -13,7 +12,7 @@ import pytest
 import torch
 from torch import nn
 
-from tests.training.runs import small_config
+from tests.training.runs import checkpoint, metrics, small_config, status
 from xplanes.errors import ConfigError
 from xplanes.models.base import LossTerm
 from xplanes.models.x_planes import XPlanesModel
@@ -37,11 +36,7 @@ FEW = ("trainer.max_steps=12", "callbacks.checkpoints.every=5", "callbacks.evalu
 SCORED = (*FEW, "callbacks.evaluation.at=[0.4]")
 
 
-def state(run_folder: Path) -> dict:
-    return torch.load(run_folder / "checkpoints" / "last.ckpt", weights_only=True)
-
-
-def test_a_gradient_is_usable_if_adam_can_square_it() -> None:
+def test_a_gradient_is_usable_if_adam_can_square_it():
     values = {0.0: True, 1e18: True, 2e19: False, math.inf: False, math.nan: False}
     for layout in (torch.contiguous_format, torch.channels_last):
         for value, expected in values.items():
@@ -57,7 +52,7 @@ def test_a_gradient_is_usable_if_adam_can_square_it() -> None:
             )
 
 
-def test_names_are_those_of_the_broken() -> None:
+def test_names_are_those_of_the_broken():
     layer = nn.Linear(2, 1)
     layer.bias.grad = torch.tensor([math.inf])
     assert unusable_gradients(layer.named_parameters()) == ["bias"]
@@ -79,26 +74,26 @@ def spoil_gradient(monkeypatch: pytest.MonkeyPatch, value: float, steps: range) 
     monkeypatch.setattr(XPlanesModel, "regularise", spoil)
 
 
-def test_one_bad_gradient_costs_one_step(scenes, tmp_path, monkeypatch) -> None:
+def test_one_bad_gradient_costs_one_step(scenes, tmp_path, monkeypatch):
     spoil_gradient(monkeypatch, 1e25, range(3, 4))
     run(small_config(scenes, *FEW, "trainer.max_steps=6"), tmp_path, [], resume=False)
-    content = json.loads((tmp_path / "metrics.json").read_text())
+    content = metrics(tmp_path)
     assert (content["steps_skipped"], content["step"]) == (1, 6)
-    assert not_finite(state(tmp_path)["state_dict"].items()) == []
+    assert not_finite(checkpoint(tmp_path)["state_dict"].items()) == []
 
 
-def test_gradients_that_stay_bad_end_training_with_a_message(scenes, tmp_path, monkeypatch) -> None:
+def test_gradients_that_stay_bad_end_training_with_a_message(scenes, tmp_path, monkeypatch):
     spoil_gradient(monkeypatch, math.nan, range(8, 1000))
     words = r"20 steps.*from step 7 on.*gradient of field\.space.*resume="
     with pytest.raises(TrainingError, match=words):
         run(small_config(scenes, *LONG), tmp_path / "all", [], resume=False)
-    kept = state(tmp_path / "all")
+    kept = checkpoint(tmp_path / "all")
     # Left out, a step counts, and changes nothing.
     assert kept["global_step"] == 25
     assert {float(each["step"]) for each in kept["optimizer_states"][0]["state"].values()} == {7}
 
 
-def test_gradients_that_are_bad_from_the_first_step_on(scenes, tmp_path, monkeypatch) -> None:
+def test_gradients_that_are_bad_from_the_first_step_on(scenes, tmp_path, monkeypatch):
     spoil_gradient(monkeypatch, 1e30, range(1000))
     words = r"step 0 on.*gradient of field\.space.*check the values and gradients of XPlanes"
     with pytest.raises(TrainingError, match=words):
@@ -158,7 +153,7 @@ def with_loss(scenes: Path, **settings) -> dict:
 
 
 @pytest.mark.parametrize(("first", "more"), [(0, r"omit it$"), (7, r"omit it; resume=")])
-def test_an_added_loss_that_is_not_finite_is_named(scenes, tmp_path, first, more) -> None:
+def test_an_added_loss_that_is_not_finite_is_named(scenes, tmp_path, first, more):
     said = refused(with_loss(scenes, first=first), tmp_path / "run")
     assert re.search(
         rf"the loss was nan.*from step {first} on; not finite: losses\.mine; largest", said
@@ -167,7 +162,7 @@ def test_an_added_loss_that_is_not_finite_is_named(scenes, tmp_path, first, more
     assert "initialisation" not in said
 
 
-def test_a_term_of_the_loss_must_be_one_number(scenes, tmp_path, monkeypatch) -> None:
+def test_a_term_of_the_loss_must_be_one_number(scenes, tmp_path, monkeypatch):
     for form in ("one", "number"):
         config = with_loss(scenes, form=form)
         config["trainer"]["max_steps"] = 2
@@ -182,7 +177,7 @@ def test_a_term_of_the_loss_must_be_one_number(scenes, tmp_path, monkeypatch) ->
     assert said.startswith("loss term own: returned a tensor of shape [3]; ")
 
 
-def test_a_term_of_the_loss_takes_no_other_ones_place(scenes, tmp_path) -> None:
+def test_a_term_of_the_loss_takes_no_other_ones_place(scenes, tmp_path):
     config = with_loss(scenes, form="one")
     config["losses"] = {"colour": config["losses"]["mine"]}
     with pytest.raises(ConfigError, match=r"^losses\.colour: the loss has a term of this name"):
@@ -191,7 +186,7 @@ def test_a_term_of_the_loss_takes_no_other_ones_place(scenes, tmp_path) -> None:
 
 def test_the_initialisation_is_blamed_if_there_was_one_and_it_renders_nothing_finite(
     scenes, tmp_path, monkeypatch
-) -> None:
+):
     for initialised, words in (
         (True, "initialisation is to blame.*set lrm=none"),
         (False, r"No step was done yet: check the values and gradients of XPlanes"),
@@ -209,7 +204,7 @@ def refused(config: dict, folder: Path) -> str:
     return str(caught.value)
 
 
-def test_a_checkpoint_never_holds_what_is_not_finite(scenes, tmp_path, monkeypatch) -> None:
+def test_a_checkpoint_never_holds_what_is_not_finite(scenes, tmp_path, monkeypatch):
     original = TrainingClock.on_train_batch_end
 
     def spoil(self, trainer, module, *rest) -> None:
@@ -221,10 +216,10 @@ def test_a_checkpoint_never_holds_what_is_not_finite(scenes, tmp_path, monkeypat
     monkeypatch.setattr(TrainingClock, "on_train_batch_end", spoil)
     with pytest.raises(TrainingError, match=r"step 10: field\.decoder\.layers\.0\.bias"):
         run(small_config(scenes, *FEW), tmp_path / "spoiled", [], resume=False)
-    assert state(tmp_path / "spoiled")["global_step"] == 5
+    assert checkpoint(tmp_path / "spoiled")["global_step"] == 5
     monkeypatch.undo()
     run(small_config(scenes, *FEW), tmp_path / "spoiled", [], resume=True)
-    assert state(tmp_path / "spoiled")["global_step"] == 12
+    assert checkpoint(tmp_path / "spoiled")["global_step"] == 12
 
 
 @pytest.fixture(scope="module")
@@ -241,7 +236,7 @@ def folder(whole: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(whole, tmp_path / "run"))
 
 
-def test_a_resumed_run_takes_new_learning_rates(scenes, folder, monkeypatch) -> None:
+def test_a_resumed_run_takes_new_learning_rates(scenes, folder, monkeypatch):
     seen = []
     original = RadianceModule.on_train_batch_start
 
@@ -268,17 +263,17 @@ def flipped(content: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("damage", [shortened, flipped])
-def test_a_damaged_checkpoint_gives_way_to_the_best(scenes, whole, folder, caplog, damage) -> None:
+def test_a_damaged_checkpoint_gives_way_to_the_best(scenes, whole, folder, caplog, damage):
     last = folder / "checkpoints" / "last.ckpt"
     last.write_bytes(damage(last.read_bytes()))
     run(small_config(scenes, *SCORED), folder, [], resume=True)
     assert "last.ckpt cannot be read" in caplog.text
     assert "Continuing from" in caplog.text
-    for name, value in state(whole)["state_dict"].items():
-        assert torch.equal(value, state(folder)["state_dict"][name]), name
+    for name, value in checkpoint(whole)["state_dict"].items():
+        assert torch.equal(value, checkpoint(folder)["state_dict"][name]), name
 
 
-def test_damaged_checkpoints_alone_are_refused_with_a_message(tmp_path: Path) -> None:
+def test_damaged_checkpoints_alone_are_refused_with_a_message(tmp_path):
     assert find_resumable(tmp_path) is None
     for name in ("last.ckpt", "best.ckpt"):
         (tmp_path / name).write_bytes(b"half")
@@ -286,7 +281,7 @@ def test_damaged_checkpoints_alone_are_refused_with_a_message(tmp_path: Path) ->
             find_resumable(tmp_path)
 
 
-def test_a_sound_checkpoint_that_cannot_be_read_is_not_called_damaged(tmp_path: Path) -> None:
+def test_a_sound_checkpoint_that_cannot_be_read_is_not_called_damaged(tmp_path):
     path = tmp_path / "last.ckpt"
     torch.save({"place": PurePosixPath("anywhere")}, path)
     with pytest.raises(ConfigError, match=r"last\.ckpt holds more than data \(pathlib\.PurePos"):
@@ -298,11 +293,11 @@ def test_a_sound_checkpoint_that_cannot_be_read_is_not_called_damaged(tmp_path: 
         load_checkpoint(path)
 
 
-def test_a_damaged_record_does_not_end_a_run(scenes, folder, caplog) -> None:
+def test_a_damaged_record_does_not_end_a_run(scenes, folder, caplog):
     (folder / "run.json").write_text('{"status": "runn')
     with pytest.raises(ConfigError, match=r"holds a run already \(damaged\)"):
         run(small_config(scenes, *SCORED), folder, [], resume=False)
     run(small_config(scenes, *SCORED), folder, [], resume=True)
     assert "record of this run starts again" in caplog.text
-    record = json.loads((folder / "run.json").read_text())
+    record = status(folder)
     assert (record["status"], record["resumed"]) == ("finished", 1)

@@ -84,7 +84,7 @@ OWN = {
 }
 
 
-def test_every_setting_is_the_papers_or_its_references() -> None:
+def test_every_setting_is_the_papers_or_its_references():
     for (name, own), lrm in zip(itertools.cycle(OWN.items()), LRMS, strict=False):
         case = f"model={name}", f"lrm={lrm}"
         experiment = Experiment.read(compose_plain("train", ["recipe=paper", *case]))
@@ -113,7 +113,7 @@ def test_every_setting_is_the_papers_or_its_references() -> None:
         assert found == own["losses"], case
 
 
-def test_the_largest_lrm_is_its_own_and_others_can_be_chosen() -> None:
+def test_the_largest_lrm_is_its_own_and_others_can_be_chosen():
     assert compose_plain("train", ["recipe=paper"])["lrm"]["name"] == "xlarge"
     plain = compose_plain("train", ["recipe=paper", "model=nine_planes", "lrm=tiny", "seed=3"])
     assert (plain["lrm"]["name"], plain["model"]["plane_lr"]) == ("tiny", 0.0025)
@@ -121,7 +121,7 @@ def test_the_largest_lrm_is_its_own_and_others_can_be_chosen() -> None:
     assert (plain["lrm"]["name"], plain["model"]["plane_lr"]) == ("none", 0.5)
 
 
-def test_baselines_refuse_it() -> None:
+def test_baselines_refuse_it():
     for name in ("kplanes", "tensor4d"):
         plain = compose_plain("train", ["recipe=paper", f"model={name}", "lrm=none"])
         with pytest.raises(ConfigError, match=r"model\.\S+: there is no such setting"):
@@ -162,7 +162,7 @@ def module_of(*overrides: str) -> tuple[RadianceModule, torch.Tensor]:
     return module, sparse
 
 
-def test_k_planes_terms_are_those_of_k_planes_on_the_same_planes() -> None:
+def test_k_planes_terms_are_those_of_k_planes_on_the_same_planes():
     module, _ = module_of("model=six_planes", "model.loss.sparse_weight=0")
     field = module.field
     products = PlaneProducts(8, 8, [1], 3, low=0.0, high=1.0)
@@ -190,7 +190,7 @@ def test_k_planes_terms_are_those_of_k_planes_on_the_same_planes() -> None:
             torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-9, msg=name)
 
 
-def test_l_r_is_the_sum_over_all_entries_in_every_step() -> None:
+def test_l_r_is_the_sum_over_all_entries_in_every_step():
     for name in OWN:
         off = ("total_variation", "time_variation", "time_smoothness", "time_identity")
         zero = [f"model.loss.{key}=0" for key in off]
@@ -220,7 +220,7 @@ def test_l_r_is_the_sum_over_all_entries_in_every_step() -> None:
             assert not module.field.space.grad.any()
 
 
-def test_a_sum_estimated_from_some_frames_is_unbiased() -> None:
+def test_a_sum_estimated_from_some_frames_is_unbiased():
     _, sparse = module_of("model=six_planes")
     planes = torch.randn(3, 3, 8, 8, generator=torch.Generator().manual_seed(0))
     rows = PLANE_SETS["six"]
@@ -235,7 +235,7 @@ def test_a_sum_estimated_from_some_frames_is_unbiased() -> None:
         SparseProduct(sparse, rows, 1, reduction="total")
 
 
-def test_time_planes_begin_as_k_planes_do() -> None:
+def test_time_planes_begin_as_k_planes_do():
     sparse = torch.randn(5, 3, 2, 6, 6)
     for plane_set in ("six", "nine"):
         planes = time_planes(sparse, plane_set=plane_set, dynamic="ones", time_resolution=3)
@@ -243,7 +243,7 @@ def test_time_planes_begin_as_k_planes_do() -> None:
         assert (planes == 1).all()
 
 
-def test_the_features_may_not_change_over_a_small_distance() -> None:
+def test_the_features_may_not_change_over_a_small_distance():
     module, _ = module_of("model=nine_planes")
     batch = {
         "origins": torch.tensor([[0.0, 0.0, 2.0]]).expand(64, 3),
@@ -274,7 +274,7 @@ def test_the_features_may_not_change_over_a_small_distance() -> None:
 
 
 @pytest.mark.parametrize("model", ["six_planes", "nine_planes"])
-def test_a_run_logs_every_term_in_its_loss(model: str, scenes: Path, tmp_path: Path) -> None:
+def test_a_run_logs_every_term_in_its_loss(model, scenes, tmp_path):
     sequence = moving_sequence()
     save_triplanes(tmp_path / "triplanes.pt", TriplaneSequence(sequence))
     config = small(
@@ -322,12 +322,12 @@ NAMED = tuple(text for text in TINY if text != "lrm=none")
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_it_runs_on_scenes_unlike_those_of_d_nerf(scenes, tmp_path, reduced, scene) -> None:
+def test_it_runs_on_scenes_unlike_those_of_d_nerf(scenes, tmp_path, reduced, scene):
     config = changed(("recipe=paper", *NAMED), "lrm=tiny", f"data.root={scenes}", *SCENES[scene])
     check_runs(config, tmp_path)
 
 
-def test_it_runs_on_a_scene_of_d_nerf_three_times_as_large(scenes, tmp_path, reduced) -> None:
+def test_it_runs_on_a_scene_of_d_nerf_three_times_as_large(scenes, tmp_path, reduced):
     ordinary = Experiment.read(small(f"data.root={scenes}")).data
     enlarge(ordinary.folder, tmp_path / "large", 3.0)
     others = tuple(text for text in NAMED if not text.startswith("data."))
@@ -367,7 +367,7 @@ def enlarge(folder: Path, target: Path, factor: float) -> None:
         path.write_text(json.dumps(content))
 
 
-def test_half_the_timesteps_are_rows_whatever_the_lrm_has() -> None:
+def test_half_the_timesteps_are_rows_whatever_the_lrm_has():
     model = Experiment.read(small("model=six_planes")).method.model
     times = torch.linspace(0, 1, 10)
     assert model.rows_of_time(times, frames=10) == 5
@@ -375,7 +375,7 @@ def test_half_the_timesteps_are_rows_whatever_the_lrm_has() -> None:
     assert (default.rows_of_time(times, frames=16), default.rows_of_time(times)) == (16, 5)
 
 
-def test_its_conversion_keeps_the_middle_frame(tmp_path: Path) -> None:
+def test_its_conversion_keeps_the_middle_frame(tmp_path):
     method = Experiment.read(small("model=nine_planes", "model.time_resolution=4")).method
     sequence, device = moving_sequence(), torch.device("cpu")
     cache = StageCache(tmp_path)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from lightning.pytorch.callbacks import Callback
 
 from tests.training.runs import small_config
@@ -21,7 +22,7 @@ from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.training import scores
 from xplanes.training.checkpoints import AtomicCheckpointIO
 from xplanes.training.module import RadianceModule
-from xplanes.training.record import KEPT, RunRecord, require_same_settings
+from xplanes.training.record import KEPT, RunRecord, require_same_run
 
 FEW = ("trainer.max_steps=6", "callbacks.evaluation.at=[]")
 PAGES = ("config.yaml", "overrides.txt", "metrics.json")
@@ -178,17 +179,21 @@ def nested(key: str, value: object) -> dict[str, Any]:
 
 
 def test_what_planes_and_frame_depend_on_is_kept(tmp_path: Path) -> None:
+    def goes_on(before: dict[str, Any], now: dict[str, Any]) -> None:
+        (tmp_path / "config.yaml").write_text(yaml.safe_dump(before))
+        require_same_run(tmp_path, now, -1)
+
     for key in KEPT:
         this, that, null = (nested(key, value) for value in ("this", "that", None))
         for before, now in ((this, that), (this, null), (null, this)):
             with pytest.raises(ConfigError, match=rf"{key}="):
-                require_same_settings(tmp_path, before, now)
+                goes_on(before, now)
         with pytest.raises(ConfigError, match=rf"{key}=that: .* {key}=this"):
-            require_same_settings(tmp_path, this, that)
-        require_same_settings(tmp_path, this, this)
+            goes_on(this, that)
+        goes_on(this, this)
         # A setting that an older version did not have.
         for without in (nested(key.rpartition(".")[0], {}) if "." in key else {}, {}):
-            require_same_settings(tmp_path, without, that)
+            goes_on(without, that)
 
 
 def test_a_limit_that_a_run_has_passed_is_refused(scenes: Path, folder: Path) -> None:

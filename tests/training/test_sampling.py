@@ -40,7 +40,7 @@ def along_the_diagonal() -> dict[str, torch.Tensor]:
     }
 
 
-def test_images_of_the_trained_field_have_samples_of_their_own(sampling) -> None:
+def test_images_of_the_trained_field_have_samples_of_their_own(sampling):
     seen = sampling.renderer.render(fog, **along_the_diagonal())
     assert len(seen.samples) == STEPS_OF_A_RAY["pictures"]
     trained = sampling.render(fog, along_the_diagonal(), TrainingState(0, 0, 0, 0))
@@ -48,7 +48,7 @@ def test_images_of_the_trained_field_have_samples_of_their_own(sampling) -> None
     assert sampling.renderer.grid is sampling.grid
 
 
-def test_room_follows_the_samples_of_batches_and_pictures_need_none(tmp_path) -> None:
+def test_room_follows_the_samples_of_batches_and_pictures_need_none(tmp_path):
     frame = cube_frame(1.0, torch.zeros(3))
     options = {"times": torch.zeros(1), "seed": 0, "precision": "32"}
     settings = Method.read(small_config(tmp_path)).model.sampler
@@ -61,6 +61,6 @@ def test_room_follows_the_samples_of_batches_and_pictures_need_none(tmp_path) ->
     assert settings.build(fog, Site(frame, **options))._training.room is None
 
 
-def test_no_samples_for_images_are_refused(tmp_path) -> None:
+def test_no_samples_for_images_are_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"model\.sampler\.render_samples=0: must be above 0"):
         Method.read(small_config(tmp_path, "model.sampler.render_samples=0"))

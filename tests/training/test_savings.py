@@ -1,7 +1,6 @@
 """Skipped samples change images by less than 0.05 dB."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 
@@ -15,7 +14,7 @@ BOUND = 0.05
 """In dB."""
 
 
-def test_a_saving_costs_less_than_its_bound(scenes: Path, tmp_path: Path) -> None:
+def test_a_saving_costs_less_than_its_bound(scenes, tmp_path):
     # Outside the silhouettes the field keeps its initial values.
     config = small_config(
         scenes,

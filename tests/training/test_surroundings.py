@@ -17,7 +17,7 @@ from xplanes.scenes.views import Scene
 from xplanes.training.collapse import CollapseWatch
 from xplanes.training.fit import Trainer
 from xplanes.training.losses import loss_terms
-from xplanes.training.scores import render_view
+from xplanes.training.scores import score_view
 
 STEPS = 30
 
@@ -72,7 +72,19 @@ def fitted(module, kind, folder, steps=STEPS, checkpoint=None, **options):
 
 def picture(module, kind="world"):
     views, background = scene(kind).splits["train"], scene(kind).background
-    return render_view(module.field, module.renderer, module.frame, views, 0, background)
+    return score_view(module.field, module.renderer, module.frame, views, 0, background)[1]
+
+
+def rendered(module, kind):
+    """A batch of a scene, and what the field shows of it."""
+    batch = SceneDataModule.of(scene(kind)).batches_for(module, 0).draw(0)
+    return batch, module.sampler.render(module.field, batch, module.state)
+
+
+def terms(module, kind):
+    """The terms of the loss of a batch."""
+    batch, rendering = rendered(module, kind)
+    return loss_terms(module.parts, module.method.losses, rendering, batch, module.state)
 
 
 @pytest.mark.parametrize("kind", ["alpha", "white"])
@@ -84,15 +96,7 @@ def test_a_plain_background_stays_as_it_was(kind):
     for name, value in with_.state_dict().items():
         assert torch.equal(value, without.state_dict()[name]), name
     assert [group["name"] for group in with_.model.groups()] == ["space", "time", "decoder"]
-    batch = SceneDataModule.of(scene(kind)).batches_for(with_, 0).draw(0)
-    terms = loss_terms(
-        with_.parts,
-        with_.method.losses,
-        with_.sampler.render(with_.field, batch, with_.state),
-        batch,
-        with_.state,
-    )
-    assert "opacity" in terms
+    assert "opacity" in terms(with_, kind)
 
 
 def test_a_world_gets_a_background_and_the_planes_are_initialised_as_ever():
@@ -109,21 +113,12 @@ def test_a_world_gets_a_background_and_the_planes_are_initialised_as_ever():
     groups = {group["name"]: group["params"] for group in with_.model.groups()}
     listed = [id(p) for params in groups.values() for p in params]
     assert sorted(listed) == sorted(id(p) for p in with_.parameters())
-    batch = SceneDataModule.of(scene("world")).batches_for(with_, 0).draw(0)
-    terms = loss_terms(
-        with_.parts,
-        with_.method.losses,
-        with_.sampler.render(with_.field, batch, with_.state),
-        batch,
-        with_.state,
-    )
-    assert set(terms) == {"colour"}
+    assert set(terms(with_, "world")) == {"colour"}
 
 
 def test_light_that_passes_the_cube_costs_until_the_field_has_taken_shape():
     module = built("world", "model.loss.passing=0.5", "model.loss.passing_steps=200")
-    batch = SceneDataModule.of(scene("world")).batches_for(module, 0).draw(0)
-    rendering = module.sampler.render(module.field, batch, module.state)
+    batch, rendering = rendered(module, "world")
     passed = float((1 - rendering.opacity.detach()).mean())
     for step, weight in ((0, 0.5), (50, 0.375), (199, 0.0025), (200, None), (900, None)):
         terms = module.model.losses(rendering, batch, replace(module.state, step=step))
@@ -135,7 +130,9 @@ def test_light_that_passes_the_cube_costs_until_the_field_has_taken_shape():
 
 @pytest.mark.parametrize("kind", ["world", "white"])
 def test_before_a_background_planes_are_less_smooth_in_time_and_cells_stay_longer(kind):
-    module = built(kind, "model.sampler.sweep_at=[20,40]", "model.loss.world_time=0.25")
+    module = built(
+        kind, "model.sampler.sweep_at=[20,40]", "model.loss.time_factor_with_background=0.25"
+    )
     loss, world = module.model.settings.loss, kind == "world"
     used = module.model.weights
     for name in ("time_variation", "time_smoothness", "time_magnitude"):
@@ -195,11 +192,8 @@ def baseline(model, kind):
 @pytest.mark.parametrize("model", BASELINES)
 def test_baselines_see_the_world_in_their_own_way(model):
     module = baseline(model, "world")
-    batch = SceneDataModule.of(scene("world")).batches_for(module, 0).draw(0)
-    rendering = module.sampler.render(module.field, batch, module.state)
-    sum(
-        loss_terms(module.parts, module.method.losses, rendering, batch, module.state).values()
-    ).backward()
+    _, rendering = rendered(module, "world")
+    sum(terms(module, "world").values()).backward()
     module.model.regularise(module.state)
     if model == "tineuvox_s":
         assert "a background" in module.field.outline

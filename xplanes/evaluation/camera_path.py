@@ -23,7 +23,7 @@ OVERSHOOT = 0.25
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Cameras and times of a video.
+    """Cameras and times of a video, as read from a file.
 
     Attributes:
         poses: Camera-to-world matrices. [F, 4, 4]
@@ -93,68 +93,35 @@ def read_camera_path(path: Path) -> CameraPath:
     )
 
 
-def path_of(views: Views, fps: int) -> CameraPath:
-    """The cameras of views in the order of their times.
+def path_contents(views: Views, fps: int) -> dict[str, dict[str, Any]]:
+    """The cameras of views in the order of their times as camera paths, for `write_json`.
 
     Cameras of a path are perspective and look through the middle of their images: lenses and
     principal points are left out, the vertical field of view is that of each image.
 
-    Args:
-        views: The views.
-        fps: Frames per second.
+    Returns:
+        ``camera_path.json``, as nerfstudio has it, and ``transforms.json``, by name.
     """
     order = views.times.argsort(stable=True)
-    heights, focal = views.intrinsics.size[order, 0], views.intrinsics.pinhole[order, 1]
-    return CameraPath(
-        poses=views.camera_to_world[order],
-        times=views.times[order],
-        tangents=0.5 * heights / focal,
-        upright=True,
-        height=views.height,
-        width=views.width,
-        fps=fps,
-    )
-
-
-def nerfstudio_content(path: CameraPath) -> dict[str, Any]:
-    """A path with size and rate as ``camera_path.json`` of nerfstudio, for `write_json`."""
-    assert path.height is not None
-    assert path.width is not None
-    assert path.fps is not None
-    fov = 2 * (0.5 * path.height / path.focal(path.height, path.width)).atan().rad2deg()
+    tangents = 0.5 * views.intrinsics.size[order, 0] / views.intrinsics.pinhole[order, 1]
+    aspect = views.width / views.height
+    fov = (2 * tangents.atan()).rad2deg().tolist()
+    across = (2 * (aspect * tangents).atan()).tolist()
+    poses, times = views.camera_to_world[order].tolist(), views.times[order].tolist()
+    flat = views.camera_to_world[order].flatten(1).tolist()
+    keys = [
+        {"camera_to_world": pose, "fov": angle, "aspect": aspect, "render_time": time}
+        for pose, angle, time in zip(flat, fov, times, strict=True)
+    ]
+    frames = [
+        {"transform_matrix": pose, "camera_angle_x": angle, "time": time}
+        for pose, angle, time in zip(poses, across, times, strict=True)
+    ]
+    size = {"render_height": views.height, "render_width": views.width}
+    rate = {"fps": fps, "seconds": len(views) / fps}
     return {
-        "camera_type": "perspective",
-        "render_height": path.height,
-        "render_width": path.width,
-        "fps": path.fps,
-        "seconds": len(path) / path.fps,
-        "camera_path": [
-            {
-                "camera_to_world": pose.flatten().tolist(),
-                "fov": angle,
-                "aspect": path.width / path.height,
-                "render_time": time,
-            }
-            for pose, angle, time in zip(path.poses, fov.tolist(), path.times.tolist(), strict=True)
-        ],
-    }
-
-
-def transforms_content(path: CameraPath) -> dict[str, Any]:
-    """A path with size as a transforms file, for `write_json`."""
-    assert path.height is not None
-    assert path.width is not None
-    angles = 2 * (0.5 * path.width / path.focal(path.height, path.width)).atan()
-    return {
-        "w": path.width,
-        "h": path.height,
-        "fps": path.fps,
-        "frames": [
-            {"transform_matrix": pose.tolist(), "camera_angle_x": angle, "time": time}
-            for pose, angle, time in zip(
-                path.poses, angles.tolist(), path.times.tolist(), strict=True
-            )
-        ],
+        "camera_path.json": {"camera_type": "perspective", **size, **rate, "camera_path": keys},
+        "transforms.json": {"w": views.width, "h": views.height, "fps": fps, "frames": frames},
     }
 
 

@@ -1,6 +1,7 @@
 """Plots of the runs of a sweep: PSNR against seconds and steps, or against a setting."""
 
 import importlib.util
+import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,11 +20,6 @@ PLACES = 60
 
 def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bool:
     """Draw PSNR against seconds, preparation included, and against steps, a column per scene.
-
-    Args:
-        rows: Runs.
-        names: Settings in which they differ.
-        path: Picture to write, PNG.
 
     Returns:
         Whether there was something to draw, and matplotlib (extra ``plots``) to draw it with.
@@ -45,84 +41,64 @@ def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> boo
     figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(2, len(scenes), squeeze=False)
     handles = {}
-    for (scene, label), runs in lines.items():
-        for row, (axis, title) in enumerate(
-            (("seconds", "seconds (preparation included)"), ("step", "steps"))
-        ):
-            panel = panels[row][scenes.index(scene)]
-            # Models differ in speed by orders of magnitude; a logarithmic axis has no 0.
-            points = np.transpose(_mean_curve(runs, axis))
-            points = points[points[:, 0] > 0]
-            colour = f"C{labels.index(label)}"
-            (handles[label],) = panel.plot(*points.T, label=label, color=colour, marker=".")
-            panel.set_xscale("log")
-            panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            panel.xaxis.set_major_formatter("{x:g}")
-            panel.xaxis.set_minor_formatter(NullFormatter())
-            panel.set(xlabel=title, ylabel="PSNR, dB", title=scene)
-            panel.grid(alpha=0.3)
-    figure.legend(
-        handles.values(), labels, loc="outside lower center", ncols=across, fontsize="small"
-    )
-    _save(figure, path)
-    return True
+    titles = {"seconds": "seconds (preparation included)", "step": "steps"}
+    for ((scene, label), runs), (row, axis) in itertools.product(lines.items(), enumerate(titles)):
+        panel = panels[row][scenes.index(scene)]
+        # Models differ in speed by orders of magnitude; a logarithmic axis has no 0.
+        points = np.transpose(_mean_curve(runs, axis))
+        points = points[points[:, 0] > 0]
+        colour = f"C{labels.index(label)}"
+        (handles[label],) = panel.plot(*points.T, label=label, color=colour, marker=".")
+        panel.set(xlabel=titles[axis], ylabel="PSNR, dB", title=scene, xscale="log")
+        panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        panel.xaxis.set_major_formatter("{x:g}")
+        panel.xaxis.set_minor_formatter(NullFormatter())
+        panel.grid(alpha=0.3)
+    place: Any = {"loc": "outside lower center", "ncols": across, "fontsize": "small"}
+    figure.legend(handles.values(), labels, **place)
+    return _save(figure, path)
 
 
 def plot_against(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bool:
     """Draw final PSNR against a setting that has three values or more, mean over scenes and seeds.
 
-    Args:
-        rows: Runs.
-        names: Settings in which they differ.
-        path: Picture to write, PNG.
-
     Returns:
         Whether there was one such setting, and matplotlib (extra ``plots``) to draw it with.
     """
     done = [row for row in rows if "psnr" in row.scores]
-    numeric = [
-        name
-        for name in names
-        if name != SEED
-        and len({_place(row, name) for row in done}) > 2
-        and all(v is None or is_number(v) for v in (row.settings.get(name) for row in done))
-    ]
+    numeric = {}
+    for name in names:
+        values = [row.settings.get(name) for row in done]
+        if name != SEED and all(value is None or is_number(value) for value in values):
+            # Null, all of something, lies behind all others.
+            places = [math.inf if value is None else float(value) for value in values]
+            numeric |= {name: places} if len(set(places)) > 2 else {}
     if len(numeric) != 1 or not importlib.util.find_spec("matplotlib"):
         return False
     from matplotlib.figure import Figure
 
-    (name,) = numeric
-    ticks = sorted({_place(row, name) for row in done})
-    scores: dict[str, dict[float, list[float]]] = {}
+    ((name, places),) = numeric.items()
+    ticks = sorted(set(places))
+    scores: dict[str, dict[int, list[float]]] = {}
     over = [n for n in names if n not in (SEED, SCENE, name)]
-    for row in done:
+    for row, place in zip(done, places, strict=True):
         values = scores.setdefault(run_label(row, over), {})
-        values.setdefault(_place(row, name), []).append(row.scores["psnr"])
+        values.setdefault(ticks.index(place), []).append(row.scores["psnr"])
     figure = Figure(figsize=(6, 4), layout="constrained")
     panel = figure.subplots()
     for label, values in scores.items():
-        places = sorted(values)
-        means = [mean(values[place]) for place in places]
-        panel.plot([ticks.index(place) for place in places], means, marker=".", label=label)
-    panel.set_xticks(
-        range(len(ticks)), ["all" if place == math.inf else f"{place:g}" for place in ticks]
-    )
-    panel.set(xlabel=name, ylabel="PSNR, dB")
+        panel.plot(sorted(values), [mean(values[x]) for x in sorted(values)], ".-", label=label)
+    words = ["all" if place == math.inf else f"{place:g}" for place in ticks]
+    panel.set(xlabel=name, ylabel="PSNR, dB", xticks=range(len(ticks)), xticklabels=words)
     panel.grid(alpha=0.3)
     panel.legend(fontsize="small")
-    _save(figure, path)
-    return True
+    return _save(figure, path)
 
 
-def _save(figure: Any, path: Path) -> None:
+def _save(figure: Any, path: Path) -> bool:
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)
-
-
-def _place(row: RunRow, name: str) -> float:
-    """A setting as a number; null, all of something, lies behind all others."""
-    value = row.settings.get(name)
-    return float(value) if isinstance(value, int | float) else math.inf
+    return True
 
 
 def run_label(row: RunRow, names: Sequence[str]) -> str:
@@ -140,6 +116,5 @@ def _mean_curve(runs: Sequence[Sequence[Point]], axis: str) -> tuple[list[float]
     curves = [([getattr(p, axis) for p in run], [p.psnr for p in run]) for run in runs]
     if len(curves) == 1:
         return curves[0]
-    first, last = max(places[0] for places, _ in curves), min(places[-1] for places, _ in curves)
-    places = np.linspace(first, last, PLACES)
+    places = np.linspace(max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves), PLACES)
     return places.tolist(), np.mean([np.interp(places, *curve) for curve in curves], 0).tolist()

@@ -34,7 +34,7 @@ class Shot:
     """What a picture is to show.
 
     Attributes:
-        pose: Camera-to-world matrix, where the world is the field's frame. [4, 4]
+        pose: Camera-to-world matrix, in the field's frame. [4, 4]
         time: From 0 to 1.
         fov: Vertical field of view, in radians.
         height: Rows.
@@ -58,7 +58,7 @@ class Shot:
 
     @property
     def camera(self) -> PosedCamera:
-        """The camera, where the world is the field's frame."""
+        """The camera, in the field's frame."""
         focal = 0.5 * self.height / math.tan(0.5 * self.fov)
         return PosedCamera(self.pose, focal, self.height, self.width)
 
@@ -112,7 +112,7 @@ def draw(
     background = background.to(device)
     shown, solid = field, renderer
     if box is not None or shot.mode == "floaters":
-        # What the grid knows to be opaque may be left out, and hides nothing then.
+        # Surfaces that the grid knows may be cropped away; they must hide nothing then.
         solid = replace(renderer, occlusion=0.0) if isinstance(renderer, GridRenderer) else renderer
     if box is not None:
         shown = field.masked(in_box(box.to(device)))

@@ -13,14 +13,14 @@ from safetensors.torch import save_file
 from torch import Tensor
 from tqdm import tqdm
 
-from xplanes.errors import ConfigError
-from xplanes.evaluation.camera_path import nerfstudio_content, path_of, transforms_content
+from xplanes.errors import ConfigError, require_between
+from xplanes.evaluation.camera_path import path_contents
 from xplanes.evaluation.export_web import Shape, write_page
 from xplanes.evaluation.render import FPS
 from xplanes.evaluation.runs import TrainedRun
 from xplanes.fields.base import SurfaceField, ViewDependentField
 from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES, XPlanes
-from xplanes.files import replacing, require_writable, write_json
+from xplanes.files import replacing, require_empty, require_writable, write_json
 from xplanes.optional import require
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.box import ray_box
@@ -56,7 +56,7 @@ PLATEAU = 0.001
 
 
 Z_UP_TO_Y_UP = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
-"""Turns a world whose z axis points up, as this program's, into one whose y axis does."""
+"""Rotates a scene whose z axis points up, as here, so that its y axis does."""
 
 
 @dataclass(frozen=True)
@@ -91,36 +91,32 @@ class ExportOptions:
         """
         if self.form not in FORMATS:
             raise ConfigError(f"--format {self.form}: must be {' or '.join(FORMATS)}")
-        for name, value, least, most in (
-            ("resolution", self.resolution, COARSEST, LARGEST),
-            ("points", POINTS if self.count is None else self.count, 1, 10**8),
-        ):
-            if not least <= value <= most:
-                raise ConfigError(f"--{name} {value}: must lie between {least} and {most}")
+        require_between("--resolution", self.resolution, COARSEST, LARGEST)
+        require_between("--points", self.count, 1, 10**8)
         if self.threshold is not None and not 0 < self.threshold < math.inf:
             raise ConfigError(f"--threshold {self.threshold:g}: must be a finite number above 0")
         if self.times is not None:
             export_times(self.times)
-        self._refuse_what_is_not_used()
-        if self.what in ("mesh", "points"):
-            require("skimage.measure", extra="export")
-            require("trimesh", extra="export")
-
-    def _refuse_what_is_not_used(self) -> None:
-        files = self.what in ("mesh", "points")
+        usual, files = ExportOptions(), self.what in ("mesh", "points")
         surface = files or self.what == "web"
-        default = ExportOptions()
-        for name, value, ordinary, used in (
-            ("times", self.times, default.times, self.what not in ("planes", "path")),
-            ("resolution", self.resolution, default.resolution, surface),
-            ("threshold", self.threshold, default.threshold, surface),
-            ("points", self.count, default.count, self.what in ("points", "web")),
-            ("format", self.form, default.form, files),
+        for name, value, default, used in (
+            ("times", self.times, usual.times, self.what not in ("planes", "path")),
+            ("resolution", self.resolution, usual.resolution, surface),
+            ("threshold", self.threshold, usual.threshold, surface),
+            ("points", self.count, usual.count, self.what in ("points", "web")),
+            ("format", self.form, usual.form, files),
         ):
-            if value != ordinary and not used:
+            if value != default and not used:
                 raise ConfigError(
                     f"--{name} {value}: --what {self.what} does not use it; leave it out"
                 )
+        if files:
+            _mesh_tools()
+
+
+def _mesh_tools() -> tuple[Any, Any]:
+    """`skimage.measure` and `trimesh`, of the extra ``export``."""
+    return require("skimage.measure", extra="export"), require("trimesh", extra="export")
 
 
 def export_times(text: str) -> list[float]:
@@ -172,52 +168,52 @@ def export(
         allowed = " or ".join((*KINDS, *field.exports))
         raise ConfigError(f"--what {options.what}: {name} has none; set --what {allowed}")
     folder = out or trained.path / "export" / options.what
-    check_folder(folder)
+    require_empty(folder)
     require_writable(folder)
-    facts: dict[str, Any] = {
-        "what": options.what,
-        "run": str(trained.path),
-        "checkpoint": trained.checkpoint,
-        "step": trained.step,
-    }
+    facts: dict[str, Any] = {"what": options.what, "run": str(trained.path)}
+    facts |= {"checkpoint": trained.checkpoint, "step": trained.step}
     if options.what in ("planes", "path"):
         write = write_planes if options.what == "planes" else write_paths
-        write_json(folder / "export.json", {**facts, "files": write(folder, trained)})
-        return folder
-    if getattr(field, "background", None) is not None:
-        facts["left_out"] = "what lies behind the field's cube"
-        say(f"left out    {facts['left_out']}, which has no surface; --what planes has it")
-    ordinary = WEB_TIMES if options.what == "web" else TIMES
-    times = export_times(options.times or str(1 if trained.is_static else ordinary))
-    if (write_own := field.exports.get(options.what)) is not None:
-        paths = [folder / f"{options.what}_{number:04d}" for number in range(len(times))]
-        written = [
-            write_own(path, time, trained.frame) for path, time in zip(paths, times, strict=True)
-        ]
-        names = [path.name for path in written]
-        write_json(folder / "export.json", {**facts, "files": names, "times": times})
-        return folder
+        facts["files"] = write(folder, trained)
+    else:
+        if getattr(field, "background", None) is not None:
+            facts["left_out"] = "what lies behind the field's cube"
+            say(f"left out    {facts['left_out']}, which has no surface; --what planes has it")
+        several = WEB_TIMES if options.what == "web" else TIMES
+        times = export_times(options.times or str(1 if trained.is_static else several))
+        facts |= {"times": times} | _write_times(folder, trained, options, times, say)
+    write_json(folder / "export.json", facts)
+    return folder
+
+
+def _write_times(
+    folder: Path,
+    trained: TrainedRun,
+    options: ExportOptions,
+    times: list[float],
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """Write what changes with time; what `export.json` says of it."""
+    paths = [folder / f"{options.what}_{number:04d}" for number in range(len(times))]
+    if (write_own := trained.module.field.exports.get(options.what)) is not None:
+        pairs = zip(paths, times, strict=True)
+        return {"files": [write_own(path, time, trained.frame).name for path, time in pairs]}
     threshold = _threshold(trained, options, times)
     if threshold is not None:
         say(f"threshold   density {threshold:.4g}")
     if options.what == "web":
-        facts |= _write_web(folder, trained, options, threshold, times, say)
-        write_json(folder / "export.json", facts)
-        return folder
-    names = [f"{options.what}_{number:04d}.{options.form}" for number in range(len(times))]
-    files = [folder / name for name in names]
+        return _write_web(folder, trained, options, threshold, times, say)
+    files = [path.with_suffix(f".{options.form}") for path in paths]
     written = _write_each(trained, options, threshold, times, files)
     try:
         for _ in tqdm(written, "times", len(times), leave=False, delay=2, disable=None):
             pass
     except ConfigError:
-        for path in files:  # So that the way out, another threshold, may write here.
+        for path in files:  # So that another threshold can be tried in this folder.
             path.unlink(missing_ok=True)
         raise
-    facts |= {"files": names, "times": times}
-    facts |= {"resolution": options.resolution, "threshold": threshold}
-    write_json(folder / "export.json", facts)
-    return folder
+    facts = {"resolution": options.resolution, "threshold": threshold}
+    return {"files": [path.name for path in files], **facts}
 
 
 def _threshold(trained: TrainedRun, options: ExportOptions, times: list[float]) -> float | None:
@@ -237,8 +233,7 @@ def _threshold(trained: TrainedRun, options: ExportOptions, times: list[float]) 
             f"nor a surface; set --what {others}"
         )
     else:
-        require("skimage.measure", extra="export")
-        require("trimesh", extra="export")
+        _mesh_tools()
         if not isinstance(field, SurfaceField):
             return threshold or find_threshold(trained, options.resolution, times[len(times) // 2])
         own = "a surface of its own"
@@ -249,22 +244,10 @@ def _threshold(trained: TrainedRun, options: ExportOptions, times: list[float]) 
     return None
 
 
-def check_folder(folder: Path) -> None:
-    """Refuse a folder in which files of two exports would mix.
-
-    Raises:
-        ConfigError: If it holds files, or is one.
-    """
-    if folder.is_file():
-        raise ConfigError(f"--out {folder} is a file: name a folder")
-    if folder.is_dir() and any(folder.iterdir()):
-        raise ConfigError(f"{folder} holds files already: empty it, or name another with --out")
-
-
 def shape_at(
     trained: TrainedRun, time: float, resolution: int, threshold: float | None, count: int | None
 ) -> Shape:
-    """The coloured surface of one timestep, in the world.
+    """The coloured surface of one timestep, in world coordinates.
 
     Args:
         trained: The run.
@@ -276,14 +259,11 @@ def shape_at(
     Raises:
         ConfigError: If there is no surface.
     """
-    mesh, trimesh = (
-        surface(trained, time, resolution, threshold),
-        require("trimesh", extra="export"),
-    )
+    mesh = surface(trained, time, resolution, threshold)
     if count is None:
         places, normals = mesh.vertices, mesh.vertex_normals
     else:
-        places, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
+        places, faces = _mesh_tools()[1].sample.sample_surface(mesh, count, seed=0)
         normals = mesh.face_normals[faces]
     points = torch.tensor(places, dtype=torch.float32)
     outward = torch.tensor(normals, dtype=torch.float32)
@@ -300,7 +280,7 @@ def _write_each(
     times: Iterable[float],
     files: Iterable[Path],
 ) -> Iterable[Path]:
-    trimesh = require("trimesh", extra="export")
+    _, trimesh = _mesh_tools()
     count = None if options.what == "mesh" else POINTS if options.count is None else options.count
     for time, path in zip(times, files, strict=True):
         shape = shape_at(trained, time, options.resolution, threshold, count)
@@ -312,10 +292,9 @@ def _write_each(
             found = trimesh.PointCloud(world, colors=pixels)
         else:
             found = trimesh.Trimesh(world, shape.faces, vertex_colors=pixels, process=False)
+        content = _glb(found) if options.form == "glb" else found.export(file_type="ply")
         with replacing(path) as temporary:
-            temporary.write_bytes(
-                _glb(found) if options.form == "glb" else found.export(file_type="ply")
-            )
+            temporary.write_bytes(content)
         yield path
 
 
@@ -353,7 +332,7 @@ def _write_web(
         eye=trained.scene.splits["train"].camera_to_world[0, :3, 3],
     )
     share = written.pop("share")
-    facts = {"files": [PAGE], "times": times, **written, "threshold": threshold}
+    facts = {"files": [PAGE], **written, "threshold": threshold}
     if written["triangles"]:
         facts["resolution"] = coarser(share)
         shown = f"{written['triangles']:,} triangles at resolution {coarser(share)}"
@@ -370,7 +349,7 @@ def _glb(geometry: Any) -> bytes:
     The standard's y axis points up, the world's z axis does; without a material, surfaces would be
     of metal, black where nothing is reflected.
     """
-    trimesh = require("trimesh", extra="export")
+    _, trimesh = _mesh_tools()
     scene = trimesh.Scene()
     scene.add_geometry(geometry, transform=Z_UP_TO_Y_UP)
 
@@ -406,8 +385,7 @@ def surface(trained: TrainedRun, time: float, resolution: int, threshold: float 
     Raises:
         ConfigError: If there is no surface.
     """
-    measure = require("skimage.measure", extra="export")
-    trimesh = require("trimesh", extra="export")
+    measure, trimesh = _mesh_tools()
     volume, empty = solidity(trained, time, resolution)
     level = 0.0 if threshold is None else -math.expm1(-threshold * 2 / resolution)
     if not float(volume.max()) > level:
@@ -436,9 +414,9 @@ def _nothing(time: float, volume: Tensor, threshold: float | None) -> str:
 def solidity(trained: TrainedRun, time: float, resolution: int) -> tuple[Tensor, float]:
     """How solid the field is at the centres of the cells of a grid, where its renderer looks.
 
-    That is the opacity of one cell, which interpolates better than a density, whose values in
-    solid things mean little; for a field of signed distances the depth below the surface, limited
-    to a cell on either side. Points in empty cells of the occupancy grid are not looked at.
+    That is the opacity of one cell, which interpolates better than a density, whose values inside
+    solid objects mean little; for a field of signed distances the depth below the surface, limited
+    to a cell on either side. Points in empty cells of the occupancy grid are not evaluated.
 
     Args:
         trained: The run.
@@ -574,18 +552,10 @@ def surface_colours(trained: TrainedRun, points: Tensor, normals: Tensor, time: 
 def write_paths(folder: Path, trained: TrainedRun) -> list[str]:
     """Write the training cameras in the order of their times as camera paths.
 
-    Args:
-        folder: Where to.
-        trained: The run.
-
     Returns:
         The files' names: ``camera_path.json``, as nerfstudio has it, and ``transforms.json``.
     """
-    path = path_of(trained.scene.splits["train"], FPS)
-    contents = {
-        "camera_path.json": nerfstudio_content(path),
-        "transforms.json": transforms_content(path),
-    }
+    contents = path_contents(trained.scene.splits["train"], FPS)
     for name, content in contents.items():
         write_json(folder / name, content)
     return list(contents)
@@ -593,10 +563,6 @@ def write_paths(folder: Path, trained: TrainedRun) -> list[str]:
 
 def write_planes(folder: Path, trained: TrainedRun) -> list[str]:
     """Write an X-Planes field as safetensors; docs/recipes.md describes the layout.
-
-    Args:
-        folder: Where to.
-        trained: The run.
 
     Returns:
         The files' names.

@@ -38,7 +38,7 @@ class Shape:
     """A coloured surface, or points on one, at one time.
 
     Attributes:
-        places: Vertices or points in the world. [N, 3]
+        places: Vertices or points in world coordinates. [N, 3]
         colours: In sRGB, from 0 to 1. [N, 3]
         faces: Triangles, counter-clockwise from outside; None for points. [F, 3]
     """
@@ -66,7 +66,7 @@ def write_page(
         times: From 0 to 1.
         title: Shown by the browser.
         background: Colour in sRGB, from 0 to 1. [3]
-        eye: Where the camera stands at first, in the world, whose z axis points up. [3]
+        eye: First position of the camera, in world coordinates with z up. [3]
 
     Returns:
         What was written: vertices, triangles, bytes, and the share.
@@ -113,7 +113,7 @@ def write_page(
 def _fitting(
     room: int, shape_at: Callable[[float, float], Shape], times: Sequence[float]
 ) -> tuple[list[dict[str, Any]], float]:
-    """Shapes that take no more than so many bytes together, and the share that they need."""
+    """Shapes that fit into ``room`` bytes, and the share of triangles or points in them."""
     share = 1.0
     while share > COARSEST:
         shapes: list[dict[str, Any]] = []
@@ -126,8 +126,8 @@ def _fitting(
         else:
             return shapes, share
     raise ConfigError(
-        f"--times {len(times)}: so many timesteps do not fit into a page of {LIMIT // 10**6} MB; "
-        "set fewer"
+        f"--times {len(times)}: these timesteps do not fit into a page of {LIMIT // 10**6} MB; set "
+        "fewer"
     )
 
 

@@ -1,4 +1,4 @@
-"""What may be wrong with a capture: findings, each with its numbers and the way out."""
+"""What may be wrong with a capture: findings, each with its numbers and a remedy."""
 
 import hashlib
 import math
@@ -19,13 +19,13 @@ from xplanes.scenes.silhouettes import count_in_squares
 from xplanes.scenes.views import Scene, Views, spread
 
 GAP_SPACINGS, GAP_SPAN = 12.0, 0.05
-"""Least length of a gap in time: in median spacings, and as a share of the whole span."""
+"""Shortest gap in time that is reported: in median spacings, and as a share of the span."""
 
 SHORT_SPAN = 0.2
-"""Share of [0, 1] that times cover at least, unless they were scaled wrongly."""
+"""Share of [0, 1] that times should cover; less suggests wrong scaling."""
 
 ASTRAY = 0.1
-"""Share of the cameras that may look past the centre of the cube."""
+"""Share of the cameras that may miss the centre of the cube."""
 
 SMALL, LARGE = 0.03, 3.0
 """Bounds of half the cube's side, in median distances of the cameras."""
@@ -37,26 +37,26 @@ CUT = 0.02
 """Share of the foreground that may lie outside of the cube."""
 
 PALE_STEPS, PALE = 16, 0.15
-"""Opaque pixels fewer of 255 steps from the background's colour look like it; share of a silhouette
-that may."""
+"""Difference from the background's colour, of 255, below which an opaque pixel looks like it; the
+share of a silhouette that may."""
 
 HALO = 0.03
-"""Squares in which soft edges fade around silhouettes, as a share of the image's longer side."""
+"""Width of the soft edge around a silhouette, as a share of the image's longer side."""
 
 EMPTY = 1e-3
-"""Share of opaque pixels below which an image shows next to nothing."""
+"""Share of opaque pixels below which an image is almost empty."""
 
 FULL = 0.98
-"""Share of opaque pixels above which a mask masks nothing."""
+"""Share of opaque pixels above which a mask hides nothing."""
 
 MOST_VIEWS = 300
-"""Images of a split that are read at most, spread evenly."""
+"""Most images of a split that are read, spread evenly."""
 
 AT_START = 32
 """The same at the start of a run, whose images may lie on the disk."""
 
 MOST_RAYS = 4096
-"""Foreground pixels of an image whose rays are tested against the cube."""
+"""Most foreground pixels of an image whose rays are tested against the cube."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class ImageFacts:
-    """What the pixels of one image tell.
+    """Statistics of the pixels of one image.
 
     Attributes:
         index: Number of the image in its split.
@@ -101,7 +101,7 @@ class ImageFacts:
 
 
 def image_facts(views: Views, background: Tensor, frame: Frame | None) -> list[ImageFacts]:
-    """What the pixels of a split's images tell, of at most `MOST_VIEWS` of them.
+    """Statistics of the pixels of a split's images, of at most `MOST_VIEWS` of them.
 
     Args:
         views: The images.
@@ -166,7 +166,7 @@ def _stray_pixels(alpha: Tensor) -> int:
 
 
 def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
-    """What cameras and times alone tell, and images that different times should tell apart.
+    """Problems that cameras and times show, and views that two splits share.
 
     Args:
         scene: The scene; its training views and those that are scored.
@@ -184,19 +184,14 @@ def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
 
 
 def image_findings(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iterator[Finding]:
-    """What the images' pixels tell.
-
-    Args:
-        scene: The scene.
-        images: What `image_facts` gives of each split.
-    """
+    """Problems that the images' pixels show."""
     seen = [each for split in images.values() for each in split]
     masks = list(_masks(seen))
     yield from masks
     yield from _shared_images(scene, images)
     yield from _stray([(each.file, each.stray) for each in seen])
     if masks:
-        return  # What silhouettes tell means little then.
+        return  # Silhouettes mean little then.
     transparent = [each for each in seen if each.coverage < FULL]
     if 2 * len(transparent) > len(seen):
         yield from _white_edges(transparent)
@@ -212,7 +207,7 @@ def image_findings(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iter
 
 
 def opaque_findings(scene: Scene) -> Iterator[Finding]:
-    """Whether opaque training images show things before a plain background."""
+    """Whether opaque training images show objects in front of a plain background."""
     if scene.splits["train"].is_opaque and not scene.is_surrounded:
         yield Finding(
             "white",
@@ -254,7 +249,7 @@ def time_steps(views: Views) -> Tensor:
 
 
 def time_gaps(views: Views) -> list[tuple[float, float]]:
-    """Stretches without views that are far longer than the usual spacing, first and last time."""
+    """Gaps between times that are far longer than the usual spacing: first and last time."""
     times = time_steps(views)
     if len(times) < 5:
         return []
@@ -290,8 +285,8 @@ def _times(scene: Scene, train: Views) -> Iterator[Finding]:
         yield Finding(
             "one_time",
             f"all training views have the time {float(times[0]):.3g}, but {first} and {second} "
-            "have one camera and show different things: the scene moves. Give every image its "
-            "time, or take those of one timestep alone",
+            "have one camera and differ: the scene moves. Give every image its time, or take those "
+            "of one timestep alone",
         )
 
 
@@ -314,23 +309,19 @@ def _shared(scene: Scene) -> Iterator[Finding]:
     names = dict(zip(train.files, range(len(train)), strict=True))
     poses = train.camera_to_world.double()
     room = 1e-5 * float((poses[:, :3, 3] - poses[:, :3, 3].mean(dim=0)).norm(dim=-1).median())
-    for split, views in scene.splits.items():
-        if split == "train":
-            continue
-        found = []
+    for split in [name for name in scene.splits if name != "train"]:
+        views, found = scene.splits[split], []
         for index, file in enumerate(views.files):
             pose, time = views.camera_to_world[index], views.times[index]
-            other = names.get(file)
-            # Formats of the user's own may name the files of each split by themselves.
-            if other is not None and torch.equal(views.image(index), train.image(other)):
-                found.append((file, file))
-                continue
             near = (poses - pose.double()).abs().flatten(1).amax(dim=1) <= max(room, 1e-9)
             near &= (train.times - time).abs() <= 1e-6
-            if near.any():
+            other = names.get(file)
+            # User-defined formats may use the same file names in several splits.
+            if other is not None and torch.equal(views.image(index), train.image(other)):
+                found.append((file, file))
+            elif near.any():
                 found.append((file, train.files[int(near.nonzero()[0, 0])]))
-        if found:
-            yield _shared_finding(split, len(views), found, "file, or the same camera and time")
+        yield from _shared_finding(split, views, found, "file, or the same camera and time")
 
 
 def _shared_images(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iterator[Finding]:
@@ -339,28 +330,28 @@ def _shared_images(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iter
         return
     train = scene.splits["train"]
     known = {each.digest: each.index for each in images["train"] if each.digest is not None}
-    for split, views in scene.splits.items():
-        if split == "train":
-            continue
-        found = []
+    for split in [name for name in scene.splits if name != "train"]:
+        poses, found = scene.splits[split].camera_to_world, []
         for each in images[split]:
-            other = known.get(each.digest) if each.digest is not None else None
+            other = known.get(each.digest or b"")
             # One camera shows the same again as long as nothing moves.
             if other is not None and not torch.equal(
-                views.camera_to_world[each.index], train.camera_to_world[other]
+                poses[each.index], train.camera_to_world[other]
             ):
                 found.append((each.file, train.files[other]))
-        if found:
-            yield _shared_finding(split, len(views), found, "pixels")
+        yield from _shared_finding(split, scene.splits[split], found, "pixels")
 
 
-def _shared_finding(split: str, total: int, found: list[tuple[str, str]], what: str) -> Finding:
-    file, other = found[0]
-    return Finding(
-        "shared",
-        f"{len(found)} of {total} {split} views are training views too, by the same {what} "
-        f"({file} is {other}): scores would flatter the field. Take them out of one of the splits",
-    )
+def _shared_finding(
+    split: str, views: Views, found: list[tuple[str, str]], what: str
+) -> Iterator[Finding]:
+    for file, other in found[:1]:
+        yield Finding(
+            "shared",
+            f"{len(found)} of {len(views)} {split} views are training views too, by the same "
+            f"{what} ({file} is {other}): scores would flatter the field. Take them out of one of "
+            "the splits",
+        )
 
 
 def _sizes(scene: Scene) -> Iterator[Finding]:
@@ -439,7 +430,7 @@ def _astray(views: Views, frame: Frame) -> Iterator[Finding]:
         yield Finding(
             "astray",
             f"{len(blind)} of {len(views)} cameras do not see the centre of the cube ({centre}), "
-            f"such as that of {views.files[blind[0]]}. All must look at one thing, from around it: "
+            f"such as that of {views.files[blind[0]]}. All must look at the same object or scene: "
             "check their poses, or leave these views out",
         )
 

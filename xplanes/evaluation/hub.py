@@ -130,13 +130,8 @@ def fetch(
         return run
     say(f"fetching    {address} to {run}")
     try:
-        snapshot_download(
-            repository,
-            revision=revision,
-            local_dir=run,
-            allow_patterns=list(PATTERNS),
-            endpoint=endpoint,
-        )
+        files: Any = {"local_dir": run, "allow_patterns": list(PATTERNS)}
+        snapshot_download(repository, revision=revision, endpoint=endpoint, **files)
     except Exception as problem:  # The hub's errors have no common class.
         raise ConfigError(
             f"{address} cannot be read ({_reason(problem)}): check its name; a private repository "
@@ -157,27 +152,16 @@ def _reason(problem: Exception) -> str:
 
 
 def model_card(run: Path, repository: str) -> str:
-    """The README of a run on the hub: metrics, command, and the licence of the LRM's weights.
-
-    Args:
-        run: The run directory.
-        repository: USER/REPOSITORY.
-    """
+    """The README of a run on the hub: metrics, command, and the licence of the LRM's weights."""
     from huggingface_hub import EvalResult, ModelCardData
 
     config, metrics = read_config(run), read_json(run / "metrics.json")
     data, model, lrm = config["data"], config["model"], config["lrm"]
     scene = f"{data['name']}/{data['scene']}"
     scores = {name: value for name, value in metrics["test"].items() if value is not None}
+    place = {"dataset_type": data["name"], "dataset_name": scene, "dataset_split": metrics["split"]}
     results = [
-        EvalResult(
-            task_type="novel-view-synthesis",
-            dataset_type=data["name"],
-            dataset_name=scene,
-            dataset_split=metrics["split"],
-            metric_type=name,
-            metric_value=round(value, 4),
-        )
+        EvalResult("novel-view-synthesis", metric_type=name, metric_value=round(value, 4), **place)
         for name, value in scores.items()
     ]
     licence, origin = lrm.get("licence"), lrm.get("repository")
@@ -223,7 +207,7 @@ in `config.yaml` says (the demo scene is rendered where it is missing). In Pytho
 
 
 def _weights(lrm: dict[str, Any]) -> str:
-    """What a card says of the weights that training began with."""
+    """The card's line on the weights that training began with, and their licence."""
     name = lrm["name"]
     if name == "none":
         return "Training began with random initialisation: no weights of others are part of it."

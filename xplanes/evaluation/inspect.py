@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from xplanes.components import build, class_of, plugins
-from xplanes.config import compose_plain, group_options, quoted
+from xplanes.config import compose_plain, group_options, quoted, settings_and_paths
 from xplanes.errors import ConfigError, SceneError
 from xplanes.evaluation.findings import (
     Finding,
@@ -34,7 +34,7 @@ from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
 
 CONSEQUENCES = {"scale": ("cut", "texels"), "astray": ("cut",)}
-"""Findings that say no more than another one does."""
+"""Findings that merely follow from another one."""
 
 NATIVE = "data.resolution=null"
 """The setting that takes images at their native size."""
@@ -46,7 +46,7 @@ MANY_POSES = 20
 
 @dataclass(frozen=True)
 class Choice:
-    """What a capture is read with.
+    """The settings with which a capture is read.
 
     Attributes:
         overrides: Settings of train.py that read the same.
@@ -76,7 +76,7 @@ class Capture:
         texels: Texels along an axis of the planes; None for fields without planes.
     """
 
-    choice: "Choice"
+    choice: Choice
     scene: Scene
     frame: Frame | None
     problem: str
@@ -112,8 +112,7 @@ def choose(arguments: Sequence[str]) -> Choice:
         SceneError: If there is no such folder, or no format fits.
     """
     usual_width = None
-    changed = [text for text in arguments if "=" in text and not Path(text).exists()]
-    folders = [Path(text) for text in arguments if text not in changed]
+    changed, folders = settings_and_paths(arguments)
     if len(folders) > 1:
         raise ConfigError(f"{folders[1]}: give one folder, and settings as key=value")
     if folders:
@@ -136,8 +135,7 @@ def choose(arguments: Sequence[str]) -> Choice:
 
 def _place(folder: Path) -> list[str]:
     """Where a scene is, as settings."""
-    parts = {"data.root": str(folder.parent), "data.scene": folder.name}
-    return [f"{key}={quoted(text)}" for key, text in parts.items()]
+    return [f"data.root={quoted(str(folder.parent))}", f"data.scene={quoted(folder.name)}"]
 
 
 def _recognised(folder: Path, changed: Sequence[str]) -> str:
@@ -249,23 +247,14 @@ def distortion(views: Views) -> float:
     intrinsics, largest = views.intrinsics, 0.0
     if intrinsics.lenses is None:
         return largest
-    done = set()
-    for index, key in enumerate(calibrations(views)):
-        key = (*key, *views.size(index))
-        if key in done:
-            continue
-        done.add(key)
+    different = {(*key, *views.size(index)): index for index, key in enumerate(calibrations(views))}
+    for index in different.values():
         height, width = views.size(index)
         lens = intrinsics.lenses[index : index + 1]
         rows = torch.tensor([-0.5, -0.5, height - 0.5, height - 0.5], dtype=torch.float64)
         columns = torch.tensor([-0.5, width - 0.5, -0.5, width - 0.5], dtype=torch.float64)
-        x, y = image_plane(
-            rows,
-            columns,
-            focal=intrinsics.focal[index],
-            centre=intrinsics.centre[index],
-            lenses=lens,
-        )
+        own = {"focal": intrinsics.focal[index], "centre": intrinsics.centre[index]}
+        x, y = image_plane(rows, columns, **own, lenses=lens)
         local, found = lens.directions(x, y)
         straight = replace(Lenses.pinholes(1), model=lens.model, limit=None)
         if lens.model[0] == LensModel.FOV:
@@ -294,15 +283,13 @@ def facts(capture: Capture) -> dict[str, Any]:
     """What was read, as builtins for JSON: lengths in world units, sizes as height and width."""
     scene, frame = capture.scene, capture.frame
     train = scene.splits["train"]
+    splits = {name: _split_facts(v, capture.images[name]) for name, v in scene.splits.items()}
     content: dict[str, Any] = {
         "scene": scene.name,
         "format": capture.choice.scene.name,
         "folder": str(capture.choice.scene.folder),
         "overrides": list(capture.choice.overrides),
-        "splits": {
-            split: _split_facts(views, capture.images[split])
-            for split, views in scene.splits.items()
-        },
+        "splits": splits,
         "video_frames": None if scene.video is None else len(scene.video),
         "static_reason": scene.static_reason,
         "notes": dict(scene.notes),

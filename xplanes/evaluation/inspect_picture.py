@@ -96,9 +96,8 @@ class _Sheet:
         while room is not None and kept > 2 and font.getlength(text) > SCALE * room:
             kept -= 1
             text = f"{whole[: kept // 2]}..{whole[len(whole) - (kept - kept // 2) :]}"
-        self.pen.text(
-            (SCALE * place[0], SCALE * place[1]), text, fill=colour, font=font, anchor=anchor
-        )
+        x, y = place
+        self.pen.text((SCALE * x, SCALE * y), text, fill=colour, font=font, anchor=anchor)
         return font.getlength(text) / SCALE
 
     def paste(self, image: Image.Image, place: tuple[float, float]) -> None:
@@ -117,10 +116,8 @@ def _legend(sheet: _Sheet, capture: Capture) -> None:
     frame = capture.frame
     if frame is not None:
         entries.append((CUBE, f"the field's cube, {2 / frame.scale:.3g} wide"))
-        blind = sum(
-            int((~sees_centre(views, frame)).sum()) for views in capture.scene.splits.values()
-        )
-        if blind:
+        splits = capture.scene.splits.values()
+        if blind := sum(int((~sees_centre(views, frame)).sum()) for views in splits):
             entries.append((ASTRAY, f"{blind} do not see the centre of the cube"))
     else:
         entries.append((ASTRAY, "no cube: the cameras see no common volume"))
@@ -155,7 +152,7 @@ class _Plan:
 def _cameras(side: int, title: str, axes: str, capture: Capture) -> Image.Image:
     """Cameras with their frusta, points, the cube, and rays through the corners of some images.
 
-    They are drawn by themselves, since rays leave the panel.
+    They have a sheet of their own, since rays leave the panel.
     """
     sheet = _Sheet(side, side)
     sheet.box((0, 0, side, side), fill=PANEL)
@@ -191,11 +188,9 @@ def _cameras(side: int, title: str, axes: str, capture: Capture) -> Image.Image:
             place = views.camera_to_world[index, :3, 3]
             sheet.dot(plan(place[None])[0], 2.2, colour)
             if index in chosen or not sees[index]:
-                tips = _corners(views, index, length)
-                outline = torch.cat([tips, tips[:1]])
-                sheet.line(plan(outline), colour, 1.0)
-                for tip in tips:
-                    sheet.line(plan(torch.stack([place, tip])), colour, 0.8)
+                ends = torch.cat([_corners(views, index, length), place[None]])
+                # Around the image, and from each of its corners to the camera.
+                sheet.line(plan(ends[[0, 1, 2, 3, 0, 4, 1, 4, 2, 4, 3]]), colour, 0.9)
     sheet.text((12, 8), f"{title}: {axes[0]} to the right, {axes[1]} up", size=15)
     step = 10.0 ** math.floor(math.log10(0.4 * plan.span))
     wide = step * plan.per_unit
@@ -219,13 +214,9 @@ def _cube_edges(frame: Frame) -> Tensor:
     """Points along the cube's edges in the world. [12, P, 3]"""
     along = torch.linspace(-1, 1, EDGE_POINTS)
     edges = []
-    for axis in range(3):
-        for signs in product((-1.0, 1.0), repeat=2):
-            points = torch.empty(EDGE_POINTS, 3)
-            points[:, axis] = along
-            for other, sign in zip([i for i in range(3) if i != axis], signs, strict=True):
-                points[:, other] = sign
-            edges.append(points)
+    for axis, (first, second) in product(range(3), product((-1.0, 1.0), repeat=2)):
+        points = torch.tensor([[first, second]]).expand(EDGE_POINTS, 2)
+        edges.append(torch.cat([points[:, :axis], along[:, None], points[:, axis:]], dim=1))
     return frame.to_world(torch.stack(edges))
 
 
@@ -305,10 +296,9 @@ def _samples(sheet: _Sheet, box: Box, capture: Capture) -> None:
         sheet.paste(_sample(views, index, size, capture.frame), (x, top))
         y = top + size[1] + 6
         name, time = views.files[index], float(views.times[index])
+        words = f"{split}, time {time:.3g}, {width}x{height} px"
         sheet.text((x, y), name, size=13, colour=_colour(split), room=cell)
-        sheet.text(
-            (x, y + 17), f"{split}, time {time:.3g}, {width}x{height} px", size=13, room=cell
-        )
+        sheet.text((x, y + 17), words, size=13, room=cell)
 
 
 def _chosen(capture: Capture) -> list[tuple[str, int]]:

@@ -126,7 +126,7 @@ def status(trainer: Trainer, module: RadianceModule) -> str:
     parts = [f"**step {trainer.global_step}**{most}, {training_seconds(trainer):.0f} s"]
     parts += [
         f"{name.split('/')[0] if '/' in name else 'train'} {value:.2f} dB"
-        for name, value in module.last.items()
+        for name, value in module.tally.last.items()
         if name.rsplit("/", 1)[-1] == "psnr"
     ]
     return "  \n".join([parts[0], ", ".join(parts[1:])])

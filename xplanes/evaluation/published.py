@@ -6,7 +6,7 @@ from pathlib import Path
 
 from xplanes.errors import ConfigError
 from xplanes.evaluation.sweep import RunRow
-from xplanes.evaluation.tabulate import differing, markdown, mean, mean_rank
+from xplanes.evaluation.tabulate import differing, markdown, mean, mean_part
 from xplanes.files import read_rows
 
 KEYS = {"model": "model.name", "lrm": "lrm.name", "sampler": "model.sampler.name"}
@@ -62,7 +62,7 @@ def beside(rows: Sequence[RunRow], tables: Sequence[str] = ()) -> str | None:
 
 
 def _ranks(rows: Sequence[RunRow], entry: Entry) -> str:
-    own = mean_rank(rows)
+    own = mean_part(rows, "rank")
     over = f"{own:.2f} over these {sum(bool(row.parts) for row in rows)} runs"
     found = over if math.isfinite(own) else "not known of these runs"
     published = f"{entry['rank']} ({entry['source']})"
@@ -75,48 +75,45 @@ def _scores(rows: Sequence[RunRow], entries: Sequence[Entry], *, whole: bool) ->
     for row in rows:
         if row.done and (whole or row.settings.get("data.name") == "dnerf"):
             rest = " ".join(f"{n}={row.settings[n]}" for n in others if n in row.settings)
-            key = (*(str(row.settings.get(name)) for name in KEYS.values()), rest)
-            groups.setdefault(key, []).append(row)
+            names = (str(row.settings.get(name)) for name in KEYS.values())
+            groups.setdefault((*names, rest) if others else (*names,), []).append(row)
     matched = {key: [e for e in entries if _agrees(runs[0], e)] for key, runs in groups.items()}
     if not groups or not (whole or any(matched.values())):
         return None
     lines = []
     for key, runs in groups.items():
-        label = key if others else key[:-1]
-        minutes = [
-            (row.scores.get("prepare_seconds", 0.0) + row.scores["train_seconds"]) / 60
-            for row in runs
-            if "train_seconds" in row.scores
-        ]
-        own = [
-            *(*label, str(len(runs))),
-            f"{mean([run.scores['psnr'] for run in runs]):.2f}",
-            f"{mean([run.scores['ssim'] for run in runs]):.4f}",
-            f"{mean(minutes):.1f}" if minutes else "",
-        ]
+        own = [str(len(runs)), *_means(runs)]
         for entry in matched[key] or [{}]:
-            lines.append([*own, *_published(entry)])
-            own = [*label, "", "", "", ""]
+            lines.append([*key, *own, *_published(entry)])
+            own = [""] * len(OWN)
+    header = [*KEYS, *["settings"] * bool(others), *OWN, *PUBLISHED]
     used = [row for runs in groups.values() for row in runs]
-    scenes, split = _values(used, "data.scene"), ", ".join(sorted({row.split for row in used}))
-    pixels, views = _values(used, "data.resolution", "native"), _values(used, "data.views", "all")
-    scored = _values(used, "data.eval_views", "all")
-    header = [*KEYS, *(["settings"] if others else []), *OWN, *PUBLISHED]
+    split = ", ".join(sorted({row.split for row in used}))
     text = (
-        f"Means of these runs ({scenes}; {split} split, {pixels} px, views: {views}, scored: "
-        f"{scored}) beside published figures (test split, 400 px, all views), comparable only "
-        "where scenes, split, pixels, views and budget are the same. Minutes are those of "
-        f"preparation and training:\n\n{markdown(header, lines)}"
+        f"Means of these runs ({_values(used, 'data.scene')}; {split} split, "
+        f"{_values(used, 'data.resolution', 'native')} px, views: "
+        f"{_values(used, 'data.views', 'all')}, scored: {_values(used, 'data.eval_views', 'all')}) "
+        "beside published figures (test split, 400 px, all views), comparable only where scenes, "
+        "split, pixels, views and budget are the same. Minutes are those of preparation and "
+        f"training:\n\n{markdown(header, lines)}"
     )
     rest = [e for e in entries if not any(e in found for found in matched.values())]
     if whole and rest:
-        header = ["method", "lrm", "resolution", *PUBLISHED]
-        lines = [[e["method"], e["lrm"], e["resolution"], *_published(e)] for e in rest]
+        columns = ["method", "lrm", "resolution"]
+        lines = [[*(entry[name] for name in columns), *_published(entry)] for entry in rest]
         text += (
             "\n\nPublished with them, of D-NeRF's scenes; none of these runs has their settings:"
-            f"\n\n{markdown(header, lines)}"
+            f"\n\n{markdown([*columns, *PUBLISHED], lines)}"
         )
     return text
+
+
+def _means(runs: Sequence[RunRow]) -> list[str]:
+    """Mean PSNR, SSIM, and minutes of preparation and training."""
+    times = [run.scores for run in runs if "train_seconds" in run.scores]
+    minutes = [(t.get("prepare_seconds", 0.0) + t["train_seconds"]) / 60 for t in times]
+    psnr, ssim = (mean([run.scores[name] for run in runs]) for name in ("psnr", "ssim"))
+    return [f"{psnr:.2f}", f"{ssim:.4f}", f"{mean(minutes):.1f}" if minutes else ""]
 
 
 def _published(entry: Entry) -> list[str]:

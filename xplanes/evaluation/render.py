@@ -14,10 +14,10 @@ from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, require_between
 from xplanes.evaluation.camera_path import CameraPath, read_camera_path
 from xplanes.evaluation.runs import TrainedRun
-from xplanes.files import replacing, require_writable
+from xplanes.files import replacing, require_empty, require_writable
 from xplanes.optional import require
 from xplanes.rendering.base import Renderer, leave_empty
 from xplanes.rendering.pictures import colour_map, to_bytes
@@ -97,8 +97,7 @@ def check_video(path: Path, *, frames: int, folder: bool = False) -> None:
         ImportError: For .mp4 without the extra ``video``, naming it.
     """
     if folder:
-        if path.is_dir() and any(path.iterdir()):
-            raise ConfigError(f"{path} holds files already: empty it, or name another folder")
+        require_empty(path)
     elif path.suffix == ".mp4":
         require("imageio_ffmpeg", extra="video")
         require("imageio.v2", extra="video")
@@ -241,19 +240,20 @@ class VideoOptions:
         Raises:
             ConfigError: As `find_view`.
         """
-        side = max(splits["train"].height, splits["train"].width)
-        if self.path.startswith("view:"):
-            views, index = find_view(splits, self.path.removeprefix("view:"))
+        height = width = max(splits["train"].height, splits["train"].width)
+        if (found := self.view(splits)) is not None:
+            views, index = found
             height, width = views.size(index)
-        elif self.cameras is None:
-            return self.size or side, self.size or side
-        else:
-            height = self.cameras.height or self.cameras.width or side
+        elif self.cameras is not None:
+            height = self.cameras.height or self.cameras.width or height
             width = self.cameras.width or height
-        if self.size is None:
-            return height, width
-        scale = self.size / max(height, width)
+        scale = 1 if self.size is None else self.size / max(height, width)
         return max(1, round(height * scale)), max(1, round(width * scale))
+
+    def view(self, splits: dict[str, Views]) -> tuple[Views, int] | None:
+        """The view that is named, as `find_view` gives it; None where none is."""
+        name = self.path.removeprefix("view:")
+        return None if name == self.path else find_view(splits, name)
 
     def check(self) -> None:
         """Refuse options that cannot be rendered.
@@ -262,12 +262,12 @@ class VideoOptions:
             ConfigError: With the option, its value and what is allowed.
             SceneError: If a camera path cannot be used.
         """
+        views = self.path.startswith("view:")
         if self.time != OWN:
             times(self.time or "back-and-forth", 1)
-        elif not self.path.startswith("view:"):
+        elif not views:
             raise ConfigError(f"--time {OWN}: only the camera of a view has one, --path view:FILE")
-        named = self.path in ("orbit", "fixed") or self.path.startswith("view:")
-        if not named and self.cameras is None:
+        if self.path not in ("orbit", "fixed") and not views and self.cameras is None:
             raise ConfigError(
                 f"--path {self.path}: must be orbit, fixed, view:FILE or a camera path, FILE.json"
             )
@@ -276,24 +276,16 @@ class VideoOptions:
                 f"--frames {self.frames}: {self.path} has {self.count} cameras, and each of them "
                 "is one frame; leave --frames out"
             )
-        for name, value, most in (
-            ("frames", self.count, 100_000),
-            ("fps", self.rate if self.fps is None else self.fps, 240),
-            ("size", 1 if self.size is None else self.size, LARGEST),
-        ):
-            if not 1 <= value <= most:
-                raise ConfigError(f"--{name} {value}: must lie between 1 and {most}")
+        require_between("--frames", self.count, 1, 100_000)
+        require_between("--fps", self.fps, 1, 240)
+        require_between("--size", self.size, 1, LARGEST)
+        require_between("--elevation", self.elevation, -90, 90)
         if self.cameras is not None and self.size is None:
             longer = max(self.cameras.height or 1, self.cameras.width or 1)
             if longer > LARGEST:
                 raise ConfigError(
-                    f"{self.path} asks for frames of {longer} px: name fewer with --size, at most "
-                    f"{LARGEST}"
+                    f"{self.path} asks for frames of {longer} px: set --size to at most {LARGEST}"
                 )
-        if not -90 <= self.elevation <= 90:
-            raise ConfigError(
-                f"--elevation {self.elevation:g}: must lie between -90 and 90 degrees"
-            )
 
 
 def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = None) -> Path:
@@ -317,22 +309,21 @@ def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = N
     check_out(out, options)
     target, folder = destination(trained.path, options, out, trained.checkpoint)
     require_writable(target.parent)
-    splits, module = trained.scene.splits, trained.module
-    if options.time == OWN:
-        views, index = find_view(splits, options.path.removeprefix("view:"))
+    if options.time == OWN and (found := options.view(trained.scene.splits)) is not None:
+        views, index = found
         options = replace(options, time=str(float(views.times[index])))
-    frames = render_path(
-        module.field,
-        module.renderer,
-        trained.frame,
-        cameras(options, splits, trained.frame),
-        options.times,
-        background=trained.scene.background,
-        what=options.what,
-        shown=pixels_with_rays(options, splits),
-    )
+    frames = _frames(trained.module, trained.scene, options)
     counted = tqdm(frames, "frames", options.count, leave=False, delay=2, disable=None)
     return write_video(target, counted, fps=options.rate, folder=folder)
+
+
+def _frames(module: RadianceModule, scene: Scene, options: VideoOptions) -> Iterator[Tensor]:
+    frame, splits = module.frame, scene.splits
+    assert frame is not None
+    path = cameras(options, splits, frame), options.times
+    shown = pixels_with_rays(options, splits)
+    how: Any = {"background": scene.background, "what": options.what, "shown": shown}
+    return render_path(module.field, module.renderer, frame, *path, **how)
 
 
 def check_out(out: str | None, options: VideoOptions) -> None:
@@ -367,18 +358,13 @@ def cameras(options: VideoOptions, splits: dict[str, Views], frame: Frame) -> li
     """The camera of each frame.
 
     That of a view shows exactly what the view shows; the others show as much as the training views.
-
-    Args:
-        options: What to render.
-        splits: The views of the scene.
-        frame: The field's frame.
     """
     rows, columns = options.shape(splits)
     if (path := options.cameras) is not None:
         focal = path.focal(rows, columns).tolist()
         return [PosedCamera(p, f, rows, columns) for p, f in zip(path.poses, focal, strict=True)]
-    if options.path.startswith("view:"):
-        views, index = find_view(splits, options.path.removeprefix("view:"))
+    if (found := options.view(splits)) is not None:
+        views, index = found
         own, intrinsics = views.camera(index), views.intrinsics
         scale = torch.tensor([columns / own.width, rows / own.height])
         lens = None if own.lens is None else replace(own.lens, skew=own.lens.skew * scale[0])
@@ -392,17 +378,11 @@ def cameras(options: VideoOptions, splits: dict[str, Views], frame: Frame) -> li
 
 
 def pixels_with_rays(options: VideoOptions, splits: dict[str, Views]) -> Tensor | None:
-    """Pixels of a frame that its lens has rays for; None for all. bool [rows, columns]
-
-    Args:
-        options: What to render.
-        splits: The views of the scene.
-    """
-    if not options.path.startswith("view:"):
+    """Pixels of a frame that its lens has rays for; None for all. bool [rows, columns]"""
+    if (found := options.view(splits)) is None:
         return None
-    views, index = find_view(splits, options.path.removeprefix("view:"))
-    known = views.intrinsics.has_ray(index)
-    if known is None:
+    views, index = found
+    if (known := views.intrinsics.has_ray(index)) is None:
         return None
     size = options.shape(splits)
     return F.interpolate(known[None, None].float(), size, mode="nearest-exact")[0, 0] > 0
@@ -414,9 +394,7 @@ def find_view(splits: dict[str, Views], name: str) -> tuple[Views, int]:
     Raises:
         ConfigError: If there is none, with similar names.
     """
-    known = {
-        file: (views, index) for views in splits.values() for index, file in enumerate(views.files)
-    }
+    known = {file: (v, index) for v in splits.values() for index, file in enumerate(v.files)}
     for file, found in known.items():
         if name in (file, file.rsplit(".", 1)[0]):
             return found
@@ -451,22 +429,8 @@ VIDEO_SIZE = 200
 
 
 def write_orbit(module: RadianceModule, scene: Scene, run: Path) -> Path:
-    """Write media/orbit.webp: one camera orbit while time runs from 0 to 1 and back.
-
-    Args:
-        module: What was trained.
-        scene: The scene.
-        run: The run directory.
-    """
-    views, frame = scene.splits["train"], module.frame
-    assert frame is not None
+    """Write media/orbit.webp: one camera orbit while time runs from 0 to 1 and back."""
+    views = scene.splits["train"]
     options = VideoOptions(frames=FRAMES, size=min(VIDEO_SIZE, max(views.height, views.width)))
-    frames = render_path(
-        module.field,
-        module.renderer,
-        frame,
-        cameras(options, scene.splits, frame),
-        options.times,
-        background=scene.background,
-    )
+    frames = _frames(module, scene, options)
     return write_video(run / "media" / "orbit.webp", frames, fps=options.rate)

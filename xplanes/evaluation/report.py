@@ -27,7 +27,7 @@ from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore, blank_psnr, mean_colour, mean_scores
 
 LITTLE = 0.5
-"""PSNR in dB above that of empty images below which a run shows nothing."""
+"""Gain in dB over empty images below which a run has learnt nothing."""
 
 CLUTTERED = 0.2
 """Share of floaters above which a run warns; successful scenes have less than a tenth."""
@@ -60,12 +60,11 @@ def header(
     if not module.field.moves:
         reason = scene.static_reason or "one timestep only"
         moving = f" · trains as a static one, without time planes: {reason}"
-    steps, seconds = trainer.get("max_steps", -1), trainer.get("max_seconds")
-    limits = [f"{steps} steps"] if steps >= 0 else []
-    if (epochs := trainer.get("max_epochs")) is not None and epochs >= 0:
-        limits.append(f"{epochs} epoch{'s' * (epochs != 1)}")
-    limits += [] if seconds is None else [f"{seconds:g} s"]
-    budget = " or ".join(limits) + ", whichever comes first" * (len(limits) > 1)
+    budget = {"step": trainer.get("max_steps", -1), "epoch": trainer.get("max_epochs")}
+    budget = {unit: count for unit, count in budget.items() if count is not None and count >= 0}
+    limits = [f"{count} {unit}{'s' * (count != 1)}" for unit, count in budget.items()]
+    if (seconds := trainer.get("max_seconds")) is not None:
+        limits.append(f"{seconds:g} s")
     lines = {
         "xplanes": f"{__version__} · torch {torch.__version__} · {device} · "
         f"{torch.get_num_threads()} threads · decoder {module.field.precision} · "
@@ -77,7 +76,7 @@ def header(
         f"{trainable:,} parameters, {frozen:,} frozen{moving}",
         "from": module.initialisation.words,
         "samples": module.sampler.outline,
-        "budget": budget,
+        "budget": " or ".join(limits) + ", whichever comes first" * (len(limits) > 1),
         "estimate": estimated(experiment, data, expected, spent),
         "changed": " ".join(overrides) or "(nothing)",
     }
@@ -87,14 +86,7 @@ def header(
 def estimated(
     experiment: Experiment, data: SceneDataModule, expected: Estimate, spent: float
 ) -> str:
-    """How long the run is going to take, as text.
-
-    Args:
-        experiment: The settings.
-        data: The data.
-        expected: What a step and a ray take.
-        spent: Seconds since the run began.
-    """
+    """How long the run is going to take, ``spent`` seconds after it began, as text."""
     trainer = experiment.trainer
     steps = float(trainer.get("max_steps", -1)) if trainer.get("max_steps", -1) > 0 else math.inf
     train = min(steps * expected.step, trainer.get("max_seconds") or math.inf)
@@ -132,7 +124,7 @@ def summary(
 ) -> dict[str, Any]:
     """The content of metrics.json."""
     clock = training_seconds(trainer)
-    counts = module.counts
+    counts = module.tally.counts
     candidates = max(1, counts["candidates"])
     tested, blank = data.scene.splits[data.test_split], data.scene.background
     if data.scene.is_surrounded:
@@ -153,7 +145,7 @@ def summary(
             "background": background_skipped,
             "static": float(not module.field.moves),
         },
-        "steps_skipped": module.unusable,
+        "steps_skipped": module.tally.skipped,
         "restarts": module.restarts,
         "threads": torch.get_num_threads(),
         "loops": backend.name(module.device),
@@ -163,7 +155,7 @@ def summary(
 
 
 def rest(seconds: dict[str, Any], total: float) -> dict[str, float]:
-    """``other``, what a run did besides the stages of ``seconds``, and ``total``."""
+    """``other``, the time that no stage of ``seconds`` accounts for, and ``total``."""
     # Stages from the cache count with what they took to make: they may exceed the run's own time.
     named = sum(seconds["prepare"].values())
     named += sum(value for name, value in seconds.items() if name != "prepare")
@@ -221,19 +213,19 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
         more += f" trainer.max_steps={2 * metrics['step']}"
     if (most := limits.get("max_seconds")) is not None and 2 * seconds["train"] > most:
         more += f" trainer.max_seconds={2 * most:g}"
-    prepare = sum(seconds["prepare"].values())
-    more_scores = ""
-    if "psnr_thing" in metrics["test"]:
-        more_scores += f"  of the object {metrics['test']['psnr_thing']:.2f}"
-    if "floaters" in metrics["test"]:
-        more_scores += f"  floaters {100 * metrics['test']['floaters']:.2f}%"
+    test, blank = metrics["test"], metrics["blank_psnr"]
+    scores = f"psnr {test['psnr']:.2f}  ssim {test['ssim']:.4f}"
+    if "psnr_foreground" in test:
+        scores += f"  of the object {test['psnr_foreground']:.2f}"
+    if "floaters" in test:
+        scores += f"  floaters {100 * test['floaters']:.2f}%"
     warnings = []
-    if metrics["test"]["psnr"] < metrics["blank_psnr"] + LITTLE:
+    if test["psnr"] < blank + LITTLE:
         warnings.append(
-            f"warning  hardly better than images of background alone ({metrics['blank_psnr']:.2f} "
-            "dB): this run shows nothing yet"
+            f"warning  hardly better than images of background alone ({blank:.2f} dB): this run "
+            "shows nothing yet"
         )
-    if (share := metrics["test"].get("floaters", 0)) > CLUTTERED:
+    if (share := test.get("floaters", 0)) > CLUTTERED:
         warnings.append(
             f"warning  {100 * share:.0f}% of the background is not empty (floaters): train longer, "
             "or check the cameras and times; content that\n         is too thin or too fast for "
@@ -253,23 +245,20 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
     steps = [*curves, f"xplanes render {place}{named}", resume_command(run) + more]
     steps = steps if kept else curves
     warm_up = f"compiling {seconds['warm_up']:.1f} s · " if seconds["warm_up"] >= 1 else ""
-    return "\n".join(
-        [
-            "",
-            f"{metrics['split']:<9}psnr {metrics['test']['psnr']:.2f}  ssim "
-            f"{metrics['test']['ssim']:.4f}{more_scores}  over {len(metrics['views'])} views, step "
-            f"{metrics['step']}",
-            *warnings,
-            f"time     prepare {prepare:.1f} s + train {seconds['train']:.1f} s · {warm_up}scoring "
-            f"{seconds['evaluate']:.1f} s · {seconds['total']:.1f} s in all · "
-            f"{metrics['rays_per_second'] / 1000:.1f}k rays/s",
-            *([skips] if metrics["samples_per_ray"] else []),
-            f"memory   {metrics['peak_memory_bytes'] / 2**30:.1f} GB at its peak",
-            f"wrote    {run}",
-            f"         metrics.json  curve.csv  {kept}{metrics.get('media', '')}",
-            *(f"{'next' if line is steps[0] else '':<9}{line}" for line in steps),
-        ]
-    )
+    lines = [
+        f"\n{metrics['split']:<9}{scores}  over {len(metrics['views'])} views, step "
+        f"{metrics['step']}",
+        *warnings,
+        f"time     prepare {sum(seconds['prepare'].values()):.1f} s + train "
+        f"{seconds['train']:.1f} s · {warm_up}scoring {seconds['evaluate']:.1f} s · "
+        f"{seconds['total']:.1f} s in all · {metrics['rays_per_second'] / 1000:.1f}k rays/s",
+        *([skips] if metrics["samples_per_ray"] else []),
+        f"memory   {metrics['peak_memory_bytes'] / 2**30:.1f} GB at its peak",
+        f"wrote    {run}",
+        f"         metrics.json  curve.csv  {kept}{metrics.get('media', '')}",
+        *(f"{'next' if line is steps[0] else '':<9}{line}" for line in steps),
+    ]
+    return "\n".join(lines)
 
 
 def device_memory(device: torch.device) -> int:

@@ -93,8 +93,7 @@ def is_run(path: Path) -> bool:
 def find_runs(folder: Path) -> list[Path]:
     """Runs in a folder, up to three levels down: outputs/sweeps/<sweep>/<run>."""
     patterns = ("*", "*/*", "*/*/*")
-    found = {record.parent for p in patterns for record in folder.glob(f"{p}/run.json")}
-    return sorted(found)
+    return sorted({path.parent for p in patterns for path in folder.glob(f"{p}/run.json")})
 
 
 def _listed(runs: list[Path]) -> str:

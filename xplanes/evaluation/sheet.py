@@ -5,7 +5,6 @@ Everything comes from the pictures that runs write while they train (``media/``)
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from xplanes.errors import ConfigError
 from xplanes.evaluation.curves import SCENE, run_label
 from xplanes.evaluation.render import write_video
 from xplanes.evaluation.sweep import RunRow, read_rows
-from xplanes.evaluation.tabulate import SEED, align, differing, seed_groups
+from xplanes.evaluation.tabulate import SEED, differing, seed_groups
 from xplanes.files import replacing
 from xplanes.metrics import psnr
 from xplanes.rendering.pictures import STRIP
@@ -31,20 +30,12 @@ LINE, GAP = 16, 4
 FPS, HELD = 2, 4
 """Frames per second of a video, and how often its last one is shown."""
 
-Line = tuple[str, Sequence["Tile"]]
+Line = tuple[str, Sequence[Image.Image]]
 """A row of tiles with its title."""
 
 _STEP = re.compile(r"step(\d+)")
 _TWICE = re.compile(r"^(train|val|test)_(?=\1_)")
 """The split before a name that begins with it, as earlier runs wrote it."""
-
-
-@dataclass(frozen=True)
-class Tile:
-    """A picture of a sheet, with what is written below it."""
-
-    picture: Image.Image
-    caption: str
 
 
 def write_sheet(
@@ -83,14 +74,11 @@ def write_sheet(
         )
     if size < 16:
         raise ConfigError(f"size={size}: a tile must have 16 pixels at least")
-    if not folder.is_dir():
-        raise ConfigError(f"{folder} is not a folder")
-    rows = align(read_rows(folder))
-    if not rows:
-        raise ConfigError(f"{folder}: no runs in it (folders with run.json)")
+    rows = read_rows(folder)
     if what == "runs":
         rows = _one_seed(rows)
-    found = {_path(folder, row): row for row in rows}
+    inside = {folder / row.name: row for row in rows}
+    found = {path if path.is_dir() else folder: row for path, row in inside.items()}
     over = [name for name in differing(rows) if name not in (SEED, SCENE)]
     if what == "parts":
         lines = _parts(found, over)
@@ -100,17 +88,15 @@ def write_sheet(
         frames = (torch.from_numpy(np.array(sheet)) for sheet in _video(lines))
         return write_video(out, frames, fps=FPS)
     with replacing(out) as temporary:
-        _assemble(lines, _cell(lines)).save(temporary, format="PNG", optimize=True)
+        _assemble(lines, _widest(lines)).save(temporary, format="PNG", optimize=True)
     return out
 
 
 def _one_seed(rows: list[RunRow]) -> list[RunRow]:
     """Runs without those that repeat another one with a different seed, if settings differ too."""
     groups = seed_groups(rows)
-    if len(groups) < 2:
-        return rows
-    repeats = {id(row) for group in groups for row in group[1:]}
-    return [row for row in rows if id(row) not in repeats]
+    repeats = [row.name for group in groups if len(groups) > 1 for row in group[1:]]
+    return [row for row in rows if row.name not in repeats]
 
 
 def check_what(what: str | None) -> None:
@@ -125,18 +111,13 @@ def check_what(what: str | None) -> None:
         )
 
 
-def _path(folder: Path, row: RunRow) -> Path:
-    inside = folder / row.name
-    return inside if inside.is_dir() else folder
-
-
-def _parts(found: dict[Path, RunRow], over: Sequence[str]) -> list[tuple[str, list[Tile]]]:
+def _parts(found: dict[Path, RunRow], over: Sequence[str]) -> list[Line]:
     lines = []
     for path, row in found.items():
         picture = path / "media" / "decomposition.png"
         if picture.is_file():
             caption = "/".join(str(part.get("rank")) for part in row.parts.values())
-            tile = Tile(Image.open(picture).convert("RGB"), f"rank of xy/xz/yz: {caption}")
+            tile = _tile(Image.open(picture).convert("RGB"), f"rank of xy/xz/yz: {caption}")
             lines.append((_title(row, over), [tile]))
     if not lines:
         raise ConfigError(
@@ -158,7 +139,7 @@ def _views(
     view: str | None,
     steps: Sequence[int] | None,
     size: int,
-) -> list[tuple[str, list[Tile]]]:
+) -> list[Line]:
     if show not in STRIP[1:]:
         raise ConfigError(f"show={show}: must be one of {', '.join(STRIP[1:])}")
     pictures = {path: _pictures(path) for path in found}
@@ -173,15 +154,15 @@ def _views(
     lines = []
     for scene, paths in scenes.items():
         name = _view(scene, [pictures[path] for path in paths], view)
-        tiles: list[Tile] = []
+        tiles: list[Image.Image] = []
         for path in paths:
             shown = _steps(path, pictures[path], name, steps, last=what == "runs")
             if what == "steps" or not tiles:
-                tiles = [Tile(_part(shown[max(shown)], 0, size), f"{name}, true")]
+                tiles = [_tile(_part(shown[max(shown)], 0, size), f"{name}, true")]
             for step, strip in shown.items():
                 score = f"{_score(strip):.2f} dB"
                 label = f"step {step}" if what == "steps" else run_label(found[path], over)
-                tiles.append(Tile(_part(strip, STRIP.index(show), size), f"{label}\n{score}"))
+                tiles.append(_tile(_part(strip, STRIP.index(show), size), f"{label}\n{score}"))
             if what == "steps":
                 lines.append((_title(found[path], over), tiles))
         if what == "runs":
@@ -255,38 +236,34 @@ def _video(lines: Sequence[Line]) -> Iterator[Image.Image]:
     last = max(len(tiles) for _, tiles in lines) - 1
     for step in [*range(1, last), *[last] * HELD]:
         shown = [(title, [tiles[0], tiles[min(step, len(tiles) - 1)]]) for title, tiles in lines]
-        yield _assemble(shown, _cell(lines))
+        yield _assemble(shown, _widest(lines))
 
 
-def _cell(lines: Sequence[Line]) -> int:
-    """Pixels from one column to the next: what the widest picture or caption takes."""
-    font = ImageFont.load_default(11)
-    wide = [
-        max(tile.picture.width, max(font.getlength(line) for line in tile.caption.split("\n")))
-        for _, tiles in lines
-        for tile in tiles
-    ]
-    return int(max(wide)) + GAP
+def _widest(lines: Sequence[Line]) -> int:
+    return max(tile.width for _, tiles in lines for tile in tiles)
 
 
-def _assemble(lines: Sequence[Line], cell: int) -> Image.Image:
-    """Titled rows of tiles with captions, on white."""
-    font = ImageFont.load_default(11)
-    boxes = []
-    for _, tiles in lines:
-        text = LINE * max(tile.caption.count("\n") + 1 for tile in tiles)
-        boxes.append((LINE, max(tile.picture.height for tile in tiles), text))
-    columns = max(len(tiles) for _, tiles in lines)
-    width = max(cell * columns, *(int(font.getlength(title)) + GAP for title, _ in lines)) + GAP
-    height = sum(map(sum, boxes)) + GAP * (2 * len(lines) + 1)
-    sheet = Image.new("RGB", (width, height), "white")
-    draw = ImageDraw.Draw(sheet)
+def _tile(picture: Image.Image, caption: str) -> Image.Image:
+    """A picture with its caption below, on white."""
+    font, lines = ImageFont.load_default(11), caption.split("\n")
+    width = max(picture.width, *(int(font.getlength(line)) for line in lines))
+    tile = Image.new("RGB", (width, picture.height + LINE * len(lines)), "white")
+    tile.paste(picture)
+    ImageDraw.Draw(tile).text((0, picture.height + 1), caption, fill="black", font=font)
+    return tile
+
+
+def _assemble(lines: Sequence[Line], widest: int) -> Image.Image:
+    """Titled rows of tiles on white, in columns of equal width."""
+    font, cell = ImageFont.load_default(11), widest + GAP
+    heights = [LINE + max(tile.height for tile in tiles) + 2 * GAP for _, tiles in lines]
+    wide = max(int(font.getlength(title)) + GAP for title, _ in lines)
+    width = max(wide, cell * max(len(tiles) for _, tiles in lines)) + GAP
+    sheet = Image.new("RGB", (width, sum(heights) + GAP), "white")
     top = GAP
-    for (title, tiles), (head, tall, text) in zip(lines, boxes, strict=True):
-        draw.text((GAP, top), title, fill="black", font=font)
+    for (title, tiles), height in zip(lines, heights, strict=True):
+        ImageDraw.Draw(sheet).text((GAP, top), title, fill="black", font=font)
         for column, tile in enumerate(tiles):
-            left = GAP + column * cell
-            sheet.paste(tile.picture, (left, top + head))
-            draw.text((left, top + head + tall + 1), tile.caption, fill="black", font=font)
-        top += head + tall + text + 2 * GAP
+            sheet.paste(tile, (GAP + column * cell, top + LINE))
+        top += height
     return sheet

@@ -10,28 +10,41 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
 
+from xplanes.config import key_and_value
+from xplanes.errors import ConfigError
 from xplanes.files import natural
 from xplanes.files import read_rows as read_csv
 from xplanes.settings import flatten
 
+
+class Score(NamedTuple):
+    """A column of a table: its heading and format, and its dotted name in metrics.json."""
+
+    heading: str
+    form: str
+    place: str = ""
+
+
 SCORES = {
-    "psnr": ("test", "psnr"),
-    "ssim": ("test", "ssim"),
-    "psnr_thing": ("test", "psnr_thing"),
-    "floaters": ("test", "floaters"),
-    "steps": ("step",),
-    "prepare_seconds": ("seconds", "prepare"),
-    "train_seconds": ("seconds", "train"),
-    "samples_per_ray": ("samples_per_ray",),
-    "parameters": ("parameters",),
+    "psnr": Score("psnr", ".2f", "test.psnr"),
+    "ssim": Score("ssim", ".4f", "test.ssim"),
+    "psnr_foreground": Score("psnr object", ".2f", "test.psnr_foreground"),
+    "floaters": Score("floaters", ".4f", "test.floaters"),
+    "start_psnr": Score("step 0", ".2f"),
+    "seconds_to_20": Score("s to 20 dB", ".1f"),
+    "steps": Score("steps", ".0f", "step"),
+    "prepare_seconds": Score("prepare s", ".1f", "seconds.prepare"),
+    "train_seconds": Score("train s", ".1f", "seconds.train"),
+    "samples_per_ray": Score("samples/ray", ".1f", "samples_per_ray"),
+    "parameters": Score("params", ",.0f", "parameters"),
 }
-"""Where metrics.json holds each score; `start_psnr` and `seconds_to_20` come from curve.csv."""
+"""Scores in the order of the columns; those without a place come from curve.csv."""
 
 GOAL = 20.0
 """PSNR that ``seconds_to_20`` stands for."""
@@ -85,13 +98,28 @@ class RunRow:
 
 
 def read_rows(folder: Path) -> list[RunRow]:
-    """All runs in a folder, however deep, and the jobs of sweeps that left no run."""
+    """All runs in a folder, however deep, and the jobs of sweeps that left no run.
+
+    Raises:
+        ConfigError: If there are none, or no such folder.
+    """
+    if not folder.is_dir():
+        raise ConfigError(f"{folder} is not a folder")
     rows, groups = [], list(_groups(folder))
     for place, runs in groups:
         rows += [read_run(run, _name(run, folder)) for run in runs]
         below = [run for other, its in groups if other.is_relative_to(place) for run in its]
         rows += _missing_jobs(place, folder, [run_overrides(run) for run in below])
-    return rows
+    if not rows:
+        raise ConfigError(f"{folder}: no runs in it (folders with run.json)")
+    known = {name for row in rows for name in row.settings if name.endswith(".name")}
+
+    def full(key: str) -> str:
+        """What runs call the setting of a job without a run: ``model`` is ``model.name``."""
+        name = f"{key.replace('/', '.')}.name"
+        return name if name in known else key
+
+    return [replace(r, settings={full(k): v for k, v in r.settings.items()}) for r in rows]
 
 
 def _name(path: Path, folder: Path) -> str:
@@ -134,22 +162,21 @@ def read_run(run: Path, name: str) -> RunRow:
     if problems:
         ended = record is not None and record["status"] != "finished"
         status = f"{status if ended else 'damaged'}; {', '.join(problems)}"
-    settings, parts = flatten(config or {}), (metrics or {}).get("decomposition")
+    settings, metrics, record = flatten(config or {}), metrics or {}, record or {}
+    parts = metrics.get("decomposition")
     parts = parts if isinstance(parts, dict) else {}
-    record = record or {}
+    device = record.get("device")
     return RunRow(
         name=name,
         # Jobs that never began still refer to other settings.
         settings={key: value for key, value in settings.items() if "${" not in str(value)},
-        overridden=frozenset(_key(line) for line in run_overrides(run)),
+        overridden=frozenset(key_and_value(line)[0] for line in run_overrides(run)),
         scores=scores | _curve_scores(curve),
         status=status,
         curve=curve,
-        split=str((metrics or {}).get("split", "")),
+        split=str(metrics.get("split", "")),
         parts={n: parts[n] for n in ("xy", "xz", "yz") if isinstance(parts.get(n), dict)},
-        machine=f"{record['device']}, {record.get('cpus')} CPU cores"
-        if record.get("device")
-        else "",
+        machine=f"{device}, {record.get('cpus')} CPU cores" if device else "",
     )
 
 
@@ -181,16 +208,12 @@ def _curve(run: Path, prepare: float, problems: list[str]) -> tuple[Point, ...]:
 
 def _curve_scores(curve: tuple[Point, ...]) -> dict[str, float]:
     """PSNR before the first step, and seconds until it reaches `GOAL`."""
-    found = {}
-    if curve and curve[0].step == 0:
-        found["start_psnr"] = curve[0].psnr
-    if curve and curve[0].psnr >= GOAL:
-        return found | {"seconds_to_20": curve[0].seconds}
-    for before, after in itertools.pairwise(curve):
-        if before.psnr < GOAL <= after.psnr:
-            share = (GOAL - before.psnr) / (after.psnr - before.psnr)
-            found["seconds_to_20"] = before.seconds + share * (after.seconds - before.seconds)
-            break
+    found = {"start_psnr": curve[0].psnr} if curve and curve[0].step == 0 else {}
+    for before, after in itertools.pairwise((curve[0], *curve) if curve else ()):
+        if after.psnr >= GOAL:
+            share = (GOAL - before.psnr) / (after.psnr - before.psnr) if after != before else 0
+            seconds = before.seconds + share * (after.seconds - before.seconds)
+            return found | {"seconds_to_20": seconds}
     return found
 
 
@@ -207,12 +230,12 @@ def _status(record: dict[str, Any] | None, metrics: dict[str, Any] | None) -> st
 
 def _scores(metrics: dict[str, Any]) -> dict[str, float]:
     found = {}
-    for name, path in SCORES.items():
+    for name, score in SCORES.items():
         value: Any = metrics
-        for key in path:
+        for key in score.place.split("."):
             value = value.get(key) if isinstance(value, dict) else None
         parts = list(value.values()) if isinstance(value, dict) else [value]
-        if parts and all(is_number(part) for part in parts):
+        if parts and all(map(is_number, parts)):
             found[name] = sum(parts) if isinstance(value, dict) else value
     return found
 
@@ -224,24 +247,16 @@ def is_number(value: Any) -> bool:
 
 def run_overrides(run: Path) -> list[str]:
     """What the command line set, from Hydra's record of it or our own."""
-    try:
+    with suppress(OSError, UnicodeDecodeError, yaml.YAMLError):
         content = yaml.safe_load((run / ".hydra" / "overrides.yaml").read_text(encoding="utf-8"))
         if isinstance(content, list):
             return [str(line) for line in content]
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
-        pass
-    try:
+    with suppress(OSError, UnicodeDecodeError):
         return (run / "overrides.txt").read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError):
-        return []
+    return []
 
 
-def _key(override: str) -> str:
-    return override.split("=", 1)[0].lstrip("+~")
-
-
-def _value(override: str) -> Any:
-    text = override.split("=", 1)[-1]
+def _value(text: str) -> Any:
     try:
         return yaml.safe_load(text)
     except yaml.YAMLError:
@@ -257,7 +272,7 @@ def _missing_jobs(sweep: Path, folder: Path, done: list[list[str]]) -> list[RunR
         if left[key]:
             left[key] -= 1
             continue
-        settings = {_key(line): _value(line) for line in job}
+        settings = {key: _value(value) for key, value in map(key_and_value, job)}
         name = str(sweep.relative_to(folder) / f"job {number}")
         rows.append(RunRow(name, settings, frozenset(settings), status="missing: no run"))
     return rows
@@ -265,8 +280,8 @@ def _missing_jobs(sweep: Path, folder: Path, done: list[list[str]]) -> list[RunR
 
 def _settings_of(overrides: Iterable[str]) -> tuple[str, ...]:
     """Overrides in order, but for those that say how Hydra runs the job."""
-    mine = ("resume", "hydra")
-    return tuple(sorted(text for text in overrides if _key(text).split(".")[0] not in mine))
+    groups = {text: key_and_value(text)[0].split(".")[0] for text in overrides}
+    return tuple(sorted(text for text in groups if groups[text] not in ("resume", "hydra")))
 
 
 def _jobs(multirun: dict[str, Any]) -> list[list[str]]:

@@ -2,9 +2,12 @@
 
 import atexit
 import os
+import re
 import sys
 import traceback
+from collections import Counter
 from collections.abc import MutableMapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +23,6 @@ from xplanes.evaluation.sheet import check_what, write_sheet
 from xplanes.evaluation.sweep import RunRow, published_tables, read_rows
 from xplanes.evaluation.tabulate import (
     SEED,
-    Line,
-    align,
     decomposition_table,
     differing,
     run_table,
@@ -30,6 +31,8 @@ from xplanes.evaluation.tabulate import (
     shown,
 )
 from xplanes.files import write_json, write_rows, write_text
+
+_say = partial(print, flush=True)
 
 
 def write_tables(folder: Path, out: Path | None = None) -> str:
@@ -46,22 +49,17 @@ def write_tables(folder: Path, out: Path | None = None) -> str:
     Raises:
         ConfigError: If there are no runs in the folder.
     """
-    if not folder.is_dir():
-        raise ConfigError(f"{folder} is not a folder")
-    rows = align(read_rows(folder))
-    if not rows:
-        raise ConfigError(f"{folder}: no runs in it (folders with run.json)")
-    out = out or folder
+    rows, out = read_rows(folder), out or folder
     names = differing(rows)
     lines = run_table(rows, names)
     text = [f"# {folder.resolve().name}", f"{_counts(rows)} {_protocol(rows)}".strip()]
     text.append(shown(lines))
-    _write(out / "table.csv", lines)
+    write_rows(out / "table.csv", lines[0], (line.values() for line in lines))
     (out / "table_seeds.csv").unlink(missing_ok=True)
     if seeds := seed_groups(rows):
         means = seed_table(seeds, [name for name in names if name != SEED])
         text += ["Mean and standard deviation over seeds:", shown(means)]
-        _write(out / "table_seeds.csv", means)
+        write_rows(out / "table_seeds.csv", means[0], (line.values() for line in means))
     if (published := beside(rows, published_tables(folder))) is not None:
         text.append(published)
     if parts := decomposition_table(rows, names):
@@ -75,43 +73,36 @@ def write_tables(folder: Path, out: Path | None = None) -> str:
     return whole
 
 
-def _write(path: Path, lines: Sequence[Line]) -> None:
-    write_rows(path, lines[0], (line.values() for line in lines))
-
-
 def _counts(rows: Sequence[RunRow]) -> str:
     """Number of runs by how they ended, and the split of their scores."""
-    kinds = [row.status.split(":")[0].split(",")[0].split(";")[0] for row in rows]
-    tally = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+    kinds = Counter(re.split("[:,;]", row.status)[0] for row in rows)
+    tally = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
     splits = {row.split for row in rows if row.split}
     scored = f" Scores of the {splits.pop()} split." if len(splits) == 1 else ""
     return f"{len(rows)} runs: {tally}.{scored}"
 
 
 PROTOCOL = {
-    "data": "data.name",
-    "width, px": "data.resolution",
-    "training views": "data.views",
-    "scored views": "data.eval_views",
-    "background": "model.rays.background",
-    "steps": "trainer.max_steps",
-    "seconds": "trainer.max_seconds",
+    "data.name": ("data", ""),
+    "data.resolution": ("width, px", "native"),
+    "data.views": ("training views", "all"),
+    "data.eval_views": ("scored views", "all"),
+    "model.rays.background": ("background", ""),
+    "trainer.max_steps": ("steps", ""),
+    "trainer.max_seconds": ("seconds", "no limit"),
 }
-"""Settings that say how runs were made and scored."""
+"""Settings that say how runs were made and scored, each with its name and what null means."""
 
 
 def _protocol(rows: Sequence[RunRow]) -> str:
     """How the runs were made and scored, as far as it is known: size, budget, machine."""
-    unset = {"data.views": "all", "data.eval_views": "all", "trainer.max_seconds": "no limit"}
-    known = [row for row in rows if row.settings and not row.missing]
+    known = [row.settings for row in rows if row.settings and not row.missing]
     parts = []
-    for words, name in PROTOCOL.items():
-        values = [row.settings[name] for row in known if name in row.settings]
-        shown = dict.fromkeys(unset.get(name, "native") if v is None else str(v) for v in values)
-        if shown:
-            parts.append(f"{words}: {', '.join(shown)}")
-    machines = dict.fromkeys(row.machine for row in rows if row.machine)
-    if machines:
+    for key, (name, unset) in PROTOCOL.items():
+        values = [settings[key] for settings in known if key in settings]
+        if shown := dict.fromkeys(unset if value is None else str(value) for value in values):
+            parts.append(f"{name}: {', '.join(shown)}")
+    if machines := dict.fromkeys(row.machine for row in rows if row.machine):
         parts.append(f"machine: {'; '.join(machines)}")
     return f"Protocol: {' · '.join(parts)}." if parts else ""
 
@@ -119,8 +110,8 @@ def _protocol(rows: Sequence[RunRow]) -> str:
 class SweepTable(Callback):
     """Reports how each job of a multirun ended, and writes and prints the table at its end.
 
-    The table comes at the end of the process, whichever that is: Hydra leaves out
-    ``on_multirun_end`` when a job has failed or the sweep is stopped.
+    The table is written when the process ends: Hydra does not call ``on_multirun_end`` if a job
+    has failed or the sweep was stopped.
 
     Args:
         published: Published tables to show with it, whatever the data.
@@ -159,7 +150,7 @@ class SweepTable(Callback):
         reason = f"{type(value).__name__}: {value}"
         _say(f"job {config.hydra.job.num} failed: {reason}  {run.name}")
         if not (run / "run.json").exists():
-            # It failed before it could keep a record of its own.
+            # It failed before it wrote its record.
             write_json(run / "run.json", {"status": "failed", "reason": reason})
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
@@ -209,7 +200,3 @@ def choose_gpu(job: int, environment: MutableMapping[str, str]) -> str | None:
         return None
     environment["CUDA_VISIBLE_DEVICES"] = gpu = gpus[job % len(gpus)]
     return gpu
-
-
-def _say(text: str) -> None:
-    print(text, flush=True)

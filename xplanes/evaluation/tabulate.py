@@ -3,39 +3,17 @@
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from statistics import fmean, stdev
 from typing import Any
 
-from xplanes.evaluation.sweep import RunRow
+from xplanes.evaluation.sweep import SCORES, RunRow
 
 SEED = "seed"
-UNLISTED = (
-    "resume",
-    "callbacks.evaluation.at",
-    "callbacks.evaluation.views",
-    "media",
-    "trainer.log_every_n_steps",
-)
+UNLISTED = ("resume", "callbacks.evaluation.at", "media", "trainer.log_every_n_steps")
 """Settings that say nothing about a result."""
 
-SPREAD = ("psnr", "ssim", "psnr_thing")
+SPREAD = ("psnr", "ssim", "psnr_foreground")
 """Scores whose standard deviation over seeds is shown."""
-
-COLUMNS = {
-    "psnr": ("psnr", ".2f"),
-    "ssim": ("ssim", ".4f"),
-    "psnr_thing": ("psnr object", ".2f"),
-    "floaters": ("floaters", ".4f"),
-    "start_psnr": ("step 0", ".2f"),
-    "seconds_to_20": ("s to 20 dB", ".1f"),
-    "steps": ("steps", ".0f"),
-    "prepare_seconds": ("prepare s", ".1f"),
-    "train_seconds": ("train s", ".1f"),
-    "samples_per_ray": ("samples/ray", ".1f"),
-    "parameters": ("params", ",.0f"),
-}
-"""Scores of a table, in their order, each with its heading and format in markdown."""
 
 LONGEST = 120
 """Characters of a cell in markdown; the CSV has all of them."""
@@ -44,22 +22,8 @@ Line = dict[str, Any]
 """A line of a table by column name: settings as text, scores as numbers."""
 
 
-def align(rows: list[RunRow]) -> list[RunRow]:
-    """Settings of jobs without a run, by the names that runs have: ``model`` is ``model.name``."""
-    known = {name for row in rows for name in row.settings if name.endswith(".name")}
-
-    def name(key: str) -> str:
-        full = f"{key.replace('/', '.')}.name"
-        return full if full in known else key
-
-    return [
-        replace(row, settings={name(key): value for key, value in row.settings.items()})
-        for row in rows
-    ]
-
-
 def differing(rows: Sequence[RunRow]) -> list[str]:
-    """Settings in which runs differ, less those that follow from a group or the model."""
+    """Settings in which runs differ, without those that a group or the model determines."""
     known = [row for row in rows if row.settings]
     whole = [row for row in known if not row.missing]
     overridden = {name for row in rows for name in row.overridden}
@@ -80,7 +44,7 @@ def differing(rows: Sequence[RunRow]) -> list[str]:
 
 
 def _follows(rows: Sequence[RunRow], name: str, group: str) -> bool:
-    """Whether the group's name decides the setting, where there is one."""
+    """Whether the group's name determines the setting, among runs that have it."""
     having = [row.settings for row in rows if name in row.settings]
     pairs = {(_text(settings.get(group)), _text(settings[name])) for settings in having}
     return len(pairs) == len({choice for choice, _ in pairs})
@@ -106,9 +70,9 @@ def run_table(rows: Sequence[RunRow], names: Sequence[str]) -> list[Line]:
 
 
 def _measures(rows: Iterable[RunRow]) -> list[str]:
-    """Scores of a table: that of the foreground object is there if any run scores it alone."""
-    known = any("psnr_thing" in row.scores for row in rows)
-    return [name for name in COLUMNS if known or name != "psnr_thing"]
+    """Scores of a table; that of the foreground object only if any run has it."""
+    known = any("psnr_foreground" in row.scores for row in rows)
+    return [name for name in SCORES if known or name != "psnr_foreground"]
 
 
 def _settings(row: RunRow, names: Sequence[str]) -> Line:
@@ -137,7 +101,7 @@ def seed_table(groups: Sequence[Sequence[RunRow]], names: Sequence[str]) -> list
         line = _settings(group[0], names) | {"seeds": len(group)}
         for name in _measures(row for group in groups for row in group):
             values = [row.scores[name] for row in group if name in row.scores]
-            # A mean of those that reached it alone would favour settings where most did not.
+            # A mean over only the seeds that reached it would favour settings that rarely do.
             line[name] = mean(values) if len(values) == len(group) else None
             if name in SPREAD:
                 line[f"{name}_std"] = stdev(values) if len(values) > 1 else None
@@ -155,9 +119,9 @@ def decomposition_table(rows: Sequence[RunRow], names: Sequence[str]) -> list[Li
             "run": row.name,
             **_settings(row, names),
             "rank": "/".join(str(part.get("rank")) for part in row.parts.values()),
-            "drift": f"{_mean_part([row], 'drift'):.3f}",
-            "energy of L, %": f"{100 * _mean_part([row], 'low_rank_energy'):.2f}",
-            "energy of S, %": f"{100 * _mean_part([row], 'sparse_energy'):.2f}",
+            "drift": f"{mean_part([row], 'drift'):.3f}",
+            "energy of L, %": f"{100 * mean_part([row], 'low_rank_energy'):.2f}",
+            "energy of S, %": f"{100 * mean_part([row], 'sparse_energy'):.2f}",
             "converged": _text(all(part.get("converged") for part in row.parts.values())),
         }
         for row in rows
@@ -165,14 +129,10 @@ def decomposition_table(rows: Sequence[RunRow], names: Sequence[str]) -> list[Li
     ]
 
 
-def _mean_part(rows: Sequence[RunRow], name: str) -> float:
+def mean_part(rows: Sequence[RunRow], name: str) -> float:
+    """Mean of a number in the decompositions of all runs and orientations; NaN without any."""
     values = [part.get(name) for row in rows for part in row.parts.values()]
-    return mean([float(value) for value in values if isinstance(value, int | float)])
-
-
-def mean_rank(rows: Sequence[RunRow]) -> float:
-    """Mean rank of the low-rank parts of all runs and orientations; NaN without any."""
-    return _mean_part(rows, "rank")
+    return mean([value for value in values if isinstance(value, int | float)])
 
 
 def mean(values: Sequence[float]) -> float:
@@ -183,15 +143,15 @@ def mean(values: Sequence[float]) -> float:
 def shown(lines: Sequence[Line]) -> str:
     """A table in markdown, scores rounded and with their standard deviation, if they have one."""
     names = [name for name in lines[0] if not name.endswith("_std")]
-    header = [COLUMNS[n][0] if n in COLUMNS else n.removesuffix(".name") for n in names]
+    header = [SCORES[n].heading if n in SCORES else n.removesuffix(".name") for n in names]
     return markdown(header, [[_shown(line, name) for name in names] for line in lines])
 
 
 def _shown(line: Line, name: str) -> str:
-    if name not in COLUMNS:
+    if name not in SCORES:
         return str(line[name])
     numbers = (line[name], line.get(f"{name}_std"))
-    return " ± ".join(format(n, COLUMNS[name][1]) for n in numbers if n is not None)
+    return " ± ".join(format(n, SCORES[name].form) for n in numbers if n is not None)
 
 
 def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:

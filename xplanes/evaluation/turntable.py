@@ -124,21 +124,22 @@ def turntable(triplanes: Tensor, model: LRM, device: torch.device) -> Iterator[T
     view = model.view
     frame = cube_frame(view.half_side, torch.zeros(3))
     decoder = model.field_decoder().requires_grad_(False)
-    shown, field, renderer = -1, None, None
-    first = view.camera_to_world()[:2, 3].tolist()
-    for number in range(FRAMES):
-        index = number * len(triplanes) // FRAMES
-        if index != shown:
-            planes: dict[str, Tensor] = dict(zip(SPACE_PLANES, triplanes[index], strict=True))
-            field = XPlanes(planes=planes, decoder=decoder, plane_set="three").to(device)
-            grid = OccupancyGrid(CELLS, 1, step=DIAGONAL / SAMPLES).to(device)
-            with torch.no_grad():
-                grid.sweep(field, step_generator(0, index, Stream.TURNTABLE))
-            renderer, shown = GridRenderer(grid, SAMPLES), index
-        assert field is not None
-        assert renderer is not None
-        azimuth = math.degrees(math.atan2(first[1], first[0])) + 360 * number / FRAMES
-        pose = camera_around(azimuth, 0.0, view.distance).float()
-        camera = PosedCamera(pose, view.focal * SIDE, SIDE, SIDE)
-        white = torch.ones(3)
-        yield from render_path(field, renderer, frame, [camera], torch.zeros(1), background=white)
+    x, y = view.camera_to_world()[:2, 3].tolist()
+    numbers = torch.arange(FRAMES)
+    for index, triplane in enumerate(triplanes):
+        shown = numbers[numbers * len(triplanes) // FRAMES == index].tolist()
+        if not shown:
+            continue
+        planes: dict[str, Tensor] = dict(zip(SPACE_PLANES, triplane, strict=True))
+        field = XPlanes(planes=planes, decoder=decoder, plane_set="three").to(device)
+        grid = OccupancyGrid(CELLS, 1, step=DIAGONAL / SAMPLES).to(device)
+        with torch.no_grad():
+            grid.sweep(field, step_generator(0, index, Stream.TURNTABLE))
+        cameras = []
+        for number in shown:
+            azimuth = math.degrees(math.atan2(y, x)) + 360 * number / FRAMES
+            pose = camera_around(azimuth, 0.0, view.distance).float()
+            cameras.append(PosedCamera(pose, view.focal * SIDE, SIDE, SIDE))
+        path, white = (cameras, torch.zeros(len(cameras))), torch.ones(3)
+        renderer = GridRenderer(grid, SAMPLES)
+        yield from render_path(field, renderer, frame, *path, background=white)

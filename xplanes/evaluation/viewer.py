@@ -30,14 +30,14 @@ LOOP_SECONDS = 4.0
 """Duration of one playback from time 0 to 1, at speed 1."""
 TICK_SECONDS = 0.04
 SETTLE_SECONDS = 0.25
-"""How long a camera must rest before the picture is drawn in full."""
+"""Seconds that a camera must rest before the picture is drawn at full size."""
 MOVING_SECONDS = 0.08
-"""What a picture may take while the camera moves or time plays."""
+"""Seconds that a picture may take while the camera moves or time plays."""
 FEWEST = 16
 """Rows of a picture at least."""
 REFRESH_SECONDS, SHARE = 0.5, 3
-"""A still picture of a field in training is drawn again once this number of seconds, and this
-multiple of the time that it took, have passed since it was begun."""
+"""A still picture of a field in training is redrawn after this number of seconds, and not before
+this multiple of its own drawing time."""
 AWAY = 1.4
 """The first camera's distance from the scene, as a share of the training cameras'."""
 FRUSTUM = 0.1
@@ -140,7 +140,7 @@ class Viewer:
         self._ticked = time.monotonic()
         # A browser may leave while its picture is drawn.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
-        with _silence():  # It prints an address of its own.
+        with _silence():  # viser prints its own message.
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.gui.set_panel_label("X-Planes")
@@ -178,12 +178,10 @@ class Viewer:
             self._play()
             now = time.monotonic()
             waiting = sorted(self._browsers.values(), key=lambda browser: browser.began)
-            due = ((browser, browser.wanted(now)) for browser in waiting)
-            browser, height = next((found for found in due if found[1]), (None, 0))
-            if browser is None:
-                return
-            browser.draw(height, now)
-            if time.monotonic() >= end:
+            due = [(browser, height) for browser in waiting if (height := browser.wanted(now))]
+            for browser, height in due[:1]:
+                browser.draw(height, now)
+            if not due or time.monotonic() >= end:
                 return
 
     def tell(self, text: str) -> None:
@@ -200,15 +198,8 @@ class Viewer:
     def shot(self, camera: Any, height: int) -> Shot:
         """What a viser camera sees now, in a given number of rows."""
         pose = camera_pose(torch.from_numpy(camera.wxyz), torch.from_numpy(camera.position))
-        return Shot(
-            pose,
-            time=float(self.time.value),
-            fov=camera.fov,
-            height=height,
-            aspect=camera.aspect,
-            mode=self.mode.value,
-            box=self.box,
-        )
+        view = float(self.time.value), camera.fov, height, camera.aspect
+        return Shot(pose, *view, mode=self.mode.value, box=self.box)
 
     @property
     def box(self) -> Tensor | None:
@@ -218,7 +209,7 @@ class Viewer:
 
     @property
     def needs_depth(self) -> bool:
-        """Whether lines are drawn, which things may hide."""
+        """Whether lines are drawn, which the scene may hide."""
         return bool(self.cameras.value or self.outline.visible)
 
     def _place_camera(self) -> None:
@@ -398,9 +389,8 @@ class _Browser:
         self.again = now + max(REFRESH_SECONDS, SHARE * spent)
 
     def _send(self, picture: Picture) -> None:
-        depth = None
-        if self.viewer.needs_depth:
-            depth = picture.depth.clamp_max(LARGEST_DEPTH).numpy()
+        hides = self.viewer.needs_depth
+        depth = picture.depth.clamp_max(LARGEST_DEPTH).numpy() if hides else None
         self.client.scene.set_background_image(
             to_bytes(picture.colours).numpy(),
             format="jpeg",

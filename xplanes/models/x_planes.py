@@ -91,8 +91,10 @@ class XPlanesLoss(Settings):
     # code, also along time, summed over planes.
     variation: Literal["mean", "coded"]
     total_variation: Weight  # Weight of the space planes' total variation.
-    world_variation: Weight  # Replaces `model.loss.total_variation` if a background is learnt.
-    world_time: Share  # Factor on the three weights of time planes below if one is learnt.
+    # Replaces `model.loss.total_variation` if a background is learnt.
+    total_variation_with_background: Weight
+    # Factor on the three weights of time planes below if a background is learnt.
+    time_factor_with_background: Share
     time_variation: Weight  # Weight of the time planes' total variation.
     time_smoothness: Weight  # Weight of time smoothness (squared second differences).
     time_magnitude: Weight  # Weight of the time planes' mean square.
@@ -114,7 +116,7 @@ class XPlanesLoss(Settings):
     def before_background(self) -> "XPlanesLoss":
         """The same with the weights of time planes in scenes where a background is learnt."""
         weights = {
-            name: self.world_time * getattr(self, name)
+            name: self.time_factor_with_background * getattr(self, name)
             for name in ("time_variation", "time_smoothness", "time_magnitude")
         }
         return replace(self, **weights)
@@ -259,7 +261,7 @@ class XPlanesModel(Model):
         self.total_variation = self.weights.total_variation
         if field.background is not None:
             self.weights = settings.loss.before_background()
-            self.total_variation = self.weights.world_variation
+            self.total_variation = self.weights.total_variation_with_background
         elif self.fine is not None:
             self.total_variation = self.fine.coarse_variation
         views = len(site.times)

@@ -164,7 +164,8 @@ class OccupancySettings(SamplerSettings):
     grid_resolution: Count  # Cells of the occupancy grid along each side.
     time_bins: Count  # Bins of the occupancy grid along time.
     threshold: Fraction  # Opacity per step below which a cell is empty.
-    world_threshold: Fraction  # Replaces `model.sampler.threshold` if a background is learnt.
+    # Replaces `model.sampler.threshold` if a background is learnt.
+    threshold_with_background: Fraction
     decay: Share  # Decay of a cell's density at each update.
     skip_empty: bool  # Skip samples in empty cells.
     skip_occluded: bool  # Skip samples behind opaque surfaces.
@@ -205,7 +206,7 @@ class OccupancySettings(SamplerSettings):
             self.grid_resolution,
             self.time_bins if site.moves else 1,
             step=DIAGONAL / along,
-            threshold=self.threshold if plain else self.world_threshold,
+            threshold=self.threshold if plain else self.threshold_with_background,
             decay=self.decay,
         )
         renderer = GridRenderer(

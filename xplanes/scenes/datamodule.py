@@ -327,7 +327,7 @@ def whole_view(views: Views, index: int, background: Tensor) -> dict[str, Any]:
     Returns:
         Its ``camera``, ``time`` from 0 to 1 [], ``target`` colours before ``background`` [H, W, 3],
         ``alpha`` uint8 [H, W], ``background`` [3], ``index`` and ``file``; where known ``shown``,
-        pixels that are scored, bool [H, W], and ``thing``, the share of each
+        pixels that are scored, bool [H, W], and ``foreground``, the share of each
         pixel that shows the foreground object, uint8 [H, W].
     """
     item = {
@@ -339,7 +339,7 @@ def whole_view(views: Views, index: int, background: Tensor) -> dict[str, Any]:
         "index": index,
         "file": views.files[index],
     }
-    more = {"shown": views.shown(index), "thing": views.thing_in(index)}
+    more = {"shown": views.shown(index), "foreground": views.foreground_in(index)}
     return item | {name: value for name, value in more.items() if value is not None}
 
 

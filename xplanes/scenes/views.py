@@ -173,12 +173,13 @@ class Views:
         intrinsics: Focal lengths and principal points in pixels, image sizes and lenses. A number
             is the shared focal length in pixels of centred images of size H x W.
         files: Name of each image, relative to the scene's folder. [V]
-        thing: Share of each pixel that the foreground object covers, from 0 to 255; used only for
+        foreground: Share of each pixel that the object covers, from 0 to 255; used only for
             scores. None if unknown. uint8 [V, H, W]
         ignored: Pixels that are neither trained on nor scored; None for none. bool [V, H, W]
 
     Raises:
-        ValueError: If the shapes of ``images``, ``intrinsics``, ``thing`` and ``ignored`` disagree.
+        ValueError: If the shapes of ``images``, ``intrinsics``, ``foreground`` and ``ignored``
+            disagree.
     """
 
     images: Tensor | StoredImages
@@ -186,7 +187,7 @@ class Views:
     times: Tensor
     intrinsics: Intrinsics
     files: tuple[str, ...]
-    thing: Tensor | None = None
+    foreground: Tensor | None = None
     ignored: Tensor | None = None
 
     def __post_init__(self) -> None:
@@ -201,7 +202,7 @@ class Views:
                 f"{len(size)} images of at most {size.amax(dim=0).tolist() if len(size) else 0} "
                 "pixels, as views.intrinsics says"
             )
-        for name in ("thing", "ignored"):
+        for name in ("foreground", "ignored"):
             pixels: Tensor | None = getattr(self, name)
             if pixels is not None and pixels.shape != (count, height, width):
                 raise ValueError(
@@ -302,12 +303,12 @@ class Views:
         shown = ~self._cropped(self.ignored, index)
         return shown if has_ray is None else shown & has_ray
 
-    def thing_in(self, index: int) -> Tensor | None:
+    def foreground_in(self, index: int) -> Tensor | None:
         """Share of each pixel of image ``index`` that shows the foreground object. uint8 [h, w]
 
         None if unknown.
         """
-        return None if self.thing is None else self._cropped(self.thing, index)
+        return None if self.foreground is None else self._cropped(self.foreground, index)
 
     def in_memory(self) -> Tensor:
         """All images, with padding. uint8 [V, H, W, 4]"""
@@ -366,7 +367,7 @@ class Views:
             self.times[indices],
             intrinsics,
             tuple(self.files[i] for i in indices.tolist()),
-            None if self.thing is None else self.thing[indices, :height, :width],
+            None if self.foreground is None else self.foreground[indices, :height, :width],
             None if self.ignored is None else self.ignored[indices, :height, :width],
         )
 

@@ -41,7 +41,7 @@ class StepBar(ProgressBar):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, RadianceModule)
         self._due = time.monotonic() + (0 if self.live else PIPED_SECONDS)
-        self._began = training_seconds(trainer), pl_module.counts["rays"]
+        self._began = training_seconds(trainer), pl_module.tally.counts["rays"]
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -64,7 +64,7 @@ class StepBar(ProgressBar):
     def line(self, trainer: Trainer, module: LightningModule) -> str:
         """The line for the present state."""
         assert isinstance(module, RadianceModule)
-        seconds, rays = training_seconds(trainer), module.counts["rays"]
+        seconds, rays = training_seconds(trainer), module.tally.counts["rays"]
         clock = find_callback(trainer, TrainingClock)
         most = None if clock is None else clock.max_seconds
         rate = (rays - self._began[1]) / max(seconds - self._began[0], 1e-9)
@@ -75,9 +75,9 @@ class StepBar(ProgressBar):
             f"{100 * module.progress:.0f}%",
             f"{rate / 1000:.1f}k rays/s",
         ]
-        if "psnr" in module.last:
-            parts.append(f"train psnr {module.last['psnr']:.2f}")
-        for name, value in module.last.items():
+        if "psnr" in module.tally.last:
+            parts.append(f"train psnr {module.tally.last['psnr']:.2f}")
+        for name, value in module.tally.last.items():
             if name.endswith("/psnr"):
                 parts.append(f"{name.replace('/', ' ')} {value:.2f}")
         parts.append(f"{int(left) // 60}:{int(left) % 60:02d} left")

@@ -254,19 +254,19 @@ def require_groups(model: Model, sampler: Sampler) -> None:
     wanted = ("params", "lr", "name")
     whole = '{"params": list(field.parameters()), "lr": 0.001, "name": "field"}'
     for owner in (model, sampler):
-        place = f"{type(owner).__name__}.groups"
         for group in owner.groups():
-            if missing := [key for key in wanted if key not in group]:
-                raise ConfigError(f"{place}: a group lacks {' and '.join(missing)}; write {whole}")
-    groups = [*model.groups(), *sampler.groups()]
+            if missing := " and ".join(key for key in wanted if key not in group):
+                place = f"{type(owner).__name__}.groups"
+                raise ConfigError(f"{place}: a group lacks {missing}; write {whole}")
+    groups, place = [*model.groups(), *sampler.groups()], f"{type(model).__name__}.groups"
     names = [group["name"] for group in groups]
     if twice := [name for name in names if names.count(name) > 1]:
-        raise ConfigError(f"{type(model).__name__}.groups: two groups have the name {twice[0]}")
+        raise ConfigError(f"{place}: two groups have the name {twice[0]}")
     keys = [(group["name"], key) for group in groups for key in group if key not in wanted]
     optimizer = model.optimizer(groups)
     for name, key in keys:
         if key not in optimizer.defaults:
             raise ConfigError(
-                f"{type(model).__name__}.groups: {type(optimizer).__name__} takes no {key!r}, "
-                f"which the group {name} has; it takes {', '.join(optimizer.defaults)}"
+                f"{place}: {type(optimizer).__name__} takes no {key!r}, which the group {name} "
+                f"has; it takes {', '.join(optimizer.defaults)}"
             )

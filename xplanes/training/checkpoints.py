@@ -105,30 +105,33 @@ class Checkpoints(ModelCheckpoint):
         # Gradients of batches that wait for others are in no checkpoint.
         whole = getattr(pl_module, "between_updates", True)
         self._due = whole and trainer.global_step % self.every == 0
-        # Else it waits for the scores, so that it knows of the best.
+        # Otherwise it waits for the scores, so that it records the best one.
         validates = trainer.val_check_batch == trainer.fit_loop.epoch_loop.total_batch_idx + 1
         if self._due and not validates:
-            self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
+            self._save_last(trainer)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self.monitor in trainer.callback_metrics:
             super().on_validation_end(trainer, pl_module)
         if self._due and not trainer.sanity_checking:
-            self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
+            self._save_last(trainer)
             self._due = False
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
+        self._save_last(trainer)
 
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
         # Any other interrupt may have come in the middle of a step.
         if isinstance(exception, Stopped) and trainer.global_step:
-            self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
+            self._save_last(trainer)
+
+    def _save_last(self, trainer: Trainer) -> None:
+        self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
 
     def _should_skip_saving_checkpoint(self, trainer: Trainer) -> bool:
-        # The last scores may be made up for after training, see `Trainer.train`.
+        # The last scores may come after training, see `Trainer.train`.
         return trainer.sanity_checking or not trainer.global_step
 
     def _save_checkpoint(self, trainer: Trainer, filepath: str) -> None:
@@ -155,9 +158,6 @@ def has_checkpoint(run: Path) -> bool:
 
 def find_resumable(folder: Path) -> Path | None:
     """The checkpoint that training goes on from; the best takes the place of a damaged last one.
-
-    Args:
-        folder: Where they lie.
 
     Returns:
         ``last.ckpt``; None where there is none, so that training starts afresh.

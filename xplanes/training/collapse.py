@@ -1,4 +1,4 @@
-"""Detects fields that collapse to nothing or to fog, and restarts them once."""
+"""Detects fields that become empty or foggy, and restarts them once."""
 
 import logging
 import math
@@ -52,7 +52,7 @@ class CollapseWatch(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         assert isinstance(pl_module, RadianceModule)
-        last = pl_module.last
+        last = pl_module.tally.last
         self._seen.append((last.get("foreground", math.nan), last.get("background", math.nan)))
         if len(self._seen) < WINDOW or not pl_module.between_updates:
             return

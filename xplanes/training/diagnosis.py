@@ -121,13 +121,7 @@ def require_finite(module: "RadianceModule") -> None:
 def _way_out(
     module: "RadianceModule", broken: Sequence[str] = (), *, rendered: bool = False
 ) -> str:
-    """What to change.
-
-    Args:
-        module: What is trained.
-        broken: Terms of the loss that are not finite.
-        rendered: Whether parameters and rendering are finite nevertheless.
-    """
+    """What to change, if these terms are not finite; ``rendered`` if all that was rendered is."""
     added = [f"losses.{name}" for name in module.method.losses] if rendered else []
     begun = module.tally.done > 0
     resume = "; resume= continues from the last checkpoint" if begun else ""

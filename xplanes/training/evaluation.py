@@ -1,4 +1,4 @@
-"""When views are scored during training, and the curve of their scores."""
+"""Scores views at given times during training, and writes the curve of their scores."""
 
 import sys
 import time
@@ -64,7 +64,7 @@ class Evaluation(Callback):
         if trainer.global_step and trainer.is_global_zero:
             forget_later(trainer, trainer.global_step)
         passed = sum(share <= pl_module.progress for share in self.at)
-        # Stopped while it scored, a run scores again; with more of a budget, less of it is passed.
+        # A run that was stopped while scoring scores again; a larger budget passes fewer shares.
         self._passed = passed if self._passed is None else min(self._passed, passed)
 
     def on_train_batch_end(
@@ -94,9 +94,8 @@ class Evaluation(Callback):
         dataloader_idx: int = 0,
     ) -> None:
         if batch_idx < SHOWN and trainer.is_global_zero:
-            parts = (outputs[name].float() for name in ("colour", "depth", "opacity"))
-            colour, depth, opacity = parts
-            picture = strip(batch["target"].cpu(), colour.clamp(0, 1), depth, opacity)
+            colour, *others = (outputs[name].float() for name in ("colour", "depth", "opacity"))
+            picture = strip(batch["target"].cpu(), colour.clamp(0, 1), *others)
             self._pictures[batch["file"]] = picture
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -116,23 +115,20 @@ class Evaluation(Callback):
         row = [f"{training_seconds(trainer):.3f}", str(step), split, f"{psnr:.4f}", f"{ssim:.5f}"]
         self._rows = [*(old for old in self._rows if old[1] != row[1]), row]
         write_rows(run / "curve.csv", CURVE, self._rows)
-        pictures = {
-            file if file.startswith(f"{split}/") else f"{split}/{file}": picture
-            for file, picture in self._pictures.items()
-        }
         if planes := module.field.planes:
             sheet = plane_sheet(planes)
             write_png(run / "media" / "planes.png", sheet)
             log_image(trainer, "planes", sheet, step)
-        for tag, picture in pictures.items():
+        for file, picture in self._pictures.items():
+            tag = f"{split}/{file.removeprefix(f'{split}/')}"
             name = tag.replace("/", "_").removesuffix(".png")
             write_png(run / "media" / f"step{step:06d}" / f"{name}.png", picture)
             log_image(trainer, tag, picture, step)
-        if trainer.sanity_checking:  # Whose scores Lightning does not log.
+        if trainer.sanity_checking:  # Lightning does not log its scores.
+            last = module.tally.last
+            scores = {n: last[n] for n in last if n.startswith(("val/", "test/"))}
             for log in trainer.loggers:
-                log.log_metrics(
-                    {n: v for n, v in module.last.items() if n.startswith(("val/", "test/"))}, step
-                )
+                log.log_metrics(scores, step)
 
     def state_dict(self) -> dict[str, Any]:
         return {"seconds": self.seconds, "passed": self._passed, "rows": self._rows}

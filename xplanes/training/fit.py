@@ -96,18 +96,15 @@ class Trainer(lightning.Trainer):
         own = list(plugins) if isinstance(plugins, list | tuple) else [plugins] * bool(plugins)
         if not any(isinstance(plugin, CheckpointIO) for plugin in own):
             own.append(AtomicCheckpointIO())
-        used = list(callbacks)
-        if not others.get("enable_progress_bar", True):
-            used = [callback for callback in used if not isinstance(callback, ProgressBar)]
-        # Of the whole process: the LRM, too, computes in what precision=32 says.
+        bar = others.get("enable_progress_bar", True)
+        used = [each for each in callbacks if bar or not isinstance(each, ProgressBar)]
+        # These hold for the whole process, the LRM included.
         torch.set_float32_matmul_precision("high" if tf32 else "highest")
         torch.backends.cudnn.allow_tf32 = tf32
         # `Evaluation` says when views are scored; without it, nothing does.
-        others.setdefault("check_val_every_n_epoch", None)
-        others.setdefault("val_check_interval", sys.maxsize)
-        others.setdefault("num_sanity_val_steps", 0)
+        usual = {"check_val_every_n_epoch": None, "val_check_interval": sys.maxsize}
         # Lightning ends after 1000 epochs where no number of steps is given.
-        others.setdefault("max_epochs", -1)
+        usual |= {"num_sanity_val_steps": 0, "max_epochs": -1}
         self.interrupt = Interrupt()
         quiet_lightning()
         super().__init__(
@@ -118,7 +115,7 @@ class Trainer(lightning.Trainer):
             log_every_n_steps=log_every_n_steps,
             callbacks=[TrainingClock(max_seconds), *used, self.interrupt],
             plugins=own,
-            **others,
+            **(usual | others),
         )
 
     def train(
@@ -272,12 +269,8 @@ OPAQUE = 1000.0
 def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
     """Time a step and some rays of a scored view.
 
-    Training makes surfaces opaque, so that rays end after a few samples. A field that is far denser
-    in the same places stands for the trained one.
-
-    Args:
-        module: The module, its loops compiled.
-        data: Its data.
+    Training makes surfaces opaque, so that rays end after a few samples. A much denser copy of the
+    field stands in for the trained one.
     """
     frame, field, renderer = module.frame, module.field, module.renderer
     assert frame is not None
@@ -302,13 +295,13 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
         solid = field.masked(lambda points: points.new_full(points.shape[:1], OPAQUE))
         later = _seconds(lambda: renderer.image(solid, origins, directions, *seen_at), device)
         if (background := getattr(field, "background", None)) is not None:
-            with torch.no_grad():  # Which shows where the cube turns out to be empty.
+            with torch.no_grad():  # It shows wherever the cube is empty.
                 later += _seconds(lambda: look(background, origins, directions), device)
     return Estimate(taken, first / len(chosen), later / len(chosen), pruned_at)
 
 
 def _seconds(work: Callable[[], Any], device: torch.device) -> float:
-    """The lesser time of two that some work takes: a first call makes memory, and GPU kernels."""
+    """The shorter of two timings: the first call allocates memory and compiles GPU kernels."""
     spent = []
     for _ in range(2):
         began = time.perf_counter()

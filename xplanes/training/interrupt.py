@@ -14,7 +14,7 @@ from xplanes.training.clock import agreeing
 
 
 class Stopped(KeyboardInterrupt):
-    """Training was asked to stop, and did so where its state is whole."""
+    """Training was asked to stop, and did so between two steps."""
 
 
 class Interrupt(Callback):
@@ -25,7 +25,7 @@ class Interrupt(Callback):
         self._before: dict[int, Any] = {}
 
     def check(self) -> None:
-        """Stop here if asked to; call it where the state is whole.
+        """Stop here if asked to; to be called between two steps.
 
         Raises:
             Stopped: If a signal came.

@@ -23,12 +23,7 @@ def logs_now(trainer: Trainer) -> bool:
 
 
 def forget_later(trainer: Trainer, step: int) -> None:
-    """Make TensorBoard drop the points after a step, which an interrupted run has left.
-
-    Args:
-        trainer: Has the loggers.
-        step: Where the run goes on.
-    """
+    """Make TensorBoard drop the points after a step, which an interrupted run has left."""
     for log in trainer.loggers:
         if isinstance(log, TensorBoardLogger):
             from tensorboard.compat.proto.event_pb2 import (  # pyright: ignore
@@ -41,24 +36,18 @@ def forget_later(trainer: Trainer, step: int) -> None:
 
 
 def log_terms(module: "RadianceModule", terms: Mapping[str, Tensor], state: TrainingState) -> None:
-    """Log every term of the loss, weighted, where the Trainer wants logs of this step.
-
-    Args:
-        module: What is trained.
-        terms: The terms that need rays, by name. [] each
-        state: How far training is.
-    """
+    """Log every term of the loss, weighted, where the Trainer wants logs of this step."""
     if not logs_now(module.trainer):
         return
     values = {name: float(term.detach()) for name, term in terms.items()}
     values |= module.model.regularisers(state)
     values |= module.sampler.regularisers(module.field, state)
     entries = {f"train/{name}": value for name, value in values.items()}
-    entries |= {"train/loss": sum(values.values()), "train/psnr": module.last["psnr"]}
-    entries |= {"train/steps_skipped": float(module.unusable), "step": float(state.step)}
+    entries |= {"train/loss": sum(values.values()), "train/psnr": module.tally.last["psnr"]}
+    entries |= {"train/steps_skipped": float(module.tally.skipped), "step": float(state.step)}
     for group in module.trainer.optimizers[0].param_groups:
         entries[f"lr/{group['name']}"] = group["lr"]
-    counts = module.counts
+    counts = module.tally.counts
     entries["sampler/samples_per_ray"] = counts["samples"] / max(1, counts["rays"])
     if seconds := training_seconds(module.trainer):
         entries["time/rays_per_s"] = counts["rays"] / seconds

@@ -1,4 +1,4 @@
-"""Statistics of training steps: sums on the device, which the host reads now and then."""
+"""Statistics of training steps: sums on the device, which the host reads at intervals."""
 
 import math
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ def due(batches: int) -> bool:
 
 
 class Meters:
-    """Sums of numbers that the host does not wait for."""
+    """Sums of numbers on the device, for which the host does not wait."""
 
     def __init__(self) -> None:
         self._sums: dict[tuple[str, ...], Tensor] = {}

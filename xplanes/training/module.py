@@ -93,7 +93,7 @@ class RadianceModule(ViewScoring):
         self.advice: str | None = None
         """What to change when the loss is not finite; the model's own advice when None."""
         self.between_updates = True
-        """Whether no gradients wait for those of further batches (`accumulate_grad_batches`)."""
+        """Whether all gradients so far are applied (see ``accumulate_grad_batches``)."""
         self.scores = []
         self.tally = Tally()
         self._parts: Parts | None = None
@@ -261,24 +261,9 @@ class RadianceModule(ViewScoring):
         done = (self.global_step, self.batches, self.global_rank)
         return TrainingState(self.method.seed, *done, progress=self.progress)
 
-    @property
-    def counts(self) -> dict[str, int]:
-        """What training has counted: rays, samples in their box, those dropped or kept."""
-        return self.tally.counts
-
-    @property
-    def last(self) -> dict[str, float]:
-        """Loss and PSNR of the last batch, mean opacities, and the last scores of views."""
-        return self.tally.last
-
-    @property
-    def unusable(self) -> int:
-        """Steps that were skipped because a loss or gradient was not finite."""
-        return self.tally.skipped
-
     def configure_optimizers(self) -> torch.optim.Optimizer:
         groups = [*self.model.groups(), *self.sampler.groups()]
-        # Not part of the optimiser, whose state a resumed run takes over: settings may change.
+        # Kept outside the optimiser, whose state a resumed run restores: settings may change.
         self._peaks = [group["lr"] for group in groups]
         return self.model.optimizer(groups)
 
@@ -333,9 +318,8 @@ class RadianceModule(ViewScoring):
         if self.trainer.world_size > 1:
             # All processes must skip a step together, for their planes must stay equal.
             torch.distributed.all_reduce(broken, op=torch.distributed.ReduceOp.MAX)
-        unusable: list[str] = []
-        if broken.device.type == "cpu" and broken:
-            unusable = unusable_gradients(self.named_parameters())
+        named = self.named_parameters() if broken.device.type == "cpu" and broken else ()
+        unusable = unusable_gradients(named)
         leave_out(optimizer, broken)
         self.tally.add_update(broken)
         if self.tally.skipped_in_a_row >= PATIENCE:
@@ -353,14 +337,14 @@ class RadianceModule(ViewScoring):
         # Here and not after the batch: a checkpoint that a callback writes must hold it.
         self.sampler.update(self.field, state)
         self.between_updates = True
-        self._seen = None  # Its graph knows the shapes of parameters, which a model may replace.
+        self._seen = None  # A model may replace parameters that its graph refers to.
 
     def on_train_end(self) -> None:
         self._read_tally()
 
     def _count(self, rendering: Rendering, rays: Batch, loss: Tensor) -> None:
         """Record the statistics of a batch; on a GPU the host reads them later."""
-        # Before a background that is learnt, no pixel is known to need opacity or to lack it.
+        # With a learnt background, no pixel is known to be opaque or empty.
         known = getattr(self.field, "background", None) is None
         if known and self.batches % OPACITIES == 0:
             self.tally.opacities = mean_opacities(rendering, rays)
@@ -375,7 +359,7 @@ class RadianceModule(ViewScoring):
         if (found := self.tally.read(self.trainer)) is None:
             return
         rays, samples = found
-        # Of batches of as many rays as the next one has.
+        # Samples of a batch with as many rays as the next one.
         self.sampler.expect(samples * self.rays / max(1, rays))
         if self.rays:
             self.rays = self.ray_settings.fitting(rays, samples)

@@ -22,7 +22,7 @@ from xplanes.lrm import LRMError
 from xplanes.process import resume_command
 from xplanes.scenes.views import Views
 from xplanes.settings import flatten
-from xplanes.training.checkpoints import LAST, load_checkpoint
+from xplanes.training.checkpoints import LAST, has_checkpoint, load_checkpoint
 
 logger = logging.getLogger(__name__)
 
@@ -31,27 +31,6 @@ data.views data.train_views data.train_on_video data.static data.half_side data.
 data.eval_every data.test_cameras data.frames data.protocol data.masks data.mask_use data.model
 data.images data.orient data.times data.time_pattern""".split()
 """Settings on which the planes, their frame and what they show depend; not where files lie."""
-
-
-def require_same_settings(run: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Refuse settings that a checkpoint cannot go on with.
-
-    Args:
-        run: The run directory.
-        before: The settings that it began with; those that are not there are not compared.
-        now: The settings that it is to go on with.
-
-    Raises:
-        ConfigError: Naming the first that differs.
-    """
-    before, now = flatten(before), flatten(now)
-    for key in KEPT:
-        if key in before and key in now and before[key] != now[key]:
-            was, wanted = ("null" if each[key] is None else each[key] for each in (before, now))
-            raise ConfigError(
-                f"resume={run} with {key}={wanted}: its checkpoint was trained with {key}={was}. "
-                "Leave it out, or start a new run in another folder"
-            )
 
 
 def require_same_views(run: Path, record: Mapping[str, Any], views: Views) -> None:
@@ -76,16 +55,7 @@ def require_same_views(run: Path, record: Mapping[str, Any], views: Views) -> No
 
 Status = Literal["running", "finished", "failed", "interrupted"]
 
-_PACKAGES = (
-    "torch",
-    "lightning",
-    "hydra-core",
-    "omegaconf",
-    "torchmetrics",
-    "tensorboard",
-    "numba",
-    "triton",
-)
+_PACKAGES = "torch lightning hydra-core omegaconf torchmetrics tensorboard numba triton".split()
 
 NOTED = ("device", "precision", "files")
 """Facts that are noted once the scene is read."""
@@ -132,11 +102,8 @@ class RunRecord:
 
     def end(self, status: Status, reason: str | None = None) -> None:
         """Set how the run ended."""
-        total = self.total_seconds
-        self.content.update(
-            status=status, ended=_now(), total_seconds=round(total, 3), reason=reason
-        )
-        write_json(self.path, self.content)
+        total = round(self.total_seconds, 3)
+        self.note(status=status, ended=_now(), total_seconds=total, reason=reason)
 
     @property
     def total_seconds(self) -> float:
@@ -149,25 +116,19 @@ class RunRecord:
         return time.perf_counter() - self._began
 
 
-def run_status(run: Path) -> str | None:
-    """Status in run.json, "damaged" if it cannot be read; None where the folder holds no run."""
-    path = run / "run.json"
-    if not path.is_file():
-        return None
-    try:
-        return str(read_json(path).get("status"))
-    except ValueError:
-        return "damaged"
-
-
 def claim(run: Path, *, resume: bool) -> None:
     """Refuse a folder that holds a run with a checkpoint, unless it is to be resumed.
 
     Raises:
         ConfigError: If there is a run and ``resume`` is off, or none and it is on.
     """
-    status = run_status(run)
-    if not resume and not (run / "checkpoints" / "last.ckpt").is_file() and status != "finished":
+    path, status = run / "run.json", None
+    if path.is_file():
+        try:
+            status = str(read_json(path).get("status"))
+        except ValueError:
+            status = "damaged"
+    if not resume and not has_checkpoint(run) and status != "finished":
         return  # It ended before its first checkpoint: nothing would be lost.
     if status is not None and not resume:
         raise ConfigError(
@@ -197,10 +158,9 @@ def _now() -> str:
 
 
 def _version(name: str) -> str | None:
-    try:
+    with suppress(PackageNotFoundError):
         return version(name)
-    except PackageNotFoundError:
-        return None
+    return None
 
 
 def _commit() -> str | None:
@@ -247,16 +207,20 @@ def require_same_run(run: Path, config: Mapping[str, Any], max_steps: int) -> No
     Raises:
         ConfigError: Saying what differs, or how many steps are done.
     """
-    # What is damaged is written again, and what does not fit is refused later.
-    try:
-        before = read_config(run)
-    except ConfigError:
-        before = {}
-    require_same_settings(run, before, config)
-    try:
+    before: dict[str, Any] = {}
+    with suppress(ConfigError):  # What is damaged is written again.
+        before = flatten(read_config(run))
+    now = flatten(config)
+    for key in KEPT:
+        if key in before and key in now and before[key] != now[key]:
+            was, wanted = ("null" if each[key] is None else each[key] for each in (before, now))
+            raise ConfigError(
+                f"resume={run} with {key}={wanted}: its checkpoint was trained with {key}={was}. "
+                "Leave it out, or start a new run in another folder"
+            )
+    done = 0
+    with suppress(ConfigError, KeyError):  # What does not fit is refused later.
         done = load_checkpoint(run / "checkpoints" / LAST)["global_step"]
-    except (ConfigError, KeyError):
-        return
     if 0 <= max_steps < done:
         raise ConfigError(
             f"trainer.max_steps={max_steps}: {run} has done {done} steps already. Give more, or "

@@ -1,4 +1,4 @@
-"""Scores of views: rendered, compared with the true images, and averaged; when Lightning asks."""
+"""Scores of views: rendered, compared with the true images, and averaged."""
 
 import math
 from abc import abstractmethod
@@ -23,7 +23,7 @@ VISIBLE = 0.05
 """Opacity above which a background pixel shows a floater."""
 
 SOLID = 128
-"""Share of a pixel, of 255, from which it counts as showing the foreground object."""
+"""Least coverage of a pixel, of 255, by the foreground object for the pixel to count."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class ViewScore:
         time: Its time, from 0 to 1.
         psnr: In dB.
         ssim: Structural similarity.
-        psnr_thing: In dB, over the pixels that show the foreground object; NaN where not known.
+        psnr_foreground: In dB, over the pixels of the foreground object; NaN where not known.
         floaters: Share of background pixels (alpha 0 in the true image) that are not transparent;
             NaN where the image has none.
     """
@@ -45,13 +45,13 @@ class ViewScore:
     psnr: float
     ssim: float
     floaters: float
-    psnr_thing: float = math.nan
+    psnr_foreground: float = math.nan
 
     @property
     def scores(self) -> dict[str, float]:
         """The numbers by name, those that are known."""
         found = {"psnr": self.psnr, "ssim": self.ssim}
-        maybe = {"psnr_thing": self.psnr_thing, "floaters": self.floaters}
+        maybe = {"psnr_foreground": self.psnr_foreground, "floaters": self.floaters}
         return found | {name: value for name, value in maybe.items() if not math.isnan(value)}
 
 
@@ -74,25 +74,8 @@ def render_item(
     return found
 
 
-def render_view(
-    field: Representation,
-    renderer: Renderer,
-    frame: Frame,
-    views: Views,
-    index: int,
-    background: Tensor,
-) -> dict[str, Tensor]:
-    """As `render_item`, for one of some views in front of ``background`` [3]."""
-    return render_item(field, renderer, frame, whole_view(views, index, background))
-
-
 def score_image(image: Mapping[str, Tensor], item: Mapping[str, Any]) -> ViewScore:
-    """Compare a rendered view with the true image.
-
-    Args:
-        image: What `render_item` gives.
-        item: What `whole_view` gives.
-    """
+    """Compare a rendered view with the true image."""
     truth = item["target"].cpu()
     colour = image["colour"].float().clamp(0, 1)
     opacity, alpha = image["opacity"].float(), item["alpha"].cpu()
@@ -106,7 +89,7 @@ def score_image(image: Mapping[str, Tensor], item: Mapping[str, Any]) -> ViewSco
         psnr=psnr(colour, truth, shown),
         ssim=ssim(colour, truth, shown),
         floaters=floaters(opacity, alpha),
-        psnr_thing=psnr_thing(colour, truth, item.get("thing")),
+        psnr_foreground=psnr_foreground(colour, truth, item.get("foreground")),
     )
 
 
@@ -118,7 +101,11 @@ def score_view(
     index: int,
     background: Tensor,
 ) -> tuple[ViewScore, dict[str, Tensor]]:
-    """As `render_view`, with the view's score, and its true colours as ``truth`` [H, W, 3]."""
+    """Render one of some views in front of ``background`` [3], and compare it with the truth.
+
+    Returns:
+        Its score, and its images as `render_item` gives them, with ``truth`` [H, W, 3].
+    """
     item = whole_view(views, index, background)
     image = render_item(field, renderer, frame, item)
     return score_image(image, item), image | {"truth": item["target"]}
@@ -127,7 +114,7 @@ def score_view(
 def gathered(scores: Sequence[ViewScore], trainer: Trainer) -> list[ViewScore]:
     """The scores of all processes, each of which scores every n-th view, in order.
 
-    A process without a view of its own has scored one of another's, which counts once.
+    A process that has no view scores one of another process, which counts once.
     """
     if trainer.world_size == 1:
         return list(scores)
@@ -138,15 +125,15 @@ def gathered(scores: Sequence[ViewScore], trainer: Trainer) -> list[ViewScore]:
     return list({score.file: score for score in found}.values())
 
 
-def psnr_thing(colour: Tensor, truth: Tensor, thing: Tensor | None) -> float:
+def psnr_foreground(colour: Tensor, truth: Tensor, foreground: Tensor | None) -> float:
     """PSNR in dB of the pixels that show the foreground object; NaN where there are none.
 
     Args:
         colour: Rendered colours. [H, W, 3]
         truth: True colours. [H, W, 3]
-        thing: Share of each pixel that shows the object; None where not known. uint8 [H, W]
+        foreground: Share of each pixel that shows the object; None where not known. uint8 [H, W]
     """
-    if thing is None or not (shown := thing.cpu() >= SOLID).any():
+    if foreground is None or not (shown := foreground.cpu() >= SOLID).any():
         return math.nan
     return psnr(colour[shown], truth[shown])
 
@@ -161,9 +148,8 @@ def floaters(opacity: Tensor, alpha: Tensor) -> float:
 
 def mean_scores(scores: Sequence[ViewScore]) -> dict[str, float]:
     """Means over views of each score that any of them has."""
-    names = ("psnr", "ssim", "psnr_thing", "floaters")
-    found = {name: [s.scores[name] for s in scores if name in s.scores] for name in names}
-    return {name: mean(values) for name, values in found.items() if values}
+    names = dict.fromkeys(name for score in scores for name in score.scores)
+    return {name: mean([s.scores[name] for s in scores if name in s.scores]) for name in names}
 
 
 def mean_colour(views: Views, background: Tensor) -> Tensor:

@@ -206,7 +206,7 @@ def test_captures_have_a_world_behind_and_masks_of_the_thing(name, tmp_path):
     shots = SUITE_SCENES[name].rig.capture({"train": 3}, f"{name} 0").shots["train"]
     for number, (time, camera) in enumerate(shots):
         mask = np.asarray(Image.open(folder / MASKS / "train" / f"r_{number:03d}.png"))
-        assert np.array_equal(scene.splits["train"].thing_in(number), mask)
+        assert np.array_equal(scene.splits["train"].foreground_in(number), mask)
         alone = render_image(assembly_of(name).pose(time), camera, SIDE)
         # The world hides nothing of the thing, but for what a pixel's rays share with it.
         assert np.abs(mask.astype(int) - alone[..., 3]).max() <= 64
@@ -225,7 +225,7 @@ def test_masks_of_a_thing_cut_it_out_where_that_is_asked_for(tmp_path):
         return build(given["data"], SceneSettings, "data").read()
 
     whole, alpha, lrm = (scene("phone", use) for use in ("score", "alpha", "lrm"))
-    masks = whole.splits["train"].thing
+    masks = whole.splits["train"].foreground
     assert whole.cut is None
     assert alpha.cut is None
     assert torch.equal(alpha.splits["train"].images[..., 3], masks)

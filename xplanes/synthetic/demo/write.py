@@ -44,7 +44,7 @@ RECORD = "demo.json"
 """File that describes the content of a scene folder; written last."""
 
 MASKS = "masks"
-"""Folder of the masks of a thing in a world, with the names of the images."""
+"""Folder of the masks of an object with surroundings, with the names of the images."""
 
 USUAL_VIEWS = {"train": 50, "val": 10, "test": 12}
 """Default number of views per split; other numbers become part of the folder name."""
@@ -125,7 +125,7 @@ def ensure_suite_scene(
     """Render a scene of the suite unless its folder exists already.
 
     Arguments, folder and errors are those of `ensure_demo_scene`. There is no fixed-view video.
-    Beside the opaque images of a thing in a world lie masks of the thing, in ``masks``, which
+    Beside the opaque images of an object with surroundings lie masks of it, in ``masks``, which
     nothing but scores may read.
     """
     counts = {"train": train_views, "val": val_views, "test": test_views}
@@ -333,13 +333,13 @@ class ProceduralSettings(SceneSettings, ABC):
 
 
 def _with_masks(scene: Scene, folder: Path) -> Scene:
-    """The scene with the masks of its thing, if it stands in a world."""
+    """The scene with the masks of its object, if it has surroundings."""
     if not folder.is_dir():
         return scene
     splits = {}
     for split, views in scene.splits.items():
         masks = load_images([folder / file for file in views.files], None)
-        splits[split] = replace(views, thing=masks[..., 0])
+        splits[split] = replace(views, foreground=masks[..., 0])
     return replace(scene, splits=splits)
 
 
@@ -366,20 +366,21 @@ class SuiteSettings(ProceduralSettings):
         train = scene.splits.get("train")
         if self.mask_use == "score" or train is None:
             return scene
-        if train.thing is None:
+        if train.foreground is None:
             raise SceneError(
                 f"data.mask_use={self.mask_use}: {self.scene} stands in no world, so it has no "
                 "masks. Set it to score."
             )
-        cut = cut_out(train, train.thing)
+        cut = cut_out(train, train.foreground)
         if self.mask_use == "lrm":
             return replace(scene, cut=cut)
         return replace(scene, splits=scene.splits | {"train": cut})
 
 
-def cut_out(views: Views, thing: Tensor) -> Views:
-    """Opaque views with the share of each pixel that shows the thing as alpha. uint8 [V, H, W]"""
+def cut_out(views: Views, foreground: Tensor) -> Views:
+    """Opaque views with the share of each pixel that shows the object as alpha. uint8 [V, H, W]"""
     images = views.in_memory().clone()
-    images[..., :3] = (images[..., :3].float() * thing[..., None] / 255).round().to(torch.uint8)
-    images[..., 3] = thing
+    share = foreground[..., None] / 255
+    images[..., :3] = (images[..., :3].float() * share).round().to(torch.uint8)
+    images[..., 3] = foreground
     return replace(views, images=images)

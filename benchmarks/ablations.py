@@ -100,10 +100,11 @@ def show_savings(rows: list[Row]) -> str:
             f"{row['train'] / firsts[row['scene']]:.2f}",
             *(number(row, "psnr"), number(row, "ssim", 3), number(row, "samples", 1)),
             *(number(row, key, 0, 100) for key in ("empty", "occluded", "background")),
+            row["seeds"],
         )
         for row in rows
     ]
-    columns += ("empty, %", "occluded, %", "background, %")
+    columns += ("empty, %", "occluded, %", "background, %", "seeds")
     return f"![Seconds and PSNR with one saving off](savings.png)\n\n{markdown(columns, lines)}"
 
 

@@ -321,9 +321,11 @@ def number(row: Row, key: str, digits: int = 2, scale: float = 1) -> str:
     """A value with its standard deviation, for a table; empty where there is none."""
     if row.get(key) is None:
         return ""
-    spread = row.get(f"{key}_std")
-    behind = "" if spread is None else f" ± {scale * spread:.{digits}f}"
-    return f"{scale * row[key]:.{digits}f}{behind}"
+    mean, spread = f"{scale * row[key]:.{digits}f}", row.get(f"{key}_std")
+    if spread is None:
+        return mean
+    nobreak = "\N{NO-BREAK SPACE}"
+    return f"{mean}{nobreak}±{nobreak}{scale * spread:.{digits}f}"
 
 
 def value(row: Row | None, key: str) -> tuple[float, float] | None:

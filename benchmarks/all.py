@@ -108,12 +108,14 @@ def main() -> int:
     parser.add_argument("--measure", action="store_true", help="measure in full, and record")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="sections")
     parser.add_argument("--together", type=int, default=1, help="runs side by side")
+    parser.add_argument("--seeds", type=int, help="at most, fewer than a section has")
     parser.add_argument("--minutes", type=float, help="begin no run after these")
     parser.add_argument("--dnerf", type=Path, help="folder of D-NeRF's scenes")
     parser.add_argument("--real", type=Path, help="folder of real captures")
     args = parser.parse_args()
     DATA.update({name: path for name in ("dnerf", "real") if (path := getattr(args, name))})
     LIMITS["together"] = args.together
+    LIMITS["seeds"] = args.seeds or LIMITS["seeds"]
     if args.minutes is not None:
         LIMITS["until"] = time.monotonic() + 60 * args.minutes
     known = every_section()

@@ -132,14 +132,17 @@ def trainings(
     return Section(settings=settings, measure=measure, **about)
 
 
-LIMITS = {"together": 1, "until": math.inf}
-"""Runs side by side; when to begin no more of them, by the clock of time.monotonic."""
+LIMITS = {"together": 1, "seeds": math.inf, "until": math.inf}
+"""Runs side by side; seeds at most; when to begin no more runs, by the clock of time.monotonic."""
 
 
 def train_all(cases: Sequence[Case], work: Path, *, quick: bool = False) -> list[Row]:
     """Train the runs of all cases that are not finished, and gather them; one row per case."""
-    chosen = [case for case in cases if case.quick] if quick else cases
-    jobs = [(case, seed) for case in chosen for seed in range(1 if quick else case.seeds)]
+    chosen = [case for case in cases if case.quick or not quick]
+    counts = [1 if quick else int(min(case.seeds, LIMITS["seeds"])) for case in chosen]
+    jobs = [
+        (case, seed) for case, count in zip(chosen, counts, strict=True) for seed in range(count)
+    ]
 
     def train(job: tuple[Case, int]) -> Measured | None:
         case, seed = job
@@ -161,7 +164,6 @@ def train_all(cases: Sequence[Case], work: Path, *, quick: bool = False) -> list
     if len(runs) < len(jobs):
         raise OutOfTimeError(f"{len(jobs) - len(runs)} of {len(jobs)} runs are left")
     done = iter(runs)
-    counts = [1 if quick else case.seeds for case in chosen]
     return [
         gathered(case, [next(done) for _ in range(count)])
         for case, count in zip(chosen, counts, strict=True)

@@ -15,11 +15,11 @@ from pathlib import Path
 from statistics import fmean, median
 
 import torch
-from decomposition_data import feature_matrix
 from figures import COLOURS, MARKS, bars, curves, legend, panels, save
 from runner import markdown, run_apart
 from sections import DATA, Row, Section, number, settings_of
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from xplanes.decomposition import robust_pca
 from xplanes.evaluation.runs import TrainedRun, load_run
@@ -159,6 +159,40 @@ STOPS = (2, 4, 6, 8, 10, 12, 14, 16, 20, 25, 32, 40, 50, 64, 80, 100, 128, 160, 
 METHODS = {"svd": "paper's ADMM, full SVD", "admm": "paper's ADMM, fused", "adaptive": "default"}
 BOUND = 1e-3
 Point = tuple[int, float, Tensor]
+
+
+def feature_matrix(frames: int, channels: int = 40, size: int = 64, noise: float = 0.02) -> Tensor:
+    """Feature-like columns, one per frame, with a root mean square near 1. [channels size size, frames]
+
+    A standing texture with slow drift, two moving discs that hide it, and noise on every entry.
+    """
+    generator = torch.Generator().manual_seed(0)
+
+    def smooth(cells: int) -> Tensor:
+        coarse = torch.randn(1, channels, cells, cells, generator=generator)
+        return interpolate(coarse, (size, size), mode="bicubic")[0]
+
+    base = smooth(8) + 0.3 * smooth(24)
+    base /= base.square().mean().sqrt()
+    drifts = [0.05 * smooth(6) for _ in range(3)]
+    colour = 1.5 * torch.randn(channels, 1, 1, generator=generator)
+    rows, columns = torch.meshgrid(*[torch.arange(size) / size] * 2, indexing="ij")
+    video = torch.empty(frames, channels, size, size)
+    for frame in range(frames):
+        time = frame / max(frames - 1, 1)
+        video[frame] = base
+        for order, drift in enumerate(drifts):
+            video[frame] += math.sin(2 * math.pi * 0.7 * time * (order + 1) + order) * drift
+        discs = (
+            (0.5 + 0.3 * math.cos(5 * time), 0.5 + 0.3 * math.sin(5 * time), 0.09, 1.0),
+            (0.2 + 0.6 * time, 0.3 + 0.2 * math.sin(9 * time), 0.06, -1.0),
+        )
+        for x, y, radius, sign in discs:
+            inside = (columns - x) ** 2 + (rows - y) ** 2 < radius**2
+            shading = 1 + 0.2 * torch.sin(20 * (columns - x))
+            video[frame] = torch.where(inside, sign * colour * shading, video[frame])
+    video += noise * torch.randn(video.shape, generator=generator)
+    return video.flatten(1).mT.contiguous()
 
 
 def plain(matrix: Tensor, budget: float) -> Iterator[Point]:

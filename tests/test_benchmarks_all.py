@@ -18,7 +18,7 @@ def every(monkeypatch):
     monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     yield importlib.import_module("all")
-    for name in (*MODULES, "decomposition_data"):
+    for name in MODULES:
         sys.modules.pop(name, None)
 
 

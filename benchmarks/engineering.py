@@ -162,7 +162,7 @@ Point = tuple[int, float, Tensor]
 
 
 def feature_matrix(frames: int, channels: int = 40, size: int = 64, noise: float = 0.02) -> Tensor:
-    """Feature-like columns, one per frame, with a root mean square near 1. [channels size size, frames]
+    """One column of features per frame, root mean square near 1. [channels size size, frames]
 
     A standing texture with slow drift, two moving discs that hide it, and noise on every entry.
     """

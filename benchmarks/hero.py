@@ -29,6 +29,9 @@ from xplanes.training.clock import off_clock, training_seconds
 from xplanes.training.module import RadianceModule
 
 SCENE, SIZE = "excavator", 256
+RENDERED, BOX = 336, (40, 80, 296, 336)
+"""Pixels that are rendered, and what is shown of them: where the scene is."""
+
 CAPTION, GAP, QUALITY = 34, 6, 60
 """Pixels of the caption and between the pictures; quality of WebP."""
 
@@ -54,7 +57,9 @@ class Film(Callback):
     def camera(self) -> PosedCamera:
         """The camera of the next frame, which orbits by a third of a turn."""
         pose = camera_at(25 + 120 * self._next / self.frames, 24)
-        return PosedCamera(pose, 0.5 * SIZE / math.tan(0.5 * CAMERA_ANGLE_X), SIZE, SIZE)
+        return PosedCamera(
+            pose, 0.5 * RENDERED / math.tan(0.5 * CAMERA_ANGLE_X), RENDERED, RENDERED
+        )
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.take(trainer, pl_module)
@@ -92,9 +97,9 @@ def truth(film: Film, place: int, time: float) -> Image.Image:
     """The scene as the camera of a frame sees it, on white."""
     film._next = place
     pose = film.camera().camera_to_world
-    picture = Image.fromarray(render_image(build_demo_scene(SCENE, 0).pose(time), pose, SIZE))
+    picture = Image.fromarray(render_image(build_demo_scene(SCENE, 0).pose(time), pose, RENDERED))
     white = Image.new("RGBA", picture.size, "white")
-    return Image.alpha_composite(white, picture).convert("RGB")
+    return Image.alpha_composite(white, picture).convert("RGB").crop(BOX)
 
 
 def beside(true: Image.Image, field: Image.Image, words: Sequence[str]) -> Image.Image:
@@ -129,7 +134,10 @@ def main() -> None:
     film, sheets, words = Film(args.frames), [], ""
     for path in sorted((folder / "film").glob("*.png")):
         place, time, seconds = path.stem.split("_")
-        true, field = truth(film, int(place), float(time)), Image.open(path).convert("RGB")
+        true, field = (
+            truth(film, int(place), float(time)),
+            Image.open(path).convert("RGB").crop(BOX),
+        )
         words = f"{float(seconds):.0f} s, {psnr(true, field):.1f} dB"
         sheets.append(beside(true, field, ("truth", words)))
     durations = [DURATION] * (len(sheets) - 1) + [HELD]

@@ -1,199 +1,157 @@
-"""The results below docs/results, made again where they are stale: some hours on two cores.
+"""The pages of results: drawn from their records in a minute, or measured again.
 
-    python benchmarks/all.py [--lego FOLDER] [--list] [--only NAME ...]
+    python benchmarks/all.py                          draw all sections again, from their records
+    python benchmarks/all.py --list                   say which sections are stale, and why
+    python benchmarks/all.py --check                  measure a part of each, and compare
+    python benchmarks/all.py --measure --only NAME    measure sections in full, and record them
 
-A result is stale if it was made with another version, on another kind of machine, or before the
-code or the settings that it measures changed; comments and docstrings do not count. --list says
-which are and why; --only makes those named, stale or not. Needs the extra `dev` and D-NeRF's lego
-(`xplanes download dnerf`). One script that fails does not stop the others, and one that was
-interrupted goes on where it stopped if nothing has changed. Nothing else should run.
+A section stands between two comments of README.md or of a page below docs/results; the words
+around it are written by hand. Its record is docs/results/records/NAME.json: what was measured, with
+which settings, when and on what. It is stale if the settings or inputs of what it measures have
+changed since. That code has changed is no reason: --check, an hour and a half on two cores with
+--together 2, sees whether it matters. A measurement that was interrupted goes on where it stopped.
+D-NeRF's lego (`xplanes download dnerf`) and real captures lie below --dnerf and --real. Needs the
+extra `dev`; nothing else should run.
 """
 
+import os
+
+from xplanes.process import defaults
+
+os.environ.update(defaults(os.environ))
+os.environ["OMP_NUM_THREADS"] = "1"
+
 import argparse
-import ast
-import hashlib
-import json
+import importlib
 import re
 import shutil
-import subprocess
 import sys
 import time
-from collections.abc import Iterable
-from functools import cache
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from runner import RESULTS, lego, machine
+import sections
+from runner import RESULTS, markdown
+from sections import DATA, LIMITS, WORK, Row, Section, read_record
 
-from xplanes import __version__
 from xplanes.files import write_text
 
-HERE = Path(__file__).resolve().parent
-MADE = RESULTS / "made.json"
-WORK = Path("outputs/benchmarks")
-"""Scripts keep finished runs below it, each in a folder of its name."""
+MODULES = ("baselines", "ablations", "paper", "engineering")
+"""Modules beside this one, with their SECTIONS."""
 
-TRAINING = ("conf", *(f"xplanes/{part}" for part in ("fields", "models", "rendering", "training")))
-START = ("conf", *(f"xplanes/{part}" for part in ("decomposition", "lrm", "preparation")))
-
-PARTS: dict[str, tuple[str, ...]] = {
-    "where_time_goes": TRAINING,
-    "lego_curves": (*TRAINING, "xplanes/baselines", "xplanes/scenes"),
-    "skips": (*TRAINING, "xplanes/scenes"),
-    "rendering": ("xplanes/fields", "xplanes/rendering"),
-    "ray_drawing": ("xplanes/scenes",),
-    "gaussian_rasteriser": ("xplanes/baselines/gaussians",),
-    "gaussians": (*TRAINING, "xplanes/baselines", "xplanes/preparation"),
-    "captures": (*TRAINING, "xplanes/scenes"),
-    "initialisation": (*TRAINING, *START[1:]),
-    "lrm_quality": (*TRAINING, *START[1:], "xplanes/synthetic/pretraining"),
-    "stages": START,
-    "pareto": (*TRAINING, *START[1:], "xplanes/baselines"),
-    "lrm_sizes": ("xplanes/lrm",),
-    "decomposition_speed": ("xplanes/decomposition",),
-    "decomposition_stress": ("xplanes/decomposition",),
-    "conversion_options": ("xplanes/fields", "xplanes/decomposition"),
-    "paper": (*TRAINING, *START[1:], "xplanes/baselines"),
-    "rank_curve": START,
-    "stability": (*TRAINING, "xplanes/decomposition", "tests/stress"),
-    "faults": ("xplanes", "tests/faults"),
-}
-"""What each script measures."""
+BLOCK = re.compile(r"(<!-- measured: (\w+) -->\n).*?(?=<!-- end -->)", re.DOTALL)
+"""What stands between the comments of a section."""
 
 
-def scripts(folder: Path) -> dict[str, list[list[str]]]:
-    """The arguments of each script's runs, by its name; ``folder`` is that of lego."""
-    scene = ["--lego", str(folder)]
-    given = {name: [scene] for name in ("lego_curves", "rendering")}
-    # CPU seconds: runs side by side do not disturb one another.
-    for name in ("skips", "initialisation", "gaussians", "pareto"):
-        given[name] = [[*scene, "--together", "2"]]
-    own = "plain,world,world_tiny,masks,masks_tiny,rough_world,rough_field,thin_fog,even_rays"
-    several = ["--together", "2", "--seeds", "3"]
-    given["captures"] = [
-        [*several, "--scenes", "phone,rig", "--variants", own],
-        [
-            *("--together", "2", "--seconds", "30", "--variants", "world,kplanes,tineuvox_s"),
-            *("--scenes", "phone_test,rig_test,dark_test,topology_test,occlusion_test"),
-            *("--name", "captures_models", "--title", "Test scenes in three models"),
-        ],
-    ]
-    for name in ("lrm_quality", "paper"):
-        given[name] = [["--together", "2"]]
-    given["ray_drawing"] = [["--gigabytes", "22"]]  # More than the system keeps in memory.
-    apart = "preparation.cache=null"
-    given["where_time_goes"] = [[apart], ["--name", "lego", apart, *lego(folder.resolve())]]
-    return {name: given.get(name, [[]]) for name in PARTS}
+def every_section() -> dict[str, Section]:
+    modules = [importlib.import_module(name) for name in MODULES]
+    return {section.name: section for module in modules for section in module.SECTIONS}
 
 
-def digest(files: Iterable[Path]) -> str:
-    """A number that changes with code and settings, but not with comments and docstrings."""
-    found = hashlib.sha256()
-    for file in files:
-        text = file.read_text(encoding="utf-8")
-        if file.suffix == ".py":
-            text = ast.dump(_without_docstrings(ast.parse(text)))
-        else:
-            lines = (line.split("  #")[0].rstrip() for line in text.splitlines())
-            text = "\n".join(line for line in lines if line and not line.startswith("#"))
-        found.update(f"{file.name}\0{text}\0".encode())
-    return found.hexdigest()[:16]
+def summaries() -> dict[str, Callable[[], str]]:
+    """Tables of several records, by the name in their comments."""
+    modules = [importlib.import_module(name) for name in MODULES]
+    return {
+        name: table
+        for module in modules
+        for name, table in getattr(module, "SUMMARIES", {}).items()
+    }
 
 
-def _without_docstrings(tree: ast.AST) -> ast.AST:
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list):
-            kept = [line for line in body if not _is_text(line)]
-            node.body = kept  # type: ignore[attr-defined]
-    return tree
+def pages() -> list[Path]:
+    """Files that hold sections."""
+    return [RESULTS.parent.parent / "README.md", *sorted(RESULTS.glob("*.md"))]
 
 
-def _is_text(line: ast.stmt) -> bool:
+def draw(known: dict[str, Section], chosen: set[str]) -> None:
+    """Write the chosen sections, and all summaries, into their pages."""
+    tables = summaries()
+    for path in pages():
+        text = path.read_text(encoding="utf-8")
+
+        def drawn(match: re.Match[str]) -> str:
+            if match[2] in tables:
+                return f"{match[1]}{tables[match[2]]()}\n"
+            if match[2] not in chosen:
+                return match[0]
+            return match[1] + block(known[match[2]])
+
+        if (new := BLOCK.sub(drawn, text)) != text:
+            write_text(path, new)
+
+
+def block(section: Section) -> str:
+    """What a record shows: whether it is stale, figure and table, and how it was made."""
+    record = read_record(section.name)
+    if record is None:
+        return "Not measured yet.\n"
+    reason = sections.why_stale(section)
+    stale = f"**Stale**: {reason}.\n\n" if reason else ""
+    made = made_words(section.name, record["made"])
+    return f"{stale}{section.show(record['rows'])}\n\n{made}\n"
+
+
+def made_words(name: str, made: Row) -> str:
+    """How, when and on what a section was measured."""
+    when = ", ".join(str(made[key]) for key in ("date", "commit") if made.get(key))
+    hours = f", {made['hours']:g} hours of a core" if made.get("hours") else ""
     return (
-        isinstance(line, ast.Expr)
-        and isinstance(line.value, ast.Constant)
-        and isinstance(line.value.value, str)
+        f"*Version {made['version']}{f' ({when})' if when else ''}; {made['machine']}{hours}. "
+        f"`python benchmarks/all.py --measure --only {name}`*"
     )
-
-
-@cache
-def digest_of(part: str) -> str:
-    """The `digest` of a file, or of the code and settings in a folder of the repository."""
-    path = HERE.parent / part
-    found = [file for ending in ("*.py", "*.yaml") for file in sorted(path.rglob(ending))]
-    return digest([path] if path.is_file() else found)
-
-
-def state_of(name: str) -> dict[str, Any]:
-    """Version, machine and measured code as they are now."""
-    parts = {part: digest_of(part) for part in (*PARTS[name], f"benchmarks/{name}.py")}
-    return {"version": __version__, "machine": kind_of(machine()), "parts": parts}
-
-
-def kind_of(machine: str) -> str:
-    """A machine without how many of its cores were used, which a script says itself."""
-    return re.sub(r"^\d+ of ", "", machine)
-
-
-def recorded() -> dict[str, dict[str, Any]]:
-    """What `state_of` was when each script last made its results."""
-    return json.loads(MADE.read_text(encoding="utf-8")) if MADE.is_file() else {}
-
-
-def why_stale(now: dict[str, Any], then: dict[str, Any] | None) -> str:
-    """What has changed since a result was made, in words; empty if nothing has."""
-    if then is None:
-        return "not recorded"
-    changes = [f"made with {then['version']}"] * (then["version"] != now["version"])
-    changes += [f"made on {then['machine']}"] * (kind_of(then["machine"]) != now["machine"])
-    parts = [name for name, code in now["parts"].items() if then["parts"].get(name) != code]
-    changes += [f"changed since: {', '.join(parts)}"] * bool(parts)
-    return "; ".join(changes)
-
-
-def keep_runs_of(state: dict[str, Any], folder: Path) -> None:
-    """Forget the runs in a script's folder, unless they were made in this very state."""
-    file = folder / "state.json"
-    if not file.is_file() or json.loads(file.read_text(encoding="utf-8")) != state:
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        write_text(file, json.dumps(state))
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--lego", type=Path, default=Path("data/dnerf/lego"))
-    parser.add_argument("--list", action="store_true", help="say what is stale, and make nothing")
-    parser.add_argument("--only", nargs="+", choices=list(PARTS))
+    parser.add_argument("--list", action="store_true", help="what is stale, and why")
+    parser.add_argument("--check", action="store_true", help="measure one seed of a part")
+    parser.add_argument("--measure", action="store_true", help="measure in full, and record")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="sections")
+    parser.add_argument("--together", type=int, default=1, help="runs side by side")
+    parser.add_argument("--seeds", type=int, help="at most, fewer than a section has")
+    parser.add_argument("--minutes", type=float, help="begin no run after these")
+    parser.add_argument("--dnerf", type=Path, help="folder of D-NeRF's scenes")
+    parser.add_argument("--real", type=Path, help="folder of real captures")
     args = parser.parse_args()
-    made = recorded()
-    stale = {name: why_stale(state_of(name), made.get(name)) for name in PARTS}
-    for name, reason in stale.items():
-        print(f"{name:<22}{reason or 'up to date'}")
+    DATA.update({name: path for name in ("dnerf", "real") if (path := getattr(args, name))})
+    LIMITS["together"] = args.together
+    LIMITS["seeds"] = args.seeds or LIMITS["seeds"]
+    if args.minutes is not None:
+        LIMITS["until"] = time.monotonic() + 60 * args.minutes
+    known = every_section()
+    if unknown := set(args.only or ()) - set(known):
+        parser.error(f"--only {' '.join(sorted(unknown))}: must be of {', '.join(known)}")
+    chosen = {name: known[name] for name in known if args.only is None or name in args.only}
     if args.list:
+        for name, section in chosen.items():
+            print(f"{name:<16}{sections.why_stale(section) or 'up to date'}")
         return 0
-    wanted = args.only or [name for name, reason in stale.items() if reason]
-    chosen = {name: runs for name, runs in scripts(args.lego).items() if name in wanted}
-    needs_lego = any("lego" in " ".join(line) for runs in chosen.values() for line in runs)
-    if needs_lego and not args.lego.is_dir():
-        parser.error(f"--lego {args.lego}: there is no such folder; xplanes download dnerf")
     failed = []
-    for name, runs in chosen.items():
-        state, began = state_of(name), time.perf_counter()
-        keep_runs_of(state, WORK / name)
-        script = [sys.executable, str(HERE / f"{name}.py")]
-        codes = [subprocess.run([*script, *line], check=False).returncode for line in runs]
-        print(f"{name}: {time.perf_counter() - began:.0f} s, exit codes {codes}", flush=True)
-        if any(codes):
-            failed.append(name)
-            continue
-        shutil.rmtree(WORK / name)
-        made = recorded() | {name: state}  # Another process may have made other results.
-        write_text(MADE, json.dumps(dict(sorted(made.items())), indent=1) + "\n")
+    if args.check or args.measure:
+        failed = [name for name, each in chosen.items() if not measured(each, quick=args.check)]
+    if not args.check:
+        draw(known, set(chosen))
     if failed:
-        print(f"failed: {', '.join(failed)}")
+        print(f"failed, changed or not finished: {', '.join(failed)}")
     return bool(failed)
+
+
+def measured(section: Section, *, quick: bool) -> bool:
+    """Measure a section, or a part to be compared with its record; whether that went well."""
+    work = WORK / f"{section.name}{'_check' if quick else ''}"
+    try:
+        if quick:
+            found = sections.drift(section, section.measure(work, True))
+            print(markdown(("case", "quantity", "record", "now", ""), found), flush=True)
+            if any(words for *_, words in found):
+                return False
+        else:
+            sections.measure(section, work)
+    except (RuntimeError, sections.OutOfTimeError, OSError) as error:
+        print(f"{section.name}: {error}", flush=True)
+        return False
+    shutil.rmtree(work, ignore_errors=True)
+    return True
 
 
 if __name__ == "__main__":

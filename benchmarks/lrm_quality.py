@@ -96,7 +96,7 @@ def across(runs: list[list[Measured]], first: bool) -> tuple[float, float]:
 
 def plot(starts: list[Start], trained: list[tuple[float, float]]) -> None:
     """PSNR after training against the LRM's own; random initialisation as a line."""
-    figure, (axes,) = panels(1, 6, 3.8)
+    figure, (axes,) = panels(1, 3.8)
     axes.margins(x=0.1)
     for number, (start, (mean, spread)) in enumerate(zip(starts, trained, strict=True)):
         if start.scores is None:

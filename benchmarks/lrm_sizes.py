@@ -1,9 +1,9 @@
-"""Every published LRM at full size, with random weights: seconds and memory to load and encode.
+"""A published LRM at full size, with random weights: seconds and memory to load and encode.
 
-    python benchmarks/lrm_sizes.py
+    python benchmarks/lrm_sizes.py write|load NAME FILE
 
-Writes results/lrm_sizes.md beside this file. Each model is written as a checkpoint under its
-published names, then loaded strictly and shown one picture, in a process of its own.
+Writes a checkpoint under its published names, or loads it strictly and encodes one image. Prints
+JSON in its last line; each in a process of its own, so that memory is that of one model.
 """
 
 import os
@@ -15,46 +15,32 @@ os.environ.update(defaults(os.environ))
 import argparse
 import json
 import resource
-import subprocess
-import sys
-import tempfile
 import time
 from pathlib import Path
 
 import torch
-from runner import RESULTS, command, machine, markdown
 from safetensors.torch import save_file
 
-from xplanes.files import write_text
 from xplanes.lrm.checkpoint import build, load
 from xplanes.lrm.config import PUBLISHED, parse_config, published_config
 from xplanes.synthetic.pretraining.run import published_state
 
-COLUMNS = (
-    "model",
-    "parameters",
-    "file, GB",
-    "load s",
-    "encode s",
-    "triplane",
-    "peak GB",
-)
 
-
-def write_random(name: str, path: Path) -> int:
-    """A checkpoint of the model's published tensors; returns how many parameters it has."""
+def write(name: str, path: Path) -> dict[str, object]:
+    """Write a checkpoint of the model's published tensors."""
     model = build(parse_config(published_config(name)))
     shapes = {key: value.shape for key, value in published_state(model).items()}  # type: ignore[arg-type]
     generator = torch.Generator().manual_seed(0)
     save_file(
         {key: 0.02 * torch.randn(shape, generator=generator) for key, shape in shapes.items()}, path
     )
-    return sum(parameter.numel() for parameter in model.parameters())
+    parameters = sum(parameter.numel() for parameter in model.parameters())
+    return {"parameters": parameters, "file": path.stat().st_size}
 
 
 @torch.no_grad()
 def try_out(name: str, path: Path) -> dict[str, object]:
-    """Load a checkpoint and show it one picture."""
+    """Load a checkpoint and encode one image."""
     began = time.perf_counter()
     model = load({"architecture": name}, path)
     loaded = time.perf_counter()
@@ -73,41 +59,12 @@ def try_out(name: str, path: Path) -> dict[str, object]:
 
 
 def main() -> None:
-    if len(sys.argv) == 3:
-        print(json.dumps(try_out(sys.argv[1], Path(sys.argv[2]))))
-        return
-    argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0]).parse_args()
-    rows = []
-    for name in PUBLISHED:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "model.safetensors"
-            count = write_random(name, path)
-            size = path.stat().st_size
-            child = [sys.executable, __file__, name, str(path)]
-            told = subprocess.run(child, check=True, capture_output=True, text=True).stdout
-        found = json.loads(told)
-        rows.append(
-            (
-                name,
-                f"{count / 1e6:.0f} M",
-                f"{size / 1e9:.2f}",
-                f"{found['load']:.1f}",
-                f"{found['encode']:.1f}",
-                " x ".join(map(str, found["shape"])),
-                f"{found['peak'] / 1e9:.1f}",
-            )
-        )
-        print(*rows[-1], flush=True)
-    page = f"""# Published LRMs at full size
-
-Random weights in float32, saved as safetensors without unused tensors
-(OpenLRM 1.0 and TripoSR are published as pickles), one image of 512 pixels;
-{machine()}. The file is memory-mapped, so part of it
-is read while the image is encoded. `{command()}`
-
-{markdown(COLUMNS, rows)}
-"""
-    write_text(RESULTS / "lrm_sizes.md", page)
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("what", choices=("write", "load"))
+    parser.add_argument("name", choices=list(PUBLISHED))
+    parser.add_argument("file", type=Path)
+    args = parser.parse_args()
+    print(json.dumps((write if args.what == "write" else try_out)(args.name, args.file)))
 
 
 if __name__ == "__main__":

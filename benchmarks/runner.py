@@ -10,7 +10,6 @@ import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import stdev
 from typing import Any
 
 import torch
@@ -78,11 +77,6 @@ def markdown(columns: tuple[str, ...], rows: list[tuple]) -> str:
     lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
     lines += ["| " + " | ".join(map(str, row)) + " |" for row in rows]
     return "\n".join(lines)
-
-
-def spread(values: list[float], digits: int = 2) -> str:
-    """The standard deviation of several seeds, as it is written behind their mean."""
-    return f" ± {stdev(values):.{digits}f}" if len(values) > 1 else ""
 
 
 def lego(folder: Path) -> list[str]:

@@ -1,10 +1,10 @@
 """Where a run's wall time goes, stage by stage, from the start of Python to its last line.
 
-    python benchmarks/where_time_goes.py [--name default] [key=value ...]
+    python benchmarks/where_time_goes.py [key=value ...]
 
-Writes results/time_NAME.md beside this file. The functions of each stage are timed as they are
-called, without what they call in other stages; what no stage claims is shown too. The first run
-after an installation compiles loops and renders the scene, which counts: run it twice.
+Prints JSON in its last line. The functions of each stage are timed as they are called, without
+what they call in other stages; what no stage claims is shown too. The first run after an
+installation compiles loops and renders the scene, which counts: run it twice.
 """
 
 import os
@@ -17,6 +17,7 @@ os.environ.update(defaults(os.environ))
 import argparse
 import functools
 import importlib
+import json
 import tempfile
 from collections import defaultdict
 from pathlib import Path
@@ -93,13 +94,10 @@ class Watch:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--name", default="default")
-    parser.add_argument("overrides", nargs="*")
+    parser.add_argument("overrides", nargs="*", default=["preparation.cache=null"])
     args = parser.parse_args()
 
-    from runner import RESULTS, command, machine, markdown, measure
-
-    from xplanes.files import write_text
+    from runner import measure
 
     watch = Watch()
     for stage in STAGES:
@@ -107,32 +105,14 @@ def main() -> None:
     imported = time.perf_counter() - BEGAN
     with tempfile.TemporaryDirectory() as work:
         metrics = measure(args.overrides, Path(work)).metrics
-    whole = time.perf_counter() - BEGAN
     found = {"imports": imported, **watch.seconds}
-    found["not accounted for"] = whole - sum(found.values())
+    found["not accounted for"] = time.perf_counter() - BEGAN - sum(found.values())
+    about = {"steps": metrics["step"], "psnr": metrics["test"]["psnr"]}
     rows = [
-        (name, f"{spent:.2f}", f"{100 * spent / whole:.1f}%", watch.calls.get(name, ""))
-        for name, spent in sorted(found.items(), key=lambda item: -item[1])
+        {"case": name, "seconds": spent, "calls": watch.calls.get(name), **about}
+        for name, spent in found.items()
     ]
-    from figures import bars, panels, save
-
-    figure, (axes,) = panels(1, 7, 0.22 * len(rows) + 0.6)
-    bars(axes, [row[0] for row in rows], {"": [float(row[1]) for row in rows]})
-    axes.set_xlabel("seconds")
-    save(figure, f"time_{args.name}")
-    page = f"""# Where the time goes: {args.name}
-
-    {command()}
-
-{whole:.1f} s in all, {metrics["step"]} steps, PSNR {metrics["test"]["psnr"]:.2f}; {machine()}.
-Times exclude nested stages.
-
-![Seconds of each stage](time_{args.name}.png)
-
-{markdown(COLUMNS, rows)}
-"""
-    write_text(RESULTS / f"time_{args.name}.md", page)
-    print(page)
+    print(json.dumps({"stages": rows}))
 
 
 if __name__ == "__main__":

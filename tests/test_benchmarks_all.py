@@ -1,97 +1,156 @@
-"""Which results are stale."""
+"""Pages of results: they show what the records say, and say when a record is stale."""
 
 import importlib
-import json
-import subprocess
+import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
+MODULES = ("all", "sections", "runner", "figures", "baselines", "ablations", "paper", "engineering")
 
 
 @pytest.fixture
 def every(monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
     monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
     yield importlib.import_module("all")
-    for name in ("all", "runner"):
+    for name in MODULES:
         sys.modules.pop(name, None)
 
 
-def test_only_code_and_settings_make_a_result_stale(every, tmp_path):
-    code, settings = tmp_path / "code.py", tmp_path / "settings.yaml"
-
-    def digest(text: str, values: str) -> str:
-        code.write_text(text)
-        settings.write_text(values)
-        return every.digest([code, settings])
-
-    first = digest('"""Words."""\ndef f(x):\n    """More."""\n    return 2 * x\n', "a: 1  # One.\n")
-    words = digest("# Others.\ndef f( x ):\n    return (2*x)\n", "# Else.\n\na: 1\n")
-    assert words == first
-    for text, values in (
-        ("def f(x):\n    return 3 * x\n", "a: 1\n"),
-        ("def f(x):\n    return 2 * x\n", "a: 2\n"),
-    ):
-        assert digest(text, values) != first
+@pytest.fixture
+def records(every, monkeypatch, tmp_path):
+    monkeypatch.setattr(every.sections, "RECORDS", tmp_path)
+    return every.sections
 
 
-def test_what_has_changed_is_said(every):
-    now = {"version": "2", "machine": "big", "parts": {"xplanes/lrm": "a", "conf": "b"}}
-    assert every.why_stale(now, None) == "not recorded"
-    assert every.why_stale(now, dict(now)) == ""
-    then = {"version": "1", "machine": "small", "parts": {"xplanes/lrm": "a", "conf": "c"}}
-    assert every.why_stale(now, then) == "made with 1; made on small; changed since: conf"
-    assert "conf" in every.why_stale(now, {**now, "parts": {"xplanes/lrm": "a"}})
-    assert every.kind_of("1 of 2 cores, small") == every.kind_of("2 cores, small")
-    cores = {**now, "machine": "2 cores, small"}
-    assert every.why_stale(cores, {**cores, "machine": "1 of 2 cores, small"}) == ""
-    assert every.why_stale(cores, {**cores, "machine": "1 of 4 cores, small"}) != ""
+def section(sections: Any, settings: dict, rows: list[dict], **about: Any) -> Any:
+    return sections.Section(
+        name="some",
+        settings=lambda: settings,
+        measure=lambda work, quick: rows,
+        show=lambda rows: f"{len(rows)} rows",
+        **about,
+    )
 
 
-def test_printed_commands_name_no_folder(every):
+def test_a_record_is_stale_when_settings_of_what_it_measured_have_changed(records) -> None:
+    case = {"model.name": "six_planes", "model.loss.opacity": 0.1}
+    rows = [{"case": "one", "psnr": 1 / 3}, {"case": "two", "psnr": 2.0}]
+    old = section(records, {"one": case, "two": {**case, "seeds": 3}}, rows)
+    assert records.why_stale(old) == "never measured"
+    records.write_record("some", {"version": "1"}, old.settings(), rows)
+    assert records.read_record("some") == {
+        "made": {"version": "1"},
+        "settings": old.settings(),
+        "rows": [{"case": "one", "psnr": 0.33333}, rows[1]],
+    }
+    assert records.why_stale(old) == ""
+    new = {"one": {**case, "model.loss.opacity": 0.2}, "two": old.settings()["two"], "three": case}
+    words = records.why_stale(section(records, new, rows))
+    assert words == "model.loss.opacity went from 0.1 to 0.2, three is new"
+    records.write_record("some", {"version": "1"}, {}, rows)
+    assert "version 1" in records.why_stale(old)
+
+
+def test_what_does_not_change_a_measurement_is_not_among_its_settings(records) -> None:
+    def settings(*changes: str) -> dict:
+        return records.settings_of(("data.scene=balls", *changes))
+
+    same = ("data.root=/there", "preparation.cache=null", "callbacks.checkpoints.every=1")
+    assert settings(*same, "logger=none", "trainer.enable_progress_bar=false") == settings()
+    for changed in ("model.loss.opacity=0.2", "lrm=none", "trainer.max_steps=5", "data.views=5"):
+        assert settings(changed) != settings(), changed
+
+
+def test_a_repeated_measurement_is_compared_with_its_record(records) -> None:
+    then = [{"case": "one", "psnr": 20.0, "psnr_std": 0.5}, {"case": "two", "psnr": 20.0}]
+    records.write_record("some", {"version": "1"}, {}, then)
+    now = [{"case": "one", "psnr": 21.4}, {"case": "two", "psnr": 21.4}, {"case": "three"}]
+    found = records.drift(section(records, {}, now), now)
+    assert [line[:4] for line in found] == [
+        ("one", "psnr", "20", "21.4"),
+        ("two", "psnr", "20", "21.4"),
+    ]
+    assert [bool(line[4]) for line in found] == [False, True]
+
+
+def test_rows_have_means_and_deviations_and_wait_for_all_runs(
+    records, monkeypatch, tmp_path
+) -> None:
+    def run(overrides: list[str], folder: Path, script: Path) -> Any:
+        seed = int(overrides[-1].removeprefix("seed="))
+        seconds = {"prepare": {"fill": 1.0}, "train": 2.0, "total": 4.0}
+        metrics = {
+            "test": {"psnr": 20.0 + seed, "ssim": 0.5},
+            "seconds": seconds,
+            "step": 10,
+            "samples_per_ray": 3.0,
+            "skipped": {"empty": 0.5},
+            "parameters": 7,
+            "peak_memory_bytes": 1e9,
+        }
+        curve = [{"seconds": f"{t}", "step": f"{t}", "psnr": f"{seed + t}"} for t in (0, 1)]
+        return records.Measured(metrics, curve)
+
+    monkeypatch.setattr(records, "run_apart", run)
+    cases = [records.Case("a", ("lrm=none",), quick=True), records.Case("b", ("lrm=none",), 1)]
+    first, second = records.train_all(cases, tmp_path)
+    assert (first["psnr"], first["psnr_std"], first["seeds"]) == (21, 1, 3)
+    assert (first["first"], first["prepare"], first["cpu"], first["empty"]) == (1, 1, 12, 0.5)
+    assert first["curve"] == [[0, 1, 1], [1, 2, 1]]
+    assert (second["psnr"], second.get("psnr_std")) == (20, None)
+    assert [row["case"] for row in records.train_all(cases, tmp_path, quick=True)] == ["a"]
+    monkeypatch.setitem(records.LIMITS, "until", 0)
+    with pytest.raises(records.OutOfTimeError, match="4 of 4"):
+        records.train_all(cases, tmp_path)
+
+
+def test_measuring_writes_a_record_and_its_page(every, records, monkeypatch, tmp_path) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text("Words.\n\n<!-- measured: some -->\nOld.\n<!-- end -->\n\nMore.\n")
+    made = section(records, {"one": {"a": 1}}, [{"case": "one", "psnr": 20.0, "cpu": 360}])
+    monkeypatch.setattr(every, "every_section", lambda: {"some": made})
+    monkeypatch.setattr(every, "summaries", dict)
+    monkeypatch.setattr(every, "pages", lambda: [page])
+    monkeypatch.setattr(sys, "argv", ["all.py"])
+    assert every.main() == 0
+    assert "\nNot measured yet.\n<!-- end -->\n\nMore." in page.read_text()
+    monkeypatch.setattr(sys, "argv", ["all.py", "--measure", "--only", "some"])
+    assert every.main() == 0
+    text = page.read_text()
+    assert "Words.\n\n<!-- measured: some -->\n1 rows\n\n*Version" in text
+    assert "0.1 hours" in text
+    monkeypatch.setattr(sys, "argv", ["all.py", "--check"])
+    assert every.main() == 0
+    assert page.read_text() == text
+
+
+STALE = re.compile(r"^\*\*Stale\*\*: .*\n\n", re.MULTILINE)
+
+
+def test_pages_show_what_the_records_say(every, monkeypatch) -> None:
+    monkeypatch.setattr(every.sections, "why_stale", lambda section: "")
+    known, tables, seen = every.every_section(), every.summaries(), []
+    for name in every.MODULES:
+        monkeypatch.setattr(sys.modules[name], "save", lambda figure, name: None)
+    for page in every.pages():
+        text = page.read_text(encoding="utf-8")
+        for match in every.BLOCK.finditer(text):
+            seen.append(match[2])
+            shown = STALE.sub("", match[0].removeprefix(match[1]))
+            table = tables.get(match[2])
+            expected = f"{table()}\n" if table else every.block(known[match[2]])
+            assert shown == expected, f"{match[2]}: run benchmarks/all.py"
+    assert sorted(seen) == sorted([*known, *tables])
+
+
+def test_printed_commands_name_no_folder(every) -> None:
     words = ["--lego", "/there/lego", "data.root=/there", "data.scene=lego", "--seeds", "3"]
     printed = ["--lego", "FOLDER", "data.root=FOLDER", "data.scene=lego", "--seeds", "3"]
     assert sys.modules["runner"].without_folders(words) == printed
-
-
-def test_every_part_and_script_exists(every):
-    for name, parts in every.PARTS.items():
-        assert (FOLDER / f"{name}.py").is_file(), name
-        for part in parts:
-            assert (FOLDER.parent / part).is_dir(), part
-    assert list(every.scripts(Path("lego"))) == list(every.PARTS)
-
-
-def test_what_is_made_is_recorded_and_what_fails_is_not(every, tmp_path, monkeypatch, capsys):
-    ran = []
-    monkeypatch.chdir(tmp_path)
-
-    def execute(line: list[str], check: bool) -> subprocess.CompletedProcess:
-        ran.append(Path(line[1]).stem)
-        (every.WORK / ran[-1] / "run").touch()
-        return subprocess.CompletedProcess(line, int(ran[-1] == "stages"))
-
-    monkeypatch.setattr(every, "MADE", tmp_path / "made.json")
-    monkeypatch.setattr(every, "machine", lambda: "this one")
-    monkeypatch.setattr(every.subprocess, "run", execute)
-    monkeypatch.setattr(sys, "argv", ["all.py", "--only", "stages", "ray_drawing"])
-    assert every.main() == 1
-    assert ran == ["ray_drawing", "stages"]
-    assert list(json.loads((tmp_path / "made.json").read_text())) == ["ray_drawing"]
-    # What a finished script kept is gone; one that failed goes on with it, unless code changed.
-    assert not (every.WORK / "ray_drawing").exists()
-    kept = every.WORK / "stages" / "run"
-    every.keep_runs_of(every.state_of("stages"), kept.parent)
-    assert kept.is_file()
-    every.keep_runs_of({**every.state_of("stages"), "version": "0"}, kept.parent)
-    assert not kept.exists()
-    capsys.readouterr()
-    monkeypatch.setattr(sys, "argv", ["all.py", "--list"])
-    assert every.main() == 0
-    listed = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
-    assert listed["ray_drawing"] == "up to date"
-    assert listed["stages"] == "not recorded"
-    assert ran == ["ray_drawing", "stages"]

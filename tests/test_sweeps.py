@@ -2,8 +2,15 @@
 
 import functools
 import itertools
+import os
 import shlex
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 import torch
@@ -14,12 +21,14 @@ from omegaconf import DictConfig, OmegaConf
 from hydra_plugins.xplanes import ALIASES
 from tests.balls import ball_scene
 from tests.test_contracts import built, small
+from tests.training.runs import SMALL as SMALL_RUN
 from tests.warm import train
 from xplanes.config import CONF, compose_plain, group_options
 from xplanes.errors import ConfigError, LRMError
 from xplanes.evaluation.published import check_published, read_published
 from xplanes.evaluation.sheet import check_what
 from xplanes.experiment import Experiment
+from xplanes.files import read_json
 from xplanes.launch import FORMER, prepare
 from xplanes.sweeps import SMALL, jobs, look_ahead
 from xplanes.training.losses import loss_terms
@@ -325,3 +334,36 @@ def test_a_sweep_says_how_long_it_takes_and_its_jobs_go_on(scenes, tmp_path):
     train(f"resume={runs[0].parent}", "trainer.max_steps=4", cwd=tmp_path)
     steps = [yaml.safe_load(path.read_text())["step"] for path in runs]
     assert steps == [4, 3, 3, 3]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not find_spec("submitit") or not find_spec("hydra_plugins.hydra_submitit_launcher"),
+    reason="jobs of a cluster need the extra sweep",
+)
+def test_a_job_of_a_cluster_that_was_killed_goes_on(scenes: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "sweep"
+    launcher = ["hydra/launcher=submitit_local", "hydra.launcher.cpus_per_task=1"]
+    words = ["-m", *launcher, f"hydra.sweep.dir={folder}", "resume=auto", f"data.root={scenes}"]
+    words += [*SMALL_RUN, "seed=0,1,2,3", "callbacks.checkpoints.every=5", "trainer.max_steps=150"]
+    command = [sys.executable, str(CONF.parent / "train.py"), *words]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        killed = "2_*_s2/checkpoints/last.ckpt"
+        while not (found := list(folder.glob(killed))) and process.poll() is None:
+            time.sleep(0.05)
+        run = found[0].parent.parent
+        os.kill(read_json(run / "run.json")["process"], signal.SIGKILL)
+        assert process.wait(240) != 0
+    finally:
+        process.kill()
+    others = [folder / f"{n}_excavator_six_planes_none_s{n}" for n in (0, 1, 3)]
+    assert not (run / "metrics.json").exists()
+    assert all((other / "metrics.json").is_file() for other in others)
+    kept = [read_json(other / "metrics.json")["test"] for other in others]
+    again = train(*words)
+    assert again.returncode == 0, again.stderr
+    assert read_json(run / "run.json")["resumed"] == 1
+    assert read_json(run / "metrics.json")["step"] == 150
+    assert [read_json(other / "metrics.json")["test"] for other in others] == kept
+    assert len((folder / "table.csv").read_text().splitlines()) == 5

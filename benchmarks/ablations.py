@@ -116,7 +116,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "no background field": ("model.background=null",),
     "no smoothness of the background": ("model.background.total_variation=0",),
     "no smoothness of the planes": (
-        *("model.loss.world_variation=0", "model.loss.world_time=0"),
+        *("model.loss.total_variation_with_background=0", "model.loss.time_factor_with_background=0"),
         "model.loss.time_smoothness=0",
     ),
     "threshold as without surroundings": ("model.sampler.world_threshold=0.001",),
@@ -153,7 +153,7 @@ def show_captures(rows: list[Row]) -> str:
     columns = ("scene", "change", "PSNR, dB", "PSNR of the object, dB", "SSIM", "seconds", "seeds")
     lines = [
         (
-            *(row["scene"], row["change"], number(row, "psnr"), number(row, "psnr_thing")),
+            *(row["scene"], row["change"], number(row, "psnr"), number(row, "psnr_foreground")),
             *(number(row, "ssim", 3), number(row, "train", 0), row["seeds"]),
         )
         for row in rows

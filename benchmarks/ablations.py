@@ -116,7 +116,10 @@ PARTS: dict[str, tuple[str, ...]] = {
     "no background field": ("model.background=null",),
     "no smoothness of the background": ("model.background.total_variation=0",),
     "no smoothness of the planes": (
-        *("model.loss.total_variation_with_background=0", "model.loss.time_factor_with_background=0"),
+        *(
+            "model.loss.total_variation_with_background=0",
+            "model.loss.time_factor_with_background=0",
+        ),
         "model.loss.time_smoothness=0",
     ),
     "threshold as without surroundings": ("model.sampler.world_threshold=0.001",),

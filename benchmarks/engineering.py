@@ -25,8 +25,9 @@ from xplanes.decomposition import robust_pca
 from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.lrm.config import PUBLISHED
 from xplanes.rendering.grid_renderer import GridRenderer
+from xplanes.scenes.datamodule import whole_view
 from xplanes.scenes.views import Views
-from xplanes.training.scores import render_view, score_view
+from xplanes.training.scores import render_item, score_view
 
 HERE = Path(__file__).parent
 
@@ -98,12 +99,12 @@ def measure_rendering(work: Path, quick: bool) -> list[Row]:
             renderer = run.module.renderer
             assert isinstance(renderer, GridRenderer)
             parts = (run.module.field, replace(renderer, samples=samples), run.frame, views)
-            draw = partial(render_view, *parts, background=run.scene.background)
-            draw(index=0)
+            items = [whole_view(views, index, run.scene.background) for index in range(FRAMES)]
+            draw = partial(render_item, *parts[:3])
+            draw(items[0])
             row: Row = {"case": f"{size} px, {samples}", "pixels": size, "samples": samples}
             row["seconds"] = median(
-                min(timed(partial(draw, index=index)) for _ in range(REPEATS))
-                for index in range(FRAMES)
+                min(timed(partial(draw, item)) for _ in range(REPEATS)) for item in items
             )
             if known:
                 scores = [score_view(*parts, i, run.scene.background)[0] for i in range(FRAMES)]

@@ -199,7 +199,9 @@ def values(run: Measured) -> dict[str, float | None]:
     metrics, seconds = run.metrics, run.metrics["seconds"]
     first = run.curve[0] if run.curve and run.curve[0]["step"] == "0" else None
     return {
-        **{key: metrics["test"].get(key) for key in ("psnr", "ssim", "psnr_foreground", "floaters")},
+        **{
+            key: metrics["test"].get(key) for key in ("psnr", "ssim", "psnr_foreground", "floaters")
+        },
         "first": float(first["psnr"]) if first else None,
         "prepare": sum(seconds["prepare"].values()),
         "train": seconds["train"],

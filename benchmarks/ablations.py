@@ -122,7 +122,7 @@ PARTS: dict[str, tuple[str, ...]] = {
         ),
         "model.loss.time_smoothness=0",
     ),
-    "threshold as without surroundings": ("model.sampler.world_threshold=0.001",),
+    "threshold as without surroundings": ("model.sampler.threshold_with_background=0.001",),
     "all pixels drawn alike": ("model.rays.skip_background=false",),
     "recipe=capture": ("recipe=capture",),
     "initialised from tiny": ("lrm=tiny",),

@@ -82,7 +82,8 @@ def diagnosis(
         terms: Terms of its loss by name.
         unusable: Parameters whose gradients are not finite.
     """
-    loss, count = float(torch.stack(list(terms.values())).sum()), module.tally.skipped_in_a_row
+    loss = float(torch.stack(list(terms.values())).detach().sum())
+    count = module.tally.skipped_in_a_row
     what = "a gradient was infinite, NaN or too large to square"
     if not math.isfinite(loss):
         what = f"the loss was {loss}"

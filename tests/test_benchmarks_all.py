@@ -1,6 +1,7 @@
 """Pages of results: they show what the records say, and say when a record is stale."""
 
 import importlib
+import pkgutil
 import re
 import sys
 from pathlib import Path
@@ -154,3 +155,10 @@ def test_printed_commands_name_no_folder(every) -> None:
     words = ["--lego", "/there/lego", "data.root=/there", "data.scene=lego", "--seeds", "3"]
     printed = ["--lego", "FOLDER", "data.root=FOLDER", "data.scene=lego", "--seeds", "3"]
     assert sys.modules["runner"].without_folders(words) == printed
+
+
+def test_stages_that_are_timed_exist(every) -> None:
+    stages = importlib.import_module("where_time_goes").STAGES
+    sys.modules.pop("where_time_goes")
+    for _, module, path in stages:
+        assert callable(pkgutil.resolve_name(f"{module}:{path}")), path

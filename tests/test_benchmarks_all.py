@@ -151,6 +151,11 @@ def test_pages_show_what_the_records_say(every, monkeypatch) -> None:
     assert sorted(seen) == sorted([*known, *tables])
 
 
+def test_settings_of_all_cases_exist(every) -> None:
+    for name, section in every.every_section().items():
+        assert all(section.settings().values()), name
+
+
 def test_printed_commands_name_no_folder(every) -> None:
     words = ["--lego", "/there/lego", "data.root=/there", "data.scene=lego", "--seeds", "3"]
     printed = ["--lego", "FOLDER", "data.root=FOLDER", "data.scene=lego", "--seeds", "3"]

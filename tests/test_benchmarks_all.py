@@ -151,6 +151,7 @@ def test_pages_show_what_the_records_say(every, monkeypatch) -> None:
     assert sorted(seen) == sorted([*known, *tables])
 
 
+@pytest.mark.slow
 def test_settings_of_all_cases_exist(every) -> None:
     for name, section in every.every_section().items():
         assert all(section.settings().values()), name

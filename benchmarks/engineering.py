@@ -27,7 +27,7 @@ from xplanes.lrm.config import PUBLISHED
 from xplanes.rendering.grid_renderer import GridRenderer
 from xplanes.scenes.datamodule import whole_view
 from xplanes.scenes.views import Views
-from xplanes.training.scores import render_item, score_view
+from xplanes.training.scores import render_item, score_image
 
 HERE = Path(__file__).parent
 
@@ -98,16 +98,16 @@ def measure_rendering(work: Path, quick: bool) -> list[Row]:
         for samples in SAMPLES:
             renderer = run.module.renderer
             assert isinstance(renderer, GridRenderer)
-            parts = (run.module.field, replace(renderer, samples=samples), run.frame, views)
+            parts = (run.module.field, replace(renderer, samples=samples), run.frame)
             items = [whole_view(views, index, run.scene.background) for index in range(FRAMES)]
-            draw = partial(render_item, *parts[:3])
-            draw(items[0])
+            render_item(*parts, items[0])
             row: Row = {"case": f"{size} px, {samples}", "pixels": size, "samples": samples}
             row["seconds"] = median(
-                min(timed(partial(draw, item)) for _ in range(REPEATS)) for item in items
+                min(timed(partial(render_item, *parts, item)) for _ in range(REPEATS))
+                for item in items
             )
             if known:
-                scores = [score_view(*parts, i, run.scene.background)[0] for i in range(FRAMES)]
+                scores = [score_image(render_item(*parts, item), item) for item in items]
                 row["psnr"] = fmean(score.psnr for score in scores)
             rows.append(row)
     return rows

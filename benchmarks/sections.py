@@ -178,7 +178,7 @@ def gathered(case: Case, runs: list[Measured]) -> Row:
         found = [value for each in numbers if (value := each[key]) is not None]
         if found:
             row[key] = fmean(found)
-        if key in ("psnr", "ssim", "psnr_foreground") and len(found) > 1:
+        if key in SCORES[:3] and len(found) > 1:
             row[f"{key}_std"] = stdev(found)
     row["cpu"] = sum(run.metrics["seconds"]["total"] for run in runs)
     row["curve"] = [
@@ -194,14 +194,15 @@ def spread_of(points: Iterable[Mapping[str, str]]) -> tuple[float, float]:
     return fmean(found), stdev(found) if len(found) > 1 else 0.0
 
 
+SCORES = ("psnr", "ssim", "psnr_foreground", "floaters")
+
+
 def values(run: Measured) -> dict[str, float | None]:
     """The numbers that tables show of a run."""
     metrics, seconds = run.metrics, run.metrics["seconds"]
     first = run.curve[0] if run.curve and run.curve[0]["step"] == "0" else None
     return {
-        **{
-            key: metrics["test"].get(key) for key in ("psnr", "ssim", "psnr_foreground", "floaters")
-        },
+        **{key: metrics["test"].get(key) for key in SCORES},
         "first": float(first["psnr"]) if first else None,
         "prepare": sum(seconds["prepare"].values()),
         "train": seconds["train"],

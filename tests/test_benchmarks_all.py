@@ -1,6 +1,7 @@
 """Pages of results: they show what the records say, and say when a record is stale."""
 
 import importlib
+import pkgutil
 import re
 import sys
 from pathlib import Path
@@ -150,7 +151,20 @@ def test_pages_show_what_the_records_say(every, monkeypatch) -> None:
     assert sorted(seen) == sorted([*known, *tables])
 
 
+@pytest.mark.slow
+def test_settings_of_all_cases_exist(every) -> None:
+    for name, section in every.every_section().items():
+        assert all(section.settings().values()), name
+
+
 def test_printed_commands_name_no_folder(every) -> None:
     words = ["--lego", "/there/lego", "data.root=/there", "data.scene=lego", "--seeds", "3"]
     printed = ["--lego", "FOLDER", "data.root=FOLDER", "data.scene=lego", "--seeds", "3"]
     assert sys.modules["runner"].without_folders(words) == printed
+
+
+def test_stages_that_are_timed_exist(every) -> None:
+    stages = importlib.import_module("where_time_goes").STAGES
+    sys.modules.pop("where_time_goes")
+    for _, module, path in stages:
+        assert callable(pkgutil.resolve_name(f"{module}:{path}")), path

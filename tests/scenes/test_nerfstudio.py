@@ -3,7 +3,9 @@
 import json
 import logging
 import math
+import re
 import unicodedata
+import warnings
 from functools import partial
 from pathlib import Path
 
@@ -418,13 +420,11 @@ def test_of_very_few_frames_none_can_be_held_out(tmp_path, count):
     capture.refused("never held out", splits=("val",), error=MissingSplitError)
 
 
-def test_a_mark_at_the_start_and_a_missing_last_row_are_read(tmp_path):
+def test_a_mark_at_the_start_and_comments_are_read(tmp_path):
     capture = Capture(tmp_path, 4)
     expected = capture.read(eval_every=10).splits["train"].camera_to_world
     path = tmp_path / "transforms.json"
     content = json.loads(path.read_text())
-    for frame in content["frames"]:
-        frame["transform_matrix"] = frame["transform_matrix"][:3]
     path.write_text(json.dumps(content), encoding="utf-8-sig")
     found = read_capture(tmp_path, ["train"], eval_every=10)
     assert torch.equal(found.splits["train"].camera_to_world, expected)
@@ -516,26 +516,48 @@ def test_a_colour_may_be_transparent(capture, level):
     assert (found.images.short() - expected.images.short()).abs().max() <= 1
 
 
-def focal_lengths(capture, **keys):
+def focal_lengths(capture, place="file", **keys):
     """What the focal lengths of a capture are read as if these keys take the place of them."""
     for key in PINHOLE:
         capture.content.pop(key, None)
-    capture.content |= keys
+    for entry in [capture.content] if place == "file" else capture.frames:
+        entry |= keys
     return capture.read().splits["train"].intrinsics.focal[0].tolist()
 
 
+DEGREES = math.degrees(ANGLE)
+FLATTER = 2 * math.atan(math.tan(0.5 * ANGLE) / 1.25)
+
+
+@pytest.mark.parametrize("place", ["file", "frames"])
 @pytest.mark.parametrize(
-    ("keys", "expected"),
+    ("keys", "expected", "words"),
     [
-        ({"fl_x": "30.5", "fl_y": "3e1", "w": f"{SIZE}", "h": SIZE}, [30.5, 30]),
-        ({"intrinsic_matrix": [[31, 0, 12, 0], [0, 29, 12, 0], [0, 0, 1, 0]]}, [31, 29]),
-        ({"K": [[31, 0, 12], [0, 31, 12], [0, 0, 1]], "fl_x": 30}, [30, 31]),
-        ({"x_fov": math.degrees(ANGLE), "fl_x": 99, "w": SIZE, "h": SIZE}, [FOCAL, FOCAL]),
-        ({"fovx": math.degrees(ANGLE), "fovy": math.degrees(ANGLE)}, [FOCAL, FOCAL]),
+        ({"fl_x": "30.5", "fl_y": "3e1", "w": f"{SIZE}", "h": SIZE}, [30.5, 30], ""),
+        ({"intrinsic_matrix": [[31, 0, 12, 0], [0, 29, 12, 0], [0, 0, 1, 0]]}, [31, 29], ""),
+        ({"K": [[31, 0, 12], [0, 31, 12], [0, 0, 1]], "fl_x": 30}, [30, 31], ""),
+        ({"x_fov": DEGREES, "fl_x": 99, "w": SIZE, "h": SIZE}, [FOCAL, FOCAL], ""),
+        ({"x_fov": DEGREES, "y_fov": DEGREES}, [FOCAL, FOCAL], ""),
+        ({"fovx": DEGREES, "fovy": DEGREES}, [FOCAL, FOCAL], ""),
+        (
+            {"camera_angle_x": DEGREES},
+            [FOCAL, FOCAL],
+            r"camera_angle_x=40\.1\d* is read in degrees",
+        ),
+        ({"camera_angle_x": ANGLE, "camera_angle_y": ANGLE}, [FOCAL, FOCAL], ""),
+        (
+            {"camera_angle_x": ANGLE, "camera_angle_y": FLATTER},
+            [FOCAL, 1.25 * FOCAL],
+            "camera_angle_y of 10 of 10 frames gives pixels that are not square",
+        ),
     ],
 )
-def test_intrinsics_as_programs_write_them(capture, keys, expected):
-    assert focal_lengths(capture, **keys) == pytest.approx(expected)
+def test_intrinsics_as_programs_write_them(capture, place, keys, expected, words):
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        assert focal_lengths(capture, place, **keys) == pytest.approx(expected)
+    assert bool(said) is bool(words)
+    assert all(re.search(words, str(each.message)) for each in said)
 
 
 def test_focal_lengths_that_disagree_with_fields_of_view(capture):
@@ -543,12 +565,19 @@ def test_focal_lengths_that_disagree_with_fields_of_view(capture):
         focal_lengths(capture, fl_x=30, w=SIZE, h=SIZE, camera_angle_x=ANGLE)
 
 
-def test_a_cameras_own_scale_turns_no_ray(capture):
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda pose: {"transform_matrix": pose[:3].tolist()},
+        lambda pose: {"transform_matrix": pose.ravel().tolist()},
+        lambda pose: {"transform_matrix": (pose * [0.3, 0.3, 0.3, 1]).tolist()},
+        lambda pose: {"transform_matrix_start": pose.tolist()},
+    ],
+)
+def test_poses_as_programs_write_them(capture, write):
     expected = capture.read().splits["train"].camera_to_world
     for frame in capture.frames:
-        frame["transform_matrix"] = (
-            np.array(frame["transform_matrix"]) * [0.3, 0.3, 0.3, 1]
-        ).tolist()
+        frame |= write(np.array(frame.pop("transform_matrix")))
     found = capture.read().splits["train"].camera_to_world
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
 
@@ -572,31 +601,6 @@ def test_a_world_whose_y_axis_is_up_is_turned(capture, keys, setting, is_turned)
     assert ("the world is turned, as it is" in scene.notes["up"]) is is_turned
 
 
-def test_two_fields_of_view_give_pixels_that_are_not_square(capture):
-    for key in PINHOLE:
-        del capture.content[key]
-    capture.content |= {"camera_angle_x": ANGLE, "camera_angle_y": ANGLE}
-    assert capture.read().splits["train"].intrinsics.focal[0].tolist() == pytest.approx([FOCAL] * 2)
-    capture.content["camera_angle_y"] = 2 * math.atan(math.tan(0.5 * ANGLE) / 1.25)
-    focal = capture.read(resolution=12).splits["train"].intrinsics.focal[0]
-    assert focal.tolist() == pytest.approx([FOCAL / 2, 1.25 * FOCAL / 2])
-
-
-@pytest.mark.parametrize("place", ["file", "frames"])
-def test_fields_of_view_in_degrees(capture, place):
-    for key in PINHOLE:
-        del capture.content[key]
-    for entry in [capture.content] if place == "file" else capture.frames:
-        entry |= {"x_fov": math.degrees(ANGLE), "y_fov": math.degrees(ANGLE)}
-    assert capture.read().splits["train"].intrinsics.focal[0].tolist() == pytest.approx([FOCAL] * 2)
-    for entry in [capture.content] if place == "file" else capture.frames:
-        del entry["x_fov"], entry["y_fov"]
-        entry["camera_angle_x"] = math.degrees(ANGLE)
-    with pytest.warns(UserWarning, match=r"camera_angle_x=40\.1\d* is read in degrees"):
-        focal = capture.read().splits["train"].intrinsics.focal[0]
-    assert focal.tolist() == pytest.approx([FOCAL] * 2)
-
-
 def test_a_vertical_field_of_view_beside_a_focal_length(capture):
     del capture.content["fl_y"]
     capture.content |= {"w": 2 * SIZE, "h": 2 * SIZE, "fl_x": 2 * FOCAL, "cx": 30.0, "cy": 20.0}
@@ -605,19 +609,6 @@ def test_a_vertical_field_of_view_beside_a_focal_length(capture):
         intrinsics = capture.read().splits["train"].intrinsics
     assert intrinsics.focal[0].tolist() == pytest.approx([FOCAL, 1.25 * FOCAL])
     assert intrinsics.centre[0].tolist() == [15, 10]
-
-
-def test_poses_as_other_programs_write_them(capture):
-    expected = capture.read().splits["train"].camera_to_world
-    for index, frame in enumerate(capture.frames):
-        matrix = frame.pop("transform_matrix")
-        if index % 2:
-            frame["transform_matrix_start"] = frame["transform_matrix_end"] = matrix
-        else:
-            frame["transform_matrix"] = [value for row in matrix[:3] for value in row]
-    with pytest.warns(UserWarning, match="not read are 'transform_matrix_end'"):
-        found = capture.read().splits["train"].camera_to_world
-    assert torch.equal(found, expected)
 
 
 def test_all_damaged_images_are_named(capture):

@@ -105,13 +105,8 @@ class ColmapSettings(CaptureSettings):
             )
         model = read_model(source)
         listing, folders, points = self._listing(model)
-        return self.capture(
-            listing,
-            self._places(listing, folders),
-            splits,
-            model.source,
-            points,
-        )
+        places = self._places(listing, folders)
+        return self.capture(listing, places, splits, model.source, points)
 
     def _listing(self, model: SparseModel) -> tuple[Listing, list[str], np.ndarray | None]:
         """All images of the capture, the folder of each, and the model's points."""

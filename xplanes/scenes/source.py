@@ -93,18 +93,20 @@ class SceneSettings(Settings, ABC):
         folder = self.folder.absolute()
         there = "is not a folder" if folder.exists() else "does not exist"
         there = f"holds no {self.files}" if folder.is_dir() else there
-        near = [place for place in (folder, folder.parent) if place.is_dir()][:1]
-        scenes = sorted(
-            path.name
-            for place in near
-            for path in place.iterdir()
-            if path.is_dir() and self.recognises(path)
-        )
-        nearby = f" Such scenes in {near[0]}: {some(scenes)}." if scenes else ""
+        near, scenes = folder if folder.is_dir() else folder.parent, []
+        with suppress(OSError):
+            scenes = [path.name for path in sorted(near.iterdir()) if self._is_scene(path)]
+        nearby = f" Such scenes in {near}: {some(scenes)}." if scenes else ""
         return SceneError(
             f"{folder} {there}.{nearby} Set data.root and data.scene to a folder with {self.files}"
             f"{self.hint}. xplanes inspect FOLDER tells which format a folder has."
         )
+
+    @classmethod
+    def _is_scene(cls, path: Path) -> bool:
+        with suppress(OSError):  # Some folders are closed to the user.
+            return path.is_dir() and cls.recognises(path)
+        return False
 
     @property
     def image_cache(self) -> Path | None:

@@ -47,6 +47,7 @@ NUMBERS = (
     *PIXELS,
     *COEFFICIENTS,
     *("sx1", "sy1", "omega", "camera_angle_x", "camera_angle_y", "time", "timestamp"),
+    *("x_fov", "y_fov", "fovx", "fovy"),
 )
 """Keys whose values are numbers, which some programs write as text."""
 
@@ -65,7 +66,7 @@ KNOWN = (
     *("camera_angle_x", "camera_angle_y", "camera_model", "is_fisheye", "distortion_params"),
     *("omega", "train_filenames", "val_filenames", "test_filenames", *PIXELS, *COEFFICIENTS),
     *("sx1", "sy1", "x_fov", "y_fov", "fovx", "fovy", *OTHER_LENSES, *OTHER_AXES),
-    *("white_transparent", "black_transparent", "orientation_override", *MATRICES),
+    *("white_transparent", "black_transparent", "orientation_override"),
 )
 """Keys that are read, or refused."""
 
@@ -264,10 +265,11 @@ def _plain(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
     for key in {*NUMBERS} & {*keys}:
         if isinstance(keys[key], str) and (number := number_in(keys[key])) is not None:
             found[key] = number
-    for matrix in [keys[key] for key in MATRICES if key in keys]:
+    for key in {*MATRICES} & {*keys}:
         with suppress(TypeError, ValueError, LookupError):
-            (fl_x, _, cx), (_, fl_y, cy) = matrix[0][:3], matrix[1][:3]
+            (fl_x, _, cx), (_, fl_y, cy) = keys[key][0][:3], keys[key][1][:3]
             found = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy} | found
+            del found[key]  # Others are warned of.
     for axis in "xy":
         angle, name = found.get(f"{axis}_fov"), f"camera_angle_{axis}"
         if is_positive(angle):

@@ -85,6 +85,7 @@ COMPOSITIONS = [
     ["data=multicamera", "model=tensor4d", "model/sampler=neus"],
     ["data=colmap", "model=tensor4d_density"],
     ["data=nerfies", "model=kplanes_explicit"],
+    ["data=llff", "model=kplanes_explicit"],
     ["recipe=paper", "preparation=paper"],
     ["recipe=paper_small", "sweep=rank", "experiment=demo"],
     ["recipe=fair"],

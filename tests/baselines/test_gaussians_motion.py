@@ -148,6 +148,10 @@ def test_loss_is_a_mixture_of_absolute_and_structural_errors():
     assert float(terms["colour"]) == pytest.approx(0.8 * float((image - truth).abs().mean()))
     expected = 0.2 * (1 - ssim(image, truth))
     assert float(terms["dissimilarity"]) == pytest.approx(expected, rel=1e-4)
+    shown = torch.rand(480) < 0.5
+    rays = {"target": torch.where(shown[:, None], image.view(-1, 3), 0.5), "shown": shown}
+    terms = model.losses(rendering, rays, TrainingState(0, 0, 0, 0))
+    assert [float(term) for term in terms.values()] == pytest.approx([0, 0], abs=1e-6)
 
 
 def test_halves_keep_their_time_and_their_path():

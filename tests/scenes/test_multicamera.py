@@ -156,21 +156,26 @@ def test_folders_of_images_keep_every_pixel(tmp_path: Path) -> None:
         lambda camera: f"cam{camera:02d}\\5",
     ):
         with_transforms(folder, name)
+        assert choose([str(folder)]).scene.name == "multicamera"
         again = read(folder)
         require_rays_of(again.splits["train"], list(range(FRAMES, CAMERAS * FRAMES)))
         assert torch.equal(again.splits["train"].in_memory(), scene.splits["train"].in_memory())
 
 
 @pytest.mark.parametrize(
-    ("inner", "name"), [("images", "{:04d}"), ("4x", "view_{}"), ("rgb/full", "cam{:02d}")]
+    ("outer", "inner", "name"),
+    [
+        *(("", "images", "{:04d}"), ("", "4x", "view_{}"), ("", "rgb/full", "cam{:02d}")),
+        ("frames", "", "CAM_{}"),
+    ],
 )
-def test_folders_of_cameras_may_have_other_names_and_levels(tmp_path, inner, name) -> None:
+def test_folders_of_cameras_may_have_other_names_and_levels(tmp_path, outer, inner, name) -> None:
     plain = neural_3d_video(tmp_path / "plain", write_images, "")
     folder = tmp_path / "deeper"
     folder.mkdir()
     np.save(folder / "poses_bounds.npy", np.load(plain / "poses_bounds.npy"))
     for camera in range(CAMERAS):
-        place = folder / name.format(camera)
+        place = folder / outer / name.format(camera)
         write_images(place / inner, rgb(camera))
         if "images" in inner:
             write_images(place / "masks", rgb(camera))
@@ -235,17 +240,13 @@ def test_images_and_cameras_that_do_not_belong_together(videos: Path, tmp_path: 
     with_colmap(folder, plain)
     assert len(read_cameras(folder)) == CAMERAS
     left = r"left0\.png, left1\.png, left2\.png, left3\.png"
-    refused(both.format("no video or folder belongs to left0.png", left), "left{}.png".format)
+    refused(both.format("left0.png may be of no video or folder", left), "left{}.png".format)
     refused(
-        both.format("cam00/2.png is of cam00.mp4, as an earlier", "cam00/1.png, cam00/2.png"),
+        both.format("cam00/1.png, cam00/2.png, .* belongs to cam00.mp4", "cam00/1.png"),
         lambda camera: f"cam00/{camera + 1}.png",
     )
     three = r"cam00\.png, cam01\.png, cam02\.png\. "
-    refused(
-        both.format("no registered image belongs to cam03.mp4", three) + ".*Register an image",
-        plain,
-        cameras=3,
-    )
+    refused(both.format("no registered image belongs to cam03.mp4", three), plain, cameras=3)
     refused(r"cam00\.mp4 has 48x48 pixels, but .* 96x48, of another aspect", plain, height=SIZE)
     (folder / "cam02.mov").write_bytes(b"")
     refused(r"cam02\.png may be of cam02\.mov or of cam02\.mp4", plain)
@@ -280,10 +281,10 @@ def test_the_video_is_that_of_a_training_camera(videos: Path) -> None:
     assert video.files == tuple(f"cam{central:02d}/{number:06d}" for number in range(FRAMES))
     assert video.times.tolist() == pytest.approx(torch.linspace(0, 1, FRAMES).tolist())
     assert read(videos, splits=("train",), video_camera="cam03").video.files[0][:5] == "cam03"
-    with pytest.raises(SceneError, match=r"video_camera=cam00.*must not see them"):
-        read(videos, video_camera="cam00")
-    with pytest.raises(SceneError, match=r"video_camera=cam9: there is no such.*cam01, cam02"):
-        read(videos, video_camera="cam9")
+    for name in ("cam00", "cam9"):
+        words = f"video_camera={name} is no training camera.*must not see.*cam01, cam02"
+        with pytest.raises(SceneError, match=words):
+            read(videos, video_camera=name)
 
 
 def test_large_captures_are_kept_on_disk(videos: Path, tmp_path: Path, monkeypatch, capsys) -> None:
@@ -347,8 +348,13 @@ def test_cameras_of_different_lengths_and_rates(videos: Path, tmp_path: Path, ca
     with pytest.raises(SceneError, match=r"cam02\.mp4 has 4 frames.*data\.frames=\[0,3,1\]"):
         read(folder, frames=[0, 5, 1])
     write_video(folder / "cam02.mp4", rgb(2), rate=25)
-    with pytest.raises(SceneError, match=r"cam02\.mp4 has 25 frames per second.* 30: .*ffmpeg"):
-        read(folder)
+    scene = read(folder)
+    times = {camera: [] for camera in ("cam01", "cam02", "cam03")}
+    for file, time in zip(scene.splits["train"].files, scene.splits["train"].times, strict=True):
+        times[file.split("/")[0]].append(float(time))
+    last = (FRAMES - 1) / 25
+    assert times["cam02"] == pytest.approx([i / 25 / last for i in range(FRAMES)], abs=0.01)
+    assert times["cam01"] == pytest.approx([i / 30 / last for i in range(FRAMES)], abs=0.01)
 
 
 def test_a_frame_that_one_camera_lacks_is_noticed(tmp_path: Path) -> None:

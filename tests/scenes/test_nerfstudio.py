@@ -3,7 +3,9 @@
 import json
 import logging
 import math
+import re
 import unicodedata
+import warnings
 from functools import partial
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from tests.balls import ball_views, surrounding
 from tests.captures import settings
 from tests.lens_oracle import direction
 from tests.refusals import assert_refused
-from xplanes.errors import ConfigError, MissingSplitError, SceneError
+from xplanes.errors import MissingSplitError, SceneError
 from xplanes.scenes import store
 from xplanes.scenes.batches import RayBatches, ViewBatches, ViewSettings
 from xplanes.scenes.datamodule import UNIFORM, SceneDataModule, whole_view
@@ -138,7 +140,7 @@ def test_frames_are_held_out_at_even_ranks_of_time(capture):
             val = capture.read(("val",), eval_every=every).splits["val"]
             assert sorted(round(time, 5) for time in val.times.tolist()) == expected
     capture.refused(
-        r"no val split.*eval_every below 100",
+        r"no val split.*data\.eval_every=100",
         error=MissingSplitError,
         splits=("val",),
         eval_every=100,
@@ -281,8 +283,8 @@ def test_pixels_that_masks_leave_out_are_neither_drawn_nor_scored(capture, caplo
     assert len(colours) > 500
     marked = (colours - torch.tensor([1.0, 0.0, 1.0])).abs().amax(dim=1) < 0.01
     assert not marked.any()
-    with pytest.raises(ConfigError, match="trains on whole images"):
-        ViewBatches(train, ViewSettings(background="white"), seed=0)
+    view = ViewBatches(train, ViewSettings(background="white"), seed=0).draw(0)
+    assert torch.equal(view["shown"].view(SIZE, SIZE), shown)
 
 
 def test_scores_leave_ignored_pixels_out(capture):
@@ -415,23 +417,22 @@ def test_all_masks_of_a_capture_have_one_scale(capture):
 @pytest.mark.parametrize("count", [1, 2])
 def test_of_very_few_frames_none_can_be_held_out(tmp_path, count):
     capture = Capture(tmp_path / "few", count)
-    message = capture.refused("never held out", splits=("val",), error=MissingSplitError)
-    assert "data.eval_every" not in message
+    capture.refused("never held out", splits=("val",), error=MissingSplitError)
 
 
-def test_a_mark_at_the_start_and_a_missing_last_row_are_read(tmp_path):
+def test_a_mark_at_the_start_and_comments_are_read(tmp_path):
     capture = Capture(tmp_path, 4)
     expected = capture.read(eval_every=10).splits["train"].camera_to_world
     path = tmp_path / "transforms.json"
     content = json.loads(path.read_text())
-    for frame in content["frames"]:
-        frame["transform_matrix"] = frame["transform_matrix"][:3]
     path.write_text(json.dumps(content), encoding="utf-8-sig")
     found = read_capture(tmp_path, ["train"], eval_every=10)
     assert torch.equal(found.splits["train"].camera_to_world, expected)
-    path.write_text('{"frames": [] // none yet\n}')
-    with pytest.raises(SceneError, match="JSON has no comments: take those that begin with //"):
-        read_capture(tmp_path, ["train"])
+    text = json.dumps({"name": "http://x//y,]", "frames": content["frames"]}, indent=1)
+    text = text.replace('"frames"', f'/* the\nlens */ {json.dumps(PINHOLE)[1:-1]}, // x\n "frames"')
+    path.write_text(text[:-2] + ", # the end\n}")
+    found = read_capture(tmp_path, ["train"], eval_every=10)
+    assert torch.equal(found.splits["train"].camera_to_world, expected)
     content["distortion_params"] = [0.1, 0.0, 0.0, 0.0]
     path.write_text(json.dumps(content))
     with pytest.raises(SceneError, match="a list of the 6 numbers k1, k2, k3, k4, p1, p2"):
@@ -462,13 +463,11 @@ def test_keys_of_other_programs_change_nothing(capture):
 
 
 def test_what_is_no_capture(tmp_path):
-    (tmp_path / "blender").mkdir()
-    (tmp_path / "blender" / "transforms_train.json").write_text("{}")
     Capture(tmp_path / "other").read()
     for name, words in (
-        ("blender", "data=blender"),
-        ("none", "none does not exist. Captures in .*: other"),
-        ("other/images", r"holds no transforms\.json"),
+        (".", r"holds no transforms\.json\. Such scenes in .*: other\. Set data\.root"),
+        ("none", r"none does not exist\. Such scenes in .*: other.*xplanes inspect FOLDER"),
+        ("other/images", r"holds no transforms\.json\. Set data\.root and data\.scene"),
     ):
         read = partial(read_capture, tmp_path / name, ["train"])
         assert_refused(SceneError, words, read, name)
@@ -498,35 +497,109 @@ def test_lenses_and_poses_of_many_cameras_stay_with_their_images(capture):
 
 
 def test_keys_that_are_not_read_are_named(capture):
-    capture.content |= {"white_transparent": True, "n_extra_learnable_dims": 0, "aabb_scale": 4}
+    capture.content |= {"mask_color": [9, 9, 9], "envmap": "", "intrinsics": {"f": 9}}
     capture.frames[2]["rolling_shutter"] = [1, 0, 0, 0]
-    with pytest.warns(UserWarning, match="not read are 'rolling_shutter', 'white_transparent'"):
+    words = "not read are 'intrinsics', 'mask_color', 'rolling_shutter'"
+    with pytest.warns(UserWarning, match=words):
         capture.read()
 
 
-def test_two_fields_of_view_give_pixels_that_are_not_square(capture):
+@pytest.mark.parametrize("level", [0, 255])
+def test_a_colour_may_be_transparent(capture, level):
+    expected = capture.read(eval_every=100).splits["train"]
+    for index, frame in enumerate(capture.frames):
+        pixels = capture.views.image(index).numpy()
+        pixels = np.where(pixels[..., 3:] > 0, pixels[..., :3].clip(1, 254), level)
+        Image.fromarray(pixels.astype(np.uint8)).save(capture.path / frame["file_path"])
+    capture.content["white_transparent" if level else "black_transparent"] = True
+    found = capture.read(eval_every=100).splits["train"]
+    assert torch.equal(found.images[..., 3], expected.images[..., 3])
+    assert (found.images.short() - expected.images.short()).abs().max() <= 1
+
+
+def focal_lengths(capture, place="file", **keys):
+    """What the focal lengths of a capture are read as if these keys take the place of them."""
     for key in PINHOLE:
-        del capture.content[key]
-    capture.content |= {"camera_angle_x": ANGLE, "camera_angle_y": ANGLE}
-    assert capture.read().splits["train"].intrinsics.focal[0].tolist() == pytest.approx([FOCAL] * 2)
-    capture.content["camera_angle_y"] = 2 * math.atan(math.tan(0.5 * ANGLE) / 1.25)
-    focal = capture.read(resolution=12).splits["train"].intrinsics.focal[0]
-    assert focal.tolist() == pytest.approx([FOCAL / 2, 1.25 * FOCAL / 2])
+        capture.content.pop(key, None)
+    for entry in [capture.content] if place == "file" else capture.frames:
+        entry |= keys
+    return capture.read().splits["train"].intrinsics.focal[0].tolist()
+
+
+DEGREES = math.degrees(ANGLE)
+FLATTER = 2 * math.atan(math.tan(0.5 * ANGLE) / 1.25)
 
 
 @pytest.mark.parametrize("place", ["file", "frames"])
-def test_fields_of_view_in_degrees(capture, place):
-    for key in PINHOLE:
-        del capture.content[key]
-    for entry in [capture.content] if place == "file" else capture.frames:
-        entry |= {"x_fov": math.degrees(ANGLE), "y_fov": math.degrees(ANGLE)}
-    assert capture.read().splits["train"].intrinsics.focal[0].tolist() == pytest.approx([FOCAL] * 2)
-    for entry in [capture.content] if place == "file" else capture.frames:
-        del entry["x_fov"], entry["y_fov"]
-        entry["camera_angle_x"] = math.degrees(ANGLE)
-    with pytest.warns(UserWarning, match=r"camera_angle_x=40\.1\d* is read in degrees"):
-        focal = capture.read().splits["train"].intrinsics.focal[0]
-    assert focal.tolist() == pytest.approx([FOCAL] * 2)
+@pytest.mark.parametrize(
+    ("keys", "expected", "words"),
+    [
+        ({"fl_x": "30.5", "fl_y": "3e1", "w": f"{SIZE}", "h": SIZE}, [30.5, 30], ""),
+        ({"intrinsic_matrix": [[31, 0, 12, 0], [0, 29, 12, 0], [0, 0, 1, 0]]}, [31, 29], ""),
+        ({"K": [[31, 0, 12], [0, 31, 12], [0, 0, 1]], "fl_x": 30}, [30, 31], ""),
+        ({"x_fov": DEGREES, "fl_x": 99, "w": SIZE, "h": SIZE}, [FOCAL, FOCAL], ""),
+        ({"x_fov": DEGREES, "y_fov": DEGREES}, [FOCAL, FOCAL], ""),
+        ({"fovx": DEGREES, "fovy": DEGREES}, [FOCAL, FOCAL], ""),
+        (
+            {"camera_angle_x": DEGREES},
+            [FOCAL, FOCAL],
+            r"camera_angle_x=40\.1\d* is read in degrees",
+        ),
+        ({"camera_angle_x": ANGLE, "camera_angle_y": ANGLE}, [FOCAL, FOCAL], ""),
+        (
+            {"camera_angle_x": ANGLE, "camera_angle_y": FLATTER},
+            [FOCAL, 1.25 * FOCAL],
+            "camera_angle_y of 10 of 10 frames gives pixels that are not square",
+        ),
+    ],
+)
+def test_intrinsics_as_programs_write_them(capture, place, keys, expected, words):
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        assert focal_lengths(capture, place, **keys) == pytest.approx(expected)
+    assert bool(said) is bool(words)
+    assert all(re.search(words, str(each.message)) for each in said)
+
+
+def test_focal_lengths_that_disagree_with_fields_of_view(capture):
+    with pytest.warns(UserWarning, match="frame 0 .*fl_x=30 is followed, but camera_angle_x m"):
+        focal_lengths(capture, fl_x=30, w=SIZE, h=SIZE, camera_angle_x=ANGLE)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda pose: {"transform_matrix": pose[:3].tolist()},
+        lambda pose: {"transform_matrix": pose.ravel().tolist()},
+        lambda pose: {"transform_matrix": (pose * [0.3, 0.3, 0.3, 1]).tolist()},
+        lambda pose: {"transform_matrix_start": pose.tolist()},
+    ],
+)
+def test_poses_as_programs_write_them(capture, write):
+    expected = capture.read().splits["train"].camera_to_world
+    for frame in capture.frames:
+        frame |= write(np.array(frame.pop("transform_matrix")))
+    found = capture.read().splits["train"].camera_to_world
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("keys", "setting", "is_turned"),
+    [({}, None, True), ({"orientation_override": "none"}, None, False), ({}, False, False)],
+)
+def test_a_world_whose_y_axis_is_up_is_turned(capture, keys, setting, is_turned):
+    notes = capture.read().notes
+    assert notes["up"].startswith("the z axis of the files; the cameras' mean up vector is")
+    for frame in capture.frames:
+        frame["transform_matrix"] = (
+            np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+            @ frame["transform_matrix"]
+        ).tolist()
+    capture.content |= keys
+    scene = capture.read(orient=setting)
+    up = scene.splits["train"].camera_to_world[:, :3, 1].mean(dim=0)
+    assert bool(up[2] > 0.99 * up.norm()) is is_turned
+    assert ("the world is turned, as it is" in scene.notes["up"]) is is_turned
 
 
 def test_a_vertical_field_of_view_beside_a_focal_length(capture):
@@ -537,19 +610,6 @@ def test_a_vertical_field_of_view_beside_a_focal_length(capture):
         intrinsics = capture.read().splits["train"].intrinsics
     assert intrinsics.focal[0].tolist() == pytest.approx([FOCAL, 1.25 * FOCAL])
     assert intrinsics.centre[0].tolist() == [15, 10]
-
-
-def test_poses_as_other_programs_write_them(capture):
-    expected = capture.read().splits["train"].camera_to_world
-    for index, frame in enumerate(capture.frames):
-        matrix = frame.pop("transform_matrix")
-        if index % 2:
-            frame["transform_matrix_start"] = frame["transform_matrix_end"] = matrix
-        else:
-            frame["transform_matrix"] = [value for row in matrix[:3] for value in row]
-    with pytest.warns(UserWarning, match="not read are 'transform_matrix_end'"):
-        found = capture.read().splits["train"].camera_to_world
-    assert torch.equal(found, expected)
 
 
 def test_all_damaged_images_are_named(capture):
@@ -584,16 +644,8 @@ def test_a_file_in_another_encoding_is_read(capture, encoding):
     path.write_text(json.dumps(capture.content, ensure_ascii=False), encoding=encoding)
     read = partial(read_capture, capture.path, ["train"])
     assert len(read().splits["train"]) == 9
-    for text, words in (
-        (json.dumps(capture.content, ensure_ascii=False).encode("cp1252"), "Save it as UTF-8"),
-        (
-            b'{"frames": [], /* none */ "w": 3}',
-            "JSON has no comments: take those that begin",
-        ),
-        (b'{"frames": [],}', "no comma before a closing bracket"),
-    ):
-        path.write_bytes(text)
-        assert_refused(SceneError, words, read, text[-40:])
+    path.write_bytes(json.dumps(capture.content, ensure_ascii=False).encode("cp1252"))
+    assert_refused(SceneError, "Save it as UTF-8", read, "cp1252")
 
 
 @pytest.mark.parametrize(

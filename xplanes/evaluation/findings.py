@@ -224,21 +224,23 @@ def stray_findings(scene: Scene) -> Iterator[Finding]:
         yield from _stray([(views.files[i], _stray_pixels(views.image(i)[..., 3])) for i in chosen])
 
 
-def texel_findings(per_texel: float, views: Views, resolution: int) -> Iterator[Finding]:
+def texel_findings(per_texel: float, native: int, wide: int, resolution: int) -> Iterator[Finding]:
     """Whether the images show far more than planes resolve.
 
     Args:
         per_texel: Image pixels that a texel of the planes covers, see `pixels_across`.
-        views: Training views.
+        native: Width of these images.
+        wide: Width of those that are trained on.
         resolution: Texels along an axis of the planes.
     """
+    per_texel *= wide / native
     if per_texel > COARSE:
-        width = max(1, round(views.width * 0.5 * COARSE / per_texel))
+        width = max(1, round(wide * 0.5 * COARSE / per_texel))
         finer = 2 ** round(math.log2(resolution * per_texel / (0.5 * COARSE)))
         yield Finding(
             "texels",
             f"a texel of planes with {resolution} texels a side covers {per_texel:.0f} pixels of "
-            f"images {views.width} pixels wide. Set data.resolution={width}, which costs nothing "
+            f"images {wide} pixels wide. Set data.resolution={width}, which costs nothing "
             f"that the planes could show, or give the planes {finer}",
         )
 

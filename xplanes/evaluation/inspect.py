@@ -40,6 +40,9 @@ NATIVE = "data.resolution=null"
 """The setting that takes images at their native size."""
 
 
+RECIPE = "recipe=capture"
+"""The settings for captures with surroundings."""
+
 MANY_POSES = 20
 """Least number of different training poses at which `recipe=capture` helps; rigs have fewer."""
 
@@ -74,6 +77,7 @@ class Capture:
         images: What the pixels of each split's images tell.
         findings: What may be wrong.
         texels: Texels along an axis of the planes; None for fields without planes.
+        recipe_helps: Whether `recipe=capture` helps, with which ``texels`` are those of training.
     """
 
     choice: Choice
@@ -83,6 +87,7 @@ class Capture:
     images: Mapping[str, list[ImageFacts]]
     findings: tuple[Finding, ...]
     texels: int | None
+    recipe_helps: bool
 
 
 @dataclass(frozen=True)
@@ -119,18 +124,26 @@ def choose(arguments: Sequence[str]) -> Choice:
         folder = folders[0] if folders[0].name not in ("", "..") else folders[0].resolve()
         if not folder.is_dir():
             raise SceneError(f"{folder} is not a folder. Give the folder of a scene")
-        given = {text.partition("=")[0] for text in changed}
-        data = [] if "data" in given else [f"data={_recognised(folder, changed)}"]
+        given, data = {text.partition("=")[0] for text in changed}, []
+        if "data" not in given:
+            folder, option = _recognised(folder, changed)
+            data = [f"data={option}"]
         place = [*data, *_place(folder)]
         if "data.resolution" not in given:
             usual_width = compose_plain("train", [*place, *changed])["data"]["resolution"]
             place.append(NATIVE)
         changed = [*place, *changed]
-    plain = compose_plain("train", changed)
+    return Choice(tuple(changed), *_settings(changed), usual_width)
+
+
+def _settings(overrides: Sequence[str]) -> tuple[SceneSettings, ModelSettings]:
+    """The settings of the scene and of the model."""
+    plain = compose_plain("train", overrides)
     with plugins(plain.get("plugins") or []):
-        scene = build(plain["data"], SceneSettings, "data")
-        model = build(plain["model"], ModelSettings, "model")
-    return Choice(tuple(changed), scene, model, usual_width)
+        return (
+            build(plain["data"], SceneSettings, "data"),
+            build(plain["model"], ModelSettings, "model"),
+        )
 
 
 def _place(folder: Path) -> list[str]:
@@ -138,8 +151,8 @@ def _place(folder: Path) -> list[str]:
     return [f"data.root={quoted(str(folder.parent))}", f"data.scene={quoted(folder.name)}"]
 
 
-def _recognised(folder: Path, changed: Sequence[str]) -> str:
-    """The option of ``data`` whose format a folder is in."""
+def _recognised(folder: Path, changed: Sequence[str]) -> tuple[Path, str]:
+    """The folder of a scene, or the only one in it, and the option of ``data`` for its format."""
     search = [text for text in changed if text.startswith(("hydra.searchpath=", "plugins="))]
     modules = compose_plain("train", search).get("plugins") or []
     search = [text for text in search if text.startswith("hydra.")]
@@ -150,17 +163,17 @@ def _recognised(folder: Path, changed: Sequence[str]) -> str:
             known.setdefault(class_of(node["_target_"], SceneSettings, "data._target_"), option)
     found = [option for cls, option in known.items() if cls.recognises(folder)]
     if len(found) == 1:
-        return found[0]
+        return folder, found[0]
     if found:
         raise ConfigError(
             f"{folder} holds files of several formats ({', '.join(found)}): choose one with "
             f"data={found[0]}"
         )
-    inside = sorted(
-        path.name
-        for path in folder.iterdir()
-        if path.is_dir() and any(cls.recognises(path) for cls in known)
-    )
+    deeper = sorted(path for path in folder.iterdir() if path.is_dir())
+    deeper = [path for path in deeper if any(cls.recognises(path) for cls in known)]
+    if len(deeper) == 1:
+        return _recognised(deeper[0], changed)
+    inside = [path.name for path in deeper]
     scenes = f" Scenes inside it: {', '.join(inside)}." if inside else ""
     there = [f"{path.name}{'/' * path.is_dir()}" for path in folder.iterdir()]
     wanted = "; ".join(f"{name}: {cls.files}" for cls, name in known.items() if cls.files)
@@ -180,6 +193,8 @@ def inspect(choice: Choice) -> Capture:
     choice.scene.prepare()
     scene, model = choice.scene.read(), choice.model
     train = scene.splits["train"]
+    if helps := _recipe_helps(choice, scene):
+        model = _settings([*choice.overrides, RECIPE])[1]
     frame, problem = None, ""
     try:
         frame = model.frame(train, choice.scene.half_side, scene.points)
@@ -194,10 +209,11 @@ def inspect(choice: Choice) -> Capture:
         pixels = pixels_across(train, frame)
         texels = model.texels(0.0 if scene.is_surrounded else pixels)
         if texels is not None:
-            findings += texel_findings(pixels / texels, train, texels)
+            width = _width_of_training(choice, scene) or train.width
+            findings += texel_findings(pixels / texels, train.width, width, texels)
     follows = {kind for each in findings for kind in CONSEQUENCES.get(each.kind, ())}
     findings = [each for each in findings if each.kind not in follows]
-    return Capture(choice, scene, frame, problem, images, tuple(findings), texels)
+    return Capture(choice, scene, frame, problem, images, tuple(findings), texels, helps)
 
 
 def cameras_of(views: Views) -> list[CameraGroup]:
@@ -407,15 +423,25 @@ def next_command(capture: Capture) -> str:
 
     With ``recipe=capture`` where a camera that moves shows surroundings.
     """
-    overrides, width = capture.choice.overrides, capture.choice.usual_width
-    sizes = [views.intrinsics.size for views in capture.scene.splits.values()]
-    if width is not None and width < int(torch.cat(sizes)[:, 1].min()):
+    overrides = [*capture.choice.overrides]
+    if width := _width_of_training(capture.choice, capture.scene):
         overrides = [f"data.resolution={width}" if text == NATIVE else text for text in overrides]
-    train, chosen = capture.scene.splits["train"], [text.partition("=")[0] for text in overrides]
-    poses = {pose.contiguous().numpy().tobytes() for pose in train.camera_to_world}
-    if capture.scene.is_surrounded and len(poses) >= MANY_POSES and "recipe" not in chosen:
-        overrides = [*overrides, "recipe=capture"]
-    return f"{train_command()} {shlex.join(overrides)}"
+    recipe = [RECIPE] if capture.recipe_helps else []
+    return f"{train_command()} {shlex.join([*overrides, *recipe])}"
+
+
+def _width_of_training(choice: Choice, scene: Scene) -> int | None:
+    """The usual width, if nobody asked for another and all images are wider."""
+    sizes = torch.cat([views.intrinsics.size for views in scene.splits.values()])
+    width = choice.usual_width
+    return width if width is not None and width < int(sizes[:, 1].min()) else None
+
+
+def _recipe_helps(choice: Choice, scene: Scene) -> bool:
+    """Whether a camera that moves shows surroundings, and no recipe was chosen."""
+    chosen = {text.partition("=")[0] for text in choice.overrides}
+    poses = {pose.numpy().tobytes() for pose in scene.splits["train"].camera_to_world.contiguous()}
+    return scene.is_surrounded and len(poses) >= MANY_POSES and "recipe" not in chosen
 
 
 def check_out(out: Path, settings: SceneSettings) -> None:

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from xplanes.backend import memory_left
-from xplanes.errors import ConfigError
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.pools import PixelPools, RunPools
 from xplanes.scenes.silhouettes import changing, foreground, plain
@@ -173,19 +172,11 @@ class ViewBatches(Batches):
         settings: What lies behind them.
         seed: The run's seed.
         rank: Number of this process among those that share the run.
-
-    Raises:
-        ConfigError: If pixels of the views are to be ignored.
     """
 
     skipped = 0.0
 
     def __init__(self, views: Views, settings: ViewSettings, *, seed: int, rank: int = 0) -> None:
-        if views.ignored is not None:
-            raise ConfigError(
-                "data.mask_use=ignore: this model trains on whole images and cannot leave pixels "
-                "out; set data.mask_use=alpha, or lrm to use no masks in training"
-            )
         self.views, self.seed, self.stream = views, seed, Stream.VIEWS + rank
         self.background = settings.background
         self.rays = max(1, views.pixels // len(views))
@@ -195,7 +186,8 @@ class ViewBatches(Batches):
 
         Returns:
             Its ``camera``, and for each pixel, row by row: ``times`` [R], ``target`` colour before
-            ``background`` [R, 3] each, and ``alpha`` [R].
+            ``background`` [R, 3] each, and ``alpha`` [R]. If some are not to be trained on, which
+            are ``shown``. bool [R]
         """
         turn, place = divmod(step, len(self.views))
         generator = step_generator(self.seed, turn, self.stream)
@@ -205,12 +197,14 @@ class ViewBatches(Batches):
             generator = step_generator(self.seed, step, self.stream)
             background = torch.rand(3, generator=generator)
         alpha = self.views.image(index)[..., 3].flatten().float() / 255
+        shown = self.views.shown(index)
         return {
             "camera": self.views.camera(index),
             "times": self.views.times[index].expand(len(alpha)),
             "target": self.views.composite(index, background).flatten(0, 1),
             "background": background.expand(len(alpha), 3),
             "alpha": alpha,
+            **({} if shown is None else {"shown": shown.flatten()}),
         }
 
 

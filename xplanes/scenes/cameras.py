@@ -12,7 +12,7 @@ from torch import Tensor
 from xplanes.scenes.lenses import Lenses
 
 
-def focal_length(angle_x: float, width: int) -> float:
+def focal_length(angle_x: float, width: float) -> float:
     """Focal length in pixels of a camera that sees ``angle_x`` radians across ``width`` pixels."""
     return 0.5 * width / math.tan(0.5 * angle_x)
 

@@ -18,13 +18,13 @@ from xplanes.files import natural
 from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, models_inside, read_model
 from xplanes.scenes.entries import (
     decoded,
-    found_images,
-    is_number,
+    image_path,
     mask_files,
-    oriented,
+    number_in,
     short,
     some,
     unit_times,
+    usable,
 )
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.listing import Listing, held_out, time_source
@@ -45,6 +45,7 @@ class ColmapSettings(CaptureSettings):
     """A capture registered with COLMAP."""
 
     files: ClassVar = "sparse/0 with cameras.bin and images.bin (or .txt), and images"
+    more_splits: ClassVar = ", or name the folders of some cameras in data.test_cameras"
 
     model: Location | None  # Folder of the COLMAP model; null: sparse/0, sparse or colmap/sparse/0.
     images: Location  # Folder of the images that COLMAP was run on.
@@ -59,7 +60,6 @@ class ColmapSettings(CaptureSettings):
     # names and is not a camera's, as in 034_cam1.
     time_pattern: str | None
     test_cameras: list[str]  # Subfolders of the image folder that form the test split.
-    orient: bool  # Rotate the world so that the cameras' mean up vector becomes its z axis.
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:
@@ -94,6 +94,8 @@ class ColmapSettings(CaptureSettings):
             )
 
     def load(self, splits: Sequence[str]) -> Scene:
+        if not self.folder.is_dir():
+            raise self.no_scene()
         source = _model_folder(self.folder, self.model)
         if "test" in splits and not self.test_cameras:
             # This needs no reading of the model and the images.
@@ -103,25 +105,20 @@ class ColmapSettings(CaptureSettings):
             )
         model = read_model(source)
         listing, folders, points = self._listing(model)
-        return self.capture(
-            listing,
-            self._places(listing, folders),
-            splits,
-            model.source,
-            "Name the folders of some cameras in data.test_cameras, lower data.eval_every="
-            f"{self.eval_every}, or choose another data.eval_split.",
-            points,
-        )
+        places = self._places(listing, folders)
+        return self.capture(listing, places, splits, model.source, points)
 
     def _listing(self, model: SparseModel) -> tuple[Listing, list[str], np.ndarray | None]:
         """All images of the capture, the folder of each, and the model's points."""
         images = _image_folder(self.folder, self.images, model)
         root = images.resolve()
+
+        def image_of(name: str) -> Path:
+            return image_path(f"{model.source}: {name}", root, name, "NAME")
+
+        kept, paths = zip(*usable("images", image_of, model.names), strict=True)
+        model = model.subset(kept)
         labels = [f"{model.source}: {name}" for name in model.names]
-        found = found_images(labels, root, model.names, "NAME")
-        kept = [place for place, path in enumerate(found) if path is not None]
-        model, paths = model.subset(kept), [path for path in found if path is not None]
-        labels = [labels[place] for place in kept]
         present = {
             path.relative_to(root).as_posix()
             for path in root.rglob("*")
@@ -134,14 +131,11 @@ class ColmapSettings(CaptureSettings):
                 *(len(rest), len(present), images, some(rest)),
             )
         times, source = self._times(model.names, labels, present)
-        poses, points = model.camera_to_world, model.points
-        if self.orient:
-            poses, points = oriented(poses, points, paths)
         listing = Listing.checked(
             model.source,
             labels,
             paths,
-            poses,
+            model.camera_to_world,
             times,
             files=tuple(
                 (images.relative_to(self.folder) / path.relative_to(root)).as_posix()
@@ -151,7 +145,7 @@ class ColmapSettings(CaptureSettings):
             masks=() if self.masks is None else self._masks(model.names, self.masks),
             time_source=source,
         )
-        return listing, [_camera(name) for name in model.names], points
+        return listing, [_camera(name) for name in model.names], model.points
 
     def _masks(self, names: Sequence[str], masks: str) -> tuple[Path | None, ...]:
         kinds = [
@@ -234,11 +228,6 @@ def _model_folder(folder: Path, name: str | None) -> Path:
             f"{folder} holds {len(found)} COLMAP models: {some(inside)}. Choose one with "
             "data.model."
         )
-    if not folder.is_dir():
-        raise SceneError(
-            f"The folder {folder.absolute()} does not exist. Set data.root and data.scene to a "
-            "folder that holds a COLMAP model and its images."
-        )
     raise SceneError(
         f"{folder} holds no COLMAP model: there is no cameras.bin or cameras.txt in "
         f"{', '.join(names)}. Set data.model to the model's folder, relative to {folder}."
@@ -282,23 +271,12 @@ def _image_folder(folder: Path, name: str, model: SparseModel) -> Path:
     )
 
 
-def _number(text: str) -> float | None:
-    """A finite number, whole where it is written so."""
-    for kind in (int, float):
-        try:
-            number = kind(text)
-        except ValueError:
-            continue
-        return number if is_number(number) else None
-    return None
-
-
 def _matched(names: Sequence[str], labels: Sequence[str], pattern: str) -> list[float]:
     """The number in each name that is a pattern's group."""
     found: list[float] = []
     for name, label in zip(names, labels, strict=True):
         match = re.search(pattern, name)
-        number = None if match is None else _number(match[1])
+        number = None if match is None else number_in(match[1])
         if number is None:
             raise SceneError(
                 f"{label} has no number where data.time_pattern={pattern} has its group. "
@@ -344,22 +322,16 @@ def _listed_times(path: Path, names: Sequence[str]) -> list[float]:
         ) from problem
     known: dict[str, float] = {}
     for line, row in enumerate(rows, start=2):
-        file, time = row.get("file"), row.get("time")
-        if file is None or time is None:
+        file, number = row.get("file"), number_in(row.get("time") or "")
+        if file is None or number is None:
             raise SceneError(
-                f"{path}: line {line} has no {'file' if file is None else 'time'}. The first line "
-                "must name the columns file and time; each further line must fill both."
-            )
-        number = _number(time)
-        if number is None:
-            raise SceneError(
-                f"{path}: line {line} gives {file} the time {short(time)}; it must be a number, in "
-                "any unit."
+                f"{path}: line {line} is {short(row)}. The first line must name the columns file "
+                "and time; each further line must fill both, with a time that is a number."
             )
         if known.setdefault(file, number) != number:
             raise SceneError(
-                f"{path}: line {line} gives {file} the time {time}, an earlier one {known[file]}. "
-                "Remove one of them."
+                f"{path}: line {line} gives {file} the time {number}, an earlier one "
+                f"{known[file]}. Remove one of them."
             )
     if bare := [name for name in names if name not in known]:
         raise SceneError(

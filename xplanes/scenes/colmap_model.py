@@ -6,6 +6,7 @@ memory or returns wrong cameras, and its errors do not name the file.
 
 import math
 import os
+import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ from typing import BinaryIO, TypeVar
 import numpy as np
 
 from xplanes.errors import SceneError
-from xplanes.scenes.entries import decoded, require_fetched, short
+from xplanes.scenes.entries import decoded, number_in, require_fetched, short
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
 from xplanes.scenes.listing import Calibration
 
@@ -285,23 +286,24 @@ def _images(path: Path) -> Iterator[tuple[str, np.ndarray, int]]:
     def parse(words: list[str]) -> tuple[list[float], int, str]:
         return [float(word) for word in words[1:8]], int(words[8]), words[9]
 
-    lines = _text_lines(path)
-    for label, line in lines:
-        if not line:
+    count = 0
+    for label, line in _text_lines(path):
+        # Every other line, which some programs leave out, holds three values for each point seen.
+        words = line.split()
+        if len(words) % 3 == 0 and all(number_in(word) is not None for word in words):
             continue
         # Names may contain spaces.
         motion, camera, name = _parsed(
             label, line, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", parse, most=9
         )
-        # A second line, empty where no points are seen, holds three values for each point.
-        below, points = next(lines, (label, None))
-        if points is None or len(points.split()) % 3:
-            raise SceneError(
-                f"{below} must hold the points that {name} sees, three values for each, or be "
-                f"empty, but {'the file ends' if points is None else f'is {short(points)}'}. The "
-                "file is truncated or damaged: export the model again."
-            )
+        count += 1
         yield name, _pose(f"{label} ({name})", motion), camera
+    stated = re.search(rb"# Number of images: (\d+)", path.read_bytes())
+    if stated and count < int(stated[1]):
+        raise SceneError(
+            f"{path} says that it lists {int(stated[1])} images, but it ends after {count}: it is "
+            "truncated. Export the model again."
+        )
 
 
 def _positions(path: Path) -> np.ndarray:

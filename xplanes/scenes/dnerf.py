@@ -11,17 +11,16 @@ from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.transforms import read_transforms
 from xplanes.scenes.views import Scene
 
-GET_DATA = (
-    "Set data.root and data.scene to a folder that holds transforms_train.json, get the D-NeRF "
-    "scenes with `xplanes download dnerf`, or take the built-in scene with data=demo."
-)
-
 
 @dataclass(frozen=True, kw_only=True)
 class BlenderSettings(SceneSettings):
     """A scene on disk in the format of D-NeRF or Blender."""
 
     files: ClassVar = "transforms_train.json"
+    hint: ClassVar = (
+        ", get the D-NeRF scenes with `xplanes download dnerf`, or take the built-in scene with "
+        "data=demo"
+    )
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:
@@ -45,7 +44,8 @@ def read_scene(settings: SceneSettings, splits: Sequence[str]) -> Scene:
         SceneError: Anything is missing, damaged or inconsistent; the message says what to do.
     """
     folder = settings.folder
-    _check_folder(folder)
+    if not any(folder.glob("transforms_*.json")):
+        raise settings.no_scene()
     paths = {split: _transforms_path(folder, split) for split in dict.fromkeys(splits)}
     listed = settings.thinned({split: _listed(split, path) for split, path in paths.items()})
     video = _list_video(folder)
@@ -81,16 +81,6 @@ def _require_times(folder: Path, parts: Mapping[str, Listing], video: Listing | 
             )
 
 
-def _check_folder(folder: Path) -> None:
-    if folder.is_dir():
-        return
-    kind = "is not a folder" if folder.exists() else "does not exist"
-    root = next(parent for parent in folder.absolute().parents if parent.is_dir())
-    names = _scenes_in(root)
-    nearby = f"Scenes in {root}: {', '.join(names)}." if names else f"There is no scene in {root}."
-    raise SceneError(f"The scene folder {folder.absolute()} {kind}. {nearby} {GET_DATA}")
-
-
 def _transforms_path(folder: Path, split: str) -> Path:
     path = folder / f"transforms_{split}.json"
     if path.is_file():
@@ -98,10 +88,6 @@ def _transforms_path(folder: Path, split: str) -> Path:
     found = sorted(
         other.stem.removeprefix("transforms_") for other in folder.glob("transforms_*.json")
     )
-    if not found:
-        names = _scenes_in(folder)
-        inside = f" Scenes inside it: {', '.join(names)}." if names else ""
-        raise SceneError(f"{folder} holds no transforms_{split}.json.{inside} {GET_DATA}")
     way_out = "Add the file."
     if split == "test" and found == ["train"]:
         way_out = (
@@ -111,10 +97,6 @@ def _transforms_path(folder: Path, split: str) -> Path:
         way_out = "Leave data.eval_split out, set it to val, or add the file."
     names = ", ".join(found)
     raise MissingSplitError(f"{path} does not exist. Splits of this scene: {names}. {way_out}")
-
-
-def _scenes_in(folder: Path) -> list[str]:
-    return sorted(path.parent.name for path in folder.glob("*/transforms_train.json"))
 
 
 def _list_video(folder: Path) -> Listing | None:

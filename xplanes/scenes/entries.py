@@ -7,20 +7,32 @@ import math
 import os
 import re
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, TypeGuard
+from typing import Any, TypeGuard, TypeVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from xplanes.errors import BrokenFrameError, MissingSplitError, SceneError, first_of, warn
+from xplanes.errors import (
+    BrokenFrameError,
+    MissingSplitError,
+    SceneError,
+    first_of,
+    refuse_all,
+    warn,
+)
 from xplanes.files import stand_in
 from xplanes.scenes.cameras import upright
 from xplanes.scenes.formats import ENDINGS, is_image, orientation
 
 logger = logging.getLogger(__name__)
+
+Item = TypeVar("Item")
+Found = TypeVar("Found")
 
 SUFFIXES = ("", *ENDINGS)
 RIGID_TOLERANCE = 1e-3
@@ -30,6 +42,9 @@ FARTHEST = 1e15
 
 STILL = 1e-4
 """World units by which the positions of a fixed camera differ at most."""
+
+FAR_OFF = 60
+"""Degrees between the cameras' mean up vector and the z axis that is not up then."""
 
 ROUNDING = 1e-4
 """Largest rounding error of camera positions in single precision, as a share of their extent."""
@@ -76,27 +91,34 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
     )
 
 
-def found_images(
-    labels: Sequence[str], folder: Path, names: Sequence[str], key: str
-) -> list[Path | None]:
-    """The image of each name, as `image_path` finds it; None, with a warning, where there is none.
+def usable(
+    what: str, read: Callable[[Item], Found], items: Sequence[Item]
+) -> list[tuple[int, Found]]:
+    """What a function makes of frames, with their places; a warning lists those left out.
+
+    Args:
+        what: What the frames are called, for the warning.
+        read: Raises `BrokenFrameError` for a frame that is to be left out.
+        items: The frames.
 
     Raises:
-        MissingSplitError: If there is none at all.
-        SceneError: If a name leads out of the folder.
+        MissingSplitError: If all are left out.
+        SceneError: If ``read`` raises others; it names all of them.
     """
-    found: list[Path | None] = []
-    missing: list[str] = []
-    for label, name in zip(labels, names, strict=True):
+    found: list[tuple[int, Found]] = []
+    left_out, wrong = [], []
+    for place, item in enumerate(items):
         try:
-            found.append(image_path(label, folder, name, key))
+            found.append((place, read(item)))
         except BrokenFrameError as problem:
-            found.append(None)
-            missing.append(str(problem))
-    if len(missing) == len(found):
-        raise MissingSplitError(first_of(missing))
-    if missing:
-        warn(f"{len(missing)} of {len(found)} images are left out:\n{first_of(missing)}")
+            left_out.append(str(problem))
+        except SceneError as problem:
+            wrong.append(str(problem))
+    refuse_all(wrong)
+    if not found:
+        raise MissingSplitError(first_of(left_out))
+    if left_out:
+        warn(f"{len(left_out)} of {len(items)} {what} are left out:\n{first_of(left_out)}")
     return found
 
 
@@ -218,20 +240,26 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
     """
     require_fetched(path)
     try:
-        found = json.loads(decoded(path.read_bytes()))
+        found = _parsed(decoded(path.read_bytes()))
     except (OSError, ValueError, RecursionError) as problem:
-        way_out = "Export or download it again"
-        if isinstance(problem, UnicodeDecodeError):
-            way_out = "Save it as UTF-8"
-        elif isinstance(problem, json.JSONDecodeError):
-            if comment := re.search(r"(?m)(?:^|[\s,{\[])(//|/\*|#)", problem.doc):
-                way_out = f"JSON has no comments: take those that begin with {comment[1]} out of it"
-            elif re.search(r",\s*[}\]]", problem.doc):
-                way_out = "JSON has no comma before a closing bracket: take it out"
+        encoded = isinstance(problem, UnicodeDecodeError)
+        way_out = "Save it as UTF-8" if encoded else "Export or download it again"
         raise SceneError(f"{path} cannot be read as JSON ({problem}). {way_out}.") from problem
     if not isinstance(found, dict):
         raise SceneError(f"{path} must hold a JSON object with {content}, not {short(found)}.")
     return found
+
+
+def _parsed(text: str) -> Any:
+    """A JSON text, which may have comments and commas before closing brackets."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        bare = re.sub(rf"{STRING}|//[^\n]*|#[^\n]*|/\*.*?\*/", r"\1", text, flags=re.S)
+        bare = re.sub(rf"{STRING}|,(?=\s*[}}\]])", r"\1", bare)
+        with suppress(json.JSONDecodeError):
+            return json.loads(bare)
+        raise
 
 
 def decoded(content: bytes) -> str:
@@ -272,11 +300,13 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
         The matrix. float64 [4, 4]
 
     Raises:
-        BrokenFrameError: If it is not finite.
+        BrokenFrameError: If it is not finite, or there is none.
         SceneError: If it is no such matrix.
     """
+    if matrix is None:
+        raise BrokenFrameError(f"{label} has no {key}: the camera is unknown.")
     try:
-        pose = np.asarray(matrix, dtype=np.float64)
+        pose = np.array(matrix, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         pose = np.empty(0)
     if pose.shape in ((12,), (16,)):
@@ -293,11 +323,16 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
             f"Poses are camera-to-world, written row by row (perhaps this one is transposed)."
         )
     rotation = pose[:3, :3]
+    # A camera's own scale turns no ray.
+    scale = np.cbrt(abs(np.linalg.det(rotation)))
+    if scale > 0 and abs(scale - 1) > RIGID_TOLERANCE:
+        rotation /= scale
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if error > RIGID_TOLERANCE:
         raise SceneError(
             f"{label}: the rotation in {key} is not orthonormal (off by {error:.2g}, "
-            f"allowed {RIGID_TOLERANCE:g}). Set the camera's scale to 1 and export again."
+            f"allowed {RIGID_TOLERANCE:g}). Set the camera's scale to 1 on all axes and export "
+            "again."
         )
     if np.linalg.det(rotation) < 0:
         raise SceneError(
@@ -307,41 +342,53 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
     return pose
 
 
+STRING = r'("(?:[^"\\]|\\.)*")'
+"""A text in JSON."""
+
 UP = {3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 """The up vector in the stored pixels (right, up) by EXIF orientation; (0, 1) for others."""
 
 
-def oriented(
-    poses: np.ndarray, points: np.ndarray | None, paths: Sequence[Path]
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """A capture whose world is turned so that the cameras' mean up vector is its z axis.
+def world_turn(
+    poses: Tensor, paths: Sequence[Path], orient: bool | None
+) -> tuple[Tensor | None, str]:
+    """How a world is turned for the cameras' mean up vector to be its z axis, and what is up then.
 
-    Up in an image follows its EXIF orientation; pixels and cameras stay as they are. If the cameras
-    have no common up vector, the world stays as it is, with a warning.
+    Up in an image follows its EXIF orientation; pixels and cameras stay as they are.
 
     Args:
-        poses: Cameras. float64 [V, 4, 4]
-        points: Points in the same world. float64 [N, 3]
-        paths: The images. [V]
+        poses: Cameras with OpenGL's axes. [V, 4, 4]
+        paths: Their images; none where these are frames of videos. [V]
+        orient: Whether to turn the world. None turns it if the mean up vector is more than
+            `FAR_OFF` degrees from the z axis.
+
+    Returns:
+        The rotation, float64 [3, 3], or None where the world stays as it is; and a sentence.
     """
-    tags = [orientation(path) for path in paths]
+    tags = [orientation(path) for path in paths] or [1] * len(poses)
     if turned_photos := sum(tag in UP for tag in tags):
         logger.info(
             "%d of %d images are to be shown turned, as their EXIF orientation says: pixels are "
             "read as they are stored, and up vectors follow EXIF",
             *(turned_photos, len(paths)),
         )
-    right, upward = np.array([UP.get(tag, (0, 1)) for tag in tags], np.float64).T[..., None]
-    rotation = upright(torch.from_numpy(poses[:, :3, 0] * right + poses[:, :3, 1] * upward))
-    if rotation is None:
-        warn(
-            "The up vectors of the cameras cancel out, so the world keeps the axes that the files "
-            "give it. data.orient=false says that it should."
+    aside = torch.tensor([UP.get(tag, (0, 1)) for tag in tags], dtype=torch.float64)
+    up = (poses[:, :3, :2].double() * aside[:, None]).sum(dim=2)
+    if (rotation := upright(up)) is None:
+        if orient:
+            warn(
+                "The up vectors of the cameras cancel out, so the world keeps the axes that the "
+                "files give it. data.orient=false says that it should."
+            )
+        return None, "the z axis of the files; the cameras' up vectors cancel out"
+    off = math.degrees(math.acos(min(1.0, max(-1.0, float(rotation[2, 2])))))
+    if orient or (orient is None and off > FAR_OFF):
+        why = "data.orient=true" if orient else "data.orient=false keeps their axes"
+        return rotation, (
+            f"the cameras' mean up vector: the world is turned, as it is {off:.3g} degrees off "
+            f"the z axis of the files ({why})"
         )
-        return poses, points
-    turned, turn = poses.copy(), rotation.numpy()
-    turned[:, :3] = turn @ poses[:, :3]
-    return turned, None if points is None else points @ turn.T
+    return None, f"the z axis of the files; the cameras' mean up vector is {off:.3g} degrees off"
 
 
 def require_precision(source: Path, positions: np.ndarray) -> None:
@@ -406,6 +453,15 @@ def is_number(value: Any) -> TypeGuard[float]:
     except OverflowError:
         # JSON holds integers that no float can.
         return False
+
+
+def number_in(text: str) -> float | None:
+    """A finite number that a text holds, whole where it is written so; None for other texts."""
+    for kind in (int, float):
+        with suppress(ValueError):
+            number = kind(text)
+            return number if is_number(number) else None
+    return None
 
 
 def is_positive(value: Any) -> TypeGuard[float]:

@@ -95,6 +95,7 @@ def read_images(
     has_ray: Sequence[Tensor | None] = (),
     cache: Path | None = None,
     kind: MaskKind = PLAIN,
+    clear: Sequence[int] = (),
 ) -> Tensor | store.StoredImages:
     """Decode images of any sizes and reduce them.
 
@@ -108,6 +109,7 @@ def read_images(
             for all; all of all images where it is empty. [V]
         cache: Folder of decoded images; that of the user when None.
         kind: What masks mean, see `masks.read_mask`.
+        clear: Levels of grey, of 255, that are transparent.
 
     Returns:
         Colour, multiplied by alpha before it was averaged, and alpha, smaller images padded with
@@ -117,11 +119,11 @@ def read_images(
         SceneError: A file cannot be decoded, or a mask does not fit its image.
         StorageError: The cache cannot be written.
     """
-    jobs = _jobs(paths, sizes, masks, has_ray, kind)
+    jobs = _jobs(paths, sizes, masks, has_ray, kind, clear)
     sources = [*paths, *(mask for mask in masks if mask is not None)]
     meaning = [MASKS, kind.labels, kind.inverted]
-    recipe = ["images", meaning, [mask is not None for mask in masks], digests(has_ray)]
-    cleared = any(masks) or any(shown is not None for shown in has_ray)
+    recipe = ["images", meaning, [mask is not None for mask in masks], digests(has_ray), *clear]
+    cleared = bool(clear) or any(masks) or any(shown is not None for shown in has_ray)
 
     def has_alpha() -> bool:
         return cleared or any(read_header(path)[1] for path in paths)
@@ -139,13 +141,14 @@ def _jobs(
     masks: Sequence[Path | None] = (),
     has_ray: Sequence[Tensor | None] = (),
     kind: MaskKind = PLAIN,
+    clear: Sequence[int] = (),
 ) -> list[store.Job]:
     """What decodes the images, one each."""
 
     def job(index: int) -> store.Job:
         def decode() -> Iterator[tuple[int, np.ndarray]]:
             mask = masks[index] if masks else None
-            pixels = read_image(paths[index], sizes[index], mask, kind)
+            pixels = read_image(paths[index], sizes[index], mask, kind, clear)
             yield index, cleared(pixels, has_ray[index] if has_ray else None)
 
         return decode
@@ -170,18 +173,25 @@ def digests(masks: Sequence[Tensor | None]) -> list[str]:
 
 
 def read_image(
-    path: Path, size: Size, mask: Path | None = None, kind: MaskKind = PLAIN
+    path: Path,
+    size: Size,
+    mask: Path | None = None,
+    kind: MaskKind = PLAIN,
+    clear: Sequence[int] = (),
 ) -> np.ndarray:
     """Decode one image, multiply it by its mask, and reduce it. uint8 [H, W, 4]"""
-    channels = load_premultiplied(path)
+    channels = load_premultiplied(path, clear)
     if mask is not None:
         channels *= read_mask(mask, kind, path)
     height, width = size
     return shrink(channels, width, height)
 
 
-def load_premultiplied(path: Path) -> np.ndarray:
-    """Decode one image to colour times alpha and alpha, from 0 to 255. float32 [4, H, W]"""
+def load_premultiplied(path: Path, clear: Sequence[int] = ()) -> np.ndarray:
+    """Decode one image to colour times alpha and alpha, from 0 to 255. float32 [4, H, W]
+
+    Pixels of some levels of grey are transparent.
+    """
     try:
         with open_image(path) as picture:
             picture.load()
@@ -190,6 +200,8 @@ def load_premultiplied(path: Path) -> np.ndarray:
         raise
     except UNREADABLE as problem:
         raise unreadable(path, problem) from problem
+    for level in clear:
+        channels[3, (channels[:3] == level).all(axis=0)] = 0
     channels[:3] *= channels[3] * np.float32(1 / 255)
     return channels
 

@@ -111,6 +111,7 @@ class Listing:
             None for an image without; empty where there are none. [V]
         mask_meaning: What the source defines masks as: "alpha", or "ignored" (white where pixels
             are to be ignored); empty if it does not.
+        clear: Levels of grey, of 255, that are transparent in its images.
         time_source: Where times come from, with examples; empty where there are none.
     """
 
@@ -122,6 +123,7 @@ class Listing:
     timed: bool
     masks: tuple[Path | None, ...] = ()
     mask_meaning: str = ""
+    clear: tuple[int, ...] = ()
     time_source: str = ""
 
     def __len__(self) -> int:
@@ -162,6 +164,12 @@ class Listing:
         )
         _require_shapes(listing)
         return listing
+
+    def turned(self, turn: Tensor) -> "Listing":
+        """The same in a world that is turned. float64 [3, 3]"""
+        poses = self.camera_to_world.double()
+        poses[:, :3] = turn @ poses[:, :3]
+        return replace(self, camera_to_world=poses.float())
 
     def subset(self, indices: Sequence[int]) -> "Listing":
         """The images at ``indices``, in that order. [K]"""
@@ -283,7 +291,7 @@ def read_views(
     has_ray = [intrinsics.has_ray(index) for index in range(len(listing))]
     require_rays(names, listing.calibrations, has_ray)
     masks = () if ignore else listing.masks
-    images = read_images(listing.paths, sizes, masks, has_ray, cache, kind)
+    images = read_images(listing.paths, sizes, masks, has_ray, cache, kind, listing.clear)
     if ignored is not None:
         ignored = ignored[:, : images.shape[1], : images.shape[2]]
     views = Views(

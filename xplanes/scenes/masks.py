@@ -52,7 +52,7 @@ RUNS = 0.6
 """Least share of a mask's pixels with a neighbour of the same value, if these are labels."""
 
 NOISE = 8 / 255
-"""Largest difference from black and from white that lossy formats make."""
+"""Largest difference from black and from white that lossy formats and videos make."""
 
 SILHOUETTE_EDGE, UNCLEAR = 0.5, (0.4, 0.7)
 """Least share of the images' edges that silhouettes leave out, and shares that may mean either."""
@@ -123,13 +123,13 @@ def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
         may_be = not lossy and _has_regions(grey)
         numbers |= set(np.unique(grey).tolist()) if may_be else {1}
         stride = -(-max(grey.shape) // LOOK)
-        stored.append((grey[::stride, ::stride], lossy))
+        stored.append(grey[::stride, ::stride])
     labels = len(numbers) <= MOST_LABELS and max(numbers, default=0) <= WHITE and 0 in numbers
     kind = MaskKind(labels, inverted=inverted)
     edges, shares, middles = [], [], []
     contents = set()
-    for place, (grey, lossy) in enumerate(stored):
-        out = 1 - _factors(grey, lossy, kind)
+    for place, grey in enumerate(stored):
+        out = 1 - _factors(grey, kind)
         contents.add(hash(out.tobytes()))
         shares.append(float(out.mean()))
         if out.all() and (edges or place < len(stored) - 1):
@@ -196,17 +196,16 @@ def read_mask(path: Path, kind: MaskKind, image: Path | None = None) -> np.ndarr
     Raises:
         SceneError: If it cannot be decoded, or has another size.
     """
-    grey, lossy = _stored(path)
+    grey, _ = _stored(path)
     if image is not None and grey.shape != (wanted := read_header(image)[0]):
         raise SceneError(mask_misfit(path, grey.shape, image, wanted))
-    return _factors(grey, lossy, kind)
+    return _factors(grey, kind)
 
 
-def _factors(grey: np.ndarray, lossy: bool, kind: MaskKind) -> np.ndarray:
+def _factors(grey: np.ndarray, kind: MaskKind) -> np.ndarray:
     """What `read_mask` makes of the values of a mask. float32 [H, W]"""
     values = (grey > 0).astype(np.float32) if kind.labels else grey.copy()
-    if lossy:
-        values[values < NOISE], values[values > 1 - NOISE] = 0, 1
+    values[values < NOISE], values[values > 1 - NOISE] = 0, 1
     return 1 - values if kind.inverted else values
 
 

@@ -30,6 +30,7 @@ from xplanes.scenes.entries import (
     require_precision,
     some,
     unit_times,
+    world_turn,
 )
 from xplanes.scenes.formats import ENDINGS, is_image, read_header
 from xplanes.scenes.images import (
@@ -77,13 +78,17 @@ class MultiCameraSettings(SceneSettings):
     """Synchronised videos of several fixed cameras."""
 
     files: ClassVar = (
-        "videos or folders cam00, cam01, ... with poses_bounds.npy or a model of COLMAP"
+        "videos or folders cam00, cam01, ... with poses_bounds.npy, a model of COLMAP, or a "
+        "transforms.json with a frame of each"
     )
 
     frames: list[int] | None  # First frame, last frame and stride; null for all frames.
     # Names of the held-out cameras: scored, not trained on. null: cam00, or else the most central.
     test_cameras: list[str] | None
     video_camera: str | None  # Camera whose video the LRM sees; null: the most central one.
+    # Rotate the world so that the cameras' mean up vector becomes its z axis. null: if that is more
+    # than 60 degrees from it.
+    orient: bool | None
 
     def check(self) -> None:
         if self.frames is None:
@@ -102,8 +107,9 @@ class MultiCameraSettings(SceneSettings):
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         if (folder / POSES).is_file():
-            return bool(recordings_of_cameras(folder))
-        return find_model(folder, MODELS[:2]) is not None and len(recordings_of_cameras(folder)) > 1
+            return bool(_recordings(folder))
+        registered = find_model(folder, MODELS[:2]) is not None
+        return is_rig(folder) or (registered and len(recordings_of_cameras(folder)) > 1)
 
     def load(self, splits: Sequence[str]) -> Scene:
         if self.train_on_video:
@@ -113,11 +119,7 @@ class MultiCameraSettings(SceneSettings):
             )
         folder = self.folder
         if not folder.is_dir():
-            raise SceneError(
-                f"The scene folder {folder.absolute()} does not exist. Set data.root and "
-                f"data.scene to a folder with {POSES}, {TRANSFORMS} or {MODELS[0]} and the "
-                "cameras' videos."
-            )
+            raise self.no_scene()
         cameras = read_cameras(folder)
         parts = _split_cameras(folder, cameras, self.test_cameras)
         for split in splits:
@@ -128,16 +130,25 @@ class MultiCameraSettings(SceneSettings):
                 )
         watched = _video_camera(cameras, parts, self.video_camera)
         recordings = [_recording(camera) for camera in cameras]
-        numbers = _frame_numbers(folder, recordings, self.frames)
+        poses = torch.from_numpy(np.stack([camera.pose for camera in cameras]))
+        images = [image for recording in recordings for image in recording.images[:1]]
+        turn, up = world_turn(poses, images if len(images) == len(poses) else (), self.orient)
+        if turn is not None:
+            poses[:, :3] = turn @ poses[:, :3]
         stamped = _are_stamped(recordings)
-        whole = _read_views(recordings, numbers, stamped, self.resolution, self.image_cache)
+        numbers = _frame_numbers(folder, recordings, self.frames, stamped)
+        whole, owner = _read_views(
+            recordings, poses, numbers, stamped, self.resolution, self.image_cache
+        )
 
         def views_of(chosen: Sequence[int]) -> Views:
-            count = len(numbers)
-            return whole.subset([camera * count + i for camera in chosen for i in range(count)])
+            return whole.subset(torch.cat([(owner == camera).nonzero()[:, 0] for camera in chosen]))
 
         chosen = self.thinned({split: views_of(parts[split]) for split in dict.fromkeys(splits)})
-        return Scene(folder.resolve().name, chosen, video=views_of([watched]))
+        origin = "when the videos show their frames" if stamped else "the numbers of the frames"
+        last = max(each[-1] for each in numbers)
+        notes = {"times": f"{origin}, from {numbers[0][0]} to {last}", "up": up}
+        return Scene(folder.resolve().name, chosen, video=views_of([watched]), notes=notes)
 
 
 @dataclass(frozen=True)
@@ -214,10 +225,36 @@ def read_cameras(folder: Path) -> list[Camera]:
 
 def recordings_of_cameras(folder: Path) -> list[Path]:
     """Videos and folders of the names cam*, or else of numbers such as 00 or view_01, by name."""
-    found = sorted(path for path in folder.glob("cam*") if _is_recording(path))
-    numbered = [path for path in folder.iterdir() if NUMBERED.fullmatch(path.stem)]
+    inside = sorted(filter(_is_recording, folder.iterdir()))
+    numbered = [path for path in inside if NUMBERED.fullmatch(path.stem)]
     numbered.sort(key=lambda path: natural(path.name))
-    return found or [path for path in numbered if _is_recording(path)]
+    return [path for path in inside if path.name.lower().startswith("cam")] or numbered
+
+
+def _recordings(folder: Path) -> list[Path]:
+    """The same in a folder, or in the only one in it that has some, such as videos."""
+    if found := recordings_of_cameras(folder):
+        return found
+    deeper = [recordings_of_cameras(path) for path in folder.iterdir() if path.is_dir()]
+    deeper = [paths for paths in deeper if paths]
+    return deeper[0] if len(deeper) == 1 else []
+
+
+def is_rig(folder: Path) -> bool:
+    """Whether the frames of transforms.json are of different videos or folders of several images.
+
+    Then they are cameras, not a capture of as many images.
+    """
+    sources: set[Path] = set()
+    try:
+        for frame in read_frames(folder / TRANSFORMS)["frames"]:
+            source = _source("", folder.resolve(), frame["file_path"])
+            if source in sources or (source.is_dir() and len(_images_in(source)) < 2):
+                return False
+            sources.add(source)
+    except SceneError:
+        return False
+    return len(sources) > 1
 
 
 def _is_recording(path: Path) -> bool:
@@ -227,6 +264,27 @@ def _is_recording(path: Path) -> bool:
 def _from_poses_bounds(folder: Path) -> list[Camera]:
     """Cameras of poses_bounds.npy, whose rows belong to the videos or folders cam* by name."""
     path = folder / POSES
+    # A video may lie beside a folder of images made of it.
+    sources = list({source.stem: source for source in _recordings(folder)}.values())
+    rows = read_poses_bounds(path, [source.name for source in sources])
+    return [
+        Camera(source.stem, source, pose, calibration, label)
+        for source, (label, pose, calibration) in zip(sources, rows, strict=True)
+    ]
+
+
+def read_poses_bounds(
+    path: Path, names: Sequence[str]
+) -> list[tuple[str, np.ndarray, Calibration]]:
+    """Label, pose and calibration of each row of poses_bounds.npy.
+
+    Args:
+        path: The file.
+        names: Images, videos or folders that the rows are of, in order.
+
+    Raises:
+        SceneError: If it cannot be read, or has another number of rows.
+    """
     require_fetched(path)
     try:
         rows = np.load(path, allow_pickle=False)
@@ -239,17 +297,14 @@ def _from_poses_bounds(folder: Path) -> list[Camera]:
             f"{path} holds {rows.dtype} {list(rows.shape)}, not one row of 17 numbers for each "
             "camera: a pose of 3 rows and 5 columns, then the nearest and the farthest depth."
         )
-    # A video may lie beside a folder of images made of it.
-    sources = list({source.stem: source for source in recordings_of_cameras(folder)}.values())
-    if len(sources) != len(rows):
-        names = ", ".join(source.name for source in sources) or "none"
+    if len(names) != len(rows):
         raise SceneError(
-            f"{path} has {len(rows)} cameras, but {folder} holds {len(sources)} (cam*, or numbers)"
-            f": {names}. Add the videos that are missing, or take the others' rows out."
+            f"{path} has {len(rows)} cameras, but {path.parent} holds {len(names)} (cam*, or "
+            f"numbers): {some(names) or 'none'}. Add what is missing, or take the others' rows out."
         )
     cameras = []
-    for index, (source, row) in enumerate(zip(sources, rows, strict=True)):
-        label = f"{path}: row {index} ({source.name})"
+    for index, (name, row) in enumerate(zip(names, rows, strict=True)):
+        label = f"{path}: row {index} ({name})"
         matrix = row[:15].astype(np.float64).reshape(3, 5)
         down, right, back, centre, (height, width, focal) = matrix.T
         for key, value in (("height", height), ("width", width), ("focal length", focal)):
@@ -259,7 +314,7 @@ def _from_poses_bounds(folder: Path) -> list[Camera]:
         pose[:3] = np.stack([right, -down, back, centre], axis=1)
         pose = checked_pose(label, pose, "the pose")
         calibration = Calibration(fl_x=float(focal), w=float(width), h=float(height))
-        cameras.append(Camera(source.stem, source, pose, calibration, label))
+        cameras.append((label, pose, calibration))
     return cameras
 
 
@@ -295,15 +350,8 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
     # Other folders, such as images and sparse, need be no cameras.
     expected = {path for paths in sources.values() for path in paths if path.is_file()}
     expected = sorted(expected | set(recordings_of_cameras(folder)))
-
-    def refused(problem: str, way_out: str) -> SceneError:
-        return SceneError(
-            f"{model.source}: {problem}. Registered images: {some(model.names)}. Videos, and "
-            f"folders of the name cam*, in {folder}: "
-            f"{some([path.name for path in expected]) or 'none'}. {way_out}"
-        )
-
-    cameras: dict[Path, Camera] = {}
+    owned: dict[Path, list[str]] = {path: [] for path in expected}
+    cameras, problems = [], []
     for name, pose, calibration in zip(
         model.names, model.camera_to_world, model.calibrations, strict=True
     ):
@@ -314,33 +362,26 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
             # A video may lie beside a folder of images made of it.
             for path in [path for path in sources[text] if path.is_file()] or sources[text]
         ]
-        if not found:
-            raise refused(
-                f"no video or folder belongs to {name}",
-                "One image of each camera must have its name: cam00.png or cam00/0001.png is of "
-                "cam00.mp4, or of the folder cam00.",
-            )
-        if len(found) > 1:
-            raise refused(
-                f"{name} may be of {' or of '.join(path.name for path in found)}",
-                "Rename what it is not of, or move it elsewhere.",
-            )
-        (source,) = found
-        label = f"{model.source}: {name}"
-        if source in cameras:
-            raise refused(
-                f"{name} is of {source.name}, as an earlier image is",
-                "Register one image of each camera, or read all images that are registered with "
-                "data=colmap.",
-            )
-        cameras[source] = Camera(source.stem, source, pose, calibration, label)
-    known = {camera.name for camera in cameras.values()}
-    if bare := [path.name for path in expected if path.stem not in known]:
-        raise refused(
-            f"no registered image belongs to {some(bare)}",
-            "Register an image of each camera, or move what is not calibrated elsewhere.",
+        for path in found:
+            owned.setdefault(path, []).append(name)
+            label = f"{model.source}: {name}"
+            cameras.append(Camera(path.stem, path, pose, calibration, label))
+        if len(found) != 1:
+            words = " or of ".join(path.name for path in found)
+            problems.append(f"{name} may be of {words or 'no video or folder'}")
+    known = {path.stem for path, names in owned.items() if names}
+    for path, names in owned.items():
+        if len(names) > 1 or path.stem not in known:
+            problems.append(f"{some(names) or 'no registered image'} belongs to {path.name}")
+    if problems:
+        raise SceneError(
+            f"{model.source}: {some(problems)}. One image of each camera must be registered, and "
+            "have its name: cam00.png or cam00/0001.png for cam00.mp4, or for the folder cam00. "
+            f"Registered images: {some(model.names)}. Videos, and folders of the name cam*, in "
+            f"{folder}: {some([path.name for path in expected]) or 'none'}. Move what is no camera "
+            "elsewhere, or read all registered images with data=colmap."
         )
-    return list(cameras.values())
+    return cameras
 
 
 def _source(label: str, folder: Path, name: Any) -> Path:
@@ -402,15 +443,11 @@ def _video_camera(cameras: Sequence[Camera], parts: dict[str, list[int]], name: 
         away = _distances(cameras)
         return min(train, key=lambda index: away[index])
     found = [index for index, camera in enumerate(cameras) if camera.name == name]
-    if not found:
+    if not found or found[0] not in train:
         raise SceneError(
-            f"data.video_camera={name}: there is no such camera. Name one of "
-            f"{', '.join(cameras[index].name for index in train)}, or null for the most central."
-        )
-    if found[0] not in train:
-        raise SceneError(
-            f"data.video_camera={name} is one of data.test_cameras, whose frames are scored: the "
-            "LRM must not see them. Name a training camera, or take it out of the test cameras."
+            f"data.video_camera={name} is no training camera, and the LRM must not see frames that "
+            f"are scored. Name one of {', '.join(cameras[index].name for index in train)}, or null "
+            "for the most central."
         )
     return found[0]
 
@@ -449,31 +486,28 @@ def _images_in(folder: Path) -> list[Path]:
 
 
 def _are_stamped(recordings: Sequence[Recording]) -> bool:
-    """Whether times are those of the files, as where the frames of a video are unevenly spaced.
+    """Whether times are those of the files, as where rates differ, or vary within a video.
 
     Elsewhere frames of one number are of one time. A warning tells of videos that begin at
     different times then.
 
     Raises:
-        SceneError: If videos have different rates.
+        SceneError: If rates differ and a recording has no times.
     """
+    timed = [(each.camera.source, each.rate) for each in recordings if each.rate]
+    other = next((t for t in timed if abs(t[1] / timed[0][1] - 1) > SAME_RATE), None)
     uneven = any(
         recording.step and np.diff(recording.times).max() > LATE * recording.step
         for recording in recordings
     )
-    if uneven and all(recording.times for recording in recordings):
+    if (uneven or other) and all(recording.times for recording in recordings):
         return True
-    timed = [
-        (recording.camera.source, recording.rate) for recording in recordings if recording.rate
-    ]
-    for source, rate in timed:
-        first, usual = timed[0]
-        if abs(rate / usual - 1) > SAME_RATE:
-            raise SceneError(
-                f"{source} has {rate:g} frames per second, but {first} {usual:g}: frames of one "
-                f"number are not of one time. Encode all videos at one rate: ffmpeg -i "
-                f"{source.name} -r {usual:g} NEW.mp4"
-            )
+    if other is not None:
+        raise SceneError(
+            f"{other[0]} has {other[1]:g} frames per second, but {timed[0][0]} {timed[0][1]:g}, "
+            "and not all cameras' files tell the times of their frames. Encode all videos at one "
+            f"rate: ffmpeg -i {other[0].name} -r {timed[0][1]:g} NEW.mp4"
+        )
     begun = [(r.times[0], r.camera.source, r.step) for r in recordings if r.times]
     if begun:
         (early, first, step), (late, last, _) = min(begun), max(begun)
@@ -510,9 +544,9 @@ def _require_same_frames(recordings: Sequence[Recording]) -> None:
 
 
 def _frame_numbers(
-    folder: Path, recordings: Sequence[Recording], frames: Sequence[int] | None
-) -> range:
-    """Numbers of the frames to read, which every camera has."""
+    folder: Path, recordings: Sequence[Recording], frames: Sequence[int] | None, stamped: bool
+) -> list[range]:
+    """Numbers of the frames to read of each camera: the same ones, unless they have own times."""
     _require_same_frames(recordings)
     shortest = min(recordings, key=lambda recording: recording.count)
     longest = max(recordings, key=lambda recording: recording.count)
@@ -525,25 +559,34 @@ def _frame_numbers(
                 f"data.frames=[{min(first, shortest.count - 1)},{shortest.count - 1},{stride}], or "
                 "null."
             )
-        return range(first, last + 1, stride)
+        return [range(first, last + 1, stride)] * len(recordings)
+    if stamped:
+        return [range(recording.count) for recording in recordings]
     if shortest.count < longest.count:
         logger.warning(
             "%s: camera %s has %d frames, but %s %d: the first %d frames of every camera are used",
             *(folder, shortest.camera.name, shortest.count, longest.camera.name, longest.count),
             shortest.count,
         )
-    return range(shortest.count)
+    return [range(shortest.count)] * len(recordings)
 
 
 def _read_views(
     recordings: Sequence[Recording],
-    numbers: range,
+    poses: Tensor,
+    numbers: Sequence[range],
     stamped: bool,
     resolution: int | None,
     cache: Path | None,
-) -> Views:
-    """All frames of all cameras, camera by camera."""
-    count = len(numbers)
+) -> tuple[Views, Tensor]:
+    """All frames of all cameras, and the camera of each."""
+    counts = torch.tensor([len(each) for each in numbers])
+    camera = torch.arange(len(recordings)).repeat_interleave(counts)
+    frames = [
+        (recording, number)
+        for recording, own in zip(recordings, numbers, strict=True)
+        for number in own
+    ]
     native = [recording.size for recording in recordings]
     sources = [recording.camera.source for recording in recordings]
     sizes = final_sizes(sources, native, resolution)
@@ -553,15 +596,18 @@ def _read_views(
     intrinsics = final_intrinsics(labels, calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(recordings))]
     require_rays(labels, calibrations, has_ray)
+    firsts = (counts.cumsum(0) - counts).tolist()
     jobs = [
-        _job(recording, numbers, sizes[index], has_ray[index], index * count)
-        for index, recording in enumerate(recordings)
+        _job(recording, own, size, shown, first)
+        for recording, own, size, shown, first in zip(
+            recordings, numbers, sizes, has_ray, firsts, strict=True
+        )
     ]
-    images = [r.images[number] for r in recordings if r.images for number in numbers]
+    images = [recording.images[number] for recording, number in frames if recording.images]
     names = [[recording.camera.name, bool(recording.images)] for recording in recordings]
-    span = [numbers.start, numbers.stop, numbers.step]
+    span = [[own.start, own.stop, own.step] for own in numbers]
     pixels = store.images(
-        [size for size in sizes for _ in numbers],
+        [sizes[index] for index in camera.tolist()],
         jobs,
         [source for source in sources if source.is_file()] + images,
         ["multicamera", names, span, digests(has_ray)],
@@ -571,25 +617,15 @@ def _read_views(
         ),
         cache,
     )
-    poses = torch.from_numpy(np.stack([recording.camera.pose for recording in recordings])).float()
-    camera = torch.arange(len(recordings)).repeat_interleave(count)
-    times = torch.linspace(0, 1, count) if count > 1 else torch.zeros(1)
-    times = times.repeat(len(recordings))
-    if stamped:
-        seconds = [recording.times[number] for recording in recordings for number in numbers]
-        times = torch.tensor(unit_times(seconds))
-        logger.info("Frames of some videos are unevenly spaced: times are those of the files")
-    return Views(
+    moments = [recording.times[number] if stamped else number for recording, number in frames]
+    views = Views(
         pixels,
-        poses[camera],
-        times,
+        poses[camera].float(),
+        torch.tensor(unit_times(moments)),
         intrinsics.subset(camera),
-        tuple(
-            f"{recording.camera.name}/{number:06d}"
-            for recording in recordings
-            for number in numbers
-        ),
+        tuple(f"{recording.camera.name}/{number:06d}" for recording, number in frames),
     )
+    return views, camera
 
 
 def _job(

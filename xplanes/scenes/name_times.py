@@ -25,7 +25,7 @@ CAMERA = re.compile(
 )
 """The number of a camera, as in 034_cam1."""
 
-CLOCK = re.compile(r"(?<![A-Za-z\d])\d+\.\d+$|(?<!\d)(\d{10})[_-](\d{9}|\d{6})$")
+CLOCK = re.compile(r"(?<![A-Za-z\d])\d+\.\d+(?=s?$)|(?<!\d)(\d{10})[_-](\d{9}|\d{6})$")
 """Seconds and their fraction at the end of a name, as in 1305031102.175304."""
 
 DATE = re.compile(
@@ -115,10 +115,12 @@ def _no_series(names: Sequence[str], stems: Sequence[str], found: Sequence[Numbe
 
 
 def _folders(names: Sequence[str]) -> list[list[int]]:
-    """Places of the images of each folder, in the order of their names without cameras."""
-    folders: dict[str, list[int]] = defaultdict(list)
+    """Places of the images of each folder and camera, in the order of their names without it."""
+    folders: dict[tuple[str, ...], list[int]] = defaultdict(list)
     for place in sorted(range(len(names)), key=lambda i: natural(CAMERA.sub("", names[i]))):
-        folders[PurePosixPath(names[place]).parent.as_posix()].append(place)
+        path = PurePosixPath(names[place])
+        cameras = (match[0] for match in CAMERA.finditer(path.stem))
+        folders[path.parent.as_posix(), *cameras].append(place)
     return list(folders.values())
 
 

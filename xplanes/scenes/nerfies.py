@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from xplanes.errors import SceneError, warn
+from xplanes.errors import BrokenFrameError, SceneError, warn
 from xplanes.scenes.entries import (
     SUFFIXES,
     checked_pose,
@@ -17,12 +17,12 @@ from xplanes.scenes.entries import (
     is_number,
     is_positive,
     mask_files,
-    oriented,
     read_object,
     require_fetched,
     short,
     some,
     unit_times,
+    usable,
 )
 from xplanes.scenes.images import native_sizes
 from xplanes.scenes.listing import Calibration, Listing, held_out, time_source
@@ -35,6 +35,9 @@ logger = logging.getLogger(__name__)
 TIMES = ("time_id", "warp_id", "appearance_id")
 """Keys of metadata.json that count timesteps; the first that all images have is taken."""
 
+EXAMPLE = '{"warp_id": 0, "camera_id": 0}'
+"""An entry of metadata.json."""
+
 DOWNLOAD = "Download or unpack the capture again."
 
 
@@ -42,7 +45,7 @@ DOWNLOAD = "Download or unpack the capture again."
 class NerfiesSettings(CaptureSettings):
     """A capture in the format of Nerfies, HyperNeRF or DyCheck."""
 
-    files: ClassVar = "dataset.json, camera/ and rgb/"
+    files: ClassVar = "dataset.json, metadata.json, scene.json, camera/ and rgb/"
 
     # Name of DyCheck's splits to use, such as mono or intl; null: those in splits/train.json if it
     # exists, otherwise those in dataset.json.
@@ -50,7 +53,6 @@ class NerfiesSettings(CaptureSettings):
     # Folder of masks, with the subfolders and file names of rgb, black outside the foreground; null
     # for none. DyCheck's co-visibility masks are unsuitable: they do not mark the foreground.
     masks: Location | None
-    orient: bool  # Rotate the world so that the cameras' mean up vector becomes its z axis.
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:
@@ -59,40 +61,40 @@ class NerfiesSettings(CaptureSettings):
     def load(self, splits: Sequence[str]) -> Scene:
         folder = self.folder
         if not (folder / "dataset.json").is_file():
-            there = "holds no dataset.json" if folder.is_dir() else "does not exist"
-            raise SceneError(
-                f"The folder {folder.absolute()} {there}. Set data.root and data.scene to a folder "
-                "with dataset.json, metadata.json, scene.json, camera/ and rgb/."
-            )
+            raise self.no_scene()
         chosen, source = _splits(folder, self.protocol)
         names = list(dict.fromkeys(name for part in chosen.values() for name in part))
         pictures = _picture_folder(folder, names, self.resolution)
-        lost = _missing(folder / "rgb" / pictures, names, SUFFIXES[1:])
-        names = [name for name in names if name not in set(lost)]
-        chosen = {split: [n for n in part if n not in set(lost)] for split, part in chosen.items()}
-        listing, points = self._listing(names, pictures)
+        lost = {*_missing(folder / "rgb" / pictures, names, SUFFIXES[1:])}
+        names = [name for name in names if name not in lost]
+        listing, names, points = self._listing(names, pictures)
+        chosen = {split: [n for n in part if n in {*names}] for split, part in chosen.items()}
         places = {name: place for place, name in enumerate(names)}
         if chosen.get("val"):
             found = {split: [places[name] for name in part] for split, part in chosen.items()}
         else:
             found = held_out(listing, self.eval_every)
-        way_out = "Leave data.eval_split out, or set it to val."
-        return self.capture(listing, found, splits, source, way_out, points)
+        return self.capture(listing, found, splits, source, points)
 
-    def _listing(self, names: Sequence[str], pictures: str) -> tuple[Listing, np.ndarray | None]:
-        """The images of these names in a folder of rgb, and the points of the capture."""
+    def _listing(
+        self, names: Sequence[str], pictures: str
+    ) -> tuple[Listing, Sequence[str], np.ndarray | None]:
+        """Images in a folder of rgb, the names of those that are not left out, and points."""
         folder = self.folder
         root = folder.resolve()
         scale, centre = _scene(folder / "scene.json")
-        if missing := _missing(folder / "camera", names, (".json",)):
-            raise SceneError(
-                f"{len(missing)} of {len(names)} files are not in {folder / 'camera'}: "
-                f"{some(missing)} (.json). {DOWNLOAD}"
-            )
-        cameras = [
-            _camera(image_path(str(folder / "dataset.json"), root, f"camera/{name}.json", "ids"))
-            for name in names
-        ]
+        path, metadata = folder / "metadata.json", {}
+        if not self.static:
+            metadata = read_object(path, "the timestep of each image")
+
+        def camera_of(name: str) -> tuple[np.ndarray, Calibration]:
+            label = str(folder / "dataset.json")
+            if not self.static and not isinstance(metadata.get(name), dict):
+                raise BrokenFrameError(f"{path} has no object for {name}, such as {EXAMPLE}.")
+            return _camera(image_path(label, root, f"camera/{name}.json", "ids"))
+
+        kept, cameras = zip(*usable("images", camera_of, names), strict=True)
+        names = [*map(names.__getitem__, kept)]
         poses = np.stack([pose for pose, _ in cameras])
         poses[:, :3, 3] = (poses[:, :3, 3] - centre) * scale
         points = _points(folder / "points.npy")
@@ -103,9 +105,7 @@ class NerfiesSettings(CaptureSettings):
             image_path(label, root, f"rgb/{pictures}/{name}", "ids")
             for label, name in zip(labels, names, strict=True)
         ]
-        if self.orient:
-            poses, points = oriented(poses, points, paths)
-        times, source = self._times(names)
+        times, source = self._times(names, metadata)
         masks = ()
         if self.masks is not None:
             kinds = [(f"{pictures}/{name}.png", f"{name}.png") for name in names]
@@ -121,39 +121,23 @@ class NerfiesSettings(CaptureSettings):
             masks=masks,
             time_source=source,
         )
-        return listing, points
+        return listing, names, points
 
-    def _times(self, names: Sequence[str]) -> tuple[list[float], str]:
+    def _times(self, names: Sequence[str], metadata: Mapping[str, Any]) -> tuple[list[float], str]:
         """Times from 0 to 1, and where they come from; none where the scene is static."""
-        path = self.folder / "metadata.json"
         if self.static:
             return [], ""
-        content = read_object(path, "the timestep of each image")
-        entries = []
-        for name in names:
-            entry = content.get(name)
-            if not isinstance(entry, dict):
-                raise SceneError(
-                    f'{path} has no object for {name}. Add one such as {{"warp_id": 0, '
-                    '"camera_id": 0}, or take the name out of dataset.json.'
-                )
-            entries.append(entry)
+        path, entries = self.folder / "metadata.json", [metadata[name] for name in names]
         key = next((key for key in TIMES if all(key in entry for entry in entries)), None)
         if key is None:
-            bare = next(
-                name for name, entry in zip(names, entries, strict=True) if TIMES[1] not in entry
-            )
             raise SceneError(
-                f"{path}: {bare} has no warp_id, and not all images have one of "
-                f"{', '.join(TIMES)}. Add the number of the timestep to each image, or set "
-                "data.static=true."
+                f"{path}: not all images have one of {', '.join(TIMES)}. Add the number of the "
+                "timestep to each image, or set data.static=true."
             )
-        for name, entry in zip(names, entries, strict=True):
-            if not is_number(entry[key]):
-                raise SceneError(
-                    f"{path}: {key} of {name} is {short(entry[key])}; it must be a number."
-                )
         times = [entry[key] for entry in entries]
+        for name, time in zip(names, times, strict=True):
+            if not is_number(time):
+                raise SceneError(f"{path}: {key} of {name} is {short(time)}; it must be a number.")
         logger.info(
             "%s: %s from %s to %s is mapped to times from 0 to 1",
             *(path, key, min(times), max(times)),

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from xplanes.errors import MissingSplitError, SceneError, warn
+from xplanes.scenes.entries import some, world_turn
 from xplanes.scenes.listing import Listing, Part, read_splits, thinned
 from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.views import Scene, Views, joined
@@ -79,10 +80,33 @@ class SceneSettings(Settings, ABC):
     files: ClassVar[str] = ""
     """What a folder of this format holds, for messages; empty for formats without folders."""
 
+    hint: ClassVar[str] = ""
+    """What else to do where there is none."""
+
     @property
     def folder(self) -> Path:
         """The scene's folder."""
         return Path(self.root) / self.scene
+
+    def no_scene(self) -> SceneError:
+        """The error for a folder that holds no scene of this format; names those that do."""
+        folder = self.folder.absolute()
+        there = "is not a folder" if folder.exists() else "does not exist"
+        there = f"holds no {self.files}" if folder.is_dir() else there
+        near, scenes = folder if folder.is_dir() else folder.parent, []
+        with suppress(OSError):
+            scenes = [path.name for path in sorted(near.iterdir()) if self._is_scene(path)]
+        nearby = f" Such scenes in {near}: {some(scenes)}." if scenes else ""
+        return SceneError(
+            f"{folder} {there}.{nearby} Set data.root and data.scene to a folder with {self.files}"
+            f"{self.hint}. xplanes inspect FOLDER tells which format a folder has."
+        )
+
+    @classmethod
+    def _is_scene(cls, path: Path) -> bool:
+        with suppress(OSError):  # Some folders are closed to the user.
+            return path.is_dir() and cls.recognises(path)
+        return False
 
     @property
     def image_cache(self) -> Path | None:
@@ -139,6 +163,7 @@ class SceneSettings(Settings, ABC):
         parts: Mapping[str, Listing],
         mask_use: MaskUse,
         whole: Listing | None = None,
+        up: str = "",
         **more: Any,
     ) -> Scene:
         """The scene of listed images, which are decoded here.
@@ -147,6 +172,7 @@ class SceneSettings(Settings, ABC):
             parts: The images of each split.
             mask_use: What the black parts of masks are.
             whole: All images of the capture, see `read_splits`.
+            up: Which way is up; empty where the world is that of the files.
             **more: Further attributes of the scene.
 
         Raises:
@@ -154,6 +180,12 @@ class SceneSettings(Settings, ABC):
         """
         read = read_splits(parts, self.resolution, self.image_cache, mask_use, whole)
         splits, cut, notes = read
+        if not up:
+            poses = torch.cat([listing.camera_to_world for listing in parts.values()])
+            up = world_turn(poses, (), False)[1]
+            if world_turn(poses, (), None)[0] is not None:
+                warn(f"{self.folder}: up is {up}. If the scene lies on its side, turn the poses.")
+        notes = {**notes, "up": up}
         return Scene(self.folder.resolve().name, splits, cut=cut, notes=notes, **more)
 
     def read(self, splits: Sequence[str] | None = None) -> Scene:
@@ -213,6 +245,12 @@ class CaptureSettings(SceneSettings, ABC):
     # What masks leave out. alpha: is empty; ignore: is neither trained on nor scored; auto: alpha
     # where they look like silhouettes, else ignore; lrm: is removed from the LRM's input alone.
     mask_use: MaskUse
+    # Rotate the world so that the cameras' mean up vector becomes its z axis. null: if that is more
+    # than 60 degrees from it.
+    orient: bool | None
+
+    more_splits: ClassVar[str] = ""
+    """What else makes a split, for messages."""
 
     def capture(
         self,
@@ -220,7 +258,6 @@ class CaptureSettings(SceneSettings, ABC):
         places: Mapping[str, Sequence[int]],
         splits: Sequence[str],
         source: Path,
-        way_out: str,
         points: np.ndarray | None = None,
     ) -> Scene:
         """The splits asked for of a whole capture.
@@ -230,7 +267,6 @@ class CaptureSettings(SceneSettings, ABC):
             places: Those of each split, by their places in the list.
             splits: Names of splits.
             source: What the splits were made from, for messages.
-            way_out: What makes another split, for messages.
             points: World points on surfaces. [N, 3]
 
         Raises:
@@ -242,8 +278,19 @@ class CaptureSettings(SceneSettings, ABC):
                 names = ", ".join(name for name, part in places.items() if part)
                 raise MissingSplitError(
                     f"{source} has no {split} split. Splits of this capture: {names or 'none'}. "
-                    f"{way_out}"
+                    f"Choose another data.eval_split, lower data.eval_every={self.eval_every} (the "
+                    f"first and the last image are never held out){self.more_splits}."
                 )
+        if not any(listing.masks) and (folder := self.folder / "masks").is_dir():
+            warn(
+                f"{folder} is not read. If it holds masks of the images, name it with "
+                "data.masks=masks, or its files as mask_path of the frames."
+            )
+        turn, up = world_turn(listing.camera_to_world, listing.paths, self.orient)
+        found = None if points is None else torch.from_numpy(points)
+        if turn is not None:
+            listing = listing.turned(turn)
+            found = None if found is None else found @ turn.T
         parts = self.thinned({split: listing.subset(places[split]) for split in splits})
-        found = None if points is None else torch.from_numpy(points).float()
-        return self.scene_of(parts, self.mask_use, listing, points=found)
+        found = None if found is None else found.float()
+        return self.scene_of(parts, self.mask_use, listing, up, points=found)

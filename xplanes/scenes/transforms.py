@@ -3,29 +3,25 @@
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from xplanes.errors import (
-    BrokenFrameError,
-    MissingSplitError,
-    SceneError,
-    first_of,
-    refuse_all,
-    warn,
-)
+from xplanes.errors import MissingSplitError, SceneError, warn
 from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.entries import (
     checked_pose,
     image_path,
     is_number,
     is_positive,
+    number_in,
     read_object,
     short,
     unit_times,
+    usable,
 )
 from xplanes.scenes.formats import read_header
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
@@ -41,8 +37,19 @@ FISHEYES = (
 OTHER_MODELS = ("FISHEYE", "EQUIRECTANGULAR", "ORTHO", "OMNI", "VR180", "DIVISION", "EUCM")
 """Parts of the names of lens models that are not read, but for those above."""
 
+OTHER_AXES = ("from_mitsuba", "normal_mts_args", "from_na")
+"""Keys with which instant-ngp and NeuS2 mark poses whose axes are not OpenGL's."""
+
 OTHER_LENSES = ("equirectangular", "latlong", "orthographic", "ftheta_p0")
 """Keys of further lenses in files of instant-ngp."""
+
+NUMBERS = (
+    *PIXELS,
+    *COEFFICIENTS,
+    *("sx1", "sy1", "omega", "camera_angle_x", "camera_angle_y", "time", "timestamp"),
+    *("x_fov", "y_fov", "fovx", "fovy"),
+)
+"""Keys whose values are numbers, which some programs write as text."""
 
 DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Order of the list of coefficients that nerfstudio writes and reads."""
@@ -50,22 +57,27 @@ DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 SQUARE = 0.01
 """Difference of focal lengths along x and y above which pixels are not square."""
 
+MATRICES = ("intrinsic_matrix", "intrinsics", "K")
+"""Keys of intrinsic matrices, of 3 rows and columns or more."""
+
 KNOWN = (
     *("frames", "file_path", "transform_matrix", "transform_matrix_start", "mask_path"),
     *("time", "timestamp"),
     *("camera_angle_x", "camera_angle_y", "camera_model", "is_fisheye", "distortion_params"),
     *("omega", "train_filenames", "val_filenames", "test_filenames", *PIXELS, *COEFFICIENTS),
-    *("sx1", "sy1", "x_fov", "y_fov", *OTHER_LENSES, "from_mitsuba", "from_na"),
+    *("sx1", "sy1", "x_fov", "y_fov", "fovx", "fovy", *OTHER_LENSES, *OTHER_AXES),
+    *("white_transparent", "black_transparent", "orientation_override"),
 )
 """Keys that are read, or refused."""
 
 IGNORED = (
     *("aabb", "aabb_scale", "offset", "scale", "up", "applied_transform", "applied_scale"),
-    *("orientation_override", "auto_scale_poses_override", "ply_file_path", "sharpness"),
+    *("auto_scale_poses_override", "ply_file_path", "sharpness", "sharpness_discard_threshold"),
+    *("n_extra_learnable_dims", "importance_sampling", "enable_ray_loading", "fix_premult"),
     *("colmap_im_id", "colmap_image_id", "camera_id", "cam_id", "id", "name", "n_frames"),
     *("depth_file_path", "depth_path", "integer_depth_scale", "enable_depth_loading"),
     *("normal_file_path", "depth_unit_scale_factor", "rotation", "render_aabb", "path"),
-    *("crop_width", "crop_height", "blur_score", "intrinsic_matrix", "n_images", "fps"),
+    *("crop_width", "crop_height", "blur_score", "n_images", "fps"),
 )
 """Keys of other programs that change nothing here."""
 
@@ -74,6 +86,9 @@ BESIDE = {
     "alpha": ["{stem}.alpha{suffix}", "{stem}{suffix}.alpha{suffix}"],
 }
 """Names of mask files beside an image, by what they mean."""
+
+TRANSPARENT = {"white_transparent": 255, "black_transparent": 0}
+"""Keys with which instant-ngp marks a colour as transparent, and its channels' value."""
 
 SYNONYMS = {"sx1": "s1", "sy1": "s3"}
 """What COLMAP calls the prism coefficients of a fisheye lens."""
@@ -117,6 +132,7 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
         calibrations=_calibrations(path, content, frames),
         masks=tuple(masks) if any(masks) else (),
         mask_meaning=meaning,
+        clear=tuple(level for key, level in TRANSPARENT.items() if content.get(key)),
         time_source=source,
     )
     _warn_of_unknown(path, content)
@@ -134,34 +150,18 @@ class _Frame(NamedTuple):
 
 
 def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame]:
-    """Frames that can be used; a warning lists those without an image or with an infinite pose.
+    """Frames that can be used; a warning lists those without an image or with an infinite pose."""
 
-    Raises:
-        MissingSplitError: If no frame can be used.
-        SceneError: If others are wrong; it names all of them.
-    """
-    found: list[_Frame] = []
-    left_out, wrong = [], []
-    for index, entry in enumerate(content["frames"]):
+    def read(item: tuple[int, dict[str, Any]]) -> _Frame:
+        index, entry = item
         label = f"{path}: frame {index} ({entry['file_path']})"
-        try:
-            image = image_path(label, folder, entry["file_path"])
-            pose = checked_pose(label, entry["transform_matrix"])
-            mask = entry.get("mask_path") or content.get("mask_path") or None
-            mask = None if mask is None else image_path(label, folder, mask, "mask_path")
-        except BrokenFrameError as problem:
-            left_out.append(str(problem))
-        except SceneError as problem:
-            wrong.append(str(problem))
-        else:
-            found.append(_Frame(label, entry, image, mask, pose))
-    refuse_all(wrong)
-    if not found:
-        raise MissingSplitError(first_of(left_out))
-    if left_out:
-        count = len(content["frames"])
-        warn(f"{len(left_out)} of {count} frames are left out:\n{first_of(left_out)}")
-    return found
+        image = image_path(label, folder, entry["file_path"])
+        pose = checked_pose(label, entry["transform_matrix"])
+        mask = entry.get("mask_path") or content.get("mask_path") or None
+        mask = None if mask is None else image_path(label, folder, mask, "mask_path")
+        return _Frame(label, entry, image, mask, pose)
+
+    return [frame for _, frame in usable("frames", read, [*enumerate(content["frames"])])]
 
 
 def _masks_beside(paths: Sequence[Path]) -> tuple[list[Path | None], str]:
@@ -192,7 +192,34 @@ def _calibrations(
             "not square, and is followed. If they are square, take it out: Blender's own angle_y "
             "belongs to the sensor, not to the image."
         )
+    _warn_of_two_focal_lengths(path, content, frames, found)
     return found
+
+
+def _warn_of_two_focal_lengths(
+    path: Path,
+    content: Mapping[str, Any],
+    frames: Sequence[_Frame],
+    cameras: Sequence[Calibration],
+) -> None:
+    """Warn of fields of view that disagree with focal lengths in pixels, which are followed."""
+    for frame, camera in zip(frames, cameras, strict=True):
+        # That along y is often the sensor's, which is higher than a landscape image.
+        for axis, side in (("x", camera.w), ("y", camera.h)):
+            keys = frame.entry if f"fl_{axis}" in frame.entry else content
+            angle, focal = keys.get(f"camera_angle_{axis}"), getattr(camera, f"fl_{axis}")
+            if not (side and focal and is_positive(angle) and angle < math.pi):
+                continue
+            other = focal_length(angle, side)
+            counts = axis == "x" or side > (camera.w or math.inf)
+            if counts and abs(other / focal - 1) > SQUARE and f"fl_{axis}" in keys:
+                warn(
+                    f"{frame.label}: fl_{axis}={focal:g} is followed, but camera_angle_{axis} "
+                    f"means {other:.4g} pixels. Compare both with the camera: BlenderNeRF takes "
+                    "the wrong side of the sensor for fl_x and fl_y of images that are higher than "
+                    "wide. Take the wrong keys out."
+                )
+                return
 
 
 def _with_height(camera: Calibration, keys: Mapping[str, Any], image: Path) -> Calibration:
@@ -228,19 +255,34 @@ def _says_something(value: Any) -> bool:
     return any(map(_says_something, value)) if isinstance(value, list) else bool(value)
 
 
-def _in_radians(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
-    """The keys with fields of view in radians: those of instant-ngp's x_fov are in degrees."""
+def _plain(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
+    """The keys with numbers that are written as text, and intrinsics as the other keys have them.
+
+    Fields of view are in radians then; instant-ngp's x_fov, which counts more than focal lengths,
+    and its converter's fovx are in degrees.
+    """
     found = dict(keys)
+    for key in {*NUMBERS} & {*keys}:
+        if isinstance(keys[key], str) and (number := number_in(keys[key])) is not None:
+            found[key] = number
+    for key in {*MATRICES} & {*keys}:
+        with suppress(TypeError, ValueError, LookupError):
+            (fl_x, _, cx), (_, fl_y, cy) = keys[key][0][:3], keys[key][1][:3]
+            found = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy} | found
+            del found[key]  # Others are warned of.
     for axis in "xy":
-        angle, name = keys.get(f"{axis}_fov"), f"camera_angle_{axis}"
+        angle, name = found.get(f"{axis}_fov"), f"camera_angle_{axis}"
         if is_positive(angle):
+            found[name] = math.radians(angle)
+            found.pop(f"fl_{axis}", None)
+        elif is_positive(angle := found.get(f"fov{axis}")) and angle > math.pi:
             found.setdefault(name, math.radians(angle))
-        elif is_number(keys.get(name)) and math.pi < keys[name] < 180:
+        if is_number(found.get(name)) and math.pi < found[name] < 180:
             warn(
-                f"{path}: {name}={keys[name]:g} is read in degrees, as it is above pi: radians are "
-                "expected."
+                f"{path}: {name}={found[name]:g} is read in degrees, as it is above pi: radians "
+                "are expected."
             )
-            found[name] = math.radians(keys[name])
+            found[name] = math.radians(found[name])
     return found
 
 
@@ -259,13 +301,20 @@ def read_frames(path: Path) -> dict[str, Any]:
             raise SceneError(f"{path}: frame {index} is {short(frame)}, not an object with keys.")
         if "transform_matrix_start" in frame:  # Of a camera that moves while it exposes.
             frame.setdefault("transform_matrix", frame["transform_matrix_start"])
-        for key in ("file_path", "transform_matrix"):
-            if key not in frame:
-                raise SceneError(
-                    f'{path}: frame {index} has no "{key}". Every frame needs file_path and '
-                    f"transform_matrix, and time in a dynamic scene."
-                )
-    return _in_radians(path, content) | {"frames": [_in_radians(path, each) for each in frames]}
+        frame.setdefault("transform_matrix", None)
+        if "file_path" not in frame:
+            raise SceneError(
+                f'{path}: frame {index} has no "file_path". Every frame needs file_path and '
+                "transform_matrix, and time in a dynamic scene."
+            )
+    for key in OTHER_AXES:
+        if content.get(key):
+            raise SceneError(
+                f"{path}: {key}={short(content[key])} stands for poses with other axes than "
+                "OpenGL's (x right, y up, z backward). Convert transform_matrix, and take the key "
+                "out."
+            )
+    return _plain(path, content) | {"frames": [_plain(path, each) for each in frames]}
 
 
 def _times(path: Path, frames: Sequence[_Frame], any_unit: bool) -> tuple[list[float], str]:

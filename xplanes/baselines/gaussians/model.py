@@ -150,11 +150,14 @@ class GaussiansModel(Model):
         return
 
     def losses(self, rendering: Any, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
-        share = self._settings.loss.dissimilarity
-        terms = {"colour": (1 - share) * (rendering.colour - rays["target"]).abs().mean()}
+        share, target = self._settings.loss.dissimilarity, rays["target"]
+        colour = rendering.colour
+        if (shown := rays.get("shown")) is not None:  # Others count as right.
+            colour = torch.where(shown[:, None], colour, target)
+        terms = {"colour": (1 - share) * (colour - target).abs().mean()}
         if share:
-            image = rendering.image.colour
-            terms["dissimilarity"] = share * dissimilarity(image, rays["target"].view_as(image))
+            shape = rendering.image.colour.shape
+            terms["dissimilarity"] = share * dissimilarity(colour.view(shape), target.view(shape))
         return terms
 
     def scalars(self) -> dict[str, float]:

@@ -1,0 +1,63 @@
+"""Captures as LLFF's tools write them."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.captures import HEIGHT, WIDTH, picture, poses, save, settings
+from tests.refusals import assert_refused
+from xplanes.errors import SceneError
+from xplanes.scenes.llff import LlffSettings
+from xplanes.scenes.multicamera import MultiCameraSettings
+
+COUNT = 10
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Images in two sizes, of cameras whose axes are down, right and back in the file."""
+    rows = []
+    for index, pose in enumerate(poses(COUNT)):
+        save(tmp_path / "fern/images" / f"IMG_{index}.JPG", picture(index, 2 * HEIGHT, 2 * WIDTH))
+        save(tmp_path / "fern/images_2" / f"IMG_{index}.png", picture(index))
+        right, up, back, centre = pose[:3].T
+        size = np.array([2 * HEIGHT, 2 * WIDTH, 70.0])
+        rows.append(np.r_[np.stack([-up, right, back, centre, size], axis=1).ravel(), 1.0, 9.0])
+    np.save(tmp_path / "fern/poses_bounds.npy", np.stack(rows))
+    return tmp_path / "fern"
+
+
+def read(folder, splits=("train",), **changes):
+    changes = {"orient": False, "eval_every": 100, **changes}
+    return settings(LlffSettings, "llff", folder, **changes).load(splits)
+
+
+@pytest.mark.parametrize(("resolution", "width"), [(None, 80), (80, 80), (41, 41), (40, 40)])
+def test_cameras_and_images_of_the_width_asked_for(folder, resolution, width):
+    assert LlffSettings.recognises(folder)
+    assert not MultiCameraSettings.recognises(folder)
+    scene = read(folder, resolution=resolution)
+    views = scene.splits["train"]
+    assert views.width == width
+    assert views.files[3] == ("images_2/IMG_3.png" if width == 40 else "images/IMG_3.JPG")
+    assert views.intrinsics.focal[0].tolist() == pytest.approx([70 * width / 80] * 2, rel=0.01)
+    found = torch.from_numpy(poses(COUNT)).float()
+    torch.testing.assert_close(views.camera_to_world, found, atol=1e-6, rtol=0)
+    assert views.is_static
+    assert scene.notes["times"].startswith("none, as in LLFF's static captures")
+
+
+def test_captures_of_dynamic_scenes_have_the_times_in_their_names(folder):
+    assert read(folder, static=False).splits["train"].times[3] == pytest.approx(3 / 9)
+    (folder / "motion_masks").mkdir()
+    scene = read(folder)
+    assert scene.splits["train"].times[3] == pytest.approx(3 / 9)
+    assert "IMG_9.JPG -> 9" in scene.notes["times"]
+    assert read(folder, static=True).splits["train"].times.tolist() != [0.0] * COUNT
+
+
+def test_other_numbers_of_images_than_of_rows(folder):
+    (folder / "images/IMG_4.JPG").unlink()
+    assert_refused(SceneError, "has 10 cameras, but .* holds 9", lambda: read(folder), "9 images")
+    (folder / "poses_bounds.npy").unlink()
+    assert_refused(SceneError, "holds no poses_bounds.npy and", lambda: read(folder), "no rows")

@@ -1,0 +1,73 @@
+"""Captures in the format of LLFF: poses_bounds.npy, and a folder with an image for each row."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from xplanes.scenes.entries import unit_times
+from xplanes.scenes.formats import is_image
+from xplanes.scenes.images import native_sizes
+from xplanes.scenes.listing import Listing, held_out, time_source
+from xplanes.scenes.multicamera import POSES, read_poses_bounds, recordings_of_cameras
+from xplanes.scenes.name_times import times_in_names
+from xplanes.scenes.source import CaptureSettings
+from xplanes.scenes.views import Scene
+
+DYNAMIC = ("motion_masks", "mv_images", "flow_i1", "flow", "disp")
+"""Folders of the methods for dynamic scenes that use this format, such as NSFF and DynamicNeRF."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LlffSettings(CaptureSettings):
+    """A capture in the format of LLFF, static unless folders for dynamic scenes lie beside it."""
+
+    files: ClassVar = "poses_bounds.npy and a folder images with an image for each of its rows"
+
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        known = (folder / POSES).is_file() and not recordings_of_cameras(folder)
+        return known and bool(_image_folders(folder))
+
+    def load(self, splits: Sequence[str]) -> Scene:
+        path = self.folder / POSES
+        if not (path.is_file() and (found := _image_folders(self.folder))):
+            raise self.no_scene()
+        images = _chosen(found, self.resolution)
+        names = [image.name for image in images]
+        labels, poses, calibrations = zip(*read_poses_bounds(path, names), strict=True)
+        dynamic = any((self.folder / name).is_dir() for name in DYNAMIC)
+        times = times_in_names(names) if self.static is False or dynamic else []
+        listing = Listing.checked(
+            path,
+            labels,
+            images,
+            np.stack(poses),
+            unit_times(times) if times else [],
+            files=tuple(image.relative_to(self.folder).as_posix() for image in images),
+            calibrations=calibrations,
+            time_source=time_source("the numbers in their names", names, times)
+            if times
+            else "none, as in LLFF's static captures (data.static=false takes those in the names)",
+        )
+        return self.capture(listing, held_out(listing, self.eval_every), splits, path)
+
+
+def _image_folders(folder: Path) -> list[list[Path]]:
+    """The images of each folder called images, images_4 and so on, in LLFF's order."""
+    found = [path for path in folder.glob("images*") if path.is_dir()]
+    listed = [sorted(filter(is_image, path.iterdir())) for path in sorted(found)]
+    return [images for images in listed if images]
+
+
+def _chosen(folders: Sequence[list[Path]], resolution: int | None) -> list[Path]:
+    """The smallest images that are at least as wide as asked for; the largest without such."""
+    widths = [native_sizes(images[:1])[0][1] for images in folders]
+    wanted = math.inf if resolution is None else resolution
+    enough = [place for place, width in enumerate(widths) if width >= wanted]
+    if enough:
+        return folders[min(enough, key=widths.__getitem__)]
+    return folders[max(range(len(folders)), key=widths.__getitem__)]

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tests import warm
+from tests import inside
 from tests.training.runs import SMALL
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -39,7 +39,7 @@ def check_outputs(folder: Path) -> None:
 
 
 def test_the_script_runs(settings: None, tmp_path: Path) -> None:
-    done = warm.run(str(EXAMPLES / "first_minute.py"), cwd=tmp_path)
+    done = inside.run(str(EXAMPLES / "first_minute.py"), cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert f"open {Path('outputs', 'first_minute', 'web', 'index.html')}" in done.stdout
     check_outputs(tmp_path)

@@ -1,6 +1,7 @@
 """Lets every test import `tests.oracles`, from wherever pytest is started."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from xplanes.process import defaults
@@ -36,6 +37,17 @@ def fake_gpu(monkeypatch: pytest.MonkeyPatch) -> torch.device:
         pytest.skip(f"torch {torch.__version__} takes no devices written in Python")
     monkeypatch.setattr(torch, "Generator", fake_device.FakeGenerator)
     return torch.device(fake_device.NAME, 0)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def short_videos() -> Iterator[None]:
+    """Demo scenes have few frames in their video: rendering it takes longer than a small run."""
+    from tests.warm import VIDEO_FRAMES
+    from xplanes.synthetic.demo import write
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(write, "VIDEO_FRAMES", VIDEO_FRAMES)
+        yield
 
 
 @pytest.fixture(scope="session")

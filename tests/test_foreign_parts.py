@@ -105,14 +105,14 @@ def test_a_resumed_run_goes_on_with_its_csv(scenes, tmp_path):
 
 
 def test_scores_are_of_the_averaged_weights_that_checkpoints_hold(scenes, tmp_path):
-    config = small_config(scenes, "trainer.max_steps=60", "data.eval_split=val")
+    config = small_config(scenes, "trainer.max_steps=40", "data.eval_split=val")
     name = "lightning.pytorch.callbacks.EMAWeightAveraging"
     config["callbacks"]["average"] = {"_target_": name, "decay": 0.98}
     run(config, tmp_path / "run", [], resume=False)
     found = metrics(tmp_path / "run")
     again = evaluate(load_run(tmp_path / "run"), "none")
     assert found["test"]["psnr"] == pytest.approx(again["test"]["psnr"], abs=1e-6)
-    plain = small_config(scenes, "trainer.max_steps=60", "data.eval_split=val")
+    plain = small_config(scenes, "trainer.max_steps=40", "data.eval_split=val")
     run(plain, tmp_path / "plain", [], resume=False)
     raw = metrics(tmp_path / "plain")
     assert abs(raw["test"]["psnr"] - found["test"]["psnr"]) > 0.1

@@ -13,7 +13,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from hydra_plugins.xplanes import ALIASES
-from tests import warm
+from tests import inside
 from tests.training.runs import SMALL, metrics, small_config, status
 from tests.warm import forked
 from xplanes.cli import main
@@ -235,7 +235,6 @@ def test_a_run_that_failed_before_its_first_checkpoint_blocks_nothing(
 
 REFUSED = (
     ("data=dnerf", "data.scene=nothing"),
-    ("data=colmap", "data.scene=nothing"),
     ("data.views=999",),
     ("lrm=large", "lrm.weights=nowhere.ckpt"),
     ("lrm=file", "lrm.triplanes=nowhere.pt"),
@@ -248,12 +247,12 @@ REFUSED = (
 def test_a_refused_run_leaves_no_directory(changes, scenes, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    monkeypatch.setenv("HF_HOME", str(scenes))
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(scenes))
     place, own = f"hydra.run.dir={tmp_path}/outputs/run", [f"data.root={scenes}", *SMALL]
     own = [text for text in own if not {text.split("=")[0]} & {c.split("=")[0] for c in changes}]
     if changes[0].startswith("data="):
         own = [text for text in own if not text.startswith("data.") or "root" in text]
-    done = warm.train(*own, *changes, place, cwd=tmp_path, code=1)
+    done = inside.train(*own, *changes, place, cwd=tmp_path, code=1)
     assert done.stderr.startswith("error: "), done.stderr
     assert not list(tmp_path.iterdir())
 

@@ -325,12 +325,20 @@ def test_the_data_serve_other_modules(config, tmp_path):
     assert float(module.colour.min()) > 0.5  # Most of the images is white.
 
 
+SMALL_MODEL = (
+    *("model.resolution=24", "model.sampler.grid_resolution=24", "model.sampler.samples=64"),
+    *("model.rays.per_batch=256", "model.rays.samples_per_batch=4096"),
+)
+
+
 def execute(page: str, pattern: str, config: dict, replaced: dict, **names) -> dict:
     """Run a script of the docs on the demo scene, and give its variables."""
     text = (ROOT / "docs" / page).read_text(encoding="utf-8")
     (script,) = re.findall(rf"```python\n({pattern})```", text, re.DOTALL)
     folder = SceneDataModule(config["data"]).settings.folder
+    small = ", ".join(f'"{text}"' for text in ("lrm=none", *SMALL_MODEL))
     here = {
+        '"lrm=none")': f"{small})",
         '"data.root=data/dnerf"': f'"data.root={folder.parent.resolve()}"',
         '"data.scene=lego"': f'"data.scene={folder.name}", "data.resolution=null"',
     }

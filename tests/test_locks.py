@@ -1,10 +1,8 @@
 """Two processes never write into one run directory."""
 
-import subprocess
-import sys
-
 import pytest
 
+from tests import warm
 from xplanes.errors import ConfigError
 from xplanes.locks import alone_in, in_turn
 
@@ -15,25 +13,22 @@ from xplanes.locks import alone_in
 from xplanes.training.record import RunRecord
 with alone_in(Path(sys.argv[1])):
     RunRecord(Path(sys.argv[1]), seed=0, resume=False)
-    print("held", flush=True)
     time.sleep(60)
 """
 
 
 def test_a_second_process_is_refused_until_the_first_is_killed(tmp_path):
-    holder = subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True
-    )
-    assert holder.stdout is not None
-    assert holder.stdout.readline() == "held\n"
+    script, run = tmp_path / "hold.py", tmp_path / "run"
+    script.write_text(HOLD)
+    holder = warm.start(str(script), str(run))
     try:
+        warm.wait_for(run / "run.json", holder)
         with pytest.raises(ConfigError, match=f"in use by process {holder.pid}: wait"):
-            alone_in(tmp_path).__enter__()
+            alone_in(run).__enter__()
     finally:
         holder.kill()
-        holder.wait()
-    with alone_in(tmp_path):
-        assert (tmp_path / ".lock").is_file()
+    with alone_in(run):
+        assert (run / ".lock").is_file()
 
 
 def test_turns_are_free_when_nobody_holds_them(tmp_path):

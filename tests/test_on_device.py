@@ -153,16 +153,16 @@ def test_training_there_comes_to_the_numbers_of_plain_torch(fake_gpu, monkeypatc
 def test_what_a_step_shows_is_read_now_and_then(fake_gpu):
     looked = [batches for batches in range(1, 100) if due(batches)]
     assert looked == [1, 2, 4, 8, 16, 32, 64, 96]
-    module, _, steps = trained("six", 33, "model.rays.background_share=0.2")
+    module, _, steps = trained("six", 17, "model.rays.background_share=0.2")
     # The sweep of step 15 lists the occupied cells, and an epoch of Lightning's ends now and then.
     waiting = {n + 1 for n, counts in enumerate(steps) if counts.waits["to the CPU"]}
-    assert waiting == {1, 2, 4, 8, 16, 32}
-    assert module.batches == 33
+    assert waiting == {1, 2, 4, 8, 16}
+    assert module.batches == 17
     seen = module.tally.counts
     left = seen["candidates"] - seen["empty"] - seen["occluded"]
     assert 0 < seen["samples"] <= left  # Others would be of rays without room.
     # The last batch is read at the end.
-    assert 33 * 128 < seen["rays"] + seen["no_room"] <= 33 * 256
+    assert 17 * 128 < seen["rays"] + seen["no_room"] <= 17 * 256
     assert 0 < module.tally.last["psnr"] < 40
     assert 0 < module.tally.last["foreground"] < 1
 
@@ -198,7 +198,8 @@ def test_steps_that_are_not_finite_are_left_out(fake_gpu, monkeypatch, gradient)
     assert not torch.equal(seen[6], seen[7])
     assert module.tally.skipped == 3
     monkeypatch.setattr(Broken, "steps", range(100))
-    with pytest.raises(TrainingError, match=r"for [23]\d steps in a row.*losses\.broken"):
+    monkeypatch.setattr("xplanes.training.module.PATIENCE", 5)  # Seen where the host looks next.
+    with pytest.raises(TrainingError, match=r"for [5-8] steps in a row.*losses\.broken"):
         trained("six", 32, losses={"broken": Broken(weight=1.0)})
 
 
@@ -311,7 +312,9 @@ BUDGETS = {
 """Operations at most, waits and copies of a normal step, and of one that maintains the grid."""
 
 
-@pytest.mark.parametrize("name", BUDGETS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "nine")) for n in BUDGETS]
+)
 def test_steps_keep_to_their_budget_and_views_are_scored(fake_gpu, name):
     module, data, steps = trained(name, max(BUDGETS[name]) + 1)
     for step, (most, waits, copies) in BUDGETS[name].items():

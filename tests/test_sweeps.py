@@ -19,10 +19,11 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from hydra_plugins.xplanes import ALIASES
+from tests import warm
 from tests.balls import ball_scene
+from tests.inside import train
 from tests.test_contracts import built, small
 from tests.training.runs import SMALL as SMALL_RUN
-from tests.warm import train
 from xplanes.config import CONF, compose_plain, group_options
 from xplanes.errors import ConfigError, LRMError
 from xplanes.evaluation.published import check_published, read_published
@@ -185,7 +186,7 @@ def test_fair_means_equal_rays_samples_and_terms():
     assert losses == {(0.0, 0.0)}
 
 
-@pytest.mark.parametrize("chosen", [["recipe=paper", "lrm=tiny"], ["recipe=paper"], []])
+@pytest.mark.parametrize("chosen", [["recipe=paper", "lrm=tiny"], []])
 def test_the_ablation_changes_one_thing_at_a_time(chosen):
     whole = compose_plain("train", chosen)
     for overrides in jobs_of("sweep=ablation", "data.scene=excavator", "seed=0", *chosen):
@@ -311,7 +312,7 @@ def test_a_sweep_says_how_long_it_takes_and_its_jobs_go_on(scenes, tmp_path):
         "defaults": [{"override /experiment": "demo"}],
         "hydra": {
             "callbacks": {"table": {"sheet": "runs"}},
-            "sweeper": {"params": {"seed": "0,1"}, "rows": ["lrm=none", "model.resolution=12"]},
+            "sweeper": {"params": {"seed": "3"}, "rows": ["lrm=none", "model.resolution=12"]},
         },
     }
     text = "# @package _global_\n" + yaml.safe_dump(sweep, sort_keys=False)
@@ -325,15 +326,15 @@ def test_a_sweep_says_how_long_it_takes_and_its_jobs_go_on(scenes, tmp_path):
     given = ("-m", "sweep=mine", f"hydra.searchpath=[file://{tmp_path / 'conf'}]", *tiny)
     given = (*given, f"hydra.sweep.dir={place}")
     first = train(*given, "trainer.max_steps=2", cwd=tmp_path)
-    assert first.stdout.startswith("4 runs, 8 steps in all")
+    assert first.stdout.startswith("2 runs, 4 steps in all")
     runs = sorted(place.glob("*/metrics.json"))
-    assert len(runs) == 4
+    assert len(runs) == 2
     assert (place / "table.md").is_file()
     assert (place / "sheet.png").is_file()
     train(*given, "trainer.max_steps=3", "resume=auto", cwd=tmp_path)
     train(f"resume={runs[0].parent}", "trainer.max_steps=4", cwd=tmp_path)
     steps = [yaml.safe_load(path.read_text())["step"] for path in runs]
-    assert steps == [4, 3, 3, 3]
+    assert steps == [4, 3]
 
 
 @pytest.mark.slow
@@ -341,10 +342,10 @@ def test_a_sweep_says_how_long_it_takes_and_its_jobs_go_on(scenes, tmp_path):
     not find_spec("submitit") or not find_spec("hydra_plugins.hydra_submitit_launcher"),
     reason="jobs of a cluster need the extra sweep",
 )
-def test_a_job_of_a_cluster_that_was_killed_goes_on(scenes: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "sweep"
+def test_a_job_of_a_cluster_that_was_killed_goes_on(tmp_path: Path) -> None:
+    folder, root = tmp_path / "sweep", f"data.root={tmp_path / 'scenes'}"
     launcher = ["hydra/launcher=submitit_local", "hydra.launcher.cpus_per_task=1"]
-    words = ["-m", *launcher, f"hydra.sweep.dir={folder}", "resume=auto", f"data.root={scenes}"]
+    words = ["-m", *launcher, f"hydra.sweep.dir={folder}", "resume=auto", root]
     words += [*SMALL_RUN, "seed=0,1,2,3", "callbacks.checkpoints.every=5", "trainer.max_steps=150"]
     command = [sys.executable, str(CONF.parent / "train.py"), *words]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -361,8 +362,7 @@ def test_a_job_of_a_cluster_that_was_killed_goes_on(scenes: Path, tmp_path: Path
     assert not (run / "metrics.json").exists()
     assert all((other / "metrics.json").is_file() for other in others)
     kept = [read_json(other / "metrics.json")["test"] for other in others]
-    again = train(*words)
-    assert again.returncode == 0, again.stderr
+    warm.train(*words)
     assert read_json(run / "run.json")["resumed"] == 1
     assert read_json(run / "metrics.json")["step"] == 150
     assert [read_json(other / "metrics.json")["test"] for other in others] == kept

@@ -17,7 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from hydra_plugins.xplanes import file_name
-from tests import warm
+from tests import inside, warm
 from tests.training.runs import SMALL
 from tests.warm import train
 from xplanes import SceneDataModule, launch
@@ -70,13 +70,15 @@ def test_settings_are_checked_before_the_run_directory_is_made(tmp_path: Path, m
 
 def test_missing_scene_says_where_to_get_one(tmp_path: Path) -> None:
     folder = f"hydra.run.dir={tmp_path / 'run'}"
-    result = train("data=dnerf", f"data.root={tmp_path}", "data.scene=nothing", folder, code=1)
+    result = inside.train(
+        "data=dnerf", f"data.root={tmp_path}", "data.scene=nothing", folder, code=1
+    )
     assert str(tmp_path / "nothing") in result.stderr
     assert "data=demo" in result.stderr
 
 
 def test_devices_in_a_sweep_are_refused(tmp_path: Path) -> None:
-    result = train("-m", "trainer=ddp", "seed=0,1", f"hydra.sweep.dir={tmp_path}", code=1)
+    result = inside.train("-m", "trainer=ddp", "seed=0,1", f"hydra.sweep.dir={tmp_path}", code=1)
     assert "one device per job" in (result.stdout + result.stderr)
 
 
@@ -141,7 +143,7 @@ def test_a_sweep_does_not_take_other_jobs_for_its_own(tmp_path: Path) -> None:
 
 def test_what_hydra_knows_may_stand_in_settings(scenes: Path, tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(scenes)
-    result = train(
+    result = inside.train(
         *(option for option in SMALL if not option.startswith("trainer.max_steps")),
         *("trainer.max_steps=2", "callbacks.evaluation.at=[]"),
         "data.root=${hydra:runtime.cwd}/link",
@@ -166,8 +168,8 @@ def test_a_run_goes_on_from_another_directory(scenes: Path, tmp_path: Path) -> N
     own = [option for option in SMALL if not option.startswith("trainer.max_steps")]
     own += ["callbacks.evaluation.at=[]", "data.root=scenes"]
     run = tmp_path / "a" / "run"
-    train(*own, "trainer.max_steps=2", f"hydra.run.dir={run}", cwd=tmp_path / "a")
-    train(f"resume={run}", "trainer.max_steps=4", cwd=tmp_path / "b")
+    inside.train(*own, "trainer.max_steps=2", f"hydra.run.dir={run}", cwd=tmp_path / "a")
+    inside.train(f"resume={run}", "trainer.max_steps=4", cwd=tmp_path / "b")
     assert json.loads((run / "metrics.json").read_text())["step"] == 4
     assert not list((tmp_path / "b").iterdir())
 
@@ -296,7 +298,8 @@ exec(compile(open({train!r}).read(), {train!r}, "exec"), globals())
 
 
 @pytest.mark.slow
-def test_two_processes_share_the_rays_and_end_with_one_model(root: str, tmp_path: Path) -> None:
+def test_two_processes_share_the_rays_and_end_with_one_model(tmp_path):
+    root = f"data.root={tmp_path / 'scenes'}"  # Of videos that are as long as usual.
     run, script = tmp_path / "run", tmp_path / "each_rank.py"
     script.write_text(
         EACH_RANK.format(root=str(ROOT), train=str(ROOT / "train.py"), folder=str(tmp_path))
@@ -341,7 +344,8 @@ def test_two_processes_share_the_rays_and_end_with_one_model(root: str, tmp_path
 
 
 @pytest.mark.slow
-def test_two_processes_stop_together_and_resume(root: str, tmp_path: Path) -> None:
+def test_two_processes_stop_together_and_resume(tmp_path):
+    root = f"data.root={tmp_path / 'scenes'}"  # Of videos that are as long as usual.
     run = tmp_path / "run"
     checkpoint = run / "checkpoints" / "last.ckpt"
     process = subprocess.Popen(

@@ -48,11 +48,11 @@ def test_rendering_a_scene_clears_what_is_a_day_old(tmp_path, monkeypatch):
     assert (old.exists(), new.exists(), folder.exists()) == (False, True, True)
 
 
-def test_a_damaged_demo_scene_says_to_delete_it(tmp_path):
-    config = small_config(tmp_path / "scenes")
-    data = Experiment.read(config).data
-    data.read()
-    (picture,) = (tmp_path / "scenes").glob("excavator*/train/r_003.png")
+def test_a_damaged_demo_scene_says_to_delete_it(scenes, tmp_path):
+    made = Experiment.read(small_config(scenes)).data.folder
+    shutil.copytree(made, tmp_path / made.name)
+    data = Experiment.read(small_config(tmp_path)).data
+    picture = tmp_path / made.name / "train" / "r_003.png"
     picture.write_bytes(picture.read_bytes()[:50])
     with pytest.raises(SceneError, match=r"r_003\.png.*demo scene: delete .* to render it again"):
         data.read()

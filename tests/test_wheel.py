@@ -42,7 +42,9 @@ COMMANDS = """
 import sys
 import xplanes
 from xplanes.cli import main
+from xplanes.synthetic.demo import write
 
+write.VIDEO_FRAMES = 2
 print(xplanes.__file__)
 for arguments in {!r}:
     try:

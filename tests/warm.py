@@ -19,6 +19,7 @@ from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
+from xplanes.config import compose_plain
 from xplanes.process import defaults
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -27,6 +28,9 @@ HEAVY = (
     *("torch.utils.tensorboard.writer", "xplanes.fields.lookup_numba", "xplanes.run"),
     "xplanes.rendering.rays_numba",
 )
+
+VIDEO_FRAMES = 16
+"""Frames of a demo scene's video in tests: the same in commands, which share the scenes."""
 
 
 class Running:
@@ -177,6 +181,9 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     for name in HEAVY:
         importlib.import_module(name)
+    write = importlib.import_module("xplanes.synthetic.demo.write")
+    write.VIDEO_FRAMES = VIDEO_FRAMES
+    compose_plain("train", [])  # Hydra's plugins and grammars.
 
     answers.write("ready\n")
     while line := sys.stdin.readline():

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from xplanes.baselines import products
 from xplanes.baselines.products import DYNAMIC, STATIC, plane_product_gpu, plane_product_reference
 
 pytest.importorskip("triton", reason="triton is not installed")
@@ -74,24 +73,3 @@ def test_points_that_fill_up_a_block_spread_no_nan():
         assert plane.grad is not None
         assert plane.grad[..., 0, 0].eq(1).all()
         assert plane.grad.sum() == 4
-
-
-def test_planes_reach_the_kernels_once_these_have_proven_themselves(monkeypatch, caplog):
-    monkeypatch.setattr(products, "cpu_loops", lambda tensor: False)
-    monkeypatch.setattr(products, "gpu_kernels", lambda tensor: True)
-    products._kernels_hold.cache_clear()
-    calls = []
-    monkeypatch.setattr(
-        products,
-        "plane_product_gpu",
-        lambda *given: calls.append(given) or plane_product_gpu(*given),
-    )
-    torch.manual_seed(0)
-    planes = products.PlaneProducts(2, 4, (1,), 3, low=0.1, high=0.5).to(DEVICE)
-    found = planes(torch.zeros(5, 3, device=DEVICE), torch.full((5,), 0.3, device=DEVICE))
-    assert len(calls) == 2  # The trial and the use.
-    assert not caplog.records
-    spaces = [planes.scales[0][name] for name in planes.names]
-    places = torch.tensor([[0.0, 0.0, 0.0, -0.4]], device=DEVICE).expand(5, -1)
-    torch.testing.assert_close(found, plane_product_reference(spaces, places, planes.names))
-    products._kernels_hold.cache_clear()

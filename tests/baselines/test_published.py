@@ -95,9 +95,9 @@ def test_a_model_brings_its_initialisation_and_changes_no_other_group():
         groups = {name for node in chosen if isinstance(node, dict) for name in node}
         assert groups <= {"sampler", "override sampler", "/lrm@_global_.lrm"}, path.name
         own = "tiny" if path.stem in ("six_planes", "nine_planes") else "none"
-        for before in ([], ["lrm=mini"]):
-            plain = composed(*before, f"model={path.stem}")
-            assert plain["lrm"]["name"] == (before[0][4:] if before else own), path.name
+        assert composed(f"model={path.stem}")["lrm"]["name"] == own, path.name
+    for model in ("nine_planes", "kplanes"):
+        assert composed("lrm=mini", f"model={model}")["lrm"]["name"] == "mini", model
     with pytest.raises(ConfigError, match=r"^lrm=tiny with model=kplanes: .* set lrm=none"):
         Experiment.read(composed("model=kplanes", "lrm=tiny"))
     lacking = {name: node for name, node in composed().items() if name != "lrm"}

@@ -209,11 +209,3 @@ def test_reduced_precision_settings_do_not_leak_in_or_out():
     finally:
         torch.set_float32_matmul_precision(before)
     assert torch.equal(plain.low_rank, guarded.low_rank)
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_on_a_gpu():
-    matrix = mixture(dtype=torch.float32)
-    here = robust_pca(matrix, sparsity_weight=0.05)
-    there = robust_pca(matrix.cuda(), sparsity_weight=0.05)
-    assert relative(there.low_rank.cpu(), here.low_rank.numpy()) < 1e-4

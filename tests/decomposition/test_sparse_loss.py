@@ -6,6 +6,7 @@ import torch
 from torch.nn.functional import grid_sample
 
 from xplanes.decomposition import sparse_product_loss
+from xplanes.decomposition.sparse_loss import SparseProduct
 from xplanes.fields.xplanes import PLANE_SETS
 
 FRAMES, CHANNELS, HEIGHT, WIDTH = 5, 2, 6, 6
@@ -83,3 +84,11 @@ def test_one_frame_and_half_precision_targets():
     )
     assert value.dtype == torch.float32
     assert torch.isfinite(value)
+
+
+def test_the_sparse_part_follows_the_planes_and_nothing_waits_for_a_value():
+    """On the device "meta" tensors have no values: asking for one raises."""
+    planes, sparse = example("six")
+    term, planes = SparseProduct(sparse, PLANE_SETS["six"], 2), planes.to("meta")
+    term.add_gradient(torch.empty_like(planes), planes, 1.0, torch.Generator())
+    assert term.sparse.device.type == "meta"

@@ -117,7 +117,7 @@ def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, type[Hub]]]:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
     handler = type("Handler", (Hub,), {"requests": [], "files": {}, "name": None})
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)
     thread.start()
     yield f"http://127.0.0.1:{server.server_address[1]}", handler
     server.shutdown()

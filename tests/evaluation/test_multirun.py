@@ -8,8 +8,8 @@ from types import SimpleNamespace
 from hydra.types import RunMode
 
 from tests.evaluation.test_sheet import areas, pictured
+from tests.inside import train
 from tests.training.runs import SMALL
-from tests.warm import train
 from xplanes.evaluation.table import SweepTable, choose_gpu
 
 CHANGED = ("model.channels", "trainer.max_steps", "callbacks.evaluation.at")

@@ -82,20 +82,21 @@ def exit_of(origin, direction):
     return far if far > near else None
 
 
-@pytest.mark.parametrize("samples", [0, 1, 5])
-def test_rays_are_composited_from_the_cube_to_infinity(samples):
+@pytest.mark.parametrize(("samples", "jittered"), [(0, False), (1, True), (5, False), (5, True)])
+def test_rays_are_composited_from_the_cube_to_infinity(samples, jittered):
     background = world(samples)
     origins, directions = some_rays(40)
-    found = look(background, origins, directions).detach().numpy()
-    misses = 0
-    for origin, direction, colour in zip(
-        origins.double().numpy(), directions.double().numpy(), found, strict=True
+    jitter = torch.linspace(0, 0.9, 40) if jittered else None
+    found = look(background, origins, directions, jitter).detach().numpy()
+    misses, within = 0, [0.5] * 40 if jitter is None else jitter.tolist()
+    for origin, direction, colour, place in zip(
+        origins.double().numpy(), directions.double().numpy(), found, within, strict=True
     ):
         start = exit_of(origin, direction)
         misses += start is None
         start = start or 0.5 * np.linalg.norm(origin)
         steps = [start / (1 - i / samples) for i in range(samples)]
-        middles = [start / (1 - (i + 0.5) / samples) for i in range(samples)]
+        middles = [start / (1 - (i + place) / samples) for i in range(samples)]
         edges = [*(contracted(origin + t * direction) for t in steps), 2 * direction]
         points = [*(contracted(origin + t * direction) for t in middles), 2 * direction]
         shown, density = background(torch.tensor(np.array(points), dtype=torch.float32))

@@ -1,14 +1,9 @@
 """Triton kernels of the plane lookup: on a GPU if there is one, else in triton's interpreter."""
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 
 from tests.fields.test_lookup import scattered, stacks
-from xplanes import backend
-from xplanes.errors import DeviceError
-from xplanes.fields import lookup
 from xplanes.fields.lookup import plane_features_gpu, plane_features_reference
 from xplanes.fields.xplanes import PLANE_SETS
 
@@ -162,80 +157,3 @@ def test_offsets_beyond_32_bits():
     expected = texels.long()[:, None] * 32 + torch.arange(4, device=DEVICE)
     expected[0] = -1  # A weight of zero reads nothing.
     assert torch.equal(found, expected)
-
-
-# Which way is taken
-
-
-@pytest.fixture
-def as_on_a_gpu(monkeypatch):
-    """Tensors of this machine are taken for ones on a GPU."""
-    monkeypatch.setattr(lookup, "cpu_loops", lambda tensor: False)
-    monkeypatch.setattr(lookup, "gpu_kernels", lambda tensor: True)
-    lookup._kernels_hold.cache_clear()
-    yield
-    lookup._kernels_hold.cache_clear()
-
-
-def features(channels=2):
-    space, time = (plane.to(DEVICE) for plane in stacks("six", torch.float32, channels=channels))
-    points, times = (where.to(DEVICE) for where in scattered(5, torch.float32))
-    given = space, time, points, times, PLANE_SETS["six"]
-    return lookup.plane_features(*given), plane_features_reference(*given)
-
-
-def test_kernels_that_prove_themselves_are_used(as_on_a_gpu, monkeypatch, caplog):
-    calls = []
-    kernels = plane_features_gpu
-    monkeypatch.setattr(
-        lookup, "plane_features_gpu", lambda *given: calls.append(given) or kernels(*given)
-    )
-    for _ in range(2):
-        with torch.inference_mode():
-            ours, theirs = features()
-        torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-5)
-    assert len(calls) == 3  # One trial, two uses.
-    assert not caplog.records
-
-
-@pytest.mark.parametrize("fault", ["raises", "wrong values"])
-def test_kernels_that_fail_their_trial_are_not_used(as_on_a_gpu, monkeypatch, caplog, fault):
-    def broken(space, *given):
-        if fault == "raises":
-            raise RuntimeError("no compiler\nsecond line")
-        return plane_features_reference(space, *given) * 1.01
-
-    monkeypatch.setattr(lookup, "plane_features_gpu", broken)
-    for _ in range(2):
-        ours, theirs = features()
-        assert torch.equal(ours, theirs)
-    (record,) = caplog.records
-    message = record.getMessage()
-    assert "plane lookup (2 channels, torch.float32)" in message
-    assert "XPLANES_GPU_KERNELS=0" in message
-    assert ("no compiler" in message) == (fault == "raises")
-    assert "second line" not in message
-
-
-def test_a_gpu_that_is_lost_in_a_trial_is_not_asked_again(as_on_a_gpu, monkeypatch):
-    def broken(*given):
-        raise RuntimeError("an illegal memory access was encountered")
-
-    monkeypatch.setattr(lookup, "plane_features_gpu", broken)
-    monkeypatch.setattr(backend, "synchronize", broken)
-    words = r"stopped answering.*plane lookup.*illegal memory access.*XPLANES_GPU_KERNELS=0"
-    with pytest.raises(DeviceError, match=words):
-        features()
-
-
-def test_when_kernels_apply(monkeypatch):
-    on_gpu = SimpleNamespace(device=torch.device("cuda", 0))
-    assert backend.gpu_kernels(on_gpu)
-    assert not backend.gpu_kernels(torch.empty(1))
-    torch.use_deterministic_algorithms(True)
-    try:
-        assert not backend.gpu_kernels(on_gpu)
-    finally:
-        torch.use_deterministic_algorithms(False)
-    monkeypatch.setenv("XPLANES_GPU_KERNELS", "0")
-    assert not backend.gpu_kernels(on_gpu)

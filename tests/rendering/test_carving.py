@@ -69,8 +69,8 @@ def test_a_moving_ball_is_never_ruled_out_and_most_else_is_empty():
         path = swinging(0.8, turns)
         grid = carved(ball_views(count, radius, centre=path, size=48), resolution=32, bins=8)
         frame, lost, tried = cube_frame(1.4, ORIGIN), 0, 0
-        for number in range(120):
-            time = (number + 0.5) / 120
+        for number in range(40):
+            time = (number + 0.5) / 40
             points = frame.points(inside_ball(300, radius, seed=number) + path(time))
             lost += int((~allowed_at(grid, points, time)).sum())
             tried += len(points)

@@ -10,7 +10,6 @@ import torch
 
 from tests.oracles import composite as oracle
 from tests.oracles import composite_gradient
-from xplanes.rendering import compositing
 from xplanes.rendering.compositing import (
     composite,
     composite_gpu,
@@ -238,43 +237,3 @@ def test_kernels_agree_with_the_twin_at_every_density():
     expected = values_and_gradients(composite_reference, *doubled((depth, colour, *rest)))
     assert all(part.isfinite().all() for part in found)
     agree(found, expected, atol=1e-6, rtol=1e-6, case="all densities")
-
-
-@pytest.fixture
-def as_on_a_gpu(monkeypatch):
-    """Tensors of this machine are taken for ones on a GPU."""
-    if torch.cuda.is_available():
-        pytest.skip("for machines without a GPU, where triton's interpreter takes such tensors")
-    monkeypatch.setattr(compositing, "cpu_loops", lambda tensor: False)
-    monkeypatch.setattr(compositing, "gpu_kernels", lambda tensor: True)
-    compositing._kernels_hold.cache_clear()
-    yield
-    compositing._kernels_hold.cache_clear()
-
-
-@needs_triton
-def test_kernels_are_used_once_they_have_proved_themselves(as_on_a_gpu, monkeypatch, caplog):
-    calls = []
-    real = compositing.composite_gpu
-    monkeypatch.setattr(
-        compositing, "composite_gpu", lambda *given: calls.append(len(given[3])) or real(*given)
-    )
-    for _ in range(2):
-        inputs = rays_of(dtype=torch.float32)
-        agree(composite(*inputs), composite_reference(*inputs), atol=1e-6, rtol=1e-5, case="used")
-    assert calls == [4, len(COUNTS), len(COUNTS)]  # One trial, two uses.
-    assert not caplog.records
-
-
-@needs_triton
-def test_kernels_that_come_to_other_numbers_are_not_used(as_on_a_gpu, monkeypatch, caplog):
-    def broken(optical_depth, *given):
-        total, weights = composite_gpu(optical_depth, *given)
-        return total * 1.01, weights
-
-    monkeypatch.setattr(compositing, "composite_gpu", broken)
-    inputs = rays_of(dtype=torch.float32)
-    for _ in range(2):
-        agree(composite(*inputs), composite_reference(*inputs), atol=0, rtol=0, case="refused")
-    (record,) = caplog.records
-    assert "compositing (torch.float32)" in record.getMessage()

@@ -60,7 +60,9 @@ def uninterrupted(settings, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place / "run"
 
 
-@pytest.mark.parametrize("stopped", ["encode", "from_sequence"])
+@pytest.mark.parametrize(
+    "stopped", [pytest.param("encode", marks=pytest.mark.slow), "from_sequence"]
+)
 def test_a_stopped_preparation_resumes_from_the_last_finished_stage(
     settings, uninterrupted, tmp_path, monkeypatch, stopped
 ):

@@ -205,15 +205,19 @@ def test_a_limit_that_a_run_has_passed_is_refused(scenes: Path, folder: Path) ->
 
 @pytest.mark.parametrize(
     ("views", "missing", "scored"),
-    [(10, ("val", "test"), 10), (20, ("val", "test"), 2), (10, ("val",), 1)],
+    [(10, ("val", "test"), 10), (20, ("val", "test"), 2), (10, ("val",), 3)],
 )
 def test_a_missing_split_is_held_out_of_training_or_nothing_is_the_best(
     scenes: Path, tmp_path: Path, views: int, missing: tuple[str, ...], scored: int
 ) -> None:
-    options = (f"data.train_views={views}", "data.val_views=1", "data.test_views=1")
-    demo = small_config(scenes, *FEW, "callbacks.evaluation.at=[0]", *options)
-    made = SceneDataModule(demo["data"]).settings.folder
-    folder = Path(shutil.copytree(made, tmp_path / "scenes" / "few"))
+    demo = small_config(scenes, *FEW, "callbacks.evaluation.at=[0]")
+    made = SceneDataModule(demo["data"])
+    folder = Path(shutil.copytree(made.settings.folder, tmp_path / "scenes" / "few"))
+    index = folder / "transforms_train.json"
+    train = json.loads(index.read_text())
+    video = json.loads((folder / "transforms_video.json").read_text())["frames"]
+    train["frames"] += video[: views - len(train["frames"])]
+    index.write_text(json.dumps(train))
     for split in missing:
         (folder / f"transforms_{split}.json").unlink()
     known = {field.name for field in fields(BlenderSettings)}

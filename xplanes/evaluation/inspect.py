@@ -1,5 +1,6 @@
 """`xplanes inspect`: what is read of a capture, as a table and a picture, with warnings."""
 
+import functools
 import math
 import shlex
 from collections.abc import Mapping, Sequence
@@ -151,6 +152,13 @@ def _place(folder: Path) -> list[str]:
     return [f"data.root={quoted(str(folder.parent))}", f"data.scene={quoted(folder.name)}"]
 
 
+@functools.cache
+def _target(option: str, *search: str) -> str:
+    """The settings class that an option of ``data`` names."""
+    node = compose_plain(None, [f"+data={option}", *_place(Path("any")), *search])["data"]
+    return node["_target_"]
+
+
 def _recognised(folder: Path, changed: Sequence[str]) -> tuple[Path, str]:
     """The folder of a scene, or the only one in it, and the option of ``data`` for its format."""
     search = [text for text in changed if text.startswith(("hydra.searchpath=", "plugins="))]
@@ -159,8 +167,8 @@ def _recognised(folder: Path, changed: Sequence[str]) -> tuple[Path, str]:
     known: dict[type[SceneSettings], str] = {}
     with plugins(modules):
         for option in group_options("data", search):
-            node = compose_plain(None, [f"+data={option}", *_place(folder), *search])["data"]
-            known.setdefault(class_of(node["_target_"], SceneSettings, "data._target_"), option)
+            target = _target(option, *search)
+            known.setdefault(class_of(target, SceneSettings, "data._target_"), option)
     found = [option for cls, option in known.items() if cls.recognises(folder)]
     if len(found) == 1:
         return folder, found[0]

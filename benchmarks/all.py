@@ -36,7 +36,7 @@ from sections import DATA, LIMITS, WORK, Row, Section, read_record
 
 from xplanes.files import write_text
 
-MODULES = ("baselines", "ablations", "paper", "engineering")
+MODULES = ("baselines", "initialisation", "ablations", "paper", "engineering")
 """Modules beside this one, with their SECTIONS."""
 
 BLOCK = re.compile(r"(<!-- measured: (\w+) -->\n).*?(?=<!-- end -->)", re.DOTALL)

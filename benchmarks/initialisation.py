@@ -1,184 +1,186 @@
-"""What the LRM's initialisation gives: PSNR at equal total time, preparation included.
+"""The page "What the LRM gives": its lead over random initialisation, and what it consists of."""
 
-    python benchmarks/initialisation.py [--lego FOLDER] [--seconds 20] [--few-seconds 15]
-        [--seeds 3] [--resolution 100] [--together 1] [--work FOLDER]
-
-Writes docs/results/initialisation.md, .csv and .png. Each scene is trained from random
-initialisation and from the bundled `tiny`: with all views for --seconds, demo scenes also with five
-of them for --few-seconds. The preparation of `tiny` is part of its time: training gets what is
-left, and its schedule ends there (total_time.py). Demo scenes bring a video of a fixed camera,
-whose frames the LRM sees and random initialisation does not; lego and the suite's scenes have none,
-so a field is trained to render them, and both see the same images. Each run is a process of its own
-with one thread, and seconds are those of its CPU time (cpu_clock.py); ``--together`` so many run
-side by side. On demo scenes both are also trained with the frames of the video among the training
-views.
-"""
-
-import argparse
-import os
-import statistics
-from concurrent.futures import ThreadPoolExecutor
+import subprocess
+import sys
 from pathlib import Path
+from statistics import fmean
 from typing import NamedTuple
 
-from runner import CPU_CLOCK, RESULTS, Measured, command, lego, machine, markdown, run_apart
-from total_time import OVERRIDES as WITHIN_TOTAL
+import controls
+from baselines import HELD_OUT, hold_out
+from figures import dots, legend, panels, save
+from runner import markdown
+from sections import DATA, WORK, Case, Row, Section, number, trainings, value
 
-from xplanes.files import replacing, write_rows, write_text
-
+DATA["oracles"] = WORK / "oracles"
 DEMOS = ("excavator", "balls")
-SUITE = ("half_circle_test",)
-VIDEO = "data.train_on_video=true"
+"""Scenes with the video of a fixed camera."""
+FEW, ALL = 5, 50
+
+
+class Start(NamedTuple):
+    """An initialisation: what it consists of, and its settings or the control of its LRM."""
+
+    words: str
+    overrides: tuple[str, ...] = ()
+    control: str = ""
+    every: bool = False
+
+
 STARTS = {
-    "none": ("lrm=none",),
-    "tiny": ("lrm=tiny",),
-    "none, on the video": ("lrm=none", VIDEO),
-    "tiny, on the video": ("lrm=tiny", VIDEO),
+    "random": Start("planes and decoder at random", ("lrm=none",), every=True),
+    "decoder alone": Start("planes at random, the LRM's decoder", control="random_planes"),
+    "mean triplane": Start(
+        "mean of the LRM's triplanes of 64 training objects", control="mean", every=True
+    ),
+    "another scene": Start("triplanes of another scene's video", control="other_scene"),
+    "one frame": Start("the middle frame's triplane at all times", control="one_frame"),
+    "fresh decoder": Start(
+        "the LRM's planes, a decoder at random", control="fresh_decoder", every=True
+    ),
+    "without S": Start(
+        "robust PCA, but time planes at random and no L_r",
+        ("lrm=tiny", "decomposition.dynamic=random", "model.loss.sparse_weight=0.0"),
+    ),
+    "median": Start("static part: median over time, no robust PCA", control="median"),
+    "not held": Start("neither L_r nor the distance term", ("lrm=tiny", *controls.NOT_HELD)),
+    "LRM": Start("the method", ("lrm=tiny",), every=True),
+    "oracle": Start("triplanes fitted to true views", control="oracle", every=True),
 }
-FEW = 5
-COLUMNS = (
-    *("scene", "views", "initialisation", "preparation, s", "before the first step, dB"),
-    *("PSNR, dB", "SSIM", "steps"),
-)
 
 
-class Case(NamedTuple):
-    """A scene with its views."""
-
-    scene: str
-    overrides: tuple[str, ...]
-    views: int | None
-    seconds: float
+def scene_of(name: str) -> tuple[str, ...]:
+    if name == "lego":
+        return (*HELD_OUT, "data.resolution=100")
+    return (f"data.scene={name}", "data.resolution=100", "data.train_on_video=true")
 
 
-def cases(args: argparse.Namespace) -> list[Case]:
-    scenes = {name: (f"data.scene={name}",) for name in DEMOS}
-    if args.lego.is_dir():
-        scenes["lego (val)"] = tuple(lego(args.lego.resolve()))
-    found = {name: ("data=suite", f"data.scene={name}") for name in SUITE}
-    every = [Case(name, given, None, args.seconds) for name, given in (scenes | found).items()]
-    few = [Case(name, scenes[name], FEW, args.few_seconds) for name in DEMOS]
-    return every + few
-
-
-def measure(case: Case, start: str, seed: int, args: argparse.Namespace) -> Measured:
-    """One run, whose preparation and training take the case's seconds."""
-    # A stage taken from the cache would cost its run nothing.
-    given = [*case.overrides, f"data.resolution={args.resolution}", "preparation.cache=null"]
-    given += [*STARTS[start], f"data.views={case.views or 'null'}", f"seed={seed}"]
-    given += [f"trainer.max_seconds={case.seconds:g}", "trainer.max_steps=1000000", *WITHIN_TOTAL]
-    given += ["callbacks.evaluation.at=[0.0]", "media=false", "logger=none"]
-    given += ["trainer.accelerator=cpu"]
-    words = start.replace(", ", " ").replace(" ", "_")
-    name = f"{case.scene.split()[0]}_{case.views or 'all'}_{words}_{seed}_{case.seconds:g}s"
-    return run_apart(given, args.work.absolute() / name, CPU_CLOCK)
-
-
-def preparation(run: Measured) -> float:
-    """Seconds before training that random initialisation does not take."""
-    return sum(run.metrics["seconds"]["prepare"].values())
-
-
-def row(case: Case, start: str, runs: list[Measured]) -> tuple:
-    """Means over the seeds, with the standard deviation of PSNR."""
-    psnr = [run.metrics["test"]["psnr"] for run in runs]
-    spread = f" ± {statistics.stdev(psnr):.2f}" if len(psnr) > 1 else ""
-    first = statistics.mean(float(run.curve[0]["psnr"]) for run in runs)
+def within(seconds: int, *plugins: str) -> tuple[str, ...]:
+    """So many seconds for preparation and training together; nothing comes from the cache."""
     return (
-        *(case.scene, case.views or "all", start),
-        f"{statistics.mean(map(preparation, runs)):.1f}",
-        f"{first:.2f}",
-        f"{statistics.mean(psnr):.2f}{spread}",
-        f"{statistics.mean(run.metrics['test']['ssim'] for run in runs):.3f}",
-        f"{statistics.mean(run.metrics['step'] for run in runs):.0f}",
+        *(f"plugins=[{','.join(('total_time', *plugins))}]", "preparation.cache=null"),
+        "+callbacks.total_time._target_=total_time.TotalTime",
+        *(f"trainer.max_seconds={seconds}", "trainer.max_steps=1000000", "trainer.accelerator=cpu"),
+        "callbacks.evaluation.at=[0.0]",
     )
 
 
-def leads(found: dict[tuple[Case, str], list[Measured]], case: Case, start: str) -> list[float]:
-    """How far `tiny` is ahead of a random start, in dB, seed by seed."""
-    pairs = zip(found[case, start.replace("none", "tiny")], found[case, start], strict=True)
-    return [a.metrics["test"]["psnr"] - b.metrics["test"]["psnr"] for a, b in pairs]
+def cases() -> list[Case]:
+    found = []
+    for views in (FEW, ALL):
+        for name, start in STARTS.items():
+            for scene in (*DEMOS, "lego"):
+                if (views == ALL and not start.every) or (scene, name) == ("lego", "oracle"):
+                    continue
+                own, plugins = start.overrides, ()
+                if start.control:
+                    plugins = ("controls",)
+                    own = controls.overrides(start.control, oracle_of(scene, start.control))
+                some = () if views == ALL else (f"data.views={views}",)
+                found.append(
+                    Case(
+                        f"{scene}, {views} views, {name}",
+                        (*scene_of(scene), *some, *within(20, *plugins), *own),
+                        seeds=1,
+                        quick=scene == "excavator" and views == FEW and name in ("random", "LRM"),
+                        about={"scene": scene, "views": views, "start": name},
+                    )
+                )
+    return found
 
 
-def plot(found: dict[tuple[Case, str], list[Measured]]) -> None:
-    """Lead of `tiny` in each scene, with all views and with few, without and with the video."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(7, 3.6))
-    scenes = list(dict.fromkeys(case.scene for case, _ in found))
-    bars = [(views, start) for views in (None, FEW) for start in STARTS if "none" in start]
-    for place, (views, start) in enumerate(bars):
-        cases = [case for case, name in found if name == start and case.views == views]
-        lead = [leads(found, case, start) for case in cases]
-        axes.bar(
-            [scenes.index(case.scene) + (place - 1.5) * 0.2 for case in cases],
-            [statistics.mean(values) for values in lead],
-            0.19,
-            yerr=[statistics.stdev(values) if len(values) > 1 else 0 for values in lead],
-            color=f"C{0 if views is None else 1}",
-            alpha=1 if start == "none" else 0.5,
-            label=f"{views or 'all'} views{start.removeprefix('none')}",
-        )
-    axes.axhline(0, color="0.3", linewidth=0.8)
-    axes.set_xticks(range(len(scenes)), scenes, rotation=20, ha="right")
-    axes.set(ylabel="lead of tiny, dB")
-    axes.legend()
-    axes.grid(axis="y", alpha=0.3)
-    figure.tight_layout()
-    with replacing(RESULTS / "initialisation.png") as temporary:
-        figure.savefig(temporary, dpi=120, format="png")
+def oracle_of(scene: str, control: str) -> Path | None:
+    return Path(f"{{oracles}}/{scene}.safetensors") if control == "oracle" else None
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--lego", type=Path, default=Path("data/dnerf/lego"))
-    parser.add_argument("--seconds", type=float, default=20)
-    parser.add_argument("--few-seconds", type=float, default=15)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--resolution", type=int, default=100)
-    parser.add_argument("--together", type=int, default=1, help="runs side by side")
-    parser.add_argument("--work", type=Path, default=Path("outputs/benchmarks/initialisation"))
-    args = parser.parse_args()
-    os.environ["OMP_NUM_THREADS"] = "1"
-    pairs = [
-        (case, start)
-        for case in cases(args)
-        for start in STARTS
-        if VIDEO not in STARTS[start] or case.scene in DEMOS
-    ]
-    jobs = [(case, start, seed) for case, start in pairs for seed in range(args.seeds)]
-    found: dict[tuple[Case, str], list[Measured]] = {}
-    with ThreadPoolExecutor(args.together) as pool:
-        measured = pool.map(lambda job: measure(*job, args), jobs)
-        for (case, start, _), run in zip(jobs, measured, strict=True):
-            runs = found.setdefault((case, start), [])
-            runs.append(run)
-            if len(runs) == args.seeds:
-                print("  ".join(map(str, row(case, start, runs))), flush=True)
-    rows = [row(*key, runs) for key, runs in found.items()]
-    write_rows(RESULTS / "initialisation.csv", COLUMNS, rows)
-    plot(found)
-    seeds = f"means of {args.seeds} seeds" if args.seeds > 1 else "one seed"
-    text = f"""# What the initialisation gives
-
-    {command()}
-
-Six planes at {args.resolution} pixels; {seeds}; {machine()}. The budget is {args.seconds:g} s of
-one core's CPU time with all views and {args.few_seconds:g} s with {FEW}; **it includes the
-preparation**, the time that `tiny` alone takes before its first step, and learning rates end with
-it. Demo scenes (the first two) have a video of a fixed camera, whose frames the LRM sees and `none`
-does not; "on the video" adds them to the training views. The other scenes have no such video: the
-preparation trains a field that renders one, and both initialisations see the same images.
-
-![Lead of tiny over random initialisation](initialisation.png)
-
-{markdown(COLUMNS, rows)}
-"""
-    write_text(RESULTS / "initialisation.md", text)
+def before() -> None:
+    """Hold out views of lego, and fit the triplanes of the oracle."""
+    hold_out(DATA["dnerf"] / "lego", DATA["held_out"] / "lego")
+    for scene in DEMOS:
+        file = DATA["oracles"] / f"{scene}.safetensors"
+        if not file.is_file():
+            script = Path(__file__).with_name("oracle.py")
+            subprocess.run([sys.executable, str(script), scene, str(file)], check=True)
 
 
-if __name__ == "__main__":
-    main()
+def table(rows: list[Row], views: int) -> str:
+    """PSNR of each initialisation by scene, and its mean lead over random initialisation."""
+    known = {(row["start"], row["scene"]): row for row in rows if row["views"] == views}
+    scenes = list(dict.fromkeys(scene for _, scene in known))
+    lines = []
+    for name in dict.fromkeys(start for start, _ in known):
+        own = [known.get((name, scene), {}) for scene in scenes]
+        leads = [
+            row["psnr"] - known["random", scene]["psnr"]
+            for row, scene in zip(own, scenes, strict=True)
+            if row
+        ]
+        cells = [number(row, "psnr") for row in own]
+        lead = "" if name == "random" else f"{fmean(leads):+.2f}"
+        lines.append((name, STARTS[name].words, *cells, lead))
+    return markdown(("initialisation", "what it is", *scenes, "mean lead, dB"), lines)
+
+
+def show(rows: list[Row]) -> str:
+    few = [row for row in rows if row["views"] == FEW]
+    names = list(dict.fromkeys(row["start"] for row in few))[1:]
+    leads: dict[str, list[tuple[float, float] | None]] = {}
+    for scene in dict.fromkeys(row["scene"] for row in few):
+        own = {row["start"]: value(row, "psnr") for row in few if row["scene"] == scene}
+        random = own["random"]
+        assert random is not None
+        leads[scene] = [
+            None if (one := own.get(name)) is None else (one[0] - random[0], one[1])
+            for name in names
+        ]
+    figure, (axes,) = panels(1, 0.35 * len(names) + 1.4)
+    dots(axes, names, leads)
+    axes.axvline(0, color="0.3", linewidth=0.8)
+    axes.set_xlabel(f"lead over random initialisation with {FEW} views, dB")
+    legend(figure, axes, 3)
+    save(figure, "controls")
+    return (
+        f"![Lead of each initialisation over a random one](controls.png)\n\nWith {FEW} views:\n\n"
+        f"{table(rows, FEW)}\n\nWith all views:\n\n{table(rows, ALL)}"
+    )
+
+
+LEAD = {
+    **{name: (f"data.scene={name}",) for name in DEMOS},
+    "lego": HELD_OUT,
+    "half_circle_test": ("data=suite", "data.scene=half_circle_test"),
+}
+VIDEO = ("data.train_on_video=true",)
+
+
+def lead_cases() -> list[Case]:
+    found = []
+    for views, scene in [*((ALL, name) for name in LEAD), *((FEW, name) for name in DEMOS)]:
+        for video in ((), VIDEO) if scene in DEMOS else ((),):
+            for lrm in ("none", "tiny"):
+                some = () if views == ALL else (f"data.views={views}",)
+                given = (*LEAD[scene], "data.resolution=100", *some, *video, f"lrm={lrm}")
+                seen = {"scene": scene, "views": views, "video": bool(video), "lrm": lrm}
+                name = f"{scene}, {views} views{', video' if video else ''}, {lrm}"
+                found.append(Case(name, (*given, *within(20)), about=seen))
+    return found
+
+
+def show_lead(rows: list[Row]) -> str:
+    known = {(row["scene"], row["views"], row["video"], row["lrm"]): row for row in rows}
+    lines = []
+    for scene, views, video, lrm in known:
+        if lrm == "none":
+            random, tiny = (known[scene, views, video, name] for name in ("none", "tiny"))
+            ahead = f"{tiny['psnr'] - random['psnr']:+.2f}"
+            scores = (number(row, "psnr") for row in (random, tiny))
+            seen = "yes" if video else ""
+            lines.append((scene, views, seen, *scores, ahead, number(tiny, "prepare", 1)))
+    columns = ("scene", "views", "video's frames for both", "random, dB", "LRM, dB")
+    return markdown((*columns, "lead, dB", "preparation, s"), lines)
+
+
+SECTIONS: tuple[Section, ...] = (
+    trainings(cases(), before=before, name="controls", show=show),
+    trainings(lead_cases(), before=before, name="lead", show=show_lead),
+)

@@ -10,7 +10,10 @@ from typing import Any
 import pytest
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
-MODULES = ("all", "sections", "runner", "figures", "baselines", "ablations", "paper", "engineering")
+MODULES = (
+    *("all", "sections", "runner", "figures", "controls"),
+    *("baselines", "initialisation", "ablations", "paper", "engineering"),
+)
 
 
 @pytest.fixture

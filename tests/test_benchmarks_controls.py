@@ -1,0 +1,109 @@
+"""Controls of the LRM: what each exchanges, and what it leaves alone."""
+
+import importlib
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.training.runs import SMALL
+from xplanes.errors import ConfigError
+from xplanes.fields import XPlanes
+from xplanes.models.initialisation import Initialisation
+from xplanes.preparation import TriplaneSequence, save_triplanes
+from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.training.module import RadianceModule
+
+FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
+
+LRM = ("lrm=tiny", "model.channels=32", "model.decoder.width=64", "preparation.frames=3")
+
+Made = tuple[Initialisation, RadianceModule]
+Make = Callable[..., Made]
+
+
+@pytest.fixture(scope="module")
+def controls() -> Iterator:
+    sys.path.insert(0, str(FOLDER))
+    yield importlib.import_module("controls")
+    sys.path.remove(str(FOLDER))
+    sys.modules.pop("controls")
+
+
+@pytest.fixture(scope="module")
+def make(controls, scenes: Path) -> Make:
+    """A field of 24 texels from `tiny`, with a control or none."""
+
+    def make(
+        control: str | None, file: Path | None = None
+    ) -> tuple[Initialisation, RadianceModule]:
+        given = [*SMALL, *LRM, f"data.root={scenes}", "preparation.cache=null"]
+        if control is not None:
+            given += [*controls.overrides(control, file), "plugins=[controls]"]
+        module, data = RadianceModule.compose(*given), SceneDataModule.compose(*given)
+        data.setup("fit")
+        module.build(data.scene, say=lambda _: None)
+        assert module.initialisation is not None
+        return module.initialisation, module
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def plain(make: Make) -> Made:
+    return make(None)
+
+
+def planes(found: Initialisation) -> dict[str, torch.Tensor]:
+    assert found.values is not None
+    return dict(found.values.planes)
+
+
+def same_decoder(a: RadianceModule, b: RadianceModule) -> bool:
+    assert isinstance(a.field, XPlanes)
+    assert isinstance(b.field, XPlanes)
+    pairs = zip(a.field.decoder.parameters(), b.field.decoder.parameters(), strict=True)
+    return all(torch.equal(one, other) for one, other in pairs)
+
+
+@pytest.mark.parametrize("control", ["random_planes", "mean", "one_frame", "other_scene", "median"])
+def test_planes_are_exchanged_and_the_decoder_stays(make, plain, control):
+    found, module = make(control)
+    before, after = planes(plain[0]), planes(found)
+    assert same_decoder(module, plain[1])
+    assert all(not torch.equal(before[name], after[name]) for name in ("xy", "xz", "yz"))
+    assert all(plane.shape == before[name].shape for name, plane in after.items())
+    assert torch.equal(found.frame.centre, plain[0].frame.centre)
+
+
+def test_a_fresh_decoder_leaves_the_planes(make, plain):
+    found, module = make("fresh_decoder")
+    assert not same_decoder(module, plain[1])
+    assert all(torch.equal(plane, planes(plain[0])[name]) for name, plane in planes(found).items())
+
+
+@pytest.mark.parametrize("control", ["random_planes", "mean", "one_frame"])
+def test_a_static_control_is_not_held_still(make, control):
+    assert make(control)[1].model.sparse is None
+
+
+def test_the_oracle_is_what_the_file_holds(make, plain, tmp_path):
+    own = 2 * torch.rand(1, 3, 32, 24, 24, generator=torch.Generator().manual_seed(0)) - 1
+    field = plain[1].field
+    assert isinstance(field, XPlanes)
+    decoder = field.decoder
+    save_triplanes(
+        tmp_path / "true.safetensors",
+        TriplaneSequence(own.expand(3, -1, -1, -1, -1), decoder.state_dict(), decoder.options),
+    )
+    found = planes(make("oracle", tmp_path / "true.safetensors")[0])
+    torch.testing.assert_close(found["xy"], own[0, 0], atol=0.02, rtol=0.02)
+
+
+def test_the_oracle_needs_a_file_and_no_other_control_takes_one(make, tmp_path):
+    with pytest.raises(ConfigError, match=r"control=oracle with lrm.triplanes=None"):
+        make("oracle")
+    with pytest.raises(ConfigError, match=r"control=mean with lrm.triplanes=.*\.pt"):
+        make("mean", tmp_path / "a.pt")

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
@@ -45,7 +46,15 @@ NOT_MEASURED = re.compile(
 
 
 class OutOfTimeError(Exception):
-    """The minutes of a measurement are over; what is finished is kept."""
+    """The minutes of a measurement are over; finished runs are kept.
+
+    Attributes:
+        rows: Of the cases that are complete.
+    """
+
+    def __init__(self, message: str, rows: list[Row]) -> None:
+        super().__init__(message)
+        self.rows = rows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,14 +169,14 @@ def train_all(cases: Sequence[Case], work: Path, *, quick: bool = False) -> list
 
     with ThreadPoolExecutor(int(LIMITS["together"])) as pool:
         found = list(pool.map(train, jobs))
-    runs = [run for run in found if run is not None]
-    if len(runs) < len(jobs):
-        raise OutOfTimeError(f"{len(jobs) - len(runs)} of {len(jobs)} runs are left")
-    done = iter(runs)
-    return [
-        gathered(case, [next(done) for _ in range(count)])
-        for case, count in zip(chosen, counts, strict=True)
-    ]
+    done, rows = iter(found), []
+    for case, count in zip(chosen, counts, strict=True):
+        runs = [run for run in islice(done, count) if run is not None]
+        if len(runs) == count:
+            rows.append(gathered(case, runs))
+    if (left := found.count(None)) > 0:
+        raise OutOfTimeError(f"{left} of {len(jobs)} runs are left", rows)
+    return rows
 
 
 def gathered(case: Case, runs: list[Measured]) -> Row:
@@ -261,12 +270,20 @@ def measure(section: Section, work: Path) -> None:
     """Measure a section in full and write its record; finished runs stay in a folder until then.
 
     Raises:
-        OutOfTimeError: If the minutes are over before all is measured; go on with another call.
+        OutOfTimeError: If the minutes are over before all is measured. Complete cases are recorded;
+            another call goes on.
         RuntimeError: If a run fails.
     """
     began = time.perf_counter()
     work.mkdir(parents=True, exist_ok=True)
-    settings, rows = section.settings(), section.measure(work, False)
+    settings, left = section.settings(), None
+    try:
+        rows = section.measure(work, False)
+    except OutOfTimeError as error:
+        rows, left = error.rows, error
+        settings = {row["case"]: settings[row["case"]] for row in rows}
+        if not rows:
+            raise
     spent = sum(row.get("cpu", 0) for row in rows) or time.perf_counter() - began
     made = {
         "version": __version__,
@@ -276,6 +293,8 @@ def measure(section: Section, work: Path) -> None:
         "hours": round(spent / 3600, 2),
     }
     write_record(section.name, made, settings, rows)
+    if left is not None:
+        raise left
 
 
 def commit() -> str:
@@ -296,7 +315,7 @@ def why_stale(section: Section) -> str:
     changes: dict[str, None] = {}
     for case, settings in now.items():
         if case not in record["settings"]:
-            changes[f"{case} is new"] = None
+            changes[f"{case} has not been measured"] = None
             continue
         then = record["settings"][case]
         for key in sorted({*then, *settings}):

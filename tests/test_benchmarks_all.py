@@ -56,7 +56,7 @@ def test_a_record_is_stale_when_settings_of_what_it_measured_have_changed(record
     assert records.why_stale(old) == ""
     new = {"one": {**case, "model.loss.opacity": 0.2}, "two": old.settings()["two"], "three": case}
     words = records.why_stale(section(records, new, rows))
-    assert words == "model.loss.opacity went from 0.1 to 0.2, three is new"
+    assert words == "model.loss.opacity went from 0.1 to 0.2, three has not been measured"
     records.write_record("some", {"version": "1"}, {}, rows)
     assert "version 1" in records.why_stale(old)
 
@@ -86,8 +86,11 @@ def test_a_repeated_measurement_is_compared_with_its_record(records) -> None:
 def test_rows_have_means_and_deviations_and_wait_for_all_runs(
     records, monkeypatch, tmp_path
 ) -> None:
+    folders: list[Path] = []
+
     def run(overrides: list[str], folder: Path, script: Path) -> Any:
         seed = int(overrides[-1].removeprefix("seed="))
+        folders.append(folder)
         seconds = {"prepare": {"fill": 1.0}, "train": 2.0, "total": 4.0}
         metrics = {
             "test": {"psnr": 20.0 + seed, "ssim": 0.5},
@@ -112,6 +115,12 @@ def test_rows_have_means_and_deviations_and_wait_for_all_runs(
     monkeypatch.setitem(records.LIMITS, "until", 0)
     with pytest.raises(records.OutOfTimeError, match="4 of 4"):
         records.train_all(cases, tmp_path)
+    folder = next(path for path in folders if path.name.startswith("b_0"))
+    folder.mkdir()
+    (folder / "metrics.json").touch()
+    with pytest.raises(records.OutOfTimeError, match="3 of 4") as caught:
+        records.train_all(cases, tmp_path)
+    assert [row["case"] for row in caught.value.rows] == ["b"]
 
 
 def test_measuring_writes_a_record_and_its_page(every, records, monkeypatch, tmp_path) -> None:

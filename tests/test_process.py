@@ -1,6 +1,7 @@
 """What the environment tells OpenMP, oneDNN, and libraries that look for a home."""
 
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -53,3 +54,30 @@ runpy.run_path({str(ROOT / command[0])!r}, run_name="__main__")
     )
     printed = done.stdout.decode().split()
     assert printed == [added[name] for name in sorted(added)], done.stderr.decode()
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries are left alone")
+def test_freed_memory_is_used_again():
+    code = """
+import ctypes, resource
+from xplanes.process import keep_freed_memory
+library = ctypes.CDLL(None)
+library.malloc.restype = ctypes.c_void_p
+def pages():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(8):
+        block = ctypes.c_void_p(library.malloc(2**26))
+        ctypes.memset(block, 1, 2**26)
+        library.free(block)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+keep_freed_memory()
+print(pages())
+"""
+    clean = {name: value for name, value in os.environ.items() if "MALLOC" not in name}
+
+    def pages(**more: str) -> int:
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, capture_output=True, cwd=ROOT, env=clean | more, check=True)
+        return int(done.stdout)
+
+    assert 4 * pages() < pages(MALLOC_ARENA_MAX="8")  # Whose own variable leaves glibc as it is.

@@ -79,13 +79,27 @@ def write_kitchen(folder: Path) -> None:
     """Neural 3D Video's calibration, with folders of images."""
     poses = ball(CAMERAS).camera_to_world
     times = torch.linspace(0, 1, FRAMES)
-    rows = []
     for camera, pose in enumerate(poses):
         views = ball(FRAMES, poses=pose.repeat(FRAMES, 1, 1), times=times)
         for index in range(FRAMES):
             save(folder / f"cam{camera:02d}" / f"{index:04d}.png", opaque(views.image(index)))
+    write_poses_bounds(folder, ball(CAMERAS))
+
+
+def write_fern(folder: Path) -> None:
+    """LLFF's rows, and an image for each."""
+    views = ball(10)
+    for index in range(10):
+        save(folder / "images" / f"IMG_{index:04d}.png", opaque(views.image(index)))
+    write_poses_bounds(folder, views)
+
+
+def write_poses_bounds(folder: Path, views: Views) -> None:
+    """A row for each view's pose, size and focal length, near and far."""
+    rows = []
+    for index, pose in enumerate(views.camera_to_world):
         right, up, back, place = pose[:3].double().numpy().T
-        size = np.array([SIZE, SIZE, float(views.intrinsics.focal[0, 0])])
+        size = np.array([SIZE, SIZE, float(views.intrinsics.focal[index, 0])])
         matrix = np.stack([-up, right, back, place, size], axis=1)
         rows.append([*matrix.ravel(), 1.0, 9.0])
     np.save(folder / "poses_bounds.npy", np.array(rows))
@@ -99,6 +113,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_dancer(captures / "dancer")
     write_statue(captures / "statue")
     write_kitchen(captures / "kitchen")
+    write_fern(captures / "fern")
     NerfiesFolder(captures / "broom", 10)
     counts = {"train_views": 10, "val_views": 2, "test_views": 3}
     demo = ensure_demo_scene(
@@ -115,7 +130,7 @@ def test_the_page_has_a_section_for_each_format():
         for text in words
         if text.startswith("data=")
     }
-    assert named == {"colmap", "nerfstudio", "blender", "nerfies", "multicamera"}
+    assert named == {"colmap", "nerfstudio", "blender", "nerfies", "llff", "multicamera"}
 
 
 @pytest.mark.parametrize("words", commands("xplanes inspect"), ids=" ".join)
@@ -137,6 +152,8 @@ def small(words: list[str]) -> list[str]:
     """A command's settings, with what makes a run last a moment."""
     kept = [text for text in SMALL if not text.startswith(("data.", "lrm="))]
     sizes = ["data.resolution=24" if text == "data.resolution=400" else text for text in words]
+    if "data=llff" in words:  # Whose images are looked for at 400 pixels if nobody says more.
+        sizes.append("data.resolution=24")
     return [*sizes, *kept, "lrm=none", "trainer.max_steps=2", "callbacks.evaluation.at=[0]"]
 
 

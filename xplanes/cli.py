@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from xplanes import __version__
 from xplanes.errors import XPlanesError
-from xplanes.process import defaults, train_command
+from xplanes.process import defaults, keep_freed_memory, train_command
 
 if TYPE_CHECKING:
     from xplanes.evaluation.runs import TrainedRun
@@ -39,6 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code: 0, 1 after a reported error, 130 after Ctrl-C.
     """
     os.environ.update(defaults(os.environ))  # before torch is loaded
+    keep_freed_memory()
     words = sys.argv[1:] if arguments is None else list(arguments)
     if words[:1] == ["resume"] and len(words) > 1 and words[1] not in ("-h", "--help"):
         from xplanes.config import quoted

@@ -15,6 +15,7 @@ from xplanes.rendering.compositing import (
     composite_gpu,
     composite_reference,
     depth_before,
+    distortion,
 )
 
 try:
@@ -52,6 +53,36 @@ def rays_of(counts=COUNTS, dtype=torch.float64, seed=0, scale=1.0):
 def expected_of(depth, colour, distances, ray, starts):
     arrays = (t.double().numpy() for t in (depth, colour, distances))
     return oracle(*arrays, ray.tolist(), len(starts))
+
+
+def test_distortion_is_the_mean_distance_of_two_photons():
+    depth, _, distances, ray, starts = given = rays_of(scale=2.0)
+    ends = torch.full((len(starts),), 20.0, dtype=torch.float64)
+    weights = composite_reference(*given)[1]
+    wanted = 0.0
+    for number in range(len(starts)):
+        mine = ray == number
+        places = torch.cat([distances[mine], ends[:1]])
+        shares = torch.cat([weights[mine], 1 - weights[mine].sum()[None]])
+        pairs = shares[:, None] * shares * (places[:, None] - places).abs()
+        wanted += float(pairs.sum() + weights[mine].square().sum() * 0.3 / 3) / len(starts)
+    found = distortion(depth, distances, ray, starts, ends, 0.3)
+    assert float(found) == pytest.approx(wanted, rel=1e-12)
+    single = distortion(depth.float(), distances.float(), ray, starts, ends.float(), 0.3)
+    assert float(single) == pytest.approx(wanted, rel=1e-6)
+    assert torch.autograd.gradcheck(
+        lambda depth: distortion(depth, distances, ray, starts, ends, 0.3),
+        depth.requires_grad_(),
+    )
+
+
+def test_rays_that_end_at_one_surface_or_at_none_have_no_distortion():
+    ray, starts = torch.tensor([0, 0, 0, 1]), torch.tensor([0, 3, 4])
+    depth, distances = torch.tensor([0.0, 1e3, 5.0, 0.0]), torch.tensor([1.0, 2.0, 3.0, 1.0])
+    assert distortion(depth, distances, ray, starts, torch.full((3,), 4.0), 1e-9) < 1e-9
+    nothing = torch.empty(0)
+    none = ray[:0]
+    assert distortion(nothing, nothing, none, none, nothing, 0.1) == 0
 
 
 @pytest.mark.parametrize("merge", ALL)

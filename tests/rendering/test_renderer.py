@@ -15,6 +15,8 @@ from xplanes.rendering.grid_renderer import (
     OccupancySettings,
 )
 from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.sampler import Site
+from xplanes.scenes.frame import cube_frame
 from xplanes.streams import TrainingState
 
 COLOUR = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
@@ -232,6 +234,33 @@ def test_random_points_of_occupied_cells_pay_for_their_opacity():
     renderer.grid.occupied.zero_()
     sampler.regularise(field, TrainingState(0, 12, 12, 0))
     assert float(field.density.grad) == pytest.approx(2 * expected, rel=1e-6)
+
+
+def test_fog_before_a_background_pays_for_its_distortion():
+    options = compose_plain("train", [])["model"]["sampler"]
+    known = {key: value for key, value in options.items() if key != "_target_"}
+    settings = OccupancySettings(**known | {"distortion": 0.5})
+    batch = dict(zip(("origins", "directions", "times"), rays_of(8), strict=True))
+    batch |= {"background": WHITE.expand(8, 3), "jitter": batch["times"]}
+    state = TrainingState(0, 1, 1, 0)
+    level = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+
+    def terms(settings):
+        sampler = OccupancySampler(renderer_of(), settings)
+        return sampler.losses(sampler.render(fog(level), batch, state))
+
+    frame = cube_frame(1.0, torch.zeros(3))
+    many, few = (Site(frame, torch.zeros(views), 0, "32") for views in (12, 11))
+    assert terms(settings.before_colour(many)) == {}
+    assert terms(settings.before_background(few)) == {}
+    found = terms(settings.before_background(many))["distortion"]
+    measured = renderer_of(distorted=True).render(fog(level), *rays_of(8), WHITE, batch["times"])
+    assert measured.distortion is not None
+    assert float(found.detach()) == pytest.approx(
+        0.5 * float(measured.distortion.detach()), rel=1e-12
+    )
+    found.backward()
+    assert level.grad != 0
 
 
 def test_points_of_occupied_cells_lie_in_all_of_them_and_in_no_others():

@@ -13,9 +13,9 @@ from xplanes.errors import ConfigError
 from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.rendering.behind import behind
-from xplanes.rendering.box import Field, shade
+from xplanes.rendering.box import Field, ray_box, shade
 from xplanes.rendering.carving import carve
-from xplanes.rendering.compositing import composite
+from xplanes.rendering.compositing import composite, distortion
 from xplanes.rendering.filling import fill
 from xplanes.rendering.front_to_back import front_to_back
 from xplanes.rendering.marching import march
@@ -41,6 +41,23 @@ SPARSE_POINTS = 2048
 DIAGONAL = 2 * math.sqrt(3)
 """Longest way through the field's cube."""
 
+VIEWS_OF_SURFACES = 12
+"""Views of a timestep on average from which fog is turned into surfaces."""
+
+BEHIND = 0.5
+"""How far behind the cube the distortion takes the background to be."""
+
+
+@dataclass(frozen=True)
+class GridRendering(Rendering):
+    """What rays see through an occupancy grid.
+
+    Attributes:
+        distortion: As `compositing.distortion` gives it; None where nobody asked. []
+    """
+
+    distortion: Tensor | None
+
 
 @dataclass(frozen=True)
 class GridRenderer(RayRenderer):
@@ -53,6 +70,7 @@ class GridRenderer(RayRenderer):
         occlusion: Skip samples behind surfaces that leave less light than this; 0 skips none. The
             grid tells; in images on the CPU the field itself does.
         room: Places for samples where nothing may wait for their number, see `march`.
+        distorted: Whether to measure the distortion.
     """
 
     grid: OccupancyGrid
@@ -60,6 +78,7 @@ class GridRenderer(RayRenderer):
     skip_empty: bool = True
     occlusion: float = 0.001
     room: int | None = None
+    distorted: bool = False
 
     @property
     def device(self) -> torch.device:
@@ -78,7 +97,7 @@ class GridRenderer(RayRenderer):
         times: Tensor,
         background: Tensor,
         jitter: Tensor | None = None,
-    ) -> Rendering:
+    ) -> GridRendering:
         """Render rays.
 
         Args:
@@ -119,7 +138,13 @@ class GridRenderer(RayRenderer):
             # A ray without room sees nothing but the background, which must not learn from it.
             background = torch.where(samples.shown[:, None], background, background.detach())
         colour, opacity, depth = _pixels(total, background)
-        return Rendering(colour, opacity, depth.detach(), density.detach(), samples)
+        spread = None
+        if self.distorted:
+            ends = ray_box(origins, directions)[1] + BEHIND
+            along = samples.distances, samples.ray, samples.starts
+            spread = distortion(density * self.step, *along, ends, self.step)
+        seen = colour, opacity, depth.detach(), density.detach(), samples
+        return GridRendering(*seen, distortion=spread)
 
     def pixels(
         self, field: Any, origins: Tensor, directions: Tensor, times: Tensor, background: Tensor
@@ -176,6 +201,9 @@ class OccupancySettings(SamplerSettings):
     # no training ray sees, such as the space below a ground plate. 0 if a background is learnt,
     # which would take over what it empties.
     sparsity: Weight
+    # Weight of the distortion (Mip-NeRF 360), which turns fog into surfaces. 0 unless a background
+    # is learnt and twelve views or more show each timestep: fewer do not tell where surfaces are.
+    distortion: Weight
     # Steps at which all occupied cells are updated; only the last one if a background is learnt,
     # which would take over what lies in cells that are only late.
     sweep_at: list[int]
@@ -221,11 +249,11 @@ class OccupancySettings(SamplerSettings):
                 carve(grid, site.views, site.frame)
             if site.initialised and self.fill:
                 fill_seconds = _fill(renderer, field, site)
-        settings = self.scaled(site) if plain else self.before_background()
+        settings = self.before_colour(site) if plain else self.before_background(site)
         return OccupancySampler(renderer, settings, site.samples_per_batch, fill_seconds)
 
-    def scaled(self, site: Site) -> "OccupancySettings":
-        """The same schedule in steps of the batches of a site.
+    def before_colour(self, site: Site) -> "OccupancySettings":
+        """What suits a plain background: the same schedule in steps of the batches of a site.
 
         Random cells are looked at as often as before, for rays of large batches meet more cells.
         """
@@ -233,11 +261,14 @@ class OccupancySettings(SamplerSettings):
             self,
             sweep_at=[site.steps(step) for step in self.sweep_at],
             sweep_every=site.steps(self.sweep_every),
+            distortion=0.0,
         )
 
-    def before_background(self) -> "OccupancySettings":
+    def before_background(self, site: Site) -> "OccupancySettings":
         """What leaves cells to the field until it has taken shape; large batches start small."""
-        return replace(self, sweep_at=self.sweep_at[-1:], sparsity=0.0)
+        enough = site.views_per_timestep >= VIEWS_OF_SURFACES
+        distortion = self.distortion if enough else 0.0
+        return replace(self, sweep_at=self.sweep_at[-1:], sparsity=0.0, distortion=distortion)
 
     def for_video(self) -> "OccupancySettings":
         samples = FEWEST_SAMPLES if self.samples == "auto" else self.samples
@@ -284,7 +315,8 @@ class OccupancySampler(Sampler):
         self.fill_seconds = fill_seconds
         self._along = renderer.samples
         room = None if samples is None else self._room(samples)
-        self._training = replace(renderer, room=room)
+        distorted = settings.distortion > 0
+        self._training = replace(renderer, room=room, distorted=distorted)
         self._images = replace(renderer, samples=settings.render_samples)
 
     @property
@@ -316,6 +348,11 @@ class OccupancySampler(Sampler):
             rays["background"],
             rays["jitter"],
         )
+
+    def losses(self, rendering: GridRendering) -> dict[str, Tensor]:
+        if rendering.distortion is None:
+            return {}
+        return {"distortion": self.settings.distortion * rendering.distortion}
 
     def observe(self, rendering: Rendering) -> None:
         samples = rendering.samples

@@ -312,15 +312,18 @@ def why_stale(section: Section) -> str:
     if not record["settings"]:
         return f"measured with version {record['made']['version']}, which recorded no settings"
     now = section.settings()
-    changes: dict[str, None] = {}
+    changes: dict[str, list[str]] = {}
     for case, settings in now.items():
         if case not in record["settings"]:
-            changes[f"{case} has not been measured"] = None
+            changes[f"{case} has not been measured"] = []
             continue
         then = record["settings"][case]
         for key in sorted({*then, *settings}):
             if (old := then.get(key)) != (new := settings.get(key)):
-                changes[f"{key} went from {old} to {new}"] = None
+                changes.setdefault(f"{key} went from {old} to {new}", []).append(case)
+    for words, cases in list(changes.items()):
+        if len(cases) == 1 < len(now):
+            changes[f"{words} ({cases[0]})"] = changes.pop(words)
     named, rest = list(changes)[:4], len(changes) - 4
     return ", ".join(named) + (f" and {rest} more changes" if rest > 0 else "")
 

@@ -56,7 +56,7 @@ def test_a_record_is_stale_when_settings_of_what_it_measured_have_changed(record
     assert records.why_stale(old) == ""
     new = {"one": {**case, "model.loss.opacity": 0.2}, "two": old.settings()["two"], "three": case}
     words = records.why_stale(section(records, new, rows))
-    assert words == "model.loss.opacity went from 0.1 to 0.2, three has not been measured"
+    assert words == "three has not been measured, model.loss.opacity went from 0.1 to 0.2 (one)"
     records.write_record("some", {"version": "1"}, {}, rows)
     assert "version 1" in records.why_stale(old)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from xplanes.decomposition import space_planes, time_planes
 from xplanes.errors import ConfigError
-from xplanes.fields.xplanes import SPACE_PLANES, TIME_PLANES, random_planes
+from xplanes.fields.xplanes import SPACE_PLANES, TIME_PLANES
 from xplanes.models.initialisation import Initialisation, Method, Place
 from xplanes.models.x_planes import XPlanesSettings
 from xplanes.preparation.reconstruct import LoadedLRM, reconstruct
@@ -97,9 +97,8 @@ class ControlInitialiser(LRMInitialiser):
         elif control == "median":
             values = replace(values, **_by_median(own.triplanes, found.model, method))
         elif bool((sequence.triplanes == sequence.triplanes[:1]).all()):
-            values = replace(
-                values, sparse=None
-            )  # Nothing moves: products are not to be held at 0.
+            # Nothing moves: products are not to be held at 0.
+            values = replace(values, sparse=None)
         return replace(found, values=values, lrm=made.report)
 
     def _exchanged(self, own: TriplaneSequence) -> TriplaneSequence:
@@ -155,16 +154,8 @@ def other_triplanes(lrm: LoadedLRM, count: int) -> Tensor:
 def _noise(model: XPlanesSettings, seed: int) -> Mapping[str, Tensor]:
     """Planes as without an LRM."""
     assert isinstance(model.time_resolution, int)
-    return random_planes(
-        model.plane_set,
-        channels=model.channels,
-        resolution=model.resolution,
-        time_resolution=model.time_resolution,
-        time_texels=model.texels_of_time,
-        space_scale=model.space_scale,
-        time_scale=model.time_scale,
-        generator=step_generator(seed, 0, Stream.INITIAL_FIELD),
-    )
+    generator = step_generator(seed, 0, Stream.INITIAL_FIELD)
+    return model.random_planes(model.plane_set, model.time_resolution, generator)
 
 
 def _by_median(triplanes: Tensor, model: XPlanesSettings, method: Method) -> dict[str, object]:

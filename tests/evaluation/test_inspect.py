@@ -485,6 +485,8 @@ def test_the_recipe_for_captures_is_named_where_a_moving_camera_shows_surroundin
         write_nerfstudio(folder, replace(views, images=images))
         command = next_command(inspect(choose([str(folder)])))
         assert command.endswith("recipe=capture") is named
+        other = inspect(choose([str(folder), "model=kplanes_reduced"]))  # Which has no such recipe.
+        assert not other.recipe_helps
 
 
 def test_errors_are_one_line_and_leave_1(tmp_path, monkeypatch, capsys):

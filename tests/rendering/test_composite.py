@@ -55,34 +55,37 @@ def expected_of(depth, colour, distances, ray, starts):
     return oracle(*arrays, ray.tolist(), len(starts))
 
 
+def spread(depth, colour, distances, ray, starts, end, step):
+    total, _ = composite(depth, colour, distances, ray, starts)
+    ends = torch.full((len(starts),), end, dtype=depth.dtype)
+    return distortion(depth, distances, ray, starts, total, ends, step)
+
+
 def test_distortion_is_the_mean_distance_of_two_photons():
-    depth, _, distances, ray, starts = given = rays_of(scale=2.0)
-    ends = torch.full((len(starts),), 20.0, dtype=torch.float64)
+    depth, *rest = given = rays_of(scale=2.0)
+    _, distances, ray, starts = rest
     weights = composite_reference(*given)[1]
     wanted = 0.0
     for number in range(len(starts)):
         mine = ray == number
-        places = torch.cat([distances[mine], ends[:1]])
+        places = torch.cat([distances[mine], torch.tensor([20.0])])
         shares = torch.cat([weights[mine], 1 - weights[mine].sum()[None]])
         pairs = shares[:, None] * shares * (places[:, None] - places).abs()
         wanted += float(pairs.sum() + weights[mine].square().sum() * 0.3 / 3) / len(starts)
-    found = distortion(depth, distances, ray, starts, ends, 0.3)
-    assert float(found) == pytest.approx(wanted, rel=1e-12)
-    single = distortion(depth.float(), distances.float(), ray, starts, ends.float(), 0.3)
-    assert float(single) == pytest.approx(wanted, rel=1e-6)
+    assert float(spread(*given, 20.0, 0.3)) == pytest.approx(wanted, rel=1e-12)
+    single = [value.float() if value.is_floating_point() else value for value in given]
+    assert float(spread(*single, 20.0, 0.3)) == pytest.approx(wanted, rel=1e-6)
     assert torch.autograd.gradcheck(
-        lambda depth: distortion(depth, distances, ray, starts, ends, 0.3),
-        depth.requires_grad_(),
+        lambda depth: spread(depth, *rest, 20.0, 0.3), depth.requires_grad_()
     )
 
 
 def test_rays_that_end_at_one_surface_or_at_none_have_no_distortion():
     ray, starts = torch.tensor([0, 0, 0, 1]), torch.tensor([0, 3, 4])
     depth, distances = torch.tensor([0.0, 1e3, 5.0, 0.0]), torch.tensor([1.0, 2.0, 3.0, 1.0])
-    assert distortion(depth, distances, ray, starts, torch.full((3,), 4.0), 1e-9) < 1e-9
-    nothing = torch.empty(0)
-    none = ray[:0]
-    assert distortion(nothing, nothing, none, none, nothing, 0.1) == 0
+    assert spread(depth, torch.rand(4, 3), distances, ray, starts, 4.0, 1e-9) < 1e-6
+    nothing, none = torch.empty(0), ray[:0]
+    assert spread(nothing, torch.empty(0, 3), nothing, none, none, 4.0, 0.1) == 0
 
 
 @pytest.mark.parametrize("merge", ALL)

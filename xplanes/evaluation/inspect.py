@@ -26,6 +26,7 @@ from xplanes.evaluation.findings import (
 )
 from xplanes.evaluation.tabulate import markdown
 from xplanes.models.base import ModelSettings
+from xplanes.models.x_planes import XPlanesSettings
 from xplanes.process import train_command
 from xplanes.scenes.cameras import image_plane
 from xplanes.scenes.entries import some
@@ -446,10 +447,11 @@ def _width_of_training(choice: Choice, scene: Scene) -> int | None:
 
 
 def _recipe_helps(choice: Choice, scene: Scene) -> bool:
-    """Whether a camera that moves shows surroundings, and no recipe was chosen."""
+    """Whether the model is X-Planes, a moving camera shows surroundings, and no recipe is chosen."""
     chosen = {text.partition("=")[0] for text in choice.overrides}
     poses = {pose.numpy().tobytes() for pose in scene.splits["train"].camera_to_world.contiguous()}
-    return scene.is_surrounded and len(poses) >= MANY_POSES and "recipe" not in chosen
+    fits = scene.is_surrounded and isinstance(choice.model, XPlanesSettings)
+    return fits and len(poses) >= MANY_POSES and "recipe" not in chosen
 
 
 def check_out(out: Path, settings: SceneSettings) -> None:

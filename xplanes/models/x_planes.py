@@ -190,6 +190,21 @@ class XPlanesSettings(ModelSettings):
             return self.time_resolution
         return max(time_rows(times), frames if self.time_resolution is None else 0)
 
+    def random_planes(
+        self, plane_set: str, rows: int, generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        """Planes at random, with this number of rows of time, see `fields.xplanes.random_planes`."""
+        return random_planes(
+            plane_set,
+            channels=self.channels,
+            resolution=self.resolution,
+            time_resolution=rows,
+            time_texels=self.texels_of_time,
+            space_scale=self.space_scale,
+            time_scale=self.time_scale,
+            generator=generator,
+        )
+
     def build(self, site: Site, initial: InitialValues | None = None) -> "XPlanesModel":
         return XPlanesModel(self, self.build_field(site, initial), site, initial)
 
@@ -202,16 +217,7 @@ class XPlanesSettings(ModelSettings):
         if initial is not None:
             planes = initial.planes
         else:
-            planes = random_planes(
-                plane_set,
-                channels=self.channels,
-                resolution=self.resolution,
-                time_resolution=self.rows_of_time(site.times),
-                time_texels=self.texels_of_time,
-                space_scale=self.space_scale,
-                time_scale=self.time_scale,
-                generator=generator,
-            )
+            planes = self.random_planes(plane_set, self.rows_of_time(site.times), generator)
         if self.fine is not None and (texels := self.fine_texels(site.pixels)):
             zeros = torch.zeros(self.fine.channels, texels, texels)
             planes = {**planes, **dict.fromkeys(FINE_PLANES, zeros)}

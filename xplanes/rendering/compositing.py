@@ -102,6 +102,7 @@ def distortion(
     distances: Tensor,
     ray: Tensor,
     starts: Tensor,
+    total: Tensor,
     ends: Tensor,
     step: float,
 ) -> Tensor:
@@ -115,6 +116,7 @@ def distortion(
         distances: Distance of each sample from the ray's origin. [N]
         ray: Ray of each sample, ascending. [N]
         starts: Index of each ray's first sample; of the next ray's where it has none. [R]
+        total: The rays' sums that `composite` gives. [R, 5]
         ends: Where light that passes all samples is stopped. [R]
         step: Length of a sample.
 
@@ -125,15 +127,11 @@ def distortion(
     """
     depth = optical_depth.clamp(0, OPAQUE)
     weights = depth_before(depth, ray, starts).neg().exp().to(depth.dtype) * stopped(depth)
-    reach = weights * distances
-    # Twice the pairs of which each sample is the farther one, and pairs within a sample.
-    pairs = weights * (
-        distances * depth_before(weights, ray, starts) - depth_before(reach, ray, starts)
-    )
+    # Pairs of which each sample is the farther one, and pairs within a sample.
+    pairs = distances * depth_before(weights, ray, starts)
+    pairs = weights * (pairs - depth_before(weights * distances, ray, starts))
     within = weights.square() * (step / 3)
-    sums = torch.stack([weights, reach], dim=1)
-    total = sums.new_zeros(len(starts), 2).index_add(0, ray, sums)
-    passing = (1 - total[:, 0]) * (total[:, 0] * ends - total[:, 1])
+    passing = (1 - total[:, 3]) * (total[:, 3] * ends - total[:, 4])
     return (2 * (pairs.sum() + passing.sum()) + within.sum()).to(depth.dtype) / max(1, len(starts))
 
 

@@ -141,7 +141,7 @@ class GridRenderer(RayRenderer):
         spread = None
         if self.distorted:
             ends = ray_box(origins, directions)[1] + BEHIND
-            along = samples.distances, samples.ray, samples.starts
+            along = samples.distances, samples.ray, samples.starts, total
             spread = distortion(density * self.step, *along, ends, self.step)
         seen = colour, opacity, depth.detach(), density.detach(), samples
         return GridRendering(*seen, distortion=spread)

@@ -224,6 +224,10 @@ def _binary(path: Path) -> Iterator[_Binary]:
         raise SceneError(f"{path} cannot be read ({problem}).") from problem
 
 
+HEADER = 4096
+"""Bytes at the beginning of a text file that hold its comments."""
+
+
 def _text_lines(path: Path) -> Iterator[tuple[str, str]]:
     """Lines that are no comments, each with its label."""
     require_fetched(path)
@@ -290,7 +294,8 @@ def _images(path: Path) -> Iterator[tuple[str, np.ndarray, int]]:
     for label, line in _text_lines(path):
         # Every other line, which some programs leave out, holds three values for each point seen.
         words = line.split()
-        if len(words) % 3 == 0 and all(number_in(word) is not None for word in words):
+        # The name of an image stands among the first twelve words, and such lines are long.
+        if len(words) % 3 == 0 and all(number_in(word) is not None for word in words[:12]):
             continue
         # Names may contain spaces.
         motion, camera, name = _parsed(
@@ -298,7 +303,8 @@ def _images(path: Path) -> Iterator[tuple[str, np.ndarray, int]]:
         )
         count += 1
         yield name, _pose(f"{label} ({name})", motion), camera
-    stated = re.search(rb"# Number of images: (\d+)", path.read_bytes())
+    with path.open("rb") as file:
+        stated = re.search(rb"# Number of images: (\d+)", file.read(HEADER))
     if stated and count < int(stated[1]):
         raise SceneError(
             f"{path} says that it lists {int(stated[1])} images, but it ends after {count}: it is "

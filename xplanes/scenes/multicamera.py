@@ -617,11 +617,11 @@ def _read_views(
         ),
         cache,
     )
-    moments = [recording.times[number] if stamped else number for recording, number in frames]
+    stamps = [recording.times[number] if stamped else number for recording, number in frames]
     views = Views(
         pixels,
         poses[camera].float(),
-        torch.tensor(unit_times(moments)),
+        torch.tensor(unit_times(stamps)),
         intrinsics.subset(camera),
         tuple(f"{recording.camera.name}/{number:06d}" for recording, number in frames),
     )

@@ -235,7 +235,7 @@ def test_masks_of_a_thing_cut_it_out_where_that_is_asked_for(tmp_path):
     shown = masks == 255
     assert torch.equal(lrm.cut.images[shown], whole.splits["train"].images[shown])
     assert not lrm.cut.images[masks == 0].any()
-    words = "data.mask_use=alpha: dark stands in no world.*score"
+    words = "data.mask_use=alpha: dark has no surroundings.*score"
     assert_refused(SceneError, words, lambda: scene("dark", "alpha"), "dark")
 
 

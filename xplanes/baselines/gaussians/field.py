@@ -169,17 +169,17 @@ class Gaussians(Representation):
         return self.logits.sigmoid()
 
     @abstractmethod
-    def moved(self, still: PosedGaussians, time: float) -> PosedGaussians:
+    def moved(self, canonical: PosedGaussians, time: float) -> PosedGaussians:
         """What moves, at a time from 0 to 1.
 
         Args:
-            still: The canonical Gaussians.
+            canonical: The canonical Gaussians.
             time: From 0 to 1.
         """
 
     def at(self, time: float) -> PosedGaussians:
         """The Gaussians at a time from 0 to 1; gradients reach the parameters."""
-        still = PosedGaussians(
+        canonical = PosedGaussians(
             self.means,
             self.quaternions,
             self.scales,
@@ -187,7 +187,7 @@ class Gaussians(Representation):
             torch.cat([self.base, self.detail], dim=1),
             int(self.degree),
         )
-        return self.moved(still, time) if self.moves and self.deforms else still
+        return self.moved(canonical, time) if self.moves and self.deforms else canonical
 
     def training_time(self, time: float, state: TrainingState) -> float:
         """The time at which a view of some time is drawn in training."""
@@ -264,15 +264,15 @@ class HexPlaneGaussians(Gaussians):
         names = self.products.names
         return {name: plane[0] for name, plane in self.products.planes()[-len(names) :]}
 
-    def moved(self, still: PosedGaussians, time: float) -> PosedGaussians:
+    def moved(self, canonical: PosedGaussians, time: float) -> PosedGaussians:
         assert self.products is not None
         times = torch.full_like(self.means[:, 0], time)
         hidden = self.network["features"](self.products(self.means.detach(), times))
         shift, turn, growth = (self.network[name](hidden) for name in HEADS)
         return replace(
-            still,
-            means=still.means + shift,
-            quaternions=still.quaternions + turn,
+            canonical,
+            means=canonical.means + shift,
+            quaternions=canonical.quaternions + turn,
             scales=(self.log_scales + growth).exp(),
         )
 
@@ -327,7 +327,7 @@ class DeformedGaussians(Gaussians):
     def planes(self) -> Mapping[str, Tensor]:
         return {}
 
-    def moved(self, still: PosedGaussians, time: float) -> PosedGaussians:
+    def moved(self, canonical: PosedGaussians, time: float) -> PosedGaussians:
         places = octaves(self.means.detach(), self.octaves[0])
         times = self.network["time"](octaves(places.new_tensor([[time]]), self.octaves[1]))
         given = torch.cat([places, times.expand(len(places), -1)], dim=1)
@@ -338,11 +338,11 @@ class DeformedGaussians(Gaussians):
             hidden = layer(hidden).relu()
         shift, turn, growth = (self.network[name](hidden) for name in HEADS)
         return replace(
-            still,
-            means=still.means + shift,
-            quaternions=F.normalize(still.quaternions, dim=1) + turn,
+            canonical,
+            means=canonical.means + shift,
+            quaternions=F.normalize(canonical.quaternions, dim=1) + turn,
             # A covariance knows no signs.
-            scales=(still.scales + growth).abs(),
+            scales=(canonical.scales + growth).abs(),
         )
 
     def training_time(self, time: float, state: TrainingState) -> float:
@@ -389,17 +389,17 @@ class SpacetimeGaussians(Gaussians):
     def planes(self) -> Mapping[str, Tensor]:
         return {}
 
-    def moved(self, still: PosedGaussians, time: float) -> PosedGaussians:
+    def moved(self, canonical: PosedGaussians, time: float) -> PosedGaussians:
         since = time - self.centres
         life = (-(since / self.log_widths.exp()).square()).exp()
         # As released: motion says nothing about when a Gaussian is there.
         since = since.detach()[:, None]
         powers = torch.cat([since**power for power in range(1, ORDER + 1)], dim=1)
         return replace(
-            still,
-            means=still.means + (powers[..., None] * self.motion).sum(dim=1),
-            quaternions=still.quaternions + since * self.spin,
-            opacities=still.opacities * life,
+            canonical,
+            means=canonical.means + (powers[..., None] * self.motion).sum(dim=1),
+            quaternions=canonical.quaternions + since * self.spin,
+            opacities=canonical.opacities * life,
         )
 
 

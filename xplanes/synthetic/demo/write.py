@@ -368,7 +368,7 @@ class SuiteSettings(ProceduralSettings):
             return scene
         if train.foreground is None:
             raise SceneError(
-                f"data.mask_use={self.mask_use}: {self.scene} stands in no world, so it has no "
+                f"data.mask_use={self.mask_use}: {self.scene} has no surroundings, so it has no "
                 "masks. Set it to score."
             )
         cut = cut_out(train, train.foreground)

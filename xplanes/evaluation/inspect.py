@@ -447,7 +447,7 @@ def _width_of_training(choice: Choice, scene: Scene) -> int | None:
 
 
 def _recipe_helps(choice: Choice, scene: Scene) -> bool:
-    """Whether the model is X-Planes, a moving camera shows surroundings, and no recipe is chosen."""
+    """Whether X-Planes see surroundings by a moving camera, and no recipe is chosen."""
     chosen = {text.partition("=")[0] for text in choice.overrides}
     poses = {pose.numpy().tobytes() for pose in scene.splits["train"].camera_to_world.contiguous()}
     fits = scene.is_surrounded and isinstance(choice.model, XPlanesSettings)

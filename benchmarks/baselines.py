@@ -118,7 +118,7 @@ def scenes() -> list[Case]:
         ends = budget(SECONDS, "callbacks.evaluation.at=[]", "trainer.limit_val_batches=1")
         name = f"{scene}, six planes"
         suite = "suite" in given[0]
-        case = Case(name, (*given, *OWN, *ends), seeds=3 if suite else 1, about=about)
+        case = Case(name, (*given, *OWN, *ends), seeds=3, about=about)
         found.append(replace(case, quick="topology" in scene))
         if suite:
             about = {"scene": scene, "method": "4D-GS"}

@@ -193,7 +193,7 @@ class XPlanesSettings(ModelSettings):
     def random_planes(
         self, plane_set: str, rows: int, generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """Planes at random, with this number of rows of time, see `fields.xplanes.random_planes`."""
+        """Planes at random with so many rows of time, see `fields.xplanes.random_planes`."""
         return random_planes(
             plane_set,
             channels=self.channels,

@@ -144,3 +144,33 @@ def test_gradients_reach_the_background_and_are_zero_where_nothing_is_seen():
     background.zero_grad()
     behind(Before(background), origins, directions, torch.ones(30), torch.ones(3)).sum().backward()
     assert all(p.grad is not None and not p.grad.any() for p in background.parameters())
+
+
+def test_what_no_ray_has_crossed_keeps_the_initial_colour():
+    usual = torch.tensor([0.6, 0.3, 0.2])
+    with initial_values(3, Stream.BACKGROUND):
+        background = Background(8, 32, width=32, samples=8, colour=usual)
+    origins, directions = some_rays(2000)
+    origins, seen = 0.1 * origins, directions[:, 2] > 0
+    with torch.no_grad():
+        at_first = look(background, origins, directions)
+    assert (at_first - usual).abs().max() < 0.005
+    planes = {"params": [background.planes], "lr": 0.2}
+    decoder = {"params": background.decoder.parameters(), "lr": 0.005}
+    optimizer = torch.optim.Adam([planes, decoder])
+    for _ in range(40):
+        optimizer.zero_grad()
+        error = look(background, origins[seen], directions[seen]) - usual
+        error.square().mean().backward()
+        optimizer.step()
+    with torch.no_grad():
+        others = look(background, origins[~seen], directions[~seen])
+    assert error.abs().max() < 0.05
+    assert (others - usual).abs().max() < 0.05
+
+
+def test_darkest_and_brightest_initial_colours_can_be_left():
+    usual = torch.tensor([0.0, 1.0, 0.5])
+    background = Background(3, 16, width=8, samples=0, colour=usual)
+    shown = look(background, *some_rays(4)).detach()
+    assert (shown - torch.tensor([0.02, 0.98, 0.5])).abs().max() < 0.005

@@ -249,11 +249,9 @@ def test_fog_before_a_background_pays_for_its_distortion():
         sampler = OccupancySampler(renderer_of(), settings)
         return sampler.losses(sampler.render(fog(level), batch, state))
 
-    frame = cube_frame(1.0, torch.zeros(3))
-    many, few = (Site(frame, torch.zeros(views), 0, "32") for views in (12, 11))
-    assert terms(settings.before_colour(many)) == {}
-    assert terms(settings.before_background(few)) == {}
-    found = terms(settings.before_background(many))["distortion"]
+    site = Site(cube_frame(1.0, torch.zeros(3)), torch.zeros(12), 0, "32")
+    assert terms(settings.before_colour(site)) == {}
+    found = terms(settings.before_background())["distortion"]
     measured = renderer_of(distorted=True).render(fog(level), *rays_of(8), WHITE, batch["times"])
     assert measured.distortion is not None
     assert float(found.detach()) == pytest.approx(

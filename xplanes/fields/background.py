@@ -12,8 +12,11 @@ RADIUS = 2.0
 FARTHEST = 1e30
 """Distance of what lies on the ball's surface."""
 
-INITIAL_SCALE = 0.1
+INITIAL_SCALE = 1e-3
 """Standard deviation of the planes' random initial values."""
+
+DARKEST = 0.02
+"""Darkest initial colour, from where it is not far to any other; 1 minus it is the brightest."""
 
 DENSITY_SCALE, DENSITY_BIAS = 25.0, -2.0
 """Of the decoder. A ray keeps about a third of its light for infinity at first."""
@@ -67,6 +70,8 @@ class Background(nn.Module):
         samples: Samples of a ray behind the cube, before the one at infinity; 0 leaves that alone,
             so that colour depends on direction only.
         precision: "bf16" multiplies in bfloat16.
+        colour: Initial colour, from 0 to 1, near which stays what no ray of training crosses; as the
+            decoder's random weights have it when None. [3]
     """
 
     def __init__(
@@ -77,6 +82,7 @@ class Background(nn.Module):
         width: int = 32,
         samples: int = 24,
         precision: Precision = "32",
+        colour: Tensor | None = None,
     ) -> None:
         super().__init__()
         planes = INITIAL_SCALE * torch.randn(3, resolution, resolution, channels)
@@ -85,7 +91,11 @@ class Background(nn.Module):
             channels, width=width, hidden=1, density_scale=DENSITY_SCALE, precision=precision
         )
         with torch.no_grad():
-            self.decoder.layers[-1].bias[0] += DENSITY_BIAS  # type: ignore[index]
+            bias = self.decoder.layers[-1].bias
+            bias[0] += DENSITY_BIAS  # type: ignore[index]
+            if colour is not None:
+                shown = self.decoder.logits(torch.zeros(1, 3 * channels))[0, 1:].float()
+                bias[1:] += colour.clamp(DARKEST, 1 - DARKEST).logit() - shown  # type: ignore[index]
 
     def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Colour, and density per unit length of contracted space. [N, 3] -> [N, 3], [N]

@@ -2,11 +2,26 @@
 
 from dataclasses import dataclass
 
+import torch
+from torch import Tensor
+
 from xplanes.fields.background import Background
 from xplanes.fields.regularisers import add_total_variation_gradient
 from xplanes.rendering.sampler import Group, Site
+from xplanes.scenes.views import Views, spread
 from xplanes.settings import Count, Positive, Settings, Steps, Weight
 from xplanes.streams import Stream, initial_values
+
+MOST_IMAGES, PIXEL_STEP = 32, 4
+"""Images that tell the usual colour, and every which row and column of them."""
+
+
+def usual_colour(views: Views) -> Tensor:
+    """Median of the images' colours, by channel, from 0 to 1. [3]"""
+    steps = slice(None, None, PIXEL_STEP)
+    chosen = spread(MOST_IMAGES, len(views))
+    pixels = torch.cat([views.image(i)[steps, steps, :3].reshape(-1, 3) for i in chosen])
+    return pixels.median(dim=0).values.float() / 255
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +47,7 @@ class BackgroundSettings(Settings):
                 width=self.width,
                 samples=self.samples,
                 precision="bf16" if site.precision == "bf16" else "32",
+                colour=None if site.views is None else usual_colour(site.views),
             )
 
     def groups(self, background: Background) -> list[Group]:

@@ -41,9 +41,6 @@ SPARSE_POINTS = 2048
 DIAGONAL = 2 * math.sqrt(3)
 """Longest way through the field's cube."""
 
-VIEWS_OF_SURFACES = 12
-"""Views of a timestep on average from which fog is turned into surfaces."""
-
 BEHIND = 0.5
 """How far behind the cube the distortion takes the background to be."""
 
@@ -202,7 +199,7 @@ class OccupancySettings(SamplerSettings):
     # which would take over what it empties.
     sparsity: Weight
     # Weight of the distortion (Mip-NeRF 360), which turns fog into surfaces. 0 unless a background
-    # is learnt and twelve views or more show each timestep: fewer do not tell where surfaces are.
+    # is learnt.
     distortion: Weight
     # Steps at which all occupied cells are updated; only the last one if a background is learnt,
     # which would take over what lies in cells that are only late.
@@ -249,7 +246,7 @@ class OccupancySettings(SamplerSettings):
                 carve(grid, site.views, site.frame)
             if site.initialised and self.fill:
                 fill_seconds = _fill(renderer, field, site)
-        settings = self.before_colour(site) if plain else self.before_background(site)
+        settings = self.before_colour(site) if plain else self.before_background()
         return OccupancySampler(renderer, settings, site.samples_per_batch, fill_seconds)
 
     def before_colour(self, site: Site) -> "OccupancySettings":
@@ -264,11 +261,9 @@ class OccupancySettings(SamplerSettings):
             distortion=0.0,
         )
 
-    def before_background(self, site: Site) -> "OccupancySettings":
+    def before_background(self) -> "OccupancySettings":
         """What leaves cells to the field until it has taken shape; large batches start small."""
-        enough = site.views_per_timestep >= VIEWS_OF_SURFACES
-        distortion = self.distortion if enough else 0.0
-        return replace(self, sweep_at=self.sweep_at[-1:], sparsity=0.0, distortion=distortion)
+        return replace(self, sweep_at=self.sweep_at[-1:], sparsity=0.0)
 
     def for_video(self) -> "OccupancySettings":
         samples = FEWEST_SAMPLES if self.samples == "auto" else self.samples

@@ -81,11 +81,6 @@ class Site:
         return len(self.times.unique()) > 1
 
     @property
-    def views_per_timestep(self) -> float:
-        """Training views of a timestep, on average."""
-        return len(self.times) / max(1, len(self.times.unique()))
-
-    @property
     def time_rows(self) -> int:
         """Default number of rows along time."""
         return time_rows(self.times)

@@ -1,6 +1,6 @@
 # On CPUs:  docker build -t xplanes .
 # On GPUs:  docker build -t xplanes:cuda --build-arg VARIANT=cuda .
-# Use:      docker run --rm --read-only --tmpfs /tmp --volume "$PWD":/work xplanes train
+# Use:      docker run --rm --read-only --tmpfs /tmp --volume "$PWD":/workspace xplanes train
 # For GPUs, add --gpus all; where your user has another number than 1000, --user "$(id -u)".
 FROM python:3.12-slim-bookworm
 
@@ -29,14 +29,14 @@ COPY . /tmp/xplanes
 RUN pip install "/tmp/xplanes[export,video,viewer]" && rm -rf /tmp/xplanes
 
 # All that is written, data/, outputs/ and caches, lies in the volume.
-RUN useradd --uid 1000 --no-create-home xplanes && install -d -o xplanes /work
+RUN useradd --uid 1000 --no-create-home xplanes && install -d -o xplanes /workspace
 USER 1000
-WORKDIR /work
-VOLUME /work
+WORKDIR /workspace
+VOLUME /workspace
 ENV HOME=/tmp \
     USER=xplanes \
-    HF_HOME=/work/.cache/huggingface \
-    TRITON_CACHE_DIR=/work/.cache/triton \
-    NUMBA_CACHE_DIR=/work/.cache/numba
+    HF_HOME=/workspace/.cache/huggingface \
+    TRITON_CACHE_DIR=/workspace/.cache/triton \
+    NUMBA_CACHE_DIR=/workspace/.cache/numba
 ENTRYPOINT ["xplanes"]
 CMD ["train"]

@@ -70,8 +70,8 @@ class Background(nn.Module):
         samples: Samples of a ray behind the cube, before the one at infinity; 0 leaves that alone,
             so that colour depends on direction only.
         precision: "bf16" multiplies in bfloat16.
-        colour: Initial colour, from 0 to 1, near which stays what no ray of training crosses; as the
-            decoder's random weights have it when None. [3]
+        colour: Initial colour, from 0 to 1, which stays where no ray of training goes; whatever the
+            decoder's random weights show when None. [3]
     """
 
     def __init__(

@@ -30,7 +30,7 @@ from xplanes.models.x_planes import XPlanesSettings
 from xplanes.process import train_command
 from xplanes.scenes.cameras import image_plane
 from xplanes.scenes.entries import some
-from xplanes.scenes.frame import Frame, pixels_across
+from xplanes.scenes.frame import Frame, pixels_across, pixels_of_detail
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
@@ -216,7 +216,7 @@ def inspect(choice: Choice) -> Capture:
     texels = None
     if frame is not None:
         pixels = pixels_across(train, frame)
-        texels = model.texels(0.0 if scene.is_surrounded else pixels)
+        texels = model.texels(pixels_of_detail(train, frame, scene.is_surrounded))
         if texels is not None:
             width = _width_of_training(choice, scene) or train.width
             findings += texel_findings(pixels / texels, train.width, width, texels)

@@ -72,7 +72,7 @@ class FineSettings(Settings):
     """Fine space planes, zero at first, that are added to some channels of the space planes."""
 
     # Texels along each space axis. auto: two for three image pixels that the field's cube covers;
-    # none in scenes with surroundings.
+    # none where things move in front of surroundings.
     texels: Count | Literal["auto"]
     channels: Count  # Channels of each plane.
     start: Steps  # Step from which they are trained.
@@ -100,7 +100,8 @@ class XPlanesLoss(Settings):
     time_magnitude: Weight  # Weight of the time planes' mean square.
     # Weight of the light that passes the cube, if a background is learnt. It falls to 0 over
     # `model.loss.passing_steps`: until the cube has taken shape, the background, which learns
-    # faster, must not take over what lies in it.
+    # faster, must not take over what lies in it. Time planes are not trained before: fog that
+    # differs from view to view would stop the light, and stay.
     passing: Weight
     passing_steps: Steps  # Steps over which `model.loss.passing` falls to 0.
     time_identity: Weight  # Weight of the time planes' mean distance from 1, as in K-Planes.
@@ -323,11 +324,10 @@ class XPlanesModel(Model):
 
     def losses(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
         terms = super().losses(rendering, rays, state)
+        if weight := self._passing(state.step):
+            terms["passing"] = weight * (1 - rendering.opacity).mean()
         if self._field.background is not None:
-            # Neither alpha nor a known background says what is opaque.
-            if weight := self._passing(state.step):
-                terms["passing"] = weight * (1 - rendering.opacity).mean()
-            return terms
+            return terms  # Neither alpha nor a known background says what is opaque.
         if self.opacity:
             error = opacity_shortfall if self._opaque else opacity_error
             terms["opacity"] = self.opacity * error(rendering, rays)
@@ -339,6 +339,8 @@ class XPlanesModel(Model):
         return warm_cosine(step, progress, warmup=self.warmup, final=self.settings.final_lr)
 
     def rate_of(self, group: str, step: int, progress: float) -> float:
+        if group == "time" and self._passing(step):
+            return 0.0
         if group != "fine":
             return self.rate(step, progress)
         since = max(0, step - self.fine_start)
@@ -426,9 +428,11 @@ class XPlanesModel(Model):
         )
 
     def _passing(self, step: int) -> float:
-        """Weight of the light that passes the cube in a scene with a background."""
+        """Weight of the light that passes the cube; 0 without a background."""
         steps = self.weights.passing_steps
-        return self.weights.passing * max(0.0, 1 - step / steps) if steps else 0.0
+        if self._field.background is None or not steps:
+            return 0.0
+        return self.weights.passing * max(0.0, 1 - step / steps)
 
     def _fading(self, step: int) -> float:
         """Factor on the regularisers that keep the field near its initialisation."""

@@ -221,12 +221,12 @@ class OccupancySettings(SamplerSettings):
             )
 
     def build(self, field: RadianceField, site: Site) -> "OccupancySampler":
+        plain = getattr(field, "background", None) is None
         if self.samples == "auto":
-            least, most = FEWEST_SAMPLES, 2 * FEWEST_SAMPLES
+            least, most = FEWEST_SAMPLES, 2 * FEWEST_SAMPLES if plain else FEWEST_SAMPLES
             samples = min(max(round(SAMPLES_PER_PIXEL * site.pixels), least), most)
             return replace(self, samples=samples).build(field, site)
         along = self.samples
-        plain = getattr(field, "background", None) is None
         grid = OccupancyGrid(
             self.grid_resolution,
             self.time_bins if site.moves else 1,

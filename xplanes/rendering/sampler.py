@@ -40,8 +40,7 @@ class Site:
             none. [2, 3]
         views: Training views; None if a checkpoint is loaded without its data.
         initialised: Whether the initial field already shows the scene.
-        pixels: Image pixels that a side of the field's cube covers, see `pixels_across`; 0 in
-            scenes with surroundings, where planes and steps keep their sizes.
+        pixels: Image pixels that a side of the field's cube covers, see `pixels_of_detail`.
         surrounded: Whether the training images show surroundings, which lie behind the field's
             cube.
         device: Device on which the field will be trained; the CPU when None.

@@ -213,6 +213,17 @@ def pixels_across(views: Views, frame: Frame) -> float:
     return float((2 / frame.scale / pixel).median())
 
 
+def pixels_of_detail(views: Views, frame: Frame, surrounded: bool) -> float:
+    """`pixels_across` where planes follow it; 0 for a scene with surroundings in which things move.
+
+    Args:
+        views: Training views.
+        frame: The field's frame.
+        surrounded: Whether the images show surroundings.
+    """
+    return 0.0 if surrounded and not views.is_static else pixels_across(views, frame)
+
+
 def _middle_box(views: Views, points: Tensor, centre: Tensor) -> Tensor | None:
     """The box of the points that most cameras see in the middle of their images, with some room.
 

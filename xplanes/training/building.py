@@ -14,7 +14,7 @@ from xplanes.fields.base import Representation
 from xplanes.models.base import Model, ModelSettings
 from xplanes.models.initialisation import Initialisation, Method, Place
 from xplanes.rendering.sampler import Sampler, Site
-from xplanes.scenes.frame import Frame, frame_content, pixels_across, read_frame
+from xplanes.scenes.frame import Frame, frame_content, pixels_of_detail, read_frame
 from xplanes.scenes.views import Scene
 
 ANOTHER_SEED = 1_000_003
@@ -127,7 +127,7 @@ def build_parts(
         bounds=found.model.bounds(views),
         views=views,
         initialised=found.values is not None,
-        pixels=0.0 if scene.is_surrounded else pixels_across(views, found.frame),
+        pixels=pixels_of_detail(views, found.frame, scene.is_surrounded),
         surrounded=scene.is_surrounded,
         device=device,
         samples_per_batch=settled.most_samples,

@@ -89,7 +89,6 @@ COMPOSITIONS = [
     ["recipe=paper", "preparation=paper"],
     ["recipe=paper_small", "sweep=rank", "experiment=demo"],
     ["recipe=fair"],
-    ["recipe=capture"],
     ["model=kplanes_reduced", "experiment=published"],
     ["model=tineuvox_b"],
     ["model=tineuvox_reduced", "sweep=suite"],
@@ -219,7 +218,6 @@ def test_every_option_composes_and_reads(overrides, tmp_path):
     [
         *(["model=" + name] for name in ("six_planes", "kplanes_explicit", *MODELS_OF_A_KIND)),
         ["model=nine_planes", "model/sampler=proposal"],
-        ["recipe=capture"],
     ],
     ids=" ".join,
 )

@@ -473,22 +473,6 @@ def test_large_images_are_trained_on_at_the_usual_width_unless_asked_for(tmp_pat
         assert again.scene.read().splits["train"].width == (400 if width == "400" else 404)
 
 
-def test_the_recipe_for_captures_is_named_where_a_moving_camera_shows_surroundings(tmp_path):
-    for count, opaque, named in ((24, True, True), (12, True, False), (24, False, False)):
-        views = ball_views(count, 0.6, size=24)
-        images = views.images.clone()
-        if opaque:
-            clear = images[..., 3] == 0
-            shades = torch.randint(0, 255, (*images.shape[:3], 3), dtype=torch.uint8)
-            images[clear] = torch.cat([shades, torch.full_like(shades[..., :1], 255)], -1)[clear]
-        folder = tmp_path / f"{count}_{opaque}"
-        write_nerfstudio(folder, replace(views, images=images))
-        command = next_command(inspect(choose([str(folder)])))
-        assert command.endswith("recipe=capture") is named
-        other = inspect(choose([str(folder), "model=kplanes_reduced"]))  # Which has no such recipe.
-        assert not other.recipe_helps
-
-
 def test_errors_are_one_line_and_leave_1(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     views = ball().splits["train"]

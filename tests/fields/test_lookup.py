@@ -10,8 +10,13 @@ from hypothesis import strategies as st
 
 from tests.oracles import plane_features as oracle
 from xplanes.backend import threads
+from xplanes.fields import lookup
 from xplanes.fields import lookup_numba as cpu
-from xplanes.fields.lookup import plane_features, plane_features_reference
+from xplanes.fields.lookup import (
+    add_plane_features,
+    plane_features,
+    plane_features_reference,
+)
 from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES
 
 SETS = ("three", "six", "nine")
@@ -83,6 +88,32 @@ def test_gradients_of_loops_and_twin_agree():
                 msg=lambda m, c=case: f"{c}: {m}",
             )
             assert theirs.abs().max() > 0.1, case
+
+
+@pytest.mark.parametrize("asks", [(True, True), (True, False), (False, True)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_further_planes_are_added_to_the_first_channels(dtype, asks, monkeypatch):
+    coarse, fine = stacks("three", dtype)[0], stacks("three", dtype, size=9, channels=2, seed=2)[0]
+    points, times = scattered(300, dtype)
+
+    def attempt():
+        leaves = [
+            p.clone().requires_grad_(asked) for p, asked in zip((coarse, fine), asks, strict=True)
+        ]
+        features = plane_features(leaves[0], None, points, times, ())
+        found = add_plane_features(features, leaves[1], points)
+        upstream = torch.linspace(-1, 1, found.numel(), dtype=dtype).view_as(found)
+        asked = [leaf for leaf in leaves if leaf.requires_grad]
+        return [found.detach(), *torch.autograd.grad((found * upstream).sum(), asked)]
+
+    compiled = attempt()
+    parts = [plane_features_reference(p, None, points, times, ()) for p in (coarse, fine)]
+    parts[0][..., :2] += parts[1]
+    torch.testing.assert_close(compiled[0], parts[0], atol=4 * TOLERANCE[dtype], rtol=1e-5)
+    monkeypatch.setattr(lookup, "cpu_loops", lambda planes: False)
+    for ours, theirs in zip(compiled, attempt(), strict=True):
+        torch.testing.assert_close(ours, theirs, atol=60 * TOLERANCE[dtype], rtol=1e-5)
+        assert theirs.abs().max() > 0.1
 
 
 def test_only_the_planes_that_ask_get_gradients():

@@ -26,7 +26,6 @@ from xplanes.evaluation.findings import (
 )
 from xplanes.evaluation.tabulate import markdown
 from xplanes.models.base import ModelSettings
-from xplanes.models.x_planes import XPlanesSettings
 from xplanes.process import train_command
 from xplanes.scenes.cameras import image_plane
 from xplanes.scenes.entries import some
@@ -40,13 +39,6 @@ CONSEQUENCES = {"scale": ("cut", "texels"), "astray": ("cut",)}
 
 NATIVE = "data.resolution=null"
 """The setting that takes images at their native size."""
-
-
-RECIPE = "recipe=capture"
-"""The settings for captures with surroundings."""
-
-MANY_POSES = 20
-"""Least number of different training poses at which `recipe=capture` helps; rigs have fewer."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +71,6 @@ class Capture:
         images: What the pixels of each split's images tell.
         findings: What may be wrong.
         texels: Texels along an axis of the planes; None for fields without planes.
-        recipe_helps: Whether `recipe=capture` helps, with which ``texels`` are those of training.
     """
 
     choice: Choice
@@ -89,7 +80,6 @@ class Capture:
     images: Mapping[str, list[ImageFacts]]
     findings: tuple[Finding, ...]
     texels: int | None
-    recipe_helps: bool
 
 
 @dataclass(frozen=True)
@@ -202,8 +192,6 @@ def inspect(choice: Choice) -> Capture:
     choice.scene.prepare()
     scene, model = choice.scene.read(), choice.model
     train = scene.splits["train"]
-    if helps := _recipe_helps(choice, scene):
-        model = _settings([*choice.overrides, RECIPE])[1]
     frame, problem = None, ""
     try:
         frame = model.frame(train, choice.scene.half_side, scene.points)
@@ -222,7 +210,7 @@ def inspect(choice: Choice) -> Capture:
             findings += texel_findings(pixels / texels, train.width, width, texels)
     follows = {kind for each in findings for kind in CONSEQUENCES.get(each.kind, ())}
     findings = [each for each in findings if each.kind not in follows]
-    return Capture(choice, scene, frame, problem, images, tuple(findings), texels, helps)
+    return Capture(choice, scene, frame, problem, images, tuple(findings), texels)
 
 
 def cameras_of(views: Views) -> list[CameraGroup]:
@@ -428,15 +416,11 @@ def _split_rows(each: Mapping[str, Any]) -> dict[str, str]:
 
 
 def next_command(capture: Capture) -> str:
-    """The command that trains on the capture, at the usual width where images are wider.
-
-    With ``recipe=capture`` where a camera that moves shows surroundings.
-    """
+    """The command that trains on the capture, at the usual width where images are wider."""
     overrides = [*capture.choice.overrides]
     if width := _width_of_training(capture.choice, capture.scene):
         overrides = [f"data.resolution={width}" if text == NATIVE else text for text in overrides]
-    recipe = [RECIPE] if capture.recipe_helps else []
-    return f"{train_command()} {shlex.join([*overrides, *recipe])}"
+    return f"{train_command()} {shlex.join(overrides)}"
 
 
 def _width_of_training(choice: Choice, scene: Scene) -> int | None:
@@ -444,14 +428,6 @@ def _width_of_training(choice: Choice, scene: Scene) -> int | None:
     sizes = torch.cat([views.intrinsics.size for views in scene.splits.values()])
     width = choice.usual_width
     return width if width is not None and width < int(sizes[:, 1].min()) else None
-
-
-def _recipe_helps(choice: Choice, scene: Scene) -> bool:
-    """Whether X-Planes see surroundings by a moving camera, and no recipe is chosen."""
-    chosen = {text.partition("=")[0] for text in choice.overrides}
-    poses = {pose.numpy().tobytes() for pose in scene.splits["train"].camera_to_world.contiguous()}
-    fits = scene.is_surrounded and isinstance(choice.model, XPlanesSettings)
-    return fits and len(poses) >= MANY_POSES and "recipe" not in chosen
 
 
 def check_out(out: Path, settings: SceneSettings) -> None:

@@ -64,6 +64,24 @@ def plane_features(
     return plane_features_reference(space, time, points, times, rows)
 
 
+def add_plane_features(features: Tensor, space: Tensor, points: Tensor) -> Tensor:
+    """Features plus those of space planes with fewer channels, which go to the first ones.
+
+    Args:
+        features: On the CPU they are overwritten; an operation that saved them for its gradient
+            cannot come before. [N, 3, C]
+        space: Planes xy, xz, yz, C' <= C. [3, H, H, C']
+        points: Positions in the field's frame. [N, 3]
+
+    Returns:
+        Gradients reach both. [N, 3, C]
+    """
+    if cpu_loops(space) and features.dtype == space.dtype:
+        return _Onto.apply(features, space, points)  # type: ignore[return-value]
+    further = plane_features(space, None, points, torch.zeros_like(points[:, 0]), ())
+    return features + F.pad(further, (0, features.shape[2] - space.shape[3]))
+
+
 def plane_features_reference(
     space: Tensor, time: Tensor | None, points: Tensor, times: Tensor, rows: Rows
 ) -> Tensor:
@@ -136,6 +154,34 @@ class _Features(torch.autograd.Function):
             tasks = cpu.tasks_a_plane(len(time))
             cpu.scatter_time(*_arrays(points, times, axes, spread), tasks, *_arrays(time))
         return space, time, None, None, None
+
+
+class _Onto(torch.autograd.Function):
+    """Autograd's own addition to a slice would copy the gradient of all channels twice."""
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, space: Tensor, points: Tensor) -> Tensor:
+        cpu = compiled("xplanes.fields.lookup_numba")
+        points = points.to(space.dtype).contiguous()
+        cpu.gather_onto(*_arrays(space, points, features))
+        ctx.mark_dirty(features)
+        ctx.save_for_backward(points)
+        ctx.shape = space.shape
+        return features
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        if not ctx.needs_input_grad[1]:
+            return gradients[0], None, None
+        cpu = compiled("xplanes.fields.lookup_numba")
+        (points,), gradient = ctx.saved_tensors, gradients[0].contiguous()
+        space = gradient.new_zeros(ctx.shape)
+        tasks = cpu.tasks_a_plane(len(space))
+        cpu.scatter_space(*_arrays(points, gradient), tasks, *_arrays(space))
+        return gradients[0], space, None
 
 
 class _Kernels(torch.autograd.Function):

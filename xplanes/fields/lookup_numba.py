@@ -88,6 +88,19 @@ def gather(space, time, points, times, rows, axes, features, factors):
                 features[n, row, c] += factors[n, a, c] * factors[n, b, c]
 
 
+@njit(parallel=True, **COMPILE)
+def gather_onto(space, points, features):
+    for n in prange(points.shape[0]):
+        for plane in range(3):
+            c0, c1, u0, u1 = space_taps(points[n, 0 if plane < 2 else 1], space.shape[2])
+            r0, r1, v0, v1 = space_taps(points[n, 1 if plane < 1 else 2], space.shape[1])
+            target = features[n, plane, : space.shape[3]]
+            add(target, space[plane, r0, c0], v0 * u0)
+            add(target, space[plane, r0, c1], v0 * u1)
+            add(target, space[plane, r1, c0], v1 * u0)
+            add(target, space[plane, r1, c1], v1 * u1)
+
+
 @njit(inline="always", **COMPILE)
 def add_to_space(points, gradient, plane, own, tasks, space):
     for n in range(points.shape[0]):

@@ -305,7 +305,7 @@ def test_the_documented_reader_sees_the_background_of_the_field(tmp_path, sample
     torch.manual_seed(0)
     background = Background(4, 12, width=8, samples=samples)
     with torch.no_grad():
-        background.planes.mul_(30)
+        background.planes.mul_(3000)
     field = x_planes("six", decoder=Decoder(5), background=background)
     trained = set_up(tmp_path, field)
     folder = export(trained, ExportOptions(what="planes"), say=quiet)

@@ -23,7 +23,7 @@ def world(samples=5, channels=3):
     with initial_values(3, Stream.BACKGROUND):
         background = Background(channels, 16, width=8, samples=samples)
     with torch.no_grad():
-        background.planes.mul_(20)  # Colours and densities that differ from place to place.
+        background.planes.mul_(2000)  # Colours and densities that differ from place to place.
     return background
 
 

@@ -1,15 +1,18 @@
 """Fine planes: as many texels as the images show, trained from their first step on, resumed."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from tests.balls import ball_views, swinging
 from tests.training.runs import small_config
 from xplanes.config import compose_plain
 from xplanes.models import x_planes
 from xplanes.models.initialisation import Method
 from xplanes.run import run
+from xplanes.scenes.frame import cube_frame, pixels_across, pixels_of_detail
 from xplanes.training.module import RadianceModule
 
 FINE = ("model.fine.texels=40", "model.fine.start=8", "model.fine.channels=3")
@@ -26,6 +29,16 @@ def test_fine_planes_have_the_texels_that_the_images_show(pixels, texels):
     model = settings("model.resolution=64")
     assert model.fine_texels(pixels) == texels
     assert model.texels(pixels) == max(64, texels)
+
+
+def test_planes_do_not_follow_pixels_where_things_move_before_surroundings():
+    moving = ball_views(4, 0.4, centre=swinging(0.5, 1), size=20)
+    still = replace(moving, times=torch.zeros_like(moving.times))
+    frame = cube_frame(1.0, torch.zeros(3))
+    pixels = pixels_across(moving, frame)
+    assert pixels > 0
+    found = [pixels_of_detail(v, frame, s) for v in (moving, still) for s in (False, True)]
+    assert found == [pixels, 0, pixels, pixels]
 
 
 def test_they_may_be_given_or_left_out():

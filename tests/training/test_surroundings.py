@@ -113,7 +113,7 @@ def test_a_world_gets_a_background_and_the_planes_are_initialised_as_ever():
     groups = {group["name"]: group["params"] for group in with_.model.groups()}
     listed = [id(p) for params in groups.values() for p in params]
     assert sorted(listed) == sorted(id(p) for p in with_.parameters())
-    assert set(terms(with_, "world")) == {"colour"}
+    assert set(terms(with_, "world")) == {"colour", "passing", "distortion"}
 
 
 def test_light_that_passes_the_cube_costs_until_the_field_has_taken_shape():
@@ -126,6 +126,16 @@ def test_light_that_passes_the_cube_costs_until_the_field_has_taken_shape():
         assert (found is None) == (weight is None), step
         if weight is not None:
             assert float(found) == pytest.approx(weight * passed)
+
+
+def test_time_planes_wait_as_long_as_light_that_passes_the_cube_costs():
+    world, white = built("world"), built("white")
+    for module, step, waits in ((world, 150, True), (world, 200, False), (white, 150, False)):
+        rates = [module.model.rate_of(name, step, 0.1) for name in ("space", "time")]
+        assert rates[0] > 0
+        assert rates[1] == (0 if waits else rates[0])
+    priceless = built("world", "model.loss.passing=0").model
+    assert priceless.rate_of("time", 150, 0.1) == priceless.rate_of("space", 150, 0.1)
 
 
 @pytest.mark.parametrize("kind", ["world", "white"])

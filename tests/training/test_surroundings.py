@@ -134,11 +134,6 @@ def test_time_planes_wait_as_long_as_light_that_passes_the_cube_costs():
         rates = [module.model.rate_of(name, step, 0.1) for name in ("space", "time")]
         assert rates[0] > 0
         assert rates[1] == (0 if waits else rates[0])
-    views = scene("world").splits["train"]
-    for together, waits in ((1, True), (2, False), (3, False)):
-        site = replace(world.site, times=views.times[torch.arange(12) // together * together])
-        model = world.method.model.build(site)
-        assert model.time_waits == waits
     priceless = built("world", "model.loss.passing=0").model
     assert priceless.rate_of("time", 150, 0.1) == priceless.rate_of("space", 150, 0.1)
 

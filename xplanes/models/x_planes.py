@@ -100,8 +100,8 @@ class XPlanesLoss(Settings):
     time_magnitude: Weight  # Weight of the time planes' mean square.
     # Weight of the light that passes the cube, if a background is learnt. It falls to 0 over
     # `model.loss.passing_steps`: until the cube has taken shape, the background, which learns
-    # faster, must not take over what lies in it. Where one view shows each timestep, time planes
-    # are not trained before: fog of each view's own would stop the light, and stay.
+    # faster, must not take over what lies in it. Time planes are not trained before: fog that
+    # differs from view to view would stop the light, and stay.
     passing: Weight
     passing_steps: Steps  # Steps over which `model.loss.passing` falls to 0.
     time_identity: Weight  # Weight of the time planes' mean distance from 1, as in K-Planes.
@@ -278,8 +278,6 @@ class XPlanesModel(Model):
         self.fine_start = 0 if settings.fine is None else site.steps(settings.fine.start)
         self.fine_warmup = site.steps(FINE_WARMUP)
         self.opacity = self.weights.opacity
-        # Fog of its own timestep could stop a single view's light, and no other view would see it.
-        self.time_waits = views < 2 * len(site.times.unique())
         self._opaque = site.views is not None and site.views.is_opaque
         self.product: SparseProduct | None = None
         self.initial_weight, self._initial = 0.0, []
@@ -341,7 +339,7 @@ class XPlanesModel(Model):
         return warm_cosine(step, progress, warmup=self.warmup, final=self.settings.final_lr)
 
     def rate_of(self, group: str, step: int, progress: float) -> float:
-        if group == "time" and self.time_waits and self._passing(step):
+        if group == "time" and self._passing(step):
             return 0.0
         if group != "fine":
             return self.rate(step, progress)

@@ -51,6 +51,8 @@ class Stream(IntEnum):
     """Rays along which points of a field are searched."""
     SPARSITY = 1_000_403
     """Points at which the sparsity prior is taken; processes add their rank."""
+    THINNING = 1_000_427
+    """Samples whose gradients are taken."""
 
 
 def step_generator(seed: int, step: int, stream: int = 0) -> torch.Generator:

@@ -3,7 +3,7 @@
 import math
 import time
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 import torch
 from torch import Tensor, distributed, nn
@@ -21,6 +21,7 @@ from xplanes.rendering.front_to_back import front_to_back
 from xplanes.rendering.marching import march
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
+from xplanes.rendering.thinning import thinned
 from xplanes.rendering.warming import render_one_ray
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Range, Share, Weight
@@ -68,6 +69,8 @@ class GridRenderer(RayRenderer):
             grid tells; in images on the CPU the field itself does.
         room: Places for samples where nothing may wait for their number, see `march`.
         distorted: Whether to measure the distortion.
+        thinning: Samples whose gradient is below this times the mean may be left out, see
+            `thinned`.
     """
 
     grid: OccupancyGrid
@@ -76,6 +79,7 @@ class GridRenderer(RayRenderer):
     occlusion: float = 0.001
     room: int | None = None
     distorted: bool = False
+    thinning: float = 0.0
 
     @property
     def device(self) -> torch.device:
@@ -94,6 +98,7 @@ class GridRenderer(RayRenderer):
         times: Tensor,
         background: Tensor,
         jitter: Tensor | None = None,
+        generator: torch.Generator | None = None,
     ) -> GridRendering:
         """Render rays.
 
@@ -104,6 +109,7 @@ class GridRenderer(RayRenderer):
             times: Time of each ray, from 0 to 1. [R]
             background: Colour behind the scene. [3] or [R, 3]
             jitter: Place of each ray's samples within their steps; the middle when None. [R]
+            generator: Chooses the samples that carry gradients, see `thinned`; all when None.
 
         Returns:
             One value per ray.
@@ -119,7 +125,16 @@ class GridRenderer(RayRenderer):
             occlusion=self.occlusion,
             room=self.room,
         )
-        colour, density = shade(field, samples.points, times, directions, samples.ray)
+
+        def ask(chosen: Tensor | slice) -> tuple[Tensor, Tensor]:
+            points, ray = samples.points[chosen], samples.ray[chosen]
+            return shade(field, points, times, directions, ray)
+
+        if generator is None:
+            colour, density = ask(slice(None))
+        else:
+            wanted = [p for p in cast("nn.Module", field).parameters() if p.requires_grad]
+            colour, density = thinned(ask, wanted, self.thinning, generator)
         if samples.live is not None:
             density = torch.where(samples.live, density, 0)
         total, _ = composite(
@@ -192,6 +207,7 @@ class OccupancySettings(SamplerSettings):
     skip_empty: bool  # Skip samples in empty cells.
     skip_occluded: bool  # Skip samples behind opaque surfaces.
     occlusion: Annotated[float, Range(0, 1)]  # Transmittance below which samples are occluded.
+    thinning: Weight  # Subsample gradients below this times the mean, on the CPU; 0: off.
     silhouettes: bool  # Prune cells outside the silhouettes (alpha).
     fill: bool  # Prune empty cells of an initialised field.
     # Weight of the mean opacity of random points in occupied cells, one step long. It empties what
@@ -311,7 +327,9 @@ class OccupancySampler(Sampler):
         self._along = renderer.samples
         room = None if samples is None else self._room(samples)
         distorted = settings.distortion > 0
-        self._training = replace(renderer, room=room, distorted=distorted)
+        self._training = replace(
+            renderer, room=room, distorted=distorted, thinning=settings.thinning
+        )
         self._images = replace(renderer, samples=settings.render_samples)
 
     @property
@@ -335,6 +353,9 @@ class OccupancySampler(Sampler):
         return min(most, 256)
 
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
+        # Elsewhere choosing costs more than what it saves.
+        thins = self.settings.thinning > 0 and self.device.type == "cpu"
+        thins = thins and torch.is_grad_enabled() and isinstance(field, nn.Module)
         return self._training.render(
             field,
             rays["origins"],
@@ -342,6 +363,7 @@ class OccupancySampler(Sampler):
             rays["times"],
             rays["background"],
             rays["jitter"],
+            state.generator(self.device, Stream.THINNING) if thins else None,
         )
 
     def losses(self, rendering: GridRendering) -> dict[str, Tensor]:

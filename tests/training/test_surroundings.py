@@ -15,6 +15,7 @@ from xplanes.baselines.proposal import spaced, unspaced
 from xplanes.rendering.behind import look
 from xplanes.scenes.views import Scene
 from xplanes.training.collapse import CollapseWatch
+from xplanes.training.evaluation import affordable
 from xplanes.training.fit import Trainer
 from xplanes.training.losses import loss_terms
 from xplanes.training.scores import score_view
@@ -136,6 +137,13 @@ def test_time_planes_wait_as_long_as_light_that_passes_the_cube_costs():
         assert rates[1] == (0 if waits else rates[0])
     priceless = built("world", "model.loss.passing=0").model
     assert priceless.rate_of("time", 150, 0.1) == priceless.rate_of("space", 150, 0.1)
+
+
+def test_few_views_are_scored_before_surroundings_and_none_at_first():
+    at = [0.0, 0.05, 0.1, 0.7]
+    assert affordable(at, 1.0, surrounded=True) == ([0.1, 0.7], 4)
+    for limit, surrounded in ((1.0, False), (7, True), (1, True), (0.5, True)):
+        assert affordable(at, limit, surrounded) == (at, limit)
 
 
 @pytest.mark.parametrize("kind", ["world", "white"])

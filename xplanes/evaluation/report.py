@@ -21,7 +21,7 @@ from xplanes.rendering.pictures import write_png
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.training.checkpoints import LAST
 from xplanes.training.clock import training_seconds
-from xplanes.training.evaluation import log_image
+from xplanes.training.evaluation import affordable, log_image
 from xplanes.training.fit import Estimate, Trainer
 from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore, blank_psnr, mean_colour, mean_scores
@@ -93,9 +93,12 @@ def estimated(
     pruned = expected.pruned_at * expected.step / train
     final = data.scene.splits[data.test_split]
     views = data.scene.splits[data.validation_split or data.test_split]
-    shares = {*experiment.callbacks.get("evaluation", {}).get("at", []), 1.0}
+    at = experiment.callbacks.get("evaluation", {}).get("at", [])
+    limit = trainer.get("limit_val_batches", 1.0)
+    at, limit = affordable(at, limit, data.scene.is_surrounded)
+    shares = {*at, 1.0}
     early = sum(share == 0 or share < pruned for share in shares)
-    count = scored_views(trainer.get("limit_val_batches", 1.0), len(views))
+    count = scored_views(limit, len(views))
     pixels = views.height * views.width * count
     later = pixels * (len(shares) - early)
     if final is not views or count < len(views):

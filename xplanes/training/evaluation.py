@@ -22,16 +22,38 @@ SHOWN = 4
 """Views whose images go to the logger at each evaluation."""
 
 
+FEW_VIEWS, FIRST_SHARE = 4, 0.1
+"""Of scenes with surroundings: views at each evaluation, unless given, and the earliest one."""
+
 CURVE = ("seconds", "step", "split", "psnr", "ssim")
 """Columns of curve.csv."""
+
+
+def affordable(
+    at: Sequence[float], limit: float, surrounded: bool
+) -> tuple[list[float], int | float]:
+    """When to evaluate, and how many views.
+
+    In scenes with surroundings all of the cube may be occupied at first, so that a view takes
+    seconds: fewer views than all are scored, and none before the cube has taken shape.
+
+    Args:
+        at: Shares of the budget at which to evaluate.
+        limit: ``trainer.limit_val_batches``; 1.0 for all views.
+        surrounded: Whether the scene has surroundings.
+    """
+    if not surrounded or limit != 1.0 or isinstance(limit, int):
+        return list(at), limit
+    return [share for share in at if share >= FIRST_SHARE], FEW_VIEWS
 
 
 class Evaluation(Callback):
     """Lets Lightning validate at given shares of the budget, and keeps what comes of it.
 
     The views are those of `SceneDataModule.val_dataloader`; ``trainer.limit_val_batches`` of them
-    are scored each time. Writes curve.csv and images into the trainer's ``default_root_dir``, and
-    gives images to its loggers. All rows of the curve score the same views; a checkpoint holds the
+    are scored each time, see `affordable`. Writes curve.csv and images into the trainer's
+    ``default_root_dir``, and gives images to its loggers. All rows of the curve score the same
+    views; a checkpoint holds the
     rows until then.
 
     Args:
@@ -55,6 +77,10 @@ class Evaluation(Callback):
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         if stage == "fit":
+            data: Any = getattr(trainer, "datamodule", None)
+            scene, limit = getattr(data, "scene", None), trainer.limit_val_batches
+            surrounded = scene is not None and scene.is_surrounded
+            self.at, trainer.limit_val_batches = affordable(self.at, limit, surrounded)
             trainer.check_val_every_n_epoch = None
             trainer.num_sanity_val_steps = float("inf") if 0 in self.at else 0
 

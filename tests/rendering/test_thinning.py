@@ -74,6 +74,18 @@ def test_few_samples_are_asked_again():
     assert parameters[2].grad is None
 
 
+def test_a_constant_colour_needs_no_gradient():
+    level = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
+
+    def fog(chosen):
+        places = torch.zeros(COUNT, 3, dtype=torch.float64)[chosen]
+        return places, level.expand(len(places))
+
+    _, density = thinned(fog, [level], 0.0, torch.Generator())
+    density.sum().backward()
+    assert float(level.grad) == COUNT
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_what_is_not_finite_is_not_hidden(value):
     upstream = problem()[2]

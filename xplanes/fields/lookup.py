@@ -144,9 +144,7 @@ class _Features(torch.autograd.Function):
         gradient = gradients[0].to(factors.dtype).contiguous()
         space = time = None
         if ctx.needs_input_grad[0]:
-            space = gradient.new_zeros(ctx.shapes[0])
-            tasks = cpu.tasks_a_plane(len(space))
-            cpu.scatter_space(*_arrays(points, gradient), tasks, *_arrays(space))
+            space = _space_gradient(points, gradient, ctx.shapes[0])
         if ctx.needs_input_grad[1]:
             time = gradient.new_zeros(ctx.shapes[1])
             spread = torch.empty_like(factors)
@@ -176,12 +174,17 @@ class _Onto(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         if not ctx.needs_input_grad[1]:
             return gradients[0], None, None
-        cpu = compiled("xplanes.fields.lookup_numba")
-        (points,), gradient = ctx.saved_tensors, gradients[0].contiguous()
-        space = gradient.new_zeros(ctx.shape)
-        tasks = cpu.tasks_a_plane(len(space))
-        cpu.scatter_space(*_arrays(points, gradient), tasks, *_arrays(space))
-        return gradients[0], space, None
+        (points,) = ctx.saved_tensors
+        return gradients[0], _space_gradient(points, gradients[0].contiguous(), ctx.shape), None
+
+
+def _space_gradient(points: Tensor, gradient: Tensor, shape: torch.Size) -> Tensor:
+    """Gradient of space planes from that of the features' first channels. [3, H, H, C']"""
+    cpu = compiled("xplanes.fields.lookup_numba")
+    space = gradient.new_zeros(shape)
+    tasks = cpu.tasks_a_plane(len(space))
+    cpu.scatter_space(*_arrays(points, gradient), tasks, *_arrays(space))
+    return space
 
 
 class _Kernels(torch.autograd.Function):

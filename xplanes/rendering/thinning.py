@@ -40,10 +40,8 @@ class _Thinned(torch.autograd.Function):
     def forward(
         ctx: Any, shade: Shade, thinning: float, generator: torch.Generator, *parameters: Tensor
     ) -> tuple[Tensor, Tensor]:
-        ctx.shade, ctx.thinning, ctx.generator, ctx.parameters = (
-            *(shade, thinning, generator),
-            parameters,
-        )
+        ctx.shade, ctx.thinning, ctx.generator = shade, thinning, generator
+        ctx.parameters = parameters
         colour, density = shade(slice(None))
         ctx.save_for_backward(density)
         return colour, density
@@ -64,10 +62,13 @@ class _Thinned(torch.autograd.Function):
         factor = (level / size[chosen]).clamp_min(1)
         with torch.enable_grad():
             found = ctx.shade(chosen)
+        upstream = to_colour[chosen] * factor[:, None], to_density[chosen] * factor
+        # One of the two may be a constant.
+        learnt = [pair for pair in zip(found, upstream, strict=True) if pair[0].requires_grad]
         given = torch.autograd.grad(
-            found,
+            [value for value, _ in learnt],
             ctx.parameters,
-            (to_colour[chosen] * factor[:, None], to_density[chosen] * factor),
+            [gradient for _, gradient in learnt],
             allow_unused=True,
         )
         return None, None, None, *given

@@ -53,8 +53,7 @@ class Evaluation(Callback):
     The views are those of `SceneDataModule.val_dataloader`; ``trainer.limit_val_batches`` of them
     are scored each time, see `affordable`. Writes curve.csv and images into the trainer's
     ``default_root_dir``, and gives images to its loggers. All rows of the curve score the same
-    views; a checkpoint holds the
-    rows until then.
+    views; a checkpoint holds the rows until then.
 
     Args:
         at: Shares of the budget, from 0 to 1; 1 is always scored.

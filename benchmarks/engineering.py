@@ -22,11 +22,11 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from xplanes.decomposition import robust_pca
-from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.lrm.config import PUBLISHED
 from xplanes.rendering.grid_renderer import GridRenderer
 from xplanes.scenes.datamodule import whole_view
 from xplanes.scenes.views import Views
+from xplanes.tools.runs import TrainedRun, load_run
 from xplanes.training.scores import render_item, score_image
 
 HERE = Path(__file__).parent

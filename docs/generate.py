@@ -22,9 +22,8 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import yaml
 
-from xplanes.cli import build_parser
+from xplanes.cli import build_parser, further_commands
 from xplanes.settings import Settings
-from xplanes.synthetic.pretraining.commands import add_commands
 from xplanes.synthetic.pretraining.settings import PretrainingSettings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -317,7 +316,7 @@ def command_line() -> str:
     """The page of all commands and their options."""
     commands = next(
         action
-        for action in build_parser([add_commands])._actions
+        for action in build_parser(further_commands())._actions
         if isinstance(action, argparse._SubParsersAction)
     )
     lines = [

@@ -40,7 +40,7 @@ def test_table(trained_run, tmp_path, capsys):
 
 
 def test_download_says_how_to_continue(tmp_path, monkeypatch, capsys):
-    from xplanes.scenes import download
+    from xplanes.tools import download
 
     monkeypatch.setattr(download, "download_dnerf", lambda root: root)
     assert main(["download", "dnerf", "--root", str(tmp_path)]) == 0
@@ -74,7 +74,7 @@ def test_known_errors_are_one_line(arguments, words, trained_run, tmp_path, caps
 def test_a_disk_that_takes_nothing_is_said_before_anything_is_rendered(
     trained_run, tmp_path, monkeypatch, capsys
 ):
-    from xplanes.evaluation import render
+    from xplanes.tools import render
 
     monkeypatch.setattr(render, "render_path", lambda *_, **__: pytest.fail("rendered first"))
     (tmp_path / "file").write_text("in the way")
@@ -90,7 +90,7 @@ def test_a_missing_extra_is_named(trained_run, monkeypatch, capsys):
 
 
 def test_other_errors_keep_their_traceback(trained_run, monkeypatch):
-    from xplanes.evaluation import runs
+    from xplanes.tools import runs
 
     def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError
@@ -102,7 +102,7 @@ def test_other_errors_keep_their_traceback(trained_run, monkeypatch):
 
 @pytest.mark.parametrize("kind", [DeviceError, GaussianError])
 def test_what_happens_while_rendering_is_one_line_too(kind, trained_run, monkeypatch, capsys):
-    from xplanes.evaluation import runs
+    from xplanes.tools import runs
 
     def broken(*_: object, **__: object) -> None:
         raise kind("what, and the way out")
@@ -114,7 +114,7 @@ def test_what_happens_while_rendering_is_one_line_too(kind, trained_run, monkeyp
 
 def test_the_view_ends_with_ctrl_c(trained_run, monkeypatch, capsys):
     pytest.importorskip("viser")
-    from xplanes.evaluation.viewer import Viewer
+    from xplanes.tools.viewer import Viewer
 
     def interrupted(self: Viewer) -> None:
         raise KeyboardInterrupt

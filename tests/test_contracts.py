@@ -641,9 +641,9 @@ LAYERS = (
     ("experiment", "sweeps"),
     ("preparation",),
     ("evaluation",),
-    ("baselines", "synthetic"),
     ("hints", "run", "launch"),
     ("cli",),
+    ("baselines", "synthetic", "tools"),
     ("__main__",),
 )
 """Layers: imports only point up this list.
@@ -651,7 +651,7 @@ LAYERS = (
 An LRM brings a decoder of the fields' kind, so fields stand above it.
 """
 
-WINGS = ("baselines", "synthetic")
+WINGS = ("baselines", "synthetic", "tools")
 """Packages that the core does not know: YAML files and entry points name them."""
 
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
@@ -730,7 +730,7 @@ def test_imports_only_point_up_the_list():
                 assert LEVEL[target] <= LEVEL[own], f"{told}: that points down the list"
 
 
-def test_no_wing_is_imported_by_the_core_or_by_the_other():
+def test_no_wing_is_imported_by_the_core_or_by_another():
     for module, path in sources().items():
         own = room(module)
         found = {name for name in imported(path) if room(name) in set(WINGS) - {own}}
@@ -760,8 +760,9 @@ def test_commands_of_a_wing_come_from_an_entry_point():
         EntryPoint(name, value, "xplanes.commands").load()
         for name, value in settings["xplanes.commands"].items()
     ]
-    assert "pretrain-lrm" not in build_parser().format_help()
-    assert "pretrain-lrm" in build_parser(entries).format_help()
+    for command in ("pretrain-lrm", "inspect", "view", "export", "table"):
+        assert not re.search(rf"\n    {command}\s", build_parser().format_help())
+        assert re.search(rf"\n    {command}\s", build_parser(entries).format_help())
 
 
 def test_modules_that_have_moved_are_found():
@@ -808,7 +809,8 @@ QUICK = {
     "import xplanes.settings": HEAVY,
     "import xplanes.config": HEAVY,
     "import xplanes.launch": ("torch", "lightning", "numba"),
-    "from xplanes.cli import build_parser; print(build_parser().format_help())": HEAVY,
+    "from xplanes.cli import build_parser, further_commands as more; "
+    "print(build_parser(more()).format_help())": HEAVY,
     "from xplanes.cli import main; main(['inspect', 'nowhere'])": ("lightning", "xplanes.run"),
 }
 """What must answer at once, and what it must not load."""

@@ -20,15 +20,14 @@ import yaml
 
 from tests.training.runs import small_config
 from xplanes import __version__
-from xplanes.cli import build_parser
+from xplanes.cli import build_parser, further_commands
 from xplanes.config import compose_plain, near_names
-from xplanes.evaluation.published import OWN, PUBLISHED
-from xplanes.evaluation.sweep import SCORES
-from xplanes.evaluation.table import write_tables
 from xplanes.experiment import Experiment
 from xplanes.files import read_json
 from xplanes.run import run
-from xplanes.synthetic.pretraining.commands import add_commands
+from xplanes.tools.published import OWN, PUBLISHED
+from xplanes.tools.sweep import SCORES
+from xplanes.tools.table import write_tables
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -145,7 +144,7 @@ def test_other_commands_of_the_pages_parse():
     others = [words for words in commands() if words[:1] != ["train"]]
     assert len(others) > 12
     for arguments in others:
-        assert build_parser([add_commands]).parse_args(arguments), arguments
+        assert build_parser(further_commands()).parse_args(arguments), arguments
 
 
 def test_shells_leave_the_commands_of_the_pages_alone():

@@ -14,9 +14,9 @@ from lightning.pytorch.loggers import CSVLogger
 from tests.training.runs import checkpoint, metrics, small_config
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError
-from xplanes.evaluation.evaluate import evaluate
-from xplanes.evaluation.runs import load_run
 from xplanes.run import run
+from xplanes.tools.evaluate import evaluate
+from xplanes.tools.runs import load_run
 from xplanes.training.fit import Trainer
 
 PLAIN = {"accelerator": "cpu", "enable_progress_bar": False, "enable_model_summary": False}

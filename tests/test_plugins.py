@@ -14,10 +14,10 @@ from tests.training.runs import metrics, small_config
 from xplanes import RadianceModule, SceneDataModule, __version__
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
-from xplanes.evaluation.runs import load_run
 from xplanes.experiment import Experiment
 from xplanes.fields.base import RadianceField
 from xplanes.run import run
+from xplanes.tools.runs import load_run
 
 BLOB = {
     "_target_": "tests.plugins.gaussian_blob.BlobSettings",

@@ -26,12 +26,12 @@ from tests.test_contracts import built, small
 from tests.training.runs import SMALL as SMALL_RUN
 from xplanes.config import CONF, compose_plain, group_options
 from xplanes.errors import ConfigError, LRMError
-from xplanes.evaluation.published import check_published, read_published
-from xplanes.evaluation.sheet import check_what
 from xplanes.experiment import Experiment
 from xplanes.files import read_json
 from xplanes.launch import FORMER, prepare
 from xplanes.sweeps import SMALL, jobs, look_ahead
+from xplanes.tools.published import check_published, read_published
+from xplanes.tools.sheet import check_what
 from xplanes.training.losses import loss_terms
 
 PAPER = {

@@ -78,6 +78,6 @@ def test_commands_work_from_an_empty_folder(installed, tmp_path):
 
 
 def test_the_page_and_its_scripts_are_shipped(installed):
-    parts = Path("xplanes", "evaluation", "web")
+    parts = Path("xplanes", "tools", "web")
     shipped = [{path.name for path in (place / parts).iterdir()} for place in (ROOT, installed)]
     assert shipped[0] == shipped[1]

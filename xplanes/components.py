@@ -18,6 +18,8 @@ TRUSTED = ("xplanes", "lightning", "torchmetrics")
 """Packages whose classes any configuration may name."""
 
 MOVED = {
+    "xplanes.evaluation.live": "xplanes.tools.live",
+    "xplanes.evaluation.table": "xplanes.tools.table",
     "xplanes.models.densification": "xplanes.baselines.gaussians.densification",
     "xplanes.models.gaussians": "xplanes.baselines.gaussians.model",
     "xplanes.models.gaussians_deform": "xplanes.baselines.gaussians.deform",

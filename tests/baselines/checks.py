@@ -10,11 +10,11 @@ import torch
 from tests.baselines.runs import baseline_config
 from tests.refusals import assert_refused
 from xplanes.errors import ConfigError
-from xplanes.evaluation.evaluate import evaluate
-from xplanes.evaluation.render import VideoOptions, render_video
-from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.experiment import Experiment
 from xplanes.run import run
+from xplanes.tools.evaluate import evaluate
+from xplanes.tools.render import VideoOptions, render_video
+from xplanes.tools.runs import TrainedRun, load_run
 from xplanes.training.clock import TrainingClock
 
 

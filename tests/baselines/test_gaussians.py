@@ -27,7 +27,6 @@ from xplanes.baselines.gaussians.renderer import GaussianRenderer, camera_in
 from xplanes.baselines.products import PlaneProducts
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, SceneError
-from xplanes.evaluation.export import ExportOptions, export
 from xplanes.models.initialisation import Method
 from xplanes.preparation.fixed_view import rendering_method
 from xplanes.rendering.sampler import Site
@@ -36,6 +35,7 @@ from xplanes.scenes.cameras import project
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.lenses import Lenses
 from xplanes.streams import TrainingState
+from xplanes.tools.export import ExportOptions, export
 
 FRAME = Frame(0.6, torch.eye(3), torch.tensor([0.3, -0.2, 0.1]))
 TURN = torch.linalg.qr(torch.tensor([[1.0, 0.5, 0.2], [-0.3, 1.0, 0.4], [0.1, -0.6, 1.0]]))[0]

@@ -9,9 +9,9 @@ import yaml
 from tests.test_sweeps import jobs_of
 from xplanes.config import CONF, compose_plain
 from xplanes.errors import ConfigError
-from xplanes.evaluation.sweep import RunRow, flatten
-from xplanes.evaluation.tabulate import differing
 from xplanes.experiment import Experiment
+from xplanes.tools.sweep import RunRow, flatten
+from xplanes.tools.tabulate import differing
 
 PUBLISHED = {
     "kplanes": ("proposal", 4096, 30000),

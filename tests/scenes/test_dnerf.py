@@ -297,7 +297,7 @@ def test_damaged_or_missing_image(scene):
     whole = path.read_bytes()
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 0xFF
-    for content in (whole[: len(whole) // 2], bytes(flipped), b"no image", b""):
+    for content in (whole[: len(whole) // 2], bytes(flipped), b"no image"):
         path.write_bytes(content)
         message = scene.error(content[:8])
         assert "r_2.png" in message, content
@@ -309,12 +309,13 @@ def test_frames_that_cannot_be_used_are_left_out_and_named(scene):
     (scene.path / "train" / "r_2.png").unlink()
     scene.frame(1)["transform_matrix"][0][3] = float("inf")
     del scene.frame(3)["transform_matrix"]
+    (scene.path / "train" / "r_4.png").write_bytes(b"")
     scene.write()
-    words = r"(?s)3 of \d+ .* left out:.*frame 1 .*infinity.*r_2\): no image.*has no transform_mat"
-    with pytest.warns(UserWarning, match=words):
+    words = r"(?s)4 of \d+ .* left out:.*frame 1 .*infinity.*r_2\): no image.*has no transform_mat"
+    with pytest.warns(UserWarning, match=words + ".*r_4.png holds 0 bytes"):
         views = scene.read().splits["train"]
-    assert len(views) == total - 3
-    assert not {"train/r_1.png", "train/r_2.png"} & {*views.files}
+    assert len(views) == total - 4
+    assert not {"train/r_1.png", "train/r_2.png", "train/r_4.png"} & {*views.files}
     for path in (scene.path / "train").iterdir():
         path.unlink()
     message = scene.error()

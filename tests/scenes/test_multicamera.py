@@ -18,13 +18,13 @@ from tests.captures import settings, write_colmap
 from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
-from xplanes.evaluation.inspect import choose
 from xplanes.optional import MissingExtraError
 from xplanes.scenes import store
 from xplanes.scenes import videos as recordings
 from xplanes.scenes.multicamera import MultiCameraSettings, read_cameras
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Views
+from xplanes.tools.inspect import choose
 
 av = pytest.importorskip("av")
 imageio = pytest.importorskip("imageio.v2")

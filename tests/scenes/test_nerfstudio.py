@@ -497,7 +497,7 @@ def test_lenses_and_poses_of_many_cameras_stay_with_their_images(capture):
 
 
 def test_keys_that_are_not_read_are_named(capture):
-    capture.content |= {"mask_color": [9, 9, 9], "envmap": "", "intrinsics": {"f": 9}}
+    capture.content |= {"mask_color": [0, 0, 0], "envmap": "", "intrinsics": {"f": 9}}
     capture.frames[2]["rolling_shutter"] = [1, 0, 0, 0]
     words = "not read are 'intrinsics', 'mask_color', 'rolling_shutter'"
     with pytest.warns(UserWarning, match=words):

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from tests.training.runs import composed, metrics, small_config
-from xplanes.evaluation.runs import load_run
 from xplanes.files import read_rows
 from xplanes.lrm.bundled import bundled_models
 from xplanes.run import run
+from xplanes.tools.runs import load_run
 
 SETTINGS = (
     "model.channels=32",

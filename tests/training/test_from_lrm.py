@@ -6,12 +6,12 @@ import pytest
 
 from tests.preparation.test_reconstruct import CHOICES, publish
 from tests.training.runs import metrics, small_config, status
-from xplanes.evaluation.evaluate import evaluate
-from xplanes.evaluation.runs import load_run
 from xplanes.models.initialisation import STAGES
 from xplanes.preparation import reconstruct as reconstruct_module
 from xplanes.preparation import sources as sources_module
 from xplanes.run import run
+from xplanes.tools.evaluate import evaluate
+from xplanes.tools.runs import load_run
 
 
 @pytest.fixture(scope="module")

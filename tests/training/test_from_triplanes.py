@@ -11,8 +11,6 @@ from tests.training.runs import checkpoint, metrics, small_config
 from xplanes.decomposition import decompose, unexplained_energy
 from xplanes.decomposition.conversion import frame_profiles
 from xplanes.errors import ConfigError
-from xplanes.evaluation.evaluate import evaluate
-from xplanes.evaluation.runs import load_run
 from xplanes.experiment import Experiment
 from xplanes.fields import Decoder, XPlanes
 from xplanes.fields.xplanes import PLANE_SETS
@@ -23,6 +21,8 @@ from xplanes.preparation import stages as stages_module
 from xplanes.run import run
 from xplanes.scenes.frame import Frame
 from xplanes.streams import TrainingState
+from xplanes.tools.evaluate import evaluate
+from xplanes.tools.runs import load_run
 from xplanes.training.clock import TrainingClock
 from xplanes.training.module import RadianceModule
 

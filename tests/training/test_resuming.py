@@ -13,12 +13,12 @@ from lightning.pytorch.callbacks import Callback
 
 from tests.training.runs import small_config
 from xplanes.errors import ConfigError
-from xplanes.evaluation.runs import load_run
 from xplanes.files import read_rows
 from xplanes.process import resume_command
 from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.dnerf import BlenderSettings
+from xplanes.tools.runs import load_run
 from xplanes.training import scores
 from xplanes.training.checkpoints import AtomicCheckpointIO
 from xplanes.training.module import RadianceModule

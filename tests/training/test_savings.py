@@ -5,9 +5,9 @@ from dataclasses import replace
 import torch
 
 from tests.training.runs import small_config
-from xplanes.evaluation.runs import load_run
 from xplanes.files import read_rows
 from xplanes.run import run
+from xplanes.tools.runs import load_run
 from xplanes.training.scores import mean, score_view
 
 BOUND = 0.05

@@ -1,1 +1,1 @@
-"""After training: scores, images, videos and tables from run directories."""
+"""After training: scores, images and videos from run directories."""

@@ -1,16 +1,12 @@
 """What may be wrong with a capture: findings, each with its numbers and a remedy."""
 
-import hashlib
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from statistics import fmean
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from xplanes.rendering.box import ray_box
 from xplanes.scenes.cameras import project
 from xplanes.scenes.entries import some
 from xplanes.scenes.frame import Frame, axes_meet, backwards, optical_centre
@@ -30,33 +26,14 @@ ASTRAY = 0.1
 SMALL, LARGE = 0.03, 3.0
 """Bounds of half the cube's side, in median distances of the cameras."""
 
-COARSE = 8.0
-"""Image pixels per texel above which planes resolve far less than the images show."""
-
-CUT = 0.02
-"""Share of the foreground that may lie outside of the cube."""
-
-PALE_STEPS, PALE = 16, 0.15
-"""Difference from the background's colour, of 255, below which an opaque pixel looks like it; the
-share of a silhouette that may."""
+PALE_STEPS = 16
+"""Difference of colours, of 255, below which two pixels look alike."""
 
 HALO = 0.03
 """Width of the soft edge around a silhouette, as a share of the image's longer side."""
 
-EMPTY = 1e-3
-"""Share of opaque pixels below which an image is almost empty."""
-
-FULL = 0.98
-"""Share of opaque pixels above which a mask hides nothing."""
-
-MOST_VIEWS = 300
-"""Most images of a split that are read, spread evenly."""
-
 AT_START = 32
-"""The same at the start of a run, whose images may lie on the disk."""
-
-MOST_RAYS = 4096
-"""Most foreground pixels of an image whose rays are tested against the cube."""
+"""Most images that are read at the start of a run, spread evenly; they may lie on the disk."""
 
 
 @dataclass(frozen=True)
@@ -72,92 +49,7 @@ class Finding:
     text: str
 
 
-@dataclass(frozen=True)
-class ImageFacts:
-    """Statistics of the pixels of one image.
-
-    Attributes:
-        index: Number of the image in its split.
-        file: Its name.
-        coverage: Share of the pixels that are opaque.
-        border: The same along the image's edges.
-        middle: The same in the middle, a tenth as wide and high as the image.
-        pale_edge: Share of the opaque pixels next to transparent ones that look like the
-            background; None where there are too few to say.
-        outside: Share of the foreground whose rays miss the cube.
-        stray: Pixels with alpha away from the silhouette.
-        digest: Hash of the pixels; None where all are alike.
-    """
-
-    index: int
-    file: str
-    coverage: float
-    border: float
-    middle: float
-    pale_edge: float | None
-    outside: float
-    stray: int
-    digest: bytes | None
-
-
-def image_facts(views: Views, background: Tensor, frame: Frame | None) -> list[ImageFacts]:
-    """Statistics of the pixels of a split's images, of at most `MOST_VIEWS` of them.
-
-    Args:
-        views: The images.
-        background: Colour behind the scene, from 0 to 1. [3]
-        frame: The field's frame; None where the cameras see no common volume.
-    """
-    chosen = spread(MOST_VIEWS, len(views))
-    return [_facts_of(views, index, background, frame) for index in chosen]
-
-
-def _facts_of(views: Views, index: int, background: Tensor, frame: Frame | None) -> ImageFacts:
-    image = views.image(index)
-    alpha = image[..., 3]
-    height, width = alpha.shape
-    shown = views.shown(index)
-    valid = torch.ones_like(alpha, dtype=torch.bool) if shown is None else shown
-    opaque, clear = alpha > 127, (alpha <= 5) & valid
-    pale = (image[..., :3].short() - (255 * background).short()).abs().amax(dim=-1) < PALE_STEPS
-    pale &= alpha >= 250
-    ring = valid.clone()
-    rim = max(1, round(0.02 * min(height, width)))
-    ring[rim : height - rim, rim : width - rim] = False
-    rows, columns = (slice(round(0.45 * n), round(0.55 * n) + 1) for n in (height, width))
-    # Half-transparent pixels lie between, so that the opaque ones are two pixels away.
-    near_clear = F.max_pool2d(clear.float()[None], 5, stride=1, padding=2)[0] > 0
-    edge = near_clear & (alpha >= 250)
-    uniform = bool((image == image[0, 0]).all())
-    return ImageFacts(
-        index=index,
-        file=views.files[index],
-        coverage=_share(opaque, valid),
-        border=_share(opaque, ring),
-        middle=_share(opaque[rows, columns], valid[rows, columns]),
-        pale_edge=_share(pale, edge) if int(edge.sum()) >= 0.1 * (height + width) else None,
-        outside=0.0 if frame is None else _outside(views, index, opaque, frame),
-        stray=_stray_pixels(alpha),
-        digest=None if uniform else hashlib.sha256(image.contiguous().numpy().data).digest(),
-    )
-
-
-def _share(what: Tensor, among: Tensor) -> float:
-    return float(what[among].float().mean()) if among.any() else 0.0
-
-
-def _outside(views: Views, index: int, opaque: Tensor, frame: Frame) -> float:
-    """Share of an image's foreground whose rays miss the cube."""
-    pixels = opaque.nonzero()
-    if not len(pixels):
-        return 0.0
-    rows, columns = pixels[:: -(-len(pixels) // MOST_RAYS)].float().T
-    rays = views.pixel_rays(torch.full_like(rows, index, dtype=torch.long), rows, columns)
-    far = ray_box(*frame.rays(*rays))[1]
-    return float((far <= 0).float().mean())
-
-
-def _stray_pixels(alpha: Tensor) -> int:
+def stray_pixels(alpha: Tensor) -> int:
     """Pixels with alpha, but away from the silhouette: noise, not soft edges."""
     side = max(1, round(HALO * max(alpha.shape)))
     held = count_in_squares(silhouette_of(alpha), side) > 0
@@ -174,36 +66,13 @@ def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
     """
     train = scene.splits["train"]
     yield from _times(scene, train)
-    yield from _shared(scene)
+    yield from shared(scene)
     yield from _sizes(scene)
     if (away := _outward(train)) is not None:
         yield away
     elif frame is not None:
         yield from _astray(train, frame)
         yield from _scale(train, frame)
-
-
-def image_findings(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iterator[Finding]:
-    """Problems that the images' pixels show."""
-    seen = [each for split in images.values() for each in split]
-    masks = list(_masks(seen))
-    yield from masks
-    yield from _shared_images(scene, images)
-    yield from _stray([(each.file, each.stray) for each in seen])
-    if masks:
-        return  # Silhouettes mean little then.
-    transparent = [each for each in seen if each.coverage < FULL]
-    if 2 * len(transparent) > len(seen):
-        yield from _white_edges(transparent)
-        share = fmean(each.outside for each in transparent)
-        if share > CUT:
-            yield Finding(
-                "cut",
-                f"the cube cuts off {share:.0%} of the foreground: nothing is shown outside of it. "
-                "Raise data.half_side, or mask what does not belong to the scene",
-            )
-        return
-    yield from opaque_findings(scene)
 
 
 def opaque_findings(scene: Scene) -> Iterator[Finding]:
@@ -221,28 +90,8 @@ def stray_findings(scene: Scene) -> Iterator[Finding]:
     views = scene.splits["train"]
     if not views.is_opaque:
         chosen = spread(AT_START, len(views))
-        yield from _stray([(views.files[i], _stray_pixels(views.image(i)[..., 3])) for i in chosen])
-
-
-def texel_findings(per_texel: float, native: int, wide: int, resolution: int) -> Iterator[Finding]:
-    """Whether the images show far more than planes resolve.
-
-    Args:
-        per_texel: Image pixels that a texel of the planes covers, see `pixels_across`.
-        native: Width of these images.
-        wide: Width of those that are trained on.
-        resolution: Texels along an axis of the planes.
-    """
-    per_texel *= wide / native
-    if per_texel > COARSE:
-        width = max(1, round(wide * 0.5 * COARSE / per_texel))
-        finer = 2 ** round(math.log2(resolution * per_texel / (0.5 * COARSE)))
-        yield Finding(
-            "texels",
-            f"a texel of planes with {resolution} texels a side covers {per_texel:.0f} pixels of "
-            f"images {wide} pixels wide. Set data.resolution={width}, which costs nothing "
-            f"that the planes could show, or give the planes {finer}",
-        )
+        stray = [(views.files[i], stray_pixels(views.image(i)[..., 3])) for i in chosen]
+        yield from stray_finding(stray)
 
 
 def time_steps(views: Views) -> Tensor:
@@ -305,7 +154,7 @@ def _same_camera_other_image(views: Views) -> tuple[int, int] | None:
     return None
 
 
-def _shared(scene: Scene) -> Iterator[Finding]:
+def shared(scene: Scene) -> Iterator[Finding]:
     """Scored views that are training views by their file, or by camera and time."""
     train = scene.splits["train"]
     names = dict(zip(train.files, range(len(train)), strict=True))
@@ -323,30 +172,13 @@ def _shared(scene: Scene) -> Iterator[Finding]:
                 found.append((file, file))
             elif near.any():
                 found.append((file, train.files[int(near.nonzero()[0, 0])]))
-        yield from _shared_finding(split, views, found, "file, or the same camera and time")
+        yield from shared_finding(split, views, found, "file, or the same camera and time")
 
 
-def _shared_images(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iterator[Finding]:
-    """Scored views whose pixels are those of a training view with another camera or file."""
-    if any(_shared(scene)):
-        return
-    train = scene.splits["train"]
-    known = {each.digest: each.index for each in images["train"] if each.digest is not None}
-    for split in [name for name in scene.splits if name != "train"]:
-        poses, found = scene.splits[split].camera_to_world, []
-        for each in images[split]:
-            other = known.get(each.digest or b"")
-            # One camera shows the same again as long as nothing moves.
-            if other is not None and not torch.equal(
-                poses[each.index], train.camera_to_world[other]
-            ):
-                found.append((each.file, train.files[other]))
-        yield from _shared_finding(split, scene.splits[split], found, "pixels")
-
-
-def _shared_finding(
+def shared_finding(
     split: str, views: Views, found: list[tuple[str, str]], what: str
 ) -> Iterator[Finding]:
+    """Scored views, each with its training view, that have the same of something."""
     for file, other in found[:1]:
         yield Finding(
             "shared",
@@ -450,45 +282,7 @@ def _scale(views: Views, frame: Frame) -> Iterator[Finding]:
         )
 
 
-def _masks(images: Sequence[ImageFacts]) -> Iterator[Finding]:
-    """Masks that hide everything, nothing, or the wrong side."""
-    count = len(images)
-    empty = [each.file for each in images if each.coverage < EMPTY]
-    if len(empty) > 0.05 * count:
-        yield Finding(
-            "empty",
-            f"{len(empty)} of {count} images show next to nothing (under {EMPTY:.1%} of their "
-            f"pixels are opaque), such as {empty[0]}. Check alpha and masks, or leave them out",
-        )
-    inverted = [e for e in images if e.border > 0.9 and e.middle < 0.1 and 0.3 < e.coverage < 1]
-    if 2 * len(inverted) > count:
-        yield Finding(
-            "inverted",
-            f"{len(inverted)} of {count} images are opaque at their edges and transparent in the "
-            f"middle; {fmean(each.coverage for each in images):.0%} of all pixels are opaque. The "
-            "masks seem inverted: they must be white, or alpha opaque, where the scene is",
-        )
-        return
-    full = [each.file for each in images if each.coverage >= 0.9995]
-    masked = [each.coverage for each in images if each.coverage < 0.9995]
-    hardly = [coverage for coverage in masked if coverage > FULL]
-    if 2 * len(hardly) > count:
-        yield Finding(
-            "opaque",
-            f"{len(hardly)} of {count} images have a mask that hides less than "
-            f"{1 - FULL:.0%} of the pixels. Check the masks: they must hide the background, or be "
-            "left out",
-        )
-    elif full and masked and fmean(masked) < 0.5:
-        yield Finding(
-            "opaque",
-            f"{len(full)} of {count} images are opaque all over, such as {full[0]}, while the "
-            f"others hide {1 - fmean(masked):.0%} of their pixels. Their masks are missing: add "
-            "them, or leave the images out",
-        )
-
-
-def _stray(counts: Sequence[tuple[str, int]]) -> Iterator[Finding]:
+def stray_finding(counts: Sequence[tuple[str, int]]) -> Iterator[Finding]:
     """Images with alpha away from their silhouettes, by file and number of such pixels."""
     found = sorted([each for each in counts if each[1]], key=lambda each: -each[1])
     if found:
@@ -500,16 +294,4 @@ def _stray(counts: Sequence[tuple[str, int]]) -> Iterator[Finding]:
             "trained on, but count as empty space when the cube and the silhouettes are found. "
             "Clear their alpha; if they show a part of the scene, set data.half_side and "
             "model.sampler.silhouettes=false",
-        )
-
-
-def _white_edges(images: Sequence[ImageFacts]) -> Iterator[Finding]:
-    """Silhouettes that look like the background."""
-    edges = [each.pale_edge for each in images if each.pale_edge is not None]
-    if edges and (pale := fmean(edges)) > PALE:
-        yield Finding(
-            "white",
-            f"{pale:.0%} of the silhouettes have the background's colour: colour alone cannot tell "
-            "the scene from empty space there. Keep model.loss.opacity above 0, which learns them "
-            "from alpha, or set model.rays.background=random",
         )

@@ -1,23 +1,15 @@
-"""Videos along a path of cameras and times: `xplanes render`."""
+"""Videos along a path of cameras and times."""
 
-import difflib
-import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
-from tqdm import tqdm
 
-from xplanes.errors import ConfigError, require_between
-from xplanes.evaluation.camera_path import CameraPath, read_camera_path
-from xplanes.evaluation.runs import TrainedRun
-from xplanes.files import replacing, require_empty, require_writable
+from xplanes.errors import ConfigError
+from xplanes.files import replacing, require_empty
 from xplanes.optional import require
 from xplanes.rendering.base import Renderer, leave_empty
 from xplanes.rendering.pictures import colour_map, to_bytes
@@ -157,280 +149,25 @@ def _write_image(path: Path, frame: Tensor) -> None:
 IMAGES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 """Formats of files with one frame, as Pillow calls them."""
 
-OWN = "own"
-"""The time of a view, for its camera."""
-
 FRAMES, FPS = 48, 16
-LARGEST = 8192
-"""Pixels per side; WebP ends at twice as many."""
-
-
-@dataclass(frozen=True)
-class VideoOptions:
-    """What to render.
-
-    Attributes:
-        path: Camera: ``orbit``, ``fixed`` (the first camera of the orbit), ``view:FILE``, or a
-            camera path, FILE.json.
-        time: ``sweep`` (from 0 to 1), ``back-and-forth``, ``own`` (that of ``view:FILE``), or a
-            number from 0 to 1; None for back-and-forth, or the times of a camera path.
-        frames: Number of frames; None for 48, for 1 where neither camera nor time moves, or for
-            those of a camera path.
-        fps: Frames per second; None for 16, or as a camera path says.
-        size: Pixels of the longer side; None for those of the training views, of the view that
-            ``path`` names, or as a camera path says. Frames of an orbit or a fixed camera are
-            square.
-        elevation: Height angle of orbit and fixed camera, in degrees.
-        what: ``colour`` or ``depth``.
-    """
-
-    path: str = "orbit"
-    time: str | None = None
-    frames: int | None = None
-    fps: int | None = None
-    size: int | None = None
-    elevation: float = ELEVATION
-    what: str = "colour"
-
-    def written_to(self, out: str | None) -> "VideoOptions":
-        """These options where the frames go to ``out``: an image of a view shows its own time."""
-        one = self.frames in (None, 1) and self.path.startswith("view:") and self.time is None
-        image = out is not None and Path(out).suffix in IMAGES and not Path(out).is_dir()
-        return replace(self, time=OWN) if one and image else self
-
-    @cached_property
-    def cameras(self) -> CameraPath | None:
-        """The camera path that is named, read from its file; None where none is.
-
-        Raises:
-            SceneError: If it cannot be used.
-        """
-        return read_camera_path(Path(self.path)) if self.path.endswith(".json") else None
-
-    @property
-    def count(self) -> int:
-        """Number of frames."""
-        if self.cameras is not None:
-            return len(self.cameras)
-        if self.frames is not None:
-            return self.frames
-        frozen = self.path != "orbit" and self.time not in (None, "sweep", "back-and-forth")
-        return 1 if frozen else FRAMES
-
-    @property
-    def rate(self) -> int:
-        """Frames per second."""
-        written = None if self.cameras is None else self.cameras.fps
-        return self.fps or written or FPS
-
-    @property
-    def times(self) -> Tensor:
-        """Time of each frame, from 0 to 1. [F]
-
-        Raises:
-            ConfigError: As `times`, and for ``own``, which only a scene can tell.
-        """
-        if self.cameras is not None and self.time is None:
-            return self.cameras.times
-        return times(self.time or "back-and-forth", self.count)
-
-    def shape(self, splits: dict[str, Views]) -> tuple[int, int]:
-        """Rows and columns of a frame of a scene with these splits.
-
-        Raises:
-            ConfigError: As `find_view`.
-        """
-        height = width = max(splits["train"].height, splits["train"].width)
-        if (found := self.view(splits)) is not None:
-            views, index = found
-            height, width = views.size(index)
-        elif self.cameras is not None:
-            height = self.cameras.height or self.cameras.width or height
-            width = self.cameras.width or height
-        scale = 1 if self.size is None else self.size / max(height, width)
-        return max(1, round(height * scale)), max(1, round(width * scale))
-
-    def view(self, splits: dict[str, Views]) -> tuple[Views, int] | None:
-        """The view that is named, as `find_view` gives it; None where none is."""
-        name = self.path.removeprefix("view:")
-        return None if name == self.path else find_view(splits, name)
-
-    def check(self) -> None:
-        """Refuse options that cannot be rendered.
-
-        Raises:
-            ConfigError: With the option, its value and what is allowed.
-            SceneError: If a camera path cannot be used.
-        """
-        views = self.path.startswith("view:")
-        if self.time != OWN:
-            times(self.time or "back-and-forth", 1)
-        elif not views:
-            raise ConfigError(f"--time {OWN}: only the camera of a view has one, --path view:FILE")
-        if self.path not in ("orbit", "fixed") and not views and self.cameras is None:
-            raise ConfigError(
-                f"--path {self.path}: must be orbit, fixed, view:FILE or a camera path, FILE.json"
-            )
-        if self.cameras is not None and self.frames is not None:
-            raise ConfigError(
-                f"--frames {self.frames}: {self.path} has {self.count} cameras, and each of them "
-                "is one frame; leave --frames out"
-            )
-        require_between("--frames", self.count, 1, 100_000)
-        require_between("--fps", self.fps, 1, 240)
-        require_between("--size", self.size, 1, LARGEST)
-        require_between("--elevation", self.elevation, -90, 90)
-        if self.cameras is not None and self.size is None:
-            longer = max(self.cameras.height or 1, self.cameras.width or 1)
-            if longer > LARGEST:
-                raise ConfigError(
-                    f"{self.path} asks for frames of {longer} px: set --size to at most {LARGEST}"
-                )
-
-
-def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = None) -> Path:
-    """Render and write a video.
-
-    Args:
-        trained: The run.
-        options: What to render.
-        out: A file (.webp, .mp4, .png, .jpg), or a folder if it ends in /; by default a file in the
-            run's media/ that is named after the paths.
-
-    Returns:
-        The file or folder that was written.
-
-    Raises:
-        ConfigError: If options are out of range or contradict one another.
-        ImportError: For .mp4 without the extra ``video``.
-    """
-    options = options.written_to(out)
-    options.check()
-    check_out(out, options)
-    target, folder = destination(trained.path, options, out, trained.checkpoint)
-    require_writable(target.parent)
-    if options.time == OWN and (found := options.view(trained.scene.splits)) is not None:
-        views, index = found
-        options = replace(options, time=str(float(views.times[index])))
-    frames = _frames(trained.module, trained.scene, options)
-    counted = tqdm(frames, "frames", options.count, leave=False, delay=2, disable=None)
-    return write_video(target, counted, fps=options.rate, folder=folder)
-
-
-def _frames(module: RadianceModule, scene: Scene, options: VideoOptions) -> Iterator[Tensor]:
-    frame, splits = module.frame, scene.splits
-    assert frame is not None
-    path = cameras(options, splits, frame), options.times
-    shown = pixels_with_rays(options, splits)
-    how: Any = {"background": scene.background, "what": options.what, "shown": shown}
-    return render_path(module.field, module.renderer, frame, *path, **how)
-
-
-def check_out(out: str | None, options: VideoOptions) -> None:
-    """Refuse an ``--out`` that could not be written, before the run is loaded.
-
-    Raises:
-        ConfigError: As `xplanes.evaluation.render.check_video`.
-        ImportError: For .mp4 without the extra ``video``.
-    """
-    options = options.written_to(out)
-    target, folder = destination(Path(), options, out, "last")
-    check_video(target, frames=options.count, folder=folder)
-
-
-def destination(
-    run: Path, options: VideoOptions, out: str | None, checkpoint: str
-) -> tuple[Path, bool]:
-    """The file or folder to write, and whether it is a folder."""
-    if out is not None:
-        return Path(out), out.endswith("/") or Path(out).is_dir()
-    if options.cameras is not None:
-        parts = ["render", Path(options.path).stem, *([options.time] if options.time else [])]
-    else:
-        camera = options.path.replace(":", "_").replace("/", "_").removesuffix(".png")
-        parts = ["render", camera, options.time or "back-and-forth"]
-    parts += [part for part in (options.what, checkpoint) if part not in ("colour", "last")]
-    ending = ".png" if options.count == 1 else ".webp"
-    return run / "media" / ("_".join(parts) + ending), False
-
-
-def cameras(options: VideoOptions, splits: dict[str, Views], frame: Frame) -> list[PosedCamera]:
-    """The camera of each frame.
-
-    That of a view shows exactly what the view shows; the others show as much as the training views.
-    """
-    rows, columns = options.shape(splits)
-    if (path := options.cameras) is not None:
-        focal = path.focal(rows, columns).tolist()
-        return [PosedCamera(p, f, rows, columns) for p, f in zip(path.poses, focal, strict=True)]
-    if (found := options.view(splits)) is not None:
-        views, index = found
-        own, intrinsics = views.camera(index), views.intrinsics
-        scale = torch.tensor([columns / own.width, rows / own.height])
-        lens = None if own.lens is None else replace(own.lens, skew=own.lens.skew * scale[0])
-        focal, centre = intrinsics.focal[index] * scale, intrinsics.centre[index] * scale
-        camera = PosedCamera(own.camera_to_world, focal, rows, columns, centre, lens)
-        return [camera] * options.count
-    views, count = splits["train"], options.count
-    poses = orbit_poses(views, frame, count if options.path == "orbit" else 1, options.elevation)
-    focal = views.intrinsics.focal_at(max(rows, columns))
-    return [PosedCamera(pose, focal, rows, columns) for pose in poses.expand(count, 4, 4)]
-
-
-def pixels_with_rays(options: VideoOptions, splits: dict[str, Views]) -> Tensor | None:
-    """Pixels of a frame that its lens has rays for; None for all. bool [rows, columns]"""
-    if (found := options.view(splits)) is None:
-        return None
-    views, index = found
-    if (known := views.intrinsics.has_ray(index)) is None:
-        return None
-    size = options.shape(splits)
-    return F.interpolate(known[None, None].float(), size, mode="nearest-exact")[0, 0] > 0
-
-
-def find_view(splits: dict[str, Views], name: str) -> tuple[Views, int]:
-    """The view whose file is called ``name``, with or without ending: its split and its number.
-
-    Raises:
-        ConfigError: If there is none, with similar names.
-    """
-    known = {file: (v, index) for v in splits.values() for index, file in enumerate(v.files)}
-    for file, found in known.items():
-        if name in (file, file.rsplit(".", 1)[0]):
-            return found
-    near = difflib.get_close_matches(name, list(known), n=3, cutoff=0.3) or list(known)[:3]
-    raise ConfigError(
-        f"--path view:{name}: no such view in {' or '.join(splits)}. Views are called "
-        f"{', '.join(near)}"
-    )
-
-
-def times(name: str, count: int) -> Tensor:
-    """Time of each frame, from 0 to 1. [F]
-
-    Raises:
-        ConfigError: If ``name`` is neither ``sweep``, ``back-and-forth`` nor a number from 0 to 1.
-    """
-    if name == "sweep":
-        return torch.linspace(0, 1, count)
-    if name == "back-and-forth":  # So that a looped video has no jump.
-        return 1 - (2 * torch.arange(count) / max(count, 1) - 1).abs()
-    try:
-        time = float(name)
-    except ValueError:
-        time = math.nan
-    if not 0 <= time <= 1:
-        raise ConfigError(f"--time {name}: must be sweep, back-and-forth or a number from 0 to 1")
-    return torch.full((count,), time)
-
+"""Frames of a video, and how many are shown per second."""
 
 VIDEO_SIZE = 200
 """Pixels of the longer side of a run's own video."""
 
 
+def back_and_forth(count: int) -> Tensor:
+    """Times from 0 to 1 and back, so that a looped video has no jump. [count]"""
+    return 1 - (2 * torch.arange(count) / max(count, 1) - 1).abs()
+
+
 def write_orbit(module: RadianceModule, scene: Scene, run: Path) -> Path:
     """Write media/orbit.webp: one camera orbit while time runs from 0 to 1 and back."""
-    views = scene.splits["train"]
-    options = VideoOptions(frames=FRAMES, size=min(VIDEO_SIZE, max(views.height, views.width)))
-    frames = _frames(module, scene, options)
-    return write_video(run / "media" / "orbit.webp", frames, fps=options.rate)
+    views, frame = scene.splits["train"], module.frame
+    assert frame is not None
+    size = min(VIDEO_SIZE, max(views.height, views.width))
+    focal = views.intrinsics.focal_at(size)
+    cameras = [PosedCamera(p, focal, size, size) for p in orbit_poses(views, frame, FRAMES)]
+    path = cameras, back_and_forth(FRAMES)
+    frames = render_path(module.field, module.renderer, frame, *path, background=scene.background)
+    return write_video(run / "media" / "orbit.webp", frames, fps=FPS)

@@ -64,14 +64,14 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         key: The key that holds the name.
 
     Raises:
-        BrokenFrameError: If there is no such file.
+        BrokenFrameError: If there is no such file, or nothing in it.
         SceneError: If it is no name, or leaves the folder.
     """
     choices = list(paths_inside(label, folder, name, key, "./train/r_000"))
     choices += [folder / "images" / path.name for path in choices if path.parent == folder]
     for image in choices:
         if image.is_file():
-            return image
+            return _with_content(label, image)
     for image in choices:
         if (parent := _like(image.parent)) is None:
             continue
@@ -79,7 +79,7 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         found = _stems(parent).get(_plain(wanted), ())
         same = [path for path in found if _plain(path.name) == _plain(image.name)]
         if len(chosen := same or found) == 1:
-            return chosen[0]
+            return _with_content(label, chosen[0])
     if Path(name).is_absolute() and Path(name).is_file():
         raise BrokenFrameError(
             f"{label}: {key} leaves the scene's folder {folder}. Put a link to {Path(name).parent} "
@@ -89,6 +89,12 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         f"{label}: no image {folder / name}, nor with {', '.join(SUFFIXES[1:4])}, ... added. "
         f"Add the file or take the frame out of the list."
     )
+
+
+def _with_content(label: str, image: Path) -> Path:
+    if image.stat().st_size == 0:
+        raise BrokenFrameError(f"{label}: {image} holds 0 bytes. Copy the file again.")
+    return image
 
 
 def usable(

@@ -242,7 +242,12 @@ def _with_height(camera: Calibration, keys: Mapping[str, Any], image: Path) -> C
 def _warn_of_unknown(path: Path, content: Mapping[str, Any]) -> None:
     """Warn of keys that are not read and may change what images or cameras mean."""
     entries = (content, *content["frames"])
-    given = {key for each in entries for key, value in each.items() if _says_something(value)}
+    given = {
+        key
+        for each in entries
+        for key, value in each.items()
+        if _says_something(value) or "color" in key  # Black is a colour.
+    }
     if unknown := sorted(given - {*KNOWN, *IGNORED}):
         warn(
             f"{path}: keys that are not read are {', '.join(map(short, unknown))}. Where one of "

@@ -9,9 +9,9 @@ from typing import Any
 
 from xplanes import __version__
 from xplanes.errors import ConfigError
-from xplanes.evaluation.runs import OUTPUTS, is_run
 from xplanes.files import read_json
 from xplanes.lrm.weights import answers
+from xplanes.tools.runs import OUTPUTS, is_run
 from xplanes.training.record import read_config
 
 SCHEME = "hf://"

@@ -13,10 +13,10 @@ from PIL import Image
 
 from xplanes.config import CONF
 from xplanes.errors import ConfigError
-from xplanes.evaluation.curves import _mean_curve
-from xplanes.evaluation.published import check_published, read_published
-from xplanes.evaluation.sweep import Point, read_rows
-from xplanes.evaluation.table import write_tables
+from xplanes.tools.curves import _mean_curve
+from xplanes.tools.published import check_published, read_published
+from xplanes.tools.sweep import Point, read_rows
+from xplanes.tools.table import write_tables
 
 
 def make(

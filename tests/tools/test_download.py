@@ -16,9 +16,9 @@ import pytest
 from tests.refusals import assert_refused
 from xplanes.errors import SceneError
 from xplanes.files import StorageError
-from xplanes.scenes import download as download_module
-from xplanes.scenes import download as fetch_module
-from xplanes.scenes.download import DNERF_URL, TRAIN_VIEWS, download_dnerf
+from xplanes.tools import download as download_module
+from xplanes.tools import download as fetch_module
+from xplanes.tools.download import DNERF_URL, TRAIN_VIEWS, download_dnerf
 
 VIEWS = {name: count // 25 for name, count in TRAIN_VIEWS.items()}
 """Numbers of training views in these tests, but for those that want the published ones."""

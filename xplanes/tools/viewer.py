@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from xplanes.errors import ConfigError
-from xplanes.evaluation.drawing import MODES, Picture, Shot, camera_outlines, draw
 from xplanes.evaluation.render import orbit_poses
 from xplanes.optional import require
 from xplanes.rendering.base import Renderer
 from xplanes.rendering.pictures import colour_map, to_bytes
 from xplanes.scenes.views import Scene
+from xplanes.tools.drawing import MODES, Picture, Shot, camera_outlines, draw
 from xplanes.training.module import RadianceModule
 
 HOST, PORT = "127.0.0.1", 8080

@@ -11,10 +11,10 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from xplanes.evaluation.findings import pixels_of, sees_centre, time_gaps
-from xplanes.evaluation.inspect import CameraGroup, Capture, cameras_of
 from xplanes.files import replacing
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views, spread
+from xplanes.tools.inspect import CameraGroup, Capture, cameras_of
 
 WIDTH, HEIGHT, MARGIN = 1600, 960, 24
 SCALE = 2

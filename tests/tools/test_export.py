@@ -22,12 +22,6 @@ from xplanes.baselines.tineuvox.field import TiNeuVox
 from xplanes.baselines.tineuvox.fixed_step import FixedStepRenderer
 from xplanes.cli import main
 from xplanes.errors import ConfigError
-from xplanes.evaluation import export as module
-from xplanes.evaluation.camera_path import (
-    read_camera_path,
-)
-from xplanes.evaluation.export import ExportOptions, export, export_times
-from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.fields import Decoder, XPlanes
 from xplanes.fields.background import Background
 from xplanes.fields.base import ViewDependentField
@@ -41,6 +35,12 @@ from xplanes.rendering.pictures import to_bytes
 from xplanes.scenes.cameras import PosedCamera, orbit
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
+from xplanes.tools import export as module
+from xplanes.tools.camera_path import (
+    read_camera_path,
+)
+from xplanes.tools.export import ExportOptions, export, export_times
+from xplanes.tools.runs import TrainedRun, load_run
 from xplanes.training.scores import score_view
 
 trimesh: Any = pytest.importorskip("trimesh")

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from statistics import fmean, stdev
 from typing import Any
 
-from xplanes.evaluation.sweep import SCORES, RunRow
+from xplanes.tools.sweep import SCORES, RunRow
 
 SEED = "seed"
 UNLISTED = ("resume", "callbacks.evaluation.at", "media", "trainer.log_every_n_steps")

@@ -5,8 +5,8 @@ import sys
 
 import pytest
 
-from xplanes.evaluation.evaluate import UnavailableError, evaluate, lpips, score_table, write_scores
-from xplanes.evaluation.runs import load_run
+from xplanes.tools.evaluate import UnavailableError, evaluate, lpips, score_table, write_scores
+from xplanes.tools.runs import load_run
 
 
 def test_scores_equal_those_of_the_run(trained_run):

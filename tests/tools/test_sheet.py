@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from tests.evaluation.test_table import make, set_to
+from tests.tools.test_table import make, set_to
 from xplanes.cli import main
 from xplanes.errors import ConfigError
-from xplanes.evaluation.sheet import WHAT, check_what, write_sheet
+from xplanes.tools.sheet import WHAT, check_what, write_sheet
 
 TRUE, ERROR, DEPTH = (255, 0, 0), (0, 0, 255), (255, 0, 255)
 SIDE = 20

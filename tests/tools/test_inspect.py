@@ -21,7 +21,13 @@ from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.evaluation.findings import camera_findings
-from xplanes.evaluation.inspect import (
+from xplanes.models.base import ModelSettings
+from xplanes.scenes.cameras import look_at
+from xplanes.scenes.frame import scene_frame
+from xplanes.scenes.lenses import Lenses, LensModel
+from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.views import Intrinsics, Scene, Views
+from xplanes.tools.inspect import (
     Choice,
     cameras_of,
     choose,
@@ -32,13 +38,7 @@ from xplanes.evaluation.inspect import (
     next_command,
     table,
 )
-from xplanes.evaluation.inspect_picture import HEIGHT, POINT, WIDTH, draw
-from xplanes.models.base import ModelSettings
-from xplanes.scenes.cameras import look_at
-from xplanes.scenes.frame import scene_frame
-from xplanes.scenes.lenses import Lenses, LensModel
-from xplanes.scenes.source import SceneSettings
-from xplanes.scenes.views import Intrinsics, Scene, Views
+from xplanes.tools.inspect_picture import HEIGHT, POINT, WIDTH, draw
 
 SIZE, COUNT, HELD = 32, 16, 4
 

@@ -11,12 +11,12 @@ import torch
 from PIL import Image
 
 from xplanes.errors import ConfigError, SceneError
-from xplanes.evaluation.camera_path import read_camera_path
-from xplanes.evaluation.render import VideoOptions, render_video
-from xplanes.evaluation.runs import TrainedRun, load_run
 from xplanes.rendering.pictures import to_bytes
 from xplanes.scenes.cameras import PosedCamera
 from xplanes.scenes.views import Views
+from xplanes.tools.camera_path import read_camera_path
+from xplanes.tools.render import VideoOptions, render_video
+from xplanes.tools.runs import TrainedRun, load_run
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 from hydra.types import RunMode
 
-from tests.evaluation.test_sheet import areas, pictured
 from tests.inside import train
+from tests.tools.test_sheet import areas, pictured
 from tests.training.runs import SMALL
-from xplanes.evaluation.table import SweepTable, choose_gpu
+from xplanes.tools.table import SweepTable, choose_gpu
 
 CHANGED = ("model.channels", "trainer.max_steps", "callbacks.evaluation.at")
 

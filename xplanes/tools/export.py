@@ -14,10 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from xplanes.errors import ConfigError, require_between
-from xplanes.evaluation.camera_path import path_contents
-from xplanes.evaluation.export_web import Shape, write_page
 from xplanes.evaluation.render import FPS
-from xplanes.evaluation.runs import TrainedRun
 from xplanes.fields.base import SurfaceField, ViewDependentField
 from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES, XPlanes
 from xplanes.files import replacing, require_empty, require_writable, write_json
@@ -25,6 +22,9 @@ from xplanes.optional import require
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.box import ray_box
 from xplanes.rendering.grid_renderer import GridRenderer
+from xplanes.tools.camera_path import path_contents
+from xplanes.tools.export_web import Shape, write_page
+from xplanes.tools.runs import TrainedRun
 
 KINDS = ("mesh", "points", "planes", "path", "web")
 """What is written of every field, or of X-Planes; a field may have more in its `exports`."""

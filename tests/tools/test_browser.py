@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.evaluation.browser import SECONDS, browser, canvas_of, needs_browser, until
+from tests.tools.browser import SECONDS, browser, canvas_of, needs_browser, until
 from tests.training.runs import small_config
-from xplanes.evaluation import live
-from xplanes.evaluation import viewer as module
-from xplanes.evaluation.viewer import Viewer
 from xplanes.rendering.pictures import to_bytes
 from xplanes.run import run
+from xplanes.tools import live
+from xplanes.tools import viewer as module
+from xplanes.tools.viewer import Viewer
 
 pytestmark = [pytest.mark.slow, needs_browser]
 

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from xplanes.errors import ConfigError
-from xplanes.evaluation.sweep import RunRow
-from xplanes.evaluation.tabulate import differing, markdown, mean, mean_part
 from xplanes.files import read_rows
+from xplanes.tools.sweep import RunRow
+from xplanes.tools.tabulate import differing, markdown, mean, mean_part
 
 KEYS = {"model": "model.name", "lrm": "lrm.name", "sampler": "model.sampler.name"}
 """Settings that runs are told apart by, and their columns in the file."""

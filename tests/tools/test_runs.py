@@ -9,8 +9,8 @@ import torch
 import yaml
 
 from xplanes.errors import ConfigError
-from xplanes.evaluation.runs import find_run, load_run
 from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.tools.runs import find_run, load_run
 
 
 @pytest.fixture

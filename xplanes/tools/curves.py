@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from xplanes.evaluation.sweep import Point, RunRow, is_number
-from xplanes.evaluation.tabulate import SEED, mean
 from xplanes.files import replacing
+from xplanes.tools.sweep import Point, RunRow, is_number
+from xplanes.tools.tabulate import SEED, mean
 
 SCENE = "data.scene"
 PLACES = 60

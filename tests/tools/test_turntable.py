@@ -12,12 +12,12 @@ from tests.preparation.test_reconstruct import publish
 from xplanes.cli import main
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, SceneError
-from xplanes.evaluation import turntable as module
-from xplanes.evaluation.turntable import find_pictures, turntable, write_triplanes
 from xplanes.experiment import Experiment
 from xplanes.lrm import LRMError
 from xplanes.preparation import load_triplanes
 from xplanes.preparation.encode import straight_alpha
+from xplanes.tools import turntable as module
+from xplanes.tools.turntable import find_pictures, turntable, write_triplanes
 
 
 def settings(*overrides: str) -> Experiment:

@@ -15,16 +15,11 @@ from xplanes.config import compose_plain, group_options, quoted, settings_and_pa
 from xplanes.errors import ConfigError, SceneError
 from xplanes.evaluation.findings import (
     Finding,
-    ImageFacts,
     calibrations,
     camera_findings,
-    image_facts,
-    image_findings,
-    texel_findings,
     time_gaps,
     time_steps,
 )
-from xplanes.evaluation.tabulate import markdown
 from xplanes.models.base import ModelSettings
 from xplanes.process import train_command
 from xplanes.scenes.cameras import image_plane
@@ -33,6 +28,8 @@ from xplanes.scenes.frame import Frame, pixels_across, pixels_of_detail
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
+from xplanes.tools.image_findings import ImageFacts, image_facts, image_findings, texel_findings
+from xplanes.tools.tabulate import markdown
 
 CONSEQUENCES = {"scale": ("cut", "texels"), "astray": ("cut",)}
 """Findings that merely follow from another one."""

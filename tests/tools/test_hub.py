@@ -18,8 +18,8 @@ import yaml
 
 from xplanes.cli import main
 from xplanes.errors import ConfigError
-from xplanes.evaluation.hub import fetch, model_card, push
-from xplanes.evaluation.runs import load_run
+from xplanes.tools.hub import fetch, model_card, push
+from xplanes.tools.runs import load_run
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 NOWHERE = "http://127.0.0.1:9"
@@ -206,7 +206,7 @@ def test_commands_read_a_run_of_the_hub(
     monkeypatch.chdir(tmp_path)
     for name, verb in (("push", push), ("fetch", fetch)):
         at_hub = functools.partial(verb, endpoint=address)
-        monkeypatch.setattr(f"xplanes.evaluation.hub.{name}", at_hub)
+        monkeypatch.setattr(f"xplanes.tools.hub.{name}", at_hub)
     assert main(["push", str(trained_run), "somebody/excavator"]) == 0
     assert f"wrote {address}/somebody/excavator" in capsys.readouterr().out
     arguments = ["--frames", "1", "--size", "16", "--time", "0", "--path", "fixed"]

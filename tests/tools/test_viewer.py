@@ -22,14 +22,14 @@ from tests.training.test_surroundings import scene
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.cli import main
 from xplanes.errors import ConfigError
-from xplanes.evaluation import live
-from xplanes.evaluation import viewer as module
-from xplanes.evaluation.live import LiveViewer
 from xplanes.evaluation.render import orbit_poses
-from xplanes.evaluation.runs import TrainedRun, load_run
-from xplanes.evaluation.viewer import HOST, Viewer, camera_pose, check_address
 from xplanes.optional import MissingExtraError
 from xplanes.run import run
+from xplanes.tools import live
+from xplanes.tools import viewer as module
+from xplanes.tools.live import LiveViewer
+from xplanes.tools.runs import TrainedRun, load_run
+from xplanes.tools.viewer import HOST, Viewer, camera_pose, check_address
 from xplanes.training.clock import TrainingClock, find_callback
 from xplanes.training.fit import Trainer
 

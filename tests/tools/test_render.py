@@ -9,18 +9,18 @@ import torch
 from PIL import Image
 
 from xplanes.errors import ConfigError
-from xplanes.evaluation.render import (
+from xplanes.evaluation.render import write_video
+from xplanes.optional import MissingExtraError
+from xplanes.rendering.pictures import to_bytes
+from xplanes.tools.render import (
     VideoOptions,
     cameras,
     check_out,
     find_view,
     render_video,
     times,
-    write_video,
 )
-from xplanes.evaluation.runs import TrainedRun, load_run
-from xplanes.optional import MissingExtraError
-from xplanes.rendering.pictures import to_bytes
+from xplanes.tools.runs import TrainedRun, load_run
 from xplanes.training.scores import score_view
 
 

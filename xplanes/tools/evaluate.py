@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from xplanes.evaluation.runs import TrainedRun
 from xplanes.files import is_there, write_json
 from xplanes.optional import require
+from xplanes.tools.runs import TrainedRun
 from xplanes.training.scores import mean, score_view
 
 DEFAULT_NETWORK = "vgg"

@@ -16,15 +16,15 @@ import numpy as np
 import pytest
 import torch
 
-from tests.evaluation.browser import browser, canvas_of, needs_browser, until
-from tests.evaluation.test_export import FRAME, Ball, quiet, set_up
+from tests.tools.browser import browser, canvas_of, needs_browser, until
+from tests.tools.test_export import FRAME, Ball, quiet, set_up
 from xplanes.cli import main
 from xplanes.errors import ConfigError
-from xplanes.evaluation import export_web as module
-from xplanes.evaluation.export import ExportOptions, export
-from xplanes.evaluation.runs import TrainedRun
 from xplanes.optional import MissingExtraError
 from xplanes.scenes.frame import Frame
+from xplanes.tools import export_web as module
+from xplanes.tools.export import ExportOptions, export
+from xplanes.tools.runs import TrainedRun
 
 trimesh: Any = pytest.importorskip("trimesh")
 pytest.importorskip("skimage")

@@ -17,11 +17,12 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from xplanes.errors import ConfigError
-from xplanes.evaluation.curves import plot_against, plot_curves
-from xplanes.evaluation.published import beside, check_published
-from xplanes.evaluation.sheet import check_what, write_sheet
-from xplanes.evaluation.sweep import RunRow, published_tables, read_rows
-from xplanes.evaluation.tabulate import (
+from xplanes.files import write_json, write_rows, write_text
+from xplanes.tools.curves import plot_against, plot_curves
+from xplanes.tools.published import beside, check_published
+from xplanes.tools.sheet import check_what, write_sheet
+from xplanes.tools.sweep import RunRow, published_tables, read_rows
+from xplanes.tools.tabulate import (
     SEED,
     decomposition_table,
     differing,
@@ -30,7 +31,6 @@ from xplanes.evaluation.tabulate import (
     seed_table,
     shown,
 )
-from xplanes.files import write_json, write_rows, write_text
 
 _say = partial(print, flush=True)
 
@@ -115,7 +115,7 @@ class SweepTable(Callback):
 
     Args:
         published: Published tables to show with it, whatever the data.
-        sheet: What the contact sheet at the end shows, one of `xplanes.evaluation.sheet.WHAT`;
+        sheet: What the contact sheet at the end shows, one of `xplanes.tools.sheet.WHAT`;
             None for no sheet.
     """
 

@@ -16,7 +16,6 @@ from xplanes.baselines.kplanes.field import DensityField, HybridDecoder, KPlanes
 from xplanes.baselines.proposal import ProposalRenderer
 from xplanes.baselines.tensor4d.neus import NeusRenderer
 from xplanes.baselines.tineuvox.fixed_step import FixedStepRenderer
-from xplanes.evaluation.drawing import Picture, Shot, camera_outlines, draw, in_box
 from xplanes.fields.base import ViewDependentField
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.grid_renderer import GridRenderer
@@ -25,6 +24,7 @@ from xplanes.rendering.pictures import depth_picture
 from xplanes.scenes.cameras import look_at, orbit, project
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Intrinsics, Views
+from xplanes.tools.drawing import Picture, Shot, camera_outlines, draw, in_box
 
 FLAT = Frame(1.0, torch.eye(3), torch.zeros(3))
 TURN = torch.linalg.qr(torch.tensor([[1.0, 0.5, 0.2], [-0.3, 1.0, 0.4], [0.1, -0.6, 1.0]]))[0]

@@ -124,7 +124,7 @@ def test_rays_without_light_left_look_no_further():
     opacity = torch.linspace(0, 1, 30)
     opacity[::3] = 1.0
     seen = []
-    background.decoder.register_forward_hook(lambda *given: seen.append(len(given[2][0])))
+    background.register_forward_hook(lambda *given: seen.append(len(given[2][0])))
     plain = torch.ones(3)
     found = behind(Before(background), origins, directions, opacity, plain)
     whole = look(background, origins, directions)
@@ -146,12 +146,13 @@ def test_gradients_reach_the_background_and_are_zero_where_nothing_is_seen():
     assert all(p.grad is not None and not p.grad.any() for p in background.parameters())
 
 
-def test_what_no_ray_has_crossed_keeps_the_initial_colour():
+def test_what_no_ray_has_crossed_keeps_its_colour_whatever_others_show():
     usual = torch.tensor([0.6, 0.3, 0.2])
     with initial_values(3, Stream.BACKGROUND):
         background = Background(8, 32, width=32, samples=8, colour=usual)
     origins, directions = some_rays(2000)
-    origins, seen = 0.1 * origins, directions[:, 2] > 0
+    origins = 0.1 * origins
+    seen, others = directions[:, 2] > 0.9, directions[:, 0] < -0.9
     with torch.no_grad():
         at_first = look(background, origins, directions)
     assert (at_first - usual).abs().max() < 0.005
@@ -160,13 +161,13 @@ def test_what_no_ray_has_crossed_keeps_the_initial_colour():
     optimizer = torch.optim.Adam([planes, decoder])
     for _ in range(40):
         optimizer.zero_grad()
-        error = look(background, origins[seen], directions[seen]) - usual
+        error = look(background, origins[seen], directions[seen]) - 0.9
         error.square().mean().backward()
         optimizer.step()
     with torch.no_grad():
-        others = look(background, origins[~seen], directions[~seen])
-    assert error.abs().max() < 0.05
-    assert (others - usual).abs().max() < 0.05
+        shown = look(background, origins[others], directions[others])
+    assert error.abs().max() < 0.15
+    assert (shown - usual).abs().max() < 0.06
 
 
 def test_darkest_and_brightest_initial_colours_can_be_left():

@@ -1,4 +1,4 @@
-"""The background behind a field: its settings, learning rates and smoothness, for any model."""
+"""The learnt background behind a field: settings, learning rates and smoothness, for any model."""
 
 from dataclasses import dataclass
 
@@ -13,11 +13,11 @@ from xplanes.settings import Count, Positive, Settings, Steps, Weight
 from xplanes.streams import Stream, initial_values
 
 MOST_IMAGES, PIXEL_STEP = 32, 4
-"""Images that tell the usual colour, and every which row and column of them."""
+"""Largest number of images for `usual_colour`, and stride between their rows and columns."""
 
 
 def usual_colour(views: Views) -> Tensor:
-    """Median of the images' colours, by channel, from 0 to 1. [3]"""
+    """Median colour of the images, per channel, from 0 to 1. [3]"""
     steps = slice(None, None, PIXEL_STEP)
     chosen = spread(MOST_IMAGES, len(views))
     pixels = torch.cat([views.image(i)[steps, steps, :3].reshape(-1, 3) for i in chosen])
@@ -59,7 +59,7 @@ class BackgroundSettings(Settings):
         ]
 
     def regularise(self, background: Background, every: int = 1) -> None:
-        """Add the gradient of its total variation, as much as for ``every`` steps."""
+        """Add the gradient of its total variation, scaled by ``every`` steps."""
         planes = background.planes
         if planes.grad is not None and self.total_variation:
             weight = self.total_variation * every

@@ -51,7 +51,7 @@ class BundledLRMSettings(ImageLRMSettings):
             if own.suffix != ".safetensors" or not own.is_file():
                 raise LRMError(
                     f"{own} is no file that ends in .safetensors: name one that xplanes "
-                    "pretrain-lrm wrote, whose .json lies beside it"
+                    "pretrain-lrm wrote, with its .json beside it"
                 )
             model, path = load_bundled(own.stem, own.parent)
         return loaded(model, path, began)
@@ -211,7 +211,7 @@ def _settled(
     if views.is_static or frames == 1:
         model = replace(model, plane_set="three")
     if model.plane_set != "three":
-        # Frames of the video tell of more timesteps than few training views do.
+        # The video has more timesteps than a few training views.
         model = replace(model, time_resolution=model.rows_of_time(views.times, frames))
     if sequence.decoder_config is not None:
         try:

@@ -1,9 +1,8 @@
 """Videos of several fixed cameras: Neural 3D Video, or a folder with a calibration.
 
-Neural 3D Video keeps the calibration in poses_bounds.npy and the cameras as cam00.mp4, cam01.mp4,
-... in the same order. In other folders a transforms.json names each camera's video, its folder of
-images, or one of these images; or COLMAP has registered one image of each camera, of the camera's
-name.
+Neural 3D Video has the calibration in poses_bounds.npy and the videos cam00.mp4, cam01.mp4, ... in
+the same order. In other folders a transforms.json names each camera's video, its folder of images,
+or one of these images; or COLMAP has registered one image per camera, with the name of the camera.
 """
 
 import logging
@@ -58,16 +57,16 @@ POSES = "poses_bounds.npy"
 TRANSFORMS = "transforms.json"
 
 NUMBERED = re.compile(r"(?i)((view|camera|c|v)[_-]?\d+|\d\d+)")
-"""Names of cameras that are not called cam*."""
+"""Pattern of camera names other than cam*."""
 
 IMAGES = ("images", "image", "rgb", "frames")
-"""Folders of a camera that hold its images, where there are others beside them."""
+"""Names of the subfolder with a camera's images, if the camera has several subfolders."""
 
 SAME_RATE = 1e-3
-"""Share by which frame rates of synchronised cameras differ at most."""
+"""Largest relative difference between frame rates of synchronised cameras."""
 
 LATE = 1.5
-"""How many times the median a gap between frames is if the rate varies."""
+"""A longer gap between frames, relative to the median gap, indicates a variable frame rate."""
 
 SAME_POSE = 1e-4
 """Largest difference between poses of a fixed camera."""
@@ -83,9 +82,9 @@ class MultiCameraSettings(SceneSettings):
     )
 
     frames: list[int] | None  # First frame, last frame and stride; null for all frames.
-    # Names of the held-out cameras: scored, not trained on. null: cam00, or else the most central.
+    # Names of held-out cameras, which are scored only. null: cam00, or else the most central one.
     test_cameras: list[str] | None
-    video_camera: str | None  # Camera whose video the LRM sees; null: the most central one.
+    video_camera: str | None  # Camera whose video the LRM is given; null: the most central one.
     # Rotate the world so that the cameras' mean up vector becomes its z axis. null: if that is more
     # than 60 degrees from it.
     orient: bool | None

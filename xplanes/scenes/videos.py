@@ -14,7 +14,7 @@ from xplanes.optional import require
 from xplanes.scenes.images import Size
 
 SUFFIXES = """.mp4 .mov .m4v .mkv .webm .avi .mpg .mpeg .ts .mts .m2ts .3gp .wmv""".split()
-"""Suffixes of files that are taken for videos."""
+"""Suffixes of video files."""
 
 
 HDR = {16: "PQ", 18: "HLG"}
@@ -28,9 +28,9 @@ class Video:
     Attributes:
         path: The file.
         size: Height and width of its frames.
-        count: Number of the frames that it shows.
+        count: Number of frames that are shown.
         rate: Frames per second; None if unknown.
-        times: When they are shown, in seconds; empty if unknown.
+        times: Presentation times of the frames in seconds; empty if unknown.
     """
 
     path: Path
@@ -44,14 +44,14 @@ def read_header(path: Path) -> Video:
     """Size, number, rate and times of a video's frames. Nothing is decoded.
 
     Raises:
-        SceneError: If the file is no video.
+        SceneError: If the file is not a video.
         MissingExtraError: If PyAV is not installed.
     """
     av = require("av", extra="video")
     try:
         with av.open(str(path)) as container:
             stream = _stream(path, container)
-            # Not of those that an edit list hides, which containers count, too.
+            # Without frames hidden by an edit list, which the container's count includes.
             stamps = [
                 packet.pts
                 for packet in container.demux(stream)
@@ -76,7 +76,7 @@ def frames(path: Path, numbers: range) -> Iterator[np.ndarray]:
 
     Args:
         path: The file.
-        numbers: Numbers of the frames, from 0 on, ascending.
+        numbers: Indices of the frames, from 0, ascending.
 
     Returns:
         Colours of each frame. uint8 [h, w, 3]
@@ -89,7 +89,7 @@ def frames(path: Path, numbers: range) -> Iterator[np.ndarray]:
     try:
         with av.open(str(path)) as container:
             stream = _stream(path, container)
-            stream.codec_context.thread_count = 1  # Other videos are decoded at the same time.
+            stream.codec_context.thread_count = 1  # Several videos are decoded in parallel.
             for number, frame in enumerate(container.decode(stream)):
                 if frame.rotation:
                     raise SceneError(

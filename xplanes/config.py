@@ -240,7 +240,7 @@ def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "
     if key is None:
         return ""
     if options := _options_with(key, groups, conf):
-        return f"{key} belongs to {' and '.join(options)}, not to what is chosen"
+        return f"{key} belongs to {' and '.join(options)}, which is not chosen"
     prefix, _, last = key.rpartition(".")
     if last in ELSEWHERE:
         return f"Did you mean {ELSEWHERE[last].format(keys[key])}?"

@@ -48,7 +48,7 @@ def storage_error(problem: OSError, path: Path | None = None) -> StorageError | 
     return StorageError(f"{place} cannot be written: {reason}{room}. {way_out}")
 
 
-_FREE = "Free some space, or choose a folder on another disk; what was there before is still whole"
+_FREE = "Free some space, or choose a folder on another disk; existing files are intact"
 _OPEN = "Choose a folder that can be written"
 _IN_THE_WAY = "A file stands where a folder should be: choose another folder"
 _WAYS_OUT = {

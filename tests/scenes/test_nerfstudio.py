@@ -182,7 +182,7 @@ def test_lists_of_file_names_are_the_splits(capture):
         capture.refused(words, change)
     capture.content = whole
     capture.frames.pop(5)
-    capture.refused("train_filenames names images/frame_00005.png, which no frame shows")
+    capture.refused("train_filenames names images/frame_00005.png, which is in no frame")
 
 
 @pytest.mark.parametrize("key", ["time", "timestamp"])

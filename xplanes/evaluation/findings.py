@@ -200,7 +200,7 @@ def _sizes(scene: Scene) -> Iterator[Finding]:
         words = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in mixed[0].items())
         yield Finding(
             "sizes",
-            f"images of one camera differ in size ({words}): small ones have fewer rays and less "
+            f"images of one camera differ in size ({words}): small ones give fewer rays. "
             "Export all at one size, or set data.resolution",
         )
 

@@ -145,7 +145,7 @@ def _find(path: Path | None, key: str) -> Stage | None:
             return Stage(payload["content"], payload["seconds"], True, key)
     except Exception as error:  # A damaged file raises many kinds of errors.
         problem = f"damaged ({type(error).__name__})"
-    logger.warning("%s is %s: making it again", path, problem)
+    logger.warning("%s is %s: it is computed again", path, problem)
     return None
 
 

@@ -77,8 +77,8 @@ class ColmapSettings(CaptureSettings):
             return
         if self.times is not None:
             raise ConfigError(
-                f"time_pattern={self.time_pattern}: file names tell no times where "
-                f"times={self.times}; set one of both to null"
+                f"time_pattern={self.time_pattern}: file names tell no times with "
+                f"times={self.times}; set one of the two to null"
             )
         try:
             groups = re.compile(self.time_pattern).groups
@@ -285,8 +285,8 @@ def _matched(names: Sequence[str], labels: Sequence[str], pattern: str) -> list[
         found.append(number)
     if len(names) > 1 and len(set(found)) == 1:
         raise SceneError(
-            f"The names of all {len(names)} images, such as {names[0]}, give the number {found[0]} "
-            f"for their time. {OTHER_TIMES}"
+            f"The names of all {len(names)} images, such as {names[0]}, contain the same time, "
+            f"{found[0]}. {OTHER_TIMES}"
         )
     return found
 
@@ -304,8 +304,8 @@ def _ranks(names: Sequence[str], present: set[str]) -> list[float]:
     counts = {len(folders[_camera(name)]) for name in names}
     if len(counts) > 1:
         logger.warning(
-            "The cameras' folders hold %d to %d images. Those of one rank are taken to show one "
-            "time: if frames are missing, set data.times to a CSV file",
+            "The cameras' folders hold %d to %d images. Images of equal rank are treated as "
+            "simultaneous: if frames are missing, set data.times to a CSV file",
             *(min(counts), max(counts)),
         )
     return [places[name] for name in names]

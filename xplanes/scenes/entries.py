@@ -374,8 +374,8 @@ def world_turn(
     tags = [orientation(path) for path in paths] or [1] * len(poses)
     if turned_photos := sum(tag in UP for tag in tags):
         logger.info(
-            "%d of %d images are to be shown turned, as their EXIF orientation says: pixels are "
-            "read as they are stored, and up vectors follow EXIF",
+            "%d of %d images have an EXIF orientation that rotates them: pixels are read as they "
+            "are stored, and up vectors follow EXIF",
             *(turned_photos, len(paths)),
         )
     aside = torch.tensor([UP.get(tag, (0, 1)) for tag in tags], dtype=torch.float64)
@@ -383,8 +383,8 @@ def world_turn(
     if (rotation := upright(up)) is None:
         if orient:
             warn(
-                "The up vectors of the cameras cancel out, so the world keeps the axes that the "
-                "files give it. data.orient=false says that it should."
+                "The up vectors of the cameras cancel out, so the world keeps the axes of the "
+                "files. data.orient=false confirms this."
             )
         return None, "the z axis of the files; the cameras' up vectors cancel out"
     off = math.degrees(math.acos(min(1.0, max(-1.0, float(rotation[2, 2])))))
@@ -414,7 +414,7 @@ def require_precision(source: Path, positions: np.ndarray) -> None:
     if not largest <= min(room, FARTHEST):
         raise SceneError(
             f"{source}: the cameras lie up to {largest:.3g} world units from the origin and "
-            f"{extent:.3g} apart, which single precision cannot hold. Move the capture to the "
+            f"{extent:.3g} apart, which single precision cannot resolve. Move the capture to the "
             "origin first, as with colmap model_transformer, or correct the cameras."
         )
 
@@ -438,7 +438,7 @@ def refuse_repeats(
     for index, label in enumerate(labels):
         other = files.setdefault(paths[index], label)
         if other is not label:
-            raise SceneError(f"{label} shows the same file as {other}. Remove one of the two.")
+            raise SceneError(f"{label} has the same file as {other}. Remove one of the two.")
         # In a static scene a camera may pass the same place twice; repeats are refused with times.
         if not times:
             continue

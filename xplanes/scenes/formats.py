@@ -104,14 +104,14 @@ def mask_misfit(mask: Path, size: tuple[int, ...], image: Path, wanted: tuple[in
     )
     if size == wanted[::-1] and (turn := UNTURN.get(orientation(image))):
         return (
-            f"{text} The image's EXIF orientation says that it is shown turned, and the mask was "
-            "made of the turned image. Images are read as they are stored: turn the masks back "
+            f"{text} The image's EXIF orientation rotates it for display, and the mask was made "
+            "from the rotated image. Images are read as they are stored: rotate the masks back "
             f"(magick mogrify {turn} {mask.parent}/*)."
         )
     if size == wanted[::-1]:
         return (
-            f"{text} Its sides are swapped: it was perhaps made of an image that was shown turned, "
-            "as an EXIF orientation says. Make it of the image's pixels as they are stored."
+            f"{text} Its sides are swapped: perhaps it was made from an image that was rotated by "
+            "its EXIF orientation. Make it from the image's pixels as they are stored."
         )
     return f"{text} Export the mask at the size of the image."
 
@@ -125,7 +125,7 @@ def _formats() -> tuple[str, ...]:
 
 def _opened(path: Path) -> Image.Image:
     if path.suffix.lower() in RAW:
-        raise OSError("it holds what the sensor measured")
+        raise OSError("it holds raw sensor data")
     return Image.open(path, formats=_formats())
 
 

@@ -82,7 +82,7 @@ def final_sizes(
         if resolution > width:
             raise SceneError(
                 f"data.resolution={resolution} is more than the {width} pixels that {path} is "
-                f"wide. Enlarged images hold no more detail: give at most {width}, or null for the "
+                f"wide. Enlarged images have no more detail: set at most {width}, or null for the "
                 "native size."
             )
     return [(max(1, round(height * resolution / width)), resolution) for height, width in native]

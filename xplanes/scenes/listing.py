@@ -304,7 +304,7 @@ def read_views(
     empty = [file for index, file in enumerate(views.files) if not views.silhouette(index).any()]
     if empty:
         warn(
-            f"{len(empty)} of {len(views)} images show nothing (alpha is next to 0 everywhere): "
+            f"{len(empty)} of {len(views)} images show nothing (alpha is near 0 everywhere): "
             f"{some(empty)} in {listing.paths[0].parent}."
         )
     return views
@@ -412,8 +412,8 @@ def misshapen(path: Path, size: Size, camera: Calibration) -> str | None:
     )
     if (height > width) != (camera.h > camera.w) and orientation(path) in UNTURN:
         return (
-            f"{text} Its EXIF orientation says that it is to be shown turned, and the camera was "
-            "calibrated with the turned image. Pixels are read as they are stored: turn those of "
+            f"{text} Its EXIF orientation rotates it for display, and the camera was calibrated "
+            "with the rotated image. Pixels are read as they are stored: rotate those of "
             f"copies of the images (magick mogrify -auto-orient *{path.suffix})."
         )
     return (
@@ -481,7 +481,7 @@ def _require_real(
         )
     if any(not abs(value) <= STRONGEST for value in camera.distortion):
         raise SceneError(
-            f"{label}: its {camera.words}, of which none may be beyond {STRONGEST:g}. Correct the "
+            f"{label}: its {camera.words}; no coefficient may exceed {STRONGEST:g}. Correct the "
             "camera, or calibrate again."
         )
 
@@ -521,4 +521,4 @@ def require_rays(
     refuse_all(problems)
     if folded:
         others = len(folded) - 1
-        warn(max(folded)[1] + (f"; so are fewer of {others} other images." if others else "."))
+        warn(max(folded)[1] + (f"; {others} other images lose fewer." if others else "."))

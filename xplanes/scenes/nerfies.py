@@ -180,8 +180,8 @@ def _splits(folder: Path, protocol: str | None) -> tuple[dict[str, list[str]], P
     shared = sorted(set(found["train"]) & set(found.get("val", ())))
     if shared:
         raise SceneError(
-            f"{path}: {len(shared)} images are to be trained on and to be scored: {some(shared)}. "
-            "Take them out of one of the two lists."
+            f"{path}: {len(shared)} images are listed both for training and for scoring: "
+            f"{some(shared)}. Remove them from one of the two lists."
         )
     return found, path
 

@@ -73,8 +73,8 @@ def _listed_splits(
                 raise
             if image not in places:
                 raise SceneError(
-                    f"{path}: {key} names {name}, which no frame shows. Add the frame, or take the "
-                    "name out."
+                    f"{path}: {key} names {name}, which is in no frame. Add the frame, or remove "
+                    "the name."
                 )
             # Validation and test splits may share views.
             other = owner.setdefault(places[image], key)

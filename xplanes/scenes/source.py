@@ -184,7 +184,7 @@ class SceneSettings(Settings, ABC):
             poses = torch.cat([listing.camera_to_world for listing in parts.values()])
             up = world_turn(poses, (), False)[1]
             if world_turn(poses, (), None)[0] is not None:
-                warn(f"{self.folder}: up is {up}. If the scene lies on its side, turn the poses.")
+                warn(f"{self.folder}: up is {up}. If the scene lies on its side, rotate the poses.")
         notes = {**notes, "up": up}
         return Scene(self.folder.resolve().name, splits, cut=cut, notes=notes, **more)
 
@@ -229,8 +229,8 @@ class SceneSettings(Settings, ABC):
             if may_hold_out(train):
                 return scene
             warn(
-                f"{self.folder}: {len(train)} images are too few to hold some out: the images that "
-                "are trained on are scored, which says little of other views."
+                f"{self.folder}: {len(train)} images are too few to hold some out: the training "
+                "images are scored, which says little about other views."
             )
             return replace(scene, splits={**scene.splits, "val": train})
 

@@ -189,7 +189,7 @@ def _calibrations(
     if stretched := sum(new != old for new, old in zip(found, stated, strict=True)):
         warn(
             f"{path}: camera_angle_y of {stretched} of {len(found)} frames gives pixels that are "
-            "not square, and is followed. If they are square, take it out: Blender's own angle_y "
+            "not square, and is used. If they are square, remove it: Blender's own angle_y "
             "belongs to the sensor, not to the image."
         )
     _warn_of_two_focal_lengths(path, content, frames, found)
@@ -214,10 +214,10 @@ def _warn_of_two_focal_lengths(
             counts = axis == "x" or side > (camera.w or math.inf)
             if counts and abs(other / focal - 1) > SQUARE and f"fl_{axis}" in keys:
                 warn(
-                    f"{frame.label}: fl_{axis}={focal:g} is followed, but camera_angle_{axis} "
-                    f"means {other:.4g} pixels. Compare both with the camera: BlenderNeRF takes "
-                    "the wrong side of the sensor for fl_x and fl_y of images that are higher than "
-                    "wide. Take the wrong keys out."
+                    f"{frame.label}: fl_{axis}={focal:g} is used, but camera_angle_{axis} "
+                    f"means {other:.4g} pixels. Compare both with the camera: BlenderNeRF computes "
+                    "fl_x and fl_y of portrait images from the wrong side of the sensor. Remove "
+                    "the wrong keys."
                 )
                 return
 
@@ -250,8 +250,8 @@ def _warn_of_unknown(path: Path, content: Mapping[str, Any]) -> None:
     }
     if unknown := sorted(given - {*KNOWN, *IGNORED}):
         warn(
-            f"{path}: keys that are not read are {', '.join(map(short, unknown))}. Where one of "
-            "them changes what the images or cameras mean, convert these and take the key out."
+            f"{path}: keys that are not read are {', '.join(map(short, unknown))}. If one of them "
+            "affects the images or cameras, convert these and remove the key."
         )
 
 
@@ -316,8 +316,8 @@ def read_frames(path: Path) -> dict[str, Any]:
         if content.get(key):
             raise SceneError(
                 f"{path}: {key}={short(content[key])} stands for poses with other axes than "
-                "OpenGL's (x right, y up, z backward). Convert transform_matrix, and take the key "
-                "out."
+                "OpenGL's (x right, y up, z backward). Convert transform_matrix, and remove the "
+                "key."
             )
     return _plain(path, content) | {"frames": [_plain(path, each) for each in frames]}
 

@@ -62,8 +62,8 @@ def read_header(path: Path) -> Video:
             times = tuple(float(stamp * stream.time_base) for stamp in known) if whole else ()
             if (curve := stream.codec_context.color_trc) in HDR:
                 warn(
-                    f"{path} is an HDR video ({HDR[curve]}): its colours look pale where they are "
-                    "taken for ordinary ones. Convert it to SDR (tone mapping) before."
+                    f"{path} is an HDR video ({HDR[curve]}): without tone mapping its colours are "
+                    "pale. Convert it to SDR first."
                 )
             size = (stream.codec_context.height, stream.codec_context.width)
             return Video(path, size, len(stamps), stream.average_rate, times)
@@ -94,7 +94,7 @@ def frames(path: Path, numbers: range) -> Iterator[np.ndarray]:
                 if frame.rotation:
                     raise SceneError(
                         f"{path} is to be shown rotated by {frame.rotation} degrees, so that its "
-                        "pixels are not those of its calibration. Encode it upright: ffmpeg -i "
+                        "pixels do not match its calibration. Encode it upright: ffmpeg -i "
                         f"{path.name} upright{path.suffix}"
                     )
                 if number in numbers:
@@ -104,7 +104,7 @@ def frames(path: Path, numbers: range) -> Iterator[np.ndarray]:
     except av.FFmpegError as problem:
         raise _unreadable(path, problem) from problem
     raise SceneError(
-        f"{path} ends after frame {number}, but frame {numbers[-1]} is wanted: it is probably "
+        f"{path} ends after frame {number}, but frame {numbers[-1]} is needed: it is probably "
         f"truncated. Download it again, or set data.frames=[{numbers[0]},{number},{numbers.step}]."
     )
 

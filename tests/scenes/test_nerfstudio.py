@@ -562,7 +562,7 @@ def test_intrinsics_as_programs_write_them(capture, place, keys, expected, words
 
 
 def test_focal_lengths_that_disagree_with_fields_of_view(capture):
-    with pytest.warns(UserWarning, match="frame 0 .*fl_x=30 is followed, but camera_angle_x m"):
+    with pytest.warns(UserWarning, match="frame 0 .*fl_x=30 is used, but camera_angle_x m"):
         focal_lengths(capture, fl_x=30, w=SIZE, h=SIZE, camera_angle_x=ANGLE)
 
 

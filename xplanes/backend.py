@@ -228,14 +228,14 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         try:
             return numba.njit(cache=True, **options)(function)
         except RuntimeError:  # A container may have no writable folder.
-            _say_not_kept()
+            _warn_not_cached()
             return numba.njit(**options)(function)
 
     return decorate
 
 
 @functools.cache
-def _say_not_kept() -> None:
+def _warn_not_cached() -> None:
     logger.warning(
         "numba finds no folder that it can write to: the inner loops are compiled again at every "
         "start, which takes about %d s. NUMBA_CACHE_DIR=FOLDER keeps them in FOLDER",
@@ -245,7 +245,7 @@ def _say_not_kept() -> None:
 
 def compiled(module: str) -> Any:
     """A module of compiled loops. Loading the first takes a second; compiling, once, a few more."""
-    _settle_threads()
+    _start_threads()
     return importlib.import_module(module)
 
 
@@ -261,7 +261,7 @@ def synchronize(device: torch.device) -> None:
 
 
 @functools.cache
-def _settle_threads() -> None:
+def _start_threads() -> None:
     """Start as many threads for the loops as PyTorch uses, without changing PyTorch's number.
 
     If both use OpenMP, starting them sets PyTorch's number to all cores, against the user's choice;
@@ -276,7 +276,7 @@ def use_threads(count: int) -> None:
     """Use ``count`` threads in PyTorch and, if they are loaded, in the compiled loops."""
     if numba := sys.modules.get("numba"):
         numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
-    if torch.get_num_threads() != count:  # Setting it creates PyTorch's thread pool anew.
+    if torch.get_num_threads() != count:  # Setting it recreates PyTorch's thread pool.
         torch.set_num_threads(count)
 
 

@@ -32,7 +32,7 @@ def write_content(path: Path, content: dict[str, Any]) -> None:
             return
         from safetensors.torch import save_file
 
-        tensors, rest = _apart(content)
+        tensors, rest = _split(content)
         tensors = {name: tensor.contiguous() for name, tensor in tensors.items()}
         save_file(tensors, temporary, metadata={MARK: json.dumps(rest)})
 
@@ -54,7 +54,7 @@ def read_content(path: Path) -> Any:
     return content
 
 
-def _apart(content: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def _split(content: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors by dotted name, and the remaining nested dict."""
     tensors: dict[str, Tensor] = {}
     rest: dict[str, Any] = {}
@@ -62,7 +62,7 @@ def _apart(content: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
         if isinstance(value, Tensor):
             tensors[name] = value
         elif isinstance(value, dict):
-            inner, other = _apart(value)
+            inner, other = _split(value)
             tensors |= {f"{name}.{key}": tensor for key, tensor in inner.items()}
             rest[name] = other
         else:

@@ -409,8 +409,8 @@ def require_precision(source: Path, positions: np.ndarray) -> None:
     """
     extent = float(np.ptp(positions, axis=0).max())
     largest = float(np.abs(positions).max())
-    still = extent <= STILL
-    room = FARTHEST if still else ROUNDING * extent / float(np.finfo(np.float32).eps)
+    fixed = extent <= STILL
+    room = FARTHEST if fixed else ROUNDING * extent / float(np.finfo(np.float32).eps)
     if not largest <= min(room, FARTHEST):
         raise SceneError(
             f"{source}: the cameras lie up to {largest:.3g} world units from the origin and "

@@ -134,7 +134,7 @@ class PixelFile:
         if len(content) < length:
             raise StorageError(
                 f"{self.source} ends too early: it was truncated while in use. Delete it and start "
-                "again; the images are then decoded anew"
+                "again; then the images are decoded again"
             )
         return np.frombuffer(content, np.uint8)
 

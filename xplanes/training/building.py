@@ -117,7 +117,7 @@ def build_parts(
     found = Initialisation(method.model, frame)
     if initialise is not None:
         found = initialise(method, Place(scene, frame, device, devices, say, half_side))
-    settled = rays.on(device)
+    resolved = rays.on(device)
     site = Site(
         frame=found.frame,
         # For a field without time planes all views have the same time.
@@ -130,8 +130,8 @@ def build_parts(
         pixels=pixels_of_detail(views, found.frame, scene.is_surrounded),
         surrounded=scene.is_surrounded,
         device=device,
-        samples_per_batch=settled.most_samples,
-        batch_scale=settled.most / rays.most if rays.most else 1.0,
+        samples_per_batch=resolved.most_samples,
+        batch_scale=resolved.most / rays.most if rays.most else 1.0,
     )
     parts = Parts.assemble(found.model, site, found)
     assert parts.initialisation is not None

@@ -53,6 +53,8 @@ class Stream(IntEnum):
     """Points at which the sparsity prior is taken; processes add their rank."""
     THINNING = 1_000_427
     """Samples whose gradients are taken."""
+    UNSEEN = 1_000_507
+    """Rays along which the background has its usual colour unless views show another."""
 
 
 def step_generator(seed: int, step: int, stream: int = 0) -> torch.Generator:

@@ -16,8 +16,7 @@ INITIAL_SCALE = 1e-3
 """Standard deviation of the planes' random initial values."""
 
 DARKEST = 0.02
-"""Darkest colour of what no ray has seen, from where it is not far to any other; 1 minus it is the
-brightest."""
+"""Darkest initial colour, from where it is not far to any other; 1 minus it is the brightest."""
 
 DENSITY_SCALE, DENSITY_BIAS = 25.0, -2.0
 """Of the decoder. A ray keeps about a third of its light for infinity at first."""
@@ -71,12 +70,9 @@ class Background(nn.Module):
         samples: Samples of a ray behind the cube, before the one at infinity; 0 leaves that alone,
             so that colour depends on direction only.
         precision: "bf16" multiplies in bfloat16.
-        colour: Colour from 0 to 1 of what no ray of training sees, and of all at first; grey when
-            None. [3]
+        colour: Initial colour, from 0 to 1; whatever the decoder's random weights show when None.
+            [3]
     """
-
-    unseen: Tensor
-    """Logits of the colour of what no ray has seen. [3]"""
 
     def __init__(
         self,
@@ -94,10 +90,12 @@ class Background(nn.Module):
         self.decoder = Decoder(
             channels, width=width, hidden=1, density_scale=DENSITY_SCALE, precision=precision
         )
-        usual = torch.full((3,), 0.5) if colour is None else colour.clamp(DARKEST, 1 - DARKEST)
-        self.register_buffer("unseen", usual.logit())
         with torch.no_grad():
-            self.decoder.layers[-1].bias[0] += DENSITY_BIAS  # type: ignore[index]
+            bias = self.decoder.layers[-1].bias
+            bias[0] += DENSITY_BIAS  # type: ignore[index]
+            if colour is not None:
+                shown = self.decoder.logits(torch.zeros(1, 3 * channels))[0, 1:].float()
+                bias[1:] += colour.clamp(DARKEST, 1 - DARKEST).logit() - shown  # type: ignore[index]
 
     def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Colour, and density per unit length of contracted space. [N, 3] -> [N, 3], [N]
@@ -106,17 +104,4 @@ class Background(nn.Module):
             points: Contracted positions. [N, 3]
         """
         places, still = points / RADIUS, torch.zeros_like(points[:, 0])
-        features = plane_features(self.planes, None, places, still, ()).flatten(1)
-        return self.decoder.activate(self.decoder.logits(features).float() + self.offset)
-
-    @property
-    def offset(self) -> Tensor:
-        """What is added to the decoder's logits, so that planes of zeros show the usual colour. [4]
-
-        The decoder learns from all views: without it, what they have in common would show where no
-        ray has been.
-        """
-        channels = self.decoder.layers[0].in_features
-        nothing = self.planes.new_zeros(1, channels)  # type: ignore[arg-type]
-        shown = self.decoder.logits(nothing)[0, 1:].float()
-        return torch.cat([shown.new_zeros(1), self.unseen - shown])
+        return self.decoder(plane_features(self.planes, None, places, still, ()).flatten(1))

@@ -53,6 +53,8 @@ class Stream(IntEnum):
     """Points at which the sparsity prior is evaluated; processes add their rank."""
     THINNING = 1_000_427
     """Choice of the samples that receive gradients."""
+    UNSEEN = 1_000_507
+    """Random rays of the prior on the background's unseen directions."""
 
 
 def step_generator(seed: int, step: int, stream: int = 0) -> torch.Generator:

@@ -114,7 +114,7 @@ def test_a_world_gets_a_background_and_the_planes_are_initialised_as_ever():
     groups = {group["name"]: group["params"] for group in with_.model.groups()}
     listed = [id(p) for params in groups.values() for p in params]
     assert sorted(listed) == sorted(id(p) for p in with_.parameters())
-    assert set(terms(with_, "world")) == {"colour", "passing", "distortion"}
+    assert set(terms(with_, "world")) == {"colour", "passing", "distortion", "unseen"}
 
 
 def test_light_that_passes_the_cube_costs_until_the_field_has_taken_shape():

@@ -70,11 +70,8 @@ class Background(nn.Module):
         samples: Samples of a ray behind the cube, besides the one at infinity; with 0, colour
             depends on direction only.
         precision: "bf16" multiplies in bfloat16.
-        colour: Initial colour from 0 to 1, kept where no training ray passes; grey when None. [3]
+        colour: Initial colour from 0 to 1; that of the decoder's random weights when None. [3]
     """
-
-    unseen: Tensor
-    """Logits of the initial colour. [3]"""
 
     def __init__(
         self,
@@ -92,10 +89,12 @@ class Background(nn.Module):
         self.decoder = Decoder(
             channels, width=width, hidden=1, density_scale=DENSITY_SCALE, precision=precision
         )
-        usual = torch.full((3,), 0.5) if colour is None else colour.clamp(DARKEST, 1 - DARKEST)
-        self.register_buffer("unseen", usual.logit())
         with torch.no_grad():
-            self.decoder.layers[-1].bias[0] += DENSITY_BIAS  # type: ignore[index]
+            bias = self.decoder.layers[-1].bias
+            bias[0] += DENSITY_BIAS  # type: ignore[index]
+            if colour is not None:
+                shown = self.decoder.logits(torch.zeros(1, 3 * channels))[0, 1:].float()
+                bias[1:] += colour.clamp(DARKEST, 1 - DARKEST).logit() - shown  # type: ignore[index]
 
     def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Colour, and density per unit length of contracted space. [N, 3] -> [N, 3], [N]
@@ -104,17 +103,4 @@ class Background(nn.Module):
             points: Contracted positions. [N, 3]
         """
         places, times = points / RADIUS, torch.zeros_like(points[:, 0])
-        features = plane_features(self.planes, None, places, times, ()).flatten(1)
-        return self.decoder.activate(self.decoder.logits(features).float() + self.offset)
-
-    @property
-    def offset(self) -> Tensor:
-        """Offset of the decoder's logits, so that planes of zeros show the initial colour. [4]
-
-        The decoder is shared by all of space: without the offset, training would change the colour
-        where no ray has passed, too.
-        """
-        channels = self.decoder.layers[0].in_features
-        nothing = self.planes.new_zeros(1, channels)  # type: ignore[arg-type]
-        shown = self.decoder.logits(nothing)[0, 1:].float()
-        return torch.cat([shown.new_zeros(1), self.unseen - shown])
+        return self.decoder(plane_features(self.planes, None, places, times, ()).flatten(1))

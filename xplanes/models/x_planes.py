@@ -326,7 +326,9 @@ class XPlanesModel(Model):
         terms = super().losses(rendering, rays, state)
         if weight := self._passing(state.step):
             terms["passing"] = weight * (1 - rendering.opacity).mean()
-        if self._field.background is not None:
+        if (background := self._field.background) is not None:
+            if (options := self.settings.background) is not None:
+                terms |= options.losses(background, rendering, rays, state)
             return terms  # The images have neither alpha nor a known background.
         if self.opacity:
             error = opacity_shortfall if self._opaque else opacity_error

@@ -586,9 +586,8 @@ def write_planes(folder: Path, trained: TrainedRun) -> list[str]:
         behind = {"decoder": background.decoder.options, "samples": background.samples}
         for name, plane in zip(SPACE_PLANES, background.planes, strict=True):
             tensors[f"background.planes.{name}"] = plane.permute(2, 0, 1)
-        decoder = {f"background.decoder.{k}": v for k, v in background.decoder.state_dict().items()}
-        last = [name for name in decoder if name.endswith("bias")][-1]
-        tensors |= decoder | {last: decoder[last] + background.offset.detach()}
+        for name, value in background.decoder.state_dict().items():
+            tensors[f"background.decoder.{name}"] = value
     names = TIME_PLANES[field.plane_set]
     pairs = [[names[plane] for plane in pair] for pair in PLANE_SETS[field.plane_set]]
     content = {

@@ -181,6 +181,8 @@ class TiNeuVoxModel(Model):
                 rendering.colours, rays["target"], rendering.weights, rendering.ray
             )
             terms["sample_colour"] = self.weights.sample_colour * spread
+        if self._field.background is not None and self.settings.background is not None:
+            terms |= self.settings.background.losses(self._field.background, rendering, rays, state)
         return terms
 
     def scalars(self) -> dict[str, float]:
